@@ -1,0 +1,10 @@
+//! CAN frames and what they mean: layouts from DBC files, decoding of what comes in, encoding of what
+//! goes out. Pure: no socket, no file, no clock. Wire units and wire signs end here.
+
+pub mod dbc;
+pub mod decode;
+pub mod encode;
+pub mod frame;
+pub mod signal;
+
+pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

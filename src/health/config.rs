@@ -1,0 +1,74 @@
+//! Settings of what is learned at charge/discharge transitions.
+
+/// When the current counts as charge, rest or discharge.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TransitionConfig {
+    /// |current| (per pack) at and below which the pack rests, A.
+    pub dead_band_a: f64,
+    /// A mode is left only when the current is this far beyond the dead band's edge, A.
+    pub hysteresis_a: f64,
+    /// A new mode must hold this long before it counts, s.
+    pub min_duration_s: f64,
+    /// Half-cycles with less charge than this fraction of the rated capacity are joined to their neighbours.
+    pub min_swing: f64,
+}
+
+/// How a half-cycle's capacity measurement is formed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CapacityMethod {
+    /// Charge over the SOC swing the voltages tell, variance computed from the swing's uncertainty.
+    Swing,
+    /// As the paper: charge / nominal swing, fixed measurement variance.
+    Nominal {
+        /// The swing assumed, fraction (paper: 0.6).
+        swing: f64,
+        /// Measurement variance, Ah^2 (paper: 0.1).
+        variance_ah2: f64,
+    },
+}
+
+/// The event-based capacity filter (A = C = 1).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CapacityConfig {
+    /// Source of the measurement.
+    pub method: CapacityMethod,
+    /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
+    pub noise_ah_per_cycle: f64,
+    /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
+    pub current_gain_std: f64,
+}
+
+/// SOC window whose charging time is the recharge period.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RechargeConfig {
+    /// Lower SOC, fraction (0.3).
+    pub from_soc: f64,
+    /// Upper SOC, fraction (0.9).
+    pub to_soc: f64,
+}
+
+/// The load at which the usable capacity is stated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct UsableConfig {
+    /// Discharge current per cell, A.
+    pub current_a: f64,
+    /// Cell temperature, degrees C.
+    pub temperature_c: f64,
+    /// Voltage under load at which discharge ends, V.
+    pub cutoff_v: f64,
+    /// SOC the charger leaves when it calls the cell full (1 = full open-circuit voltage), fraction.
+    pub full_soc: f64,
+}
+
+/// Everything about learning at transitions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HealthConfig {
+    /// Mode detection.
+    pub transition: TransitionConfig,
+    /// Capacity filter.
+    pub capacity: CapacityConfig,
+    /// Recharge period.
+    pub recharge: RechargeConfig,
+    /// Usable capacity; `None` = not reported.
+    pub usable: Option<UsableConfig>,
+}

@@ -1,0 +1,38 @@
+//! packwatch: streaming battery health monitoring over SocketCAN.
+//!
+//! # Map
+//! A lower layer never names a higher one; `tests/layering.rs` holds the code to this table.
+//!
+//! | layer | module | what lives there |
+//! | --- | --- | --- |
+//! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
+//! | 1 | [`filter`] | unscented and linear Kalman filters: pure numbers |
+//! | 1 | [`can`] | frame, signal layout, decode, encode |
+//! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
+//! | 2 | [`cell`] | equivalent circuit, thermal model, estimator |
+//! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity |
+//! | 2 | [`alarm`] | rules over named values |
+//! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |
+//! | 3 | [`sim`] | truth model, sensor errors, scenarios |
+//! | 4 | [`config`] | TOML to checked settings, all faults at once |
+//! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service |
+//! | 6 | [`cli`] | one file per command |
+//!
+//! # Invariants
+//! * Layers 0 to 3 never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte for byte.
+//! * Inside, current is positive for discharge, SOC is a fraction; wire units end in [`can`].
+//! * A bad reading is data with a fault; nothing unknown looks healthy.
+
+pub mod alarm;
+pub mod can;
+pub mod cell;
+pub mod cli;
+pub mod config;
+pub mod daemon;
+pub mod filter;
+pub mod health;
+pub mod io;
+pub mod monitor;
+pub mod quantity;
+pub mod sample;
+pub mod sim;

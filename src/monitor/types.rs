@@ -1,0 +1,295 @@
+//! What goes into the [`Monitor`](super::Monitor) and what comes out.
+
+use serde::{Deserialize, Serialize};
+
+use crate::alarm::{Rule, Severity};
+use crate::can::Frame;
+use crate::can::decode::Channel;
+use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
+
+/// What an interface reports besides data frames.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "bus_event")]
+pub enum BusEvent {
+    /// The interface is there and up; frames may come.
+    Up,
+    /// The interface exists but is down.
+    Down,
+    /// The interface does not exist (missing at start, or removed).
+    Missing,
+    /// The kernel or a full queue of ours dropped this many frames since the last report.
+    Dropped {
+        /// Frames lost.
+        frames: u64,
+    },
+    /// An error frame; `class` is the error class mask of the frame's identifier (linux/can/error.h).
+    ErrorFrame {
+        /// CAN_ERR_* class bits.
+        class: u32,
+    },
+    /// Frames of ours could not be sent (queue full, interface gone).
+    SendFailed {
+        /// Frames not sent.
+        frames: u64,
+    },
+}
+
+/// One thing that happened, with the driver's time. Inputs come in the order in which they happened; a
+/// time before the latest one is counted and treated as the latest one (buses merge out of order).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Input<'a> {
+    /// A frame was received.
+    Frame {
+        /// When the kernel received it.
+        time: Timestamp,
+        /// Where.
+        bus: BusIndex,
+        /// What.
+        frame: &'a Frame,
+    },
+    /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs follow from ticks.
+    Tick {
+        /// Now.
+        time: Timestamp,
+    },
+    /// An interface changed or lost something.
+    Bus {
+        /// When.
+        time: Timestamp,
+        /// Which.
+        bus: BusIndex,
+        /// What.
+        event: BusEvent,
+    },
+    /// The record continues at `time`, but how much time really passed is unknown (a log without stamps between its parts).
+    UnknownGap {
+        /// The stamp from which the record goes on.
+        time: Timestamp,
+    },
+}
+
+impl Input<'_> {
+    /// The driver's time of this input.
+    pub fn time(&self) -> Timestamp {
+        match *self {
+            Input::Frame { time, .. } | Input::Tick { time } | Input::Bus { time, .. } | Input::UnknownGap { time } => {
+                time
+            }
+        }
+    }
+}
+
+/// Period of the driver's ticks, ms: ten times faster than the fastest sensible cyclic frame needs.
+pub const TICK_PERIOD_MS: u32 = 10;
+
+/// A frame to send.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Transmit {
+    /// Time of the input that caused it.
+    pub time: Timestamp,
+    /// Where to.
+    pub bus: BusIndex,
+    /// What.
+    pub frame: Frame,
+}
+
+/// Validity of the published estimates, as on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum Validity {
+    /// No estimate yet.
+    Unavailable = 0,
+    /// Inputs fresh, filter consistent.
+    Valid = 1,
+    /// An input is stale: the estimate is coasting and its deviation grows.
+    Degraded = 2,
+    /// The filter's innovations contradict its covariance.
+    Untrusted = 3,
+}
+
+/// Something worth a line in a log or a history row. Core events go to the driver, which logs them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "event")]
+pub enum EventKind {
+    /// The pack's mode changed; the new mode held for its minimum duration.
+    Mode {
+        /// Mode left.
+        from: Mode,
+        /// Mode entered.
+        to: Mode,
+    },
+    /// One half-cycle of one cell is complete.
+    HalfCycle {
+        /// Which cell.
+        cell: CellIndex,
+        /// Charge or discharge.
+        mode: Mode,
+        /// Charge moved, Ah, positive.
+        charge_ah: f64,
+        /// SOC swing, fraction, positive.
+        swing: f64,
+        /// Its standard deviation.
+        swing_std: f64,
+        /// Duration, s.
+        duration_s: f64,
+        /// Mean cell current, A, positive = discharge.
+        mean_current_a: f64,
+        /// Mean temperature, degrees C; `None` when no sensor was valid.
+        mean_temperature_c: Option<f64>,
+    },
+    /// The capacity filter ran.
+    Capacity {
+        /// Which cell.
+        cell: CellIndex,
+        /// What the half-cycle alone says, Ah; `None` = it carried no information.
+        measured_ah: Option<f64>,
+        /// Its standard deviation, Ah.
+        measured_std_ah: Option<f64>,
+        /// Estimate after the update, Ah.
+        capacity_ah: f64,
+        /// Its standard deviation, Ah.
+        capacity_std_ah: f64,
+        /// Usable capacity at the configured load, Ah.
+        usable_capacity_ah: Option<f64>,
+        /// Its standard deviation, Ah.
+        usable_capacity_std_ah: Option<f64>,
+        /// Resistance relative to new.
+        resistance_ratio: f64,
+        /// Its standard deviation.
+        resistance_ratio_std: f64,
+    },
+    /// A charge covered the recharge window.
+    RechargePeriod {
+        /// Seconds between the two configured SOC values.
+        seconds: f64,
+    },
+    /// An alarm was raised, changed severity or cleared.
+    Alarm {
+        /// Which rule.
+        rule: Rule,
+        /// Which cell; `None` = the pack.
+        cell: Option<CellIndex>,
+        /// Active after the change.
+        active: bool,
+        /// Its severity.
+        severity: Severity,
+        /// The value that decided; `None` = unknown.
+        value: Option<f64>,
+        /// The threshold it is compared with.
+        threshold: f64,
+    },
+    /// A signal turned bad (told once per change, then counted).
+    SignalBad {
+        /// Which signal.
+        channel: Channel,
+        /// Why.
+        fault: Fault,
+    },
+    /// A signal is good again.
+    SignalGood {
+        /// Which signal.
+        channel: Channel,
+        /// Bad readings in between.
+        bad_readings: u64,
+    },
+    /// An interface event.
+    Bus {
+        /// Which interface.
+        bus: BusIndex,
+        /// What.
+        what: BusEvent,
+    },
+    /// Nobody measured for this long (asleep, or the log has a hole).
+    Gap {
+        /// Seconds; `None` = unknown.
+        seconds: Option<f64>,
+    },
+    /// An input's time was before the latest one.
+    TimeBackwards {
+        /// By how much, s.
+        seconds: f64,
+    },
+    /// A cell's filter could not go on and started again from its voltage.
+    FilterReset {
+        /// Which cell.
+        cell: CellIndex,
+    },
+    /// The estimate of a cell can (not) be trusted.
+    Trust {
+        /// Which cell.
+        cell: CellIndex,
+        /// Whether its innovations agree with its covariance.
+        trusted: bool,
+        /// Mean normalised innovation squared over the window.
+        mean_nis: f64,
+    },
+}
+
+/// An event and when it happened.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Event {
+    /// Time of the input that caused it.
+    pub time: Timestamp,
+    /// What.
+    #[serde(flatten)]
+    pub kind: EventKind,
+}
+
+/// One cell's estimate after one voltage update.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Time of the voltage reading.
+    pub time: Timestamp,
+    /// Which cell.
+    pub cell: CellIndex,
+    /// State of charge, fraction.
+    pub soc: f64,
+    /// Its standard deviation.
+    pub soc_std: f64,
+    /// Branch voltages, V; NaN beyond the model's branches.
+    pub branch_v: [f64; crate::cell::MAX_BRANCHES],
+    /// Learned capacity, Ah.
+    pub capacity_ah: f64,
+    /// Its standard deviation, Ah.
+    pub capacity_std_ah: f64,
+    /// Resistance relative to new.
+    pub resistance_ratio: f64,
+    /// Its standard deviation.
+    pub resistance_ratio_std: f64,
+    /// Measured minus predicted voltage, V.
+    pub innovation_v: f64,
+    /// Its predicted standard deviation, V.
+    pub innovation_std_v: f64,
+    /// Whether the reading passed the gate and moved the estimate.
+    pub accepted: bool,
+    /// The voltage used, V.
+    pub voltage_v: f64,
+    /// The cell current used, A, positive = discharge.
+    pub current_a: f64,
+    /// The temperature used, degrees C.
+    pub temperature_c: f64,
+}
+
+/// Where the Monitor puts what came out; the caller empties it. Reused from input to input, so that the
+/// steady state allocates nothing.
+#[derive(Debug, Default)]
+pub struct Outputs {
+    /// Frames to send.
+    pub frames: Vec<Transmit>,
+    /// Events to log.
+    pub events: Vec<Event>,
+    /// Estimates, only when `want_estimates`.
+    pub estimates: Vec<Estimate>,
+    /// Whether anybody wants `estimates`.
+    pub want_estimates: bool,
+}
+
+impl Outputs {
+    /// Empties the lists, keeps their memory.
+    pub fn clear(&mut self) {
+        self.frames.clear();
+        self.events.clear();
+        self.estimates.clear();
+    }
+}

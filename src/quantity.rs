@@ -1,0 +1,138 @@
+//! Time, cell numbers, quality of a reading, and the conventions every module keeps.
+//!
+//! Conventions inside the program (wire units and wire signs end in `can` and `config`):
+//! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
+//! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
+//! * SOC and SOH are fractions 0..1.
+
+use serde::{Deserialize, Serialize};
+
+/// A point on a clock that never steps, in integer nanoseconds.
+///
+/// Its origin is the driver's choice (the daemon starts it at the wall time of its start, a log at the
+/// log's own stamps); only differences mean anything to the core.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Timestamp(i64);
+
+impl Timestamp {
+    /// The clock's origin.
+    pub const ZERO: Self = Self(0);
+
+    /// From nanoseconds since the clock's origin.
+    pub const fn from_nanos(nanos: i64) -> Self {
+        Self(nanos)
+    }
+
+    /// From seconds since the clock's origin, rounded to the nearest nanosecond; saturates at the ends
+    /// of the range (292 years), NaN gives the origin.
+    pub fn from_secs(seconds: f64) -> Self {
+        Self((seconds * 1e9).round() as i64)
+    }
+
+    /// Nanoseconds since the clock's origin.
+    pub const fn nanos(self) -> i64 {
+        self.0
+    }
+
+    /// Seconds since the clock's origin (a float: about 0.2 us resolution at today's Unix time).
+    pub fn secs(self) -> f64 {
+        self.0 as f64 * 1e-9
+    }
+
+    /// Seconds from `earlier` to `self`; negative when `earlier` is later.
+    pub fn since(self, earlier: Self) -> f64 {
+        self.0.saturating_sub(earlier.0) as f64 * 1e-9
+    }
+
+    /// This point moved by `seconds` (may be negative).
+    pub fn plus_secs(self, seconds: f64) -> Self {
+        self.plus_nanos((seconds * 1e9).round() as i64)
+    }
+
+    /// This point moved by `nanos` (may be negative).
+    pub const fn plus_nanos(self, nanos: i64) -> Self {
+        Self(self.0.saturating_add(nanos))
+    }
+}
+
+/// Largest number of cells (series elements) one daemon watches: 1,024, so that a cell number and
+/// "the pack as a whole" fit the 11-bit field of the alarm frame.
+pub const MAX_CELLS: usize = 1024;
+
+/// Which cell of the pack, counted from 0 inside; people and DBC patterns may count from 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct CellIndex(pub u16);
+
+impl CellIndex {
+    /// As an index into per-cell arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Which CAN interface, in the order of the configuration's `interfaces`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct BusIndex(pub u8);
+
+impl BusIndex {
+    /// As an index into per-interface arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Why a reading cannot be used. A bad reading is data, not an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Fault {
+    /// The frame carries fewer bytes than the signal needs.
+    ShortFrame,
+    /// The sender said "signal not available".
+    NotAvailable,
+    /// NaN or infinite on the wire (IEEE float signals).
+    NotFinite,
+    /// Outside the range the DBC or the configuration gives.
+    OutOfRange,
+    /// Moved faster than the configured rate allows.
+    RateTooHigh,
+    /// Did not move for longer than the configured time although it should have.
+    Stuck,
+    /// No value for longer than the configured age.
+    Stale,
+}
+
+/// What the cells do, by the sign of the current after dead band, hysteresis and minimum duration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// No current reading yet, or it is stale.
+    Unknown,
+    /// Current negative beyond the dead band.
+    Charge,
+    /// Current inside the dead band.
+    Rest,
+    /// Current positive beyond the dead band.
+    Discharge,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_round_trip_at_unix_scale() {
+        let t = Timestamp::from_secs(1_700_000_000.25);
+        assert_eq!(t.nanos(), 1_700_000_000_250_000_000);
+        assert_eq!(t.plus_secs(-0.25).since(t), -0.25);
+    }
+
+    #[test]
+    fn differences_saturate_instead_of_wrapping() {
+        let far = Timestamp::from_nanos(i64::MAX);
+        assert!(far.since(Timestamp::from_nanos(i64::MIN)) > 9.0e9);
+        assert_eq!(far.plus_secs(1.0), far);
+    }
+}

@@ -1,0 +1,51 @@
+//! Settings of the sample stage: what a plausible value is, how old it may be, which sensor serves which cell.
+
+use crate::can::decode::SensorIndex;
+
+/// Limits on one kind of reading. A value outside them is a bad reading and moves no estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Smallest plausible value, in the channel's unit.
+    pub min: f64,
+    /// Largest plausible value.
+    pub max: f64,
+    /// Fastest plausible change, unit per second; `None` = not checked.
+    pub max_rate_per_s: Option<f64>,
+    /// A value that does not move at all for this long, while the current does, is stuck; `None` = not checked.
+    pub stuck_after_s: Option<f64>,
+    /// A value older than this is stale.
+    pub max_age_s: f64,
+}
+
+/// Where the cells' voltages come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum VoltageSource {
+    /// One reading per cell.
+    Cells,
+    /// Only the pack's total: `series` equal cells are assumed and estimated as one.
+    PackTotal {
+        /// Cells in series the total is divided by.
+        series: u16,
+    },
+}
+
+/// Checked settings of the sample stage.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SampleConfig {
+    /// Estimated cells (1 with [`VoltageSource::PackTotal`]), 1 to [`crate::quantity::MAX_CELLS`].
+    pub cells: u16,
+    /// Where voltages come from.
+    pub voltage_source: VoltageSource,
+    /// Parallel strings that share the pack current equally.
+    pub strings: u16,
+    /// Limits of the pack current (per pack, not per string), A.
+    pub current: Limits,
+    /// Limits of a cell's voltage, V.
+    pub voltage: Limits,
+    /// Limits of a temperature, degrees C.
+    pub temperature: Limits,
+    /// For each cell the sensor that serves it; `None` = no sensor, the thermal model alone.
+    pub sensor_of_cell: Vec<Option<SensorIndex>>,
+    /// Temperature assumed for surroundings when no sensor says otherwise, degrees C.
+    pub ambient_c: f64,
+}
