@@ -1,2 +1,7 @@
 //! The binary: parse, dispatch, exit code.
-fn main() {}
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    packwatch::cli::main()
+}

@@ -1,1 +1,77 @@
-//! (being built)
+//! The command line: one file per command; here only parsing, dispatch and exit codes.
+#![expect(clippy::print_stdout, clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
+
+mod check;
+mod demo;
+mod replay;
+mod run;
+mod simulate;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Exit code of a bad configuration (EX_CONFIG; systemd does not restart on it).
+pub const EXIT_CONFIG: u8 = 78;
+
+/// Streaming battery health monitoring over SocketCAN.
+#[derive(Debug, Parser)]
+#[command(name = "packwatch", version, about, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the service on live CAN interfaces
+    Run(run::Args),
+    /// Replay journals, candump logs or CSV files through the same core
+    Replay(replay::Args),
+    /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
+    Simulate(simulate::Args),
+    /// A short ageing life on an in-process bus, ending in alarms; needs nothing
+    Demo(demo::Args),
+    /// Check a configuration and show what each configured signal resolves to
+    Check(check::Args),
+}
+
+/// Why a command ended without success: what to print and the exit code.
+#[derive(Debug)]
+pub struct Failure {
+    /// For the terminal, without the program's name.
+    pub message: String,
+    /// Exit code.
+    pub code: u8,
+}
+
+impl Failure {
+    /// A failure of the work itself: exit code 1.
+    pub fn new(message: impl Into<String>) -> Self {
+        Self { message: message.into(), code: 1 }
+    }
+}
+
+impl From<crate::config::ConfigFaults> for Failure {
+    fn from(faults: crate::config::ConfigFaults) -> Self {
+        Self { message: faults.0.join("\n"), code: EXIT_CONFIG }
+    }
+}
+
+/// Parses the command line and runs the command.
+pub fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Run(args) => run::run(&args),
+        Command::Replay(args) => replay::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
+        Command::Demo(args) => demo::run(&args),
+        Command::Check(args) => check::run(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("{}", failure.message);
+            ExitCode::from(failure.code)
+        }
+    }
+}
