@@ -27,7 +27,9 @@ impl Timestamp {
     /// From seconds since the clock's origin, rounded to the nearest nanosecond; saturates at the ends
     /// of the range (292 years), NaN gives the origin.
     pub fn from_secs(seconds: f64) -> Self {
-        Self((seconds * 1e9).round() as i64)
+        // Whole seconds apart: their product with 1e9 would not fit a float's 53 bits.
+        let whole = seconds.floor();
+        Self((whole as i64).saturating_mul(1_000_000_000).saturating_add(((seconds - whole) * 1e9).round() as i64))
     }
 
     /// Nanoseconds since the clock's origin.

@@ -74,6 +74,8 @@ pub struct Learner {
     prior: Vec<Belief>,
     /// Event filter's belief.
     capacity: Vec<Belief>,
+    /// Time without current since the last half-cycle, s.
+    rest_s: f64,
 }
 
 impl Learner {
@@ -85,6 +87,7 @@ impl Learner {
             candidate: None,
             prior: vec![initial_capacity; cells],
             capacity: vec![initial_capacity; cells],
+            rest_s: 0.0,
         }
     }
 
@@ -96,6 +99,16 @@ impl Learner {
             totals.temperature_integral += temperature_c * elapsed_s;
             totals.temperature_s += elapsed_s;
         }
+    }
+
+    /// The pack carried no current for `seconds`.
+    pub fn observe_rest(&mut self, seconds: f64) {
+        self.rest_s += seconds;
+    }
+
+    /// All cells have learned from the half-cycle at hand.
+    pub fn finish(&mut self) {
+        self.rest_s = 0.0;
     }
 
     /// A mode that may follow the present one begins here.
@@ -186,7 +199,11 @@ impl Learner {
         }
         self.capacity[cell] = belief;
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
-        estimator.widen_capacity(config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles);
+        let rest_days = (self.rest_s / 86_400.0).min(1.0);
+        estimator.widen_capacity(
+            config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
+                + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days,
+        );
         self.prior[cell] = estimator.capacity();
         measurement
     }
