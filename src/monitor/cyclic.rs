@@ -6,7 +6,7 @@ use super::{Event, EventKind, Monitor, Outputs, Transmit, Validity};
 use crate::alarm::{ActiveAlarm, AlarmChange, Rule};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, StatusFields};
-use crate::quantity::{CellIndex, Timestamp};
+use crate::quantity::{CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 const HOUSEKEEPING_S: f64 = 0.1;
@@ -70,23 +70,29 @@ impl Monitor {
     fn keep_house(&mut self, out: &mut Outputs) {
         self.sampler.poll(self.now, &mut self.scratch.signal_changes);
         self.report_signals(out);
-        self.observe_current(self.sampler.current_a(self.now), out);
+        self.observe_current(self.sampler.pack_current_a(self.now), out);
         self.watch_inputs(out);
         self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
     }
 
-    /// Age and plausibility of every input, for the rules about them.
+    /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
+    /// what belongs to no cell under the pack.
     fn watch_inputs(&mut self, out: &mut Outputs) {
-        let pack = self.sampler.pack_inputs(self.now);
-        self.observe_alarm(Rule::InputMissing, None, Some(pack.age_s), true, out);
-        self.observe_alarm(Rule::InputImplausible, None, Some(pack.bad_share), true, out);
-        for index in 0..self.config.sample.cells {
-            let cell = CellIndex(index);
-            let input = self.sampler.cell_input(cell, self.now);
-            self.observe_alarm(Rule::InputMissing, Some(cell), Some(input.age_s), true, out);
-            self.observe_alarm(Rule::InputImplausible, Some(cell), Some(input.bad_share), true, out);
+        let mut pack = (0.0_f64, 0.0_f64);
+        for index in 0..self.sampler.channel_count() {
+            let channel = self.sampler.channel(index);
+            let silence_s = self.sampler.silence_s(channel, self.now).unwrap_or(0.0);
+            let bad_share = self.sampler.bad_share(channel).unwrap_or(0.0);
+            if let Channel::CellVoltage(cell) = channel {
+                self.observe_alarm(Rule::InputMissing, Some(cell), Some(silence_s), true, out);
+                self.observe_alarm(Rule::InputImplausible, Some(cell), Some(bad_share), true, out);
+            } else {
+                pack = (pack.0.max(silence_s), pack.1.max(bad_share));
+            }
         }
+        self.observe_alarm(Rule::InputMissing, None, Some(pack.0), true, out);
+        self.observe_alarm(Rule::InputImplausible, None, Some(pack.1), true, out);
     }
 
     /// Takes a value into the rules; what changes goes out at once.
@@ -129,7 +135,7 @@ impl Monitor {
             Validity::Unavailable
         } else if self.cells.iter().any(|cell| !cell.trusted) {
             Validity::Untrusted
-        } else if self.sampler.any_stale() {
+        } else if self.sampler.any_bad() {
             Validity::Degraded
         } else {
             Validity::Valid

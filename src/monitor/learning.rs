@@ -20,7 +20,8 @@ impl Monitor {
             self.complete_mode(change, out);
         }
         if observed.candidate_begins {
-            self.learner.mark_candidate(self.now, self.sampler.charge_as());
+            let (charge_as, _) = self.sampler.counted(self.now);
+            self.learner.mark_candidate(self.now, charge_as);
         }
     }
 

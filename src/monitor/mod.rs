@@ -24,7 +24,7 @@ use crate::can::decode::InputMap;
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
 use crate::health::{HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
-use crate::quantity::{BusIndex, CellIndex, Mode, Reading, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
 /// Without any input, not even a tick, for this long, the computer was asleep, s: 500 ticks.
@@ -247,10 +247,10 @@ impl Monitor {
         let mut readings = std::mem::take(&mut self.scratch.readings);
         self.config.input.decode(bus, frame, |reading| readings.push(reading));
         for reading in readings.drain(..) {
-            let sample = self.sampler.handle(self.now, reading, &mut self.scratch.signal_changes);
+            let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
             self.report_signals(out);
-            if reading.channel == crate::quantity::Channel::Current {
-                self.observe_current(self.sampler.current_a(self.now), out);
+            if reading.channel == Channel::Current {
+                self.observe_current(self.sampler.pack_current_a(self.now), out);
             }
             if let Some(sample) = sample {
                 self.step_cell(&sample, out);
@@ -261,9 +261,10 @@ impl Monitor {
 
     fn report_signals(&mut self, out: &mut Outputs) {
         for change in self.scratch.signal_changes.drain(..) {
-            let kind = match change {
-                SignalChange::Bad { channel, fault } => EventKind::SignalBad { channel, fault },
-                SignalChange::Good { channel, bad_readings } => EventKind::SignalGood { channel, bad_readings },
+            let channel = change.channel;
+            let kind = match change.state {
+                Err(fault) => EventKind::SignalBad { channel, fault },
+                Ok(bad_readings) => EventKind::SignalGood { channel, bad_readings },
             };
             out.events.push(Event { time: self.now, kind });
         }

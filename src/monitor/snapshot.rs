@@ -98,6 +98,7 @@ impl Monitor {
         let branches = self.config.model.branches.len();
         let fits = snapshot.cells.len() == self.cells.len()
             && snapshot.learner.fits(self.cells.len())
+            && self.sampler.fits(&snapshot.sampler)
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
             return Err(RestoreError::Shape {
@@ -119,7 +120,8 @@ impl Monitor {
         for (slot, document) in self.cells.iter_mut().zip(&snapshot.cells) {
             slot.take_up(document, branches);
         }
-        self.sampler.restore(&snapshot.sampler);
+        // Checked in `restore`.
+        let _ = self.sampler.restore(&snapshot.sampler);
         self.detector = snapshot.detector;
         self.learner = snapshot.learner;
         self.recharge = snapshot.recharge;

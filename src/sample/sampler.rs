@@ -232,6 +232,21 @@ impl Sampler {
         (0..self.state.signals.len()).map(|slot| self.channel(slot))
     }
 
+    /// How many channels feed something.
+    pub fn channel_count(&self) -> usize {
+        self.state.signals.len()
+    }
+
+    /// Whether any signal is bad or stale.
+    pub fn any_bad(&self) -> bool {
+        self.state.signals.iter().any(Signal::is_bad)
+    }
+
+    /// Whether a stored state is of this many signals.
+    pub fn fits(&self, state: &SamplerState) -> bool {
+        state.signals.len() == self.state.signals.len()
+    }
+
     /// Readings that came for channels that feed nothing.
     pub fn unused_readings(&self) -> u64 {
         self.state.unused_readings
@@ -318,7 +333,8 @@ impl Sampler {
         }
     }
 
-    fn channel(&self, slot: usize) -> Channel {
+    /// The channel in a place of [`Sampler::channels`].
+    pub fn channel(&self, slot: usize) -> Channel {
         let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
         match (slot, self.config.voltage_source) {
             (0, _) => Channel::Current,
