@@ -38,6 +38,9 @@ const MAX_WALK_S: f64 = 600.0;
 /// Readings beyond the gate in a row before the filter may be called lost: one or two can be glitches.
 const MIN_REJECTED: u32 = 3;
 
+/// The same when the first came right after a gap: a record is missing, most likely.
+const MIN_REJECTED_AFTER_GAP: u32 = 2;
+
 /// Largest standard deviation a load that may have gone on through a gap adds to the SOC, fraction.
 const MAX_GAP_LOAD_STD: f64 = 0.3;
 
@@ -85,6 +88,8 @@ pub struct CellEstimator {
     /// Readings beyond the gate in a row, and since how long, s.
     rejected: u32,
     rejected_s: f64,
+    /// Whether the first of them came right after a gap: then the gap, not the sensor, is to blame.
+    rejected_after_gap: bool,
 }
 
 /// One filter per number of branches: N = branches + 3.
@@ -124,6 +129,7 @@ impl CellEstimator {
             information_s: config.max_information_s,
             rejected: 0,
             rejected_s: 0.0,
+            rejected_after_gap: false,
         }
     }
 
@@ -170,13 +176,18 @@ impl CellEstimator {
             (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
         } else {
             // The time before the first of them is not part of the run.
-            self.rejected_s += if self.rejected > 0 { elapsed_s } else { 0.0 };
+            if self.rejected == 0 {
+                (self.rejected_s, self.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
+            } else {
+                self.rejected_s += elapsed_s;
+            }
             self.rejected += 1;
         }
     }
 
     fn lost(&self, config: &EstimatorConfig) -> bool {
-        self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s
+        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
+        long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
     }
 
     /// Starts SOC and branches from the voltage at hand; keeps what was learned of resistance and capacity.
@@ -195,11 +206,15 @@ impl CellEstimator {
         });
         let soc = Belief { mean: soc, variance: square(config.initial_soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = square(config.initial_branch_std_v).max(KNOWN_VARIANCE);
-        let (log_r, capacity) = (self.log_resistance, self.capacity);
+        let kept = Kept {
+            log_resistance: self.log_resistance,
+            capacity: self.capacity,
+            covariance: self.capacity_resistance_covariance(),
+        };
         self.filter = Some(match model.branches.len() {
-            1 => Filter::One(fresh(soc, branch_variance, log_r, capacity)),
-            2 => Filter::Two(fresh(soc, branch_variance, log_r, capacity)),
-            _ => Filter::Three(fresh(soc, branch_variance, log_r, capacity)),
+            1 => Filter::One(fresh(soc, branch_variance, &kept)),
+            2 => Filter::Two(fresh(soc, branch_variance, &kept)),
+            _ => Filter::Three(fresh(soc, branch_variance, &kept)),
         });
         self.mean_nis = 0.0;
         self.information_s = config.max_information_s;
@@ -317,13 +332,22 @@ fn marginal<const N: usize>(x: &Gaussian<N>, i: usize) -> Belief {
     Belief { mean: x.mean[i], variance: x.covariance[(i, i)] }
 }
 
-fn fresh<const N: usize>(soc: Belief, branch_variance: f64, log_r: Belief, capacity: Belief) -> Gaussian<N> {
+/// What a reset keeps.
+struct Kept {
+    log_resistance: Belief,
+    capacity: Belief,
+    covariance: f64,
+}
+
+fn fresh<const N: usize>(soc: Belief, branch_variance: f64, kept: &Kept) -> Gaussian<N> {
     let mut mean = SVector::zeros();
     let mut variance = SVector::<f64, N>::repeat(branch_variance);
     (mean[0], variance[0]) = (soc.mean, soc.variance);
-    (mean[N - 2], variance[N - 2]) = (log_r.mean, log_r.variance);
-    (mean[N - 1], variance[N - 1]) = (capacity.mean, capacity.variance);
-    Gaussian { mean, covariance: SMatrix::from_diagonal(&variance) }
+    (mean[N - 2], variance[N - 2]) = (kept.log_resistance.mean, kept.log_resistance.variance);
+    (mean[N - 1], variance[N - 1]) = (kept.capacity.mean, kept.capacity.variance);
+    let mut covariance = SMatrix::from_diagonal(&variance);
+    (covariance[(N - 2, N - 1)], covariance[(N - 1, N - 2)]) = (kept.covariance, kept.covariance);
+    Gaussian { mean, covariance }
 }
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> Spread {
@@ -445,6 +469,7 @@ pub struct CellState {
     information_s: f64,
     rejected: u32,
     rejected_s: f64,
+    rejected_after_gap: bool,
 }
 
 impl CellEstimator {
@@ -465,6 +490,7 @@ impl CellEstimator {
             information_s: self.information_s,
             rejected: self.rejected,
             rejected_s: self.rejected_s,
+            rejected_after_gap: self.rejected_after_gap,
         }
     }
 
@@ -487,6 +513,7 @@ impl CellEstimator {
             information_s: state.information_s,
             rejected: state.rejected,
             rejected_s: state.rejected_s,
+            rejected_after_gap: state.rejected_after_gap,
         })
     }
 }

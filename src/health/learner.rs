@@ -27,6 +27,8 @@ pub struct HalfCycle {
     pub swing: f64,
     /// Its standard deviation; the errors of both ends taken as independent.
     pub swing_std: f64,
+    /// SOC at its end, fraction.
+    pub end_soc: f64,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
@@ -101,11 +103,6 @@ impl Learner {
         }
     }
 
-    /// The pack carried no current for `seconds`.
-    pub fn observe_rest(&mut self, seconds: f64) {
-        self.rest_s += seconds;
-    }
-
     /// All cells have learned from the half-cycle at hand.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
@@ -120,10 +117,10 @@ impl Learner {
 
     /// The mode that began at the candidate mark is confirmed: the marks of the mode that ended, or `None`
     /// when there are not two yet.
-    fn close(&mut self) -> Option<(Mark, &Mark)> {
+    fn close(&mut self) -> Option<(Mark, Mark)> {
         let end = self.candidate.take()?;
-        let start = self.start.replace(end)?;
-        self.start.as_ref().map(|end| (start, end))
+        let start = self.start.replace(end.clone())?;
+        Some((start, end))
     }
 
     /// Completes the mode `from`. Appends each cell's half-cycle to `half_cycles` in cell order when it was a
@@ -139,7 +136,10 @@ impl Learner {
         let sign = match from {
             Mode::Discharge => 1.0,
             Mode::Charge => -1.0,
-            Mode::Rest | Mode::Unknown => return,
+            Mode::Rest | Mode::Unknown => {
+                self.rest_s += end.time.since(start.time);
+                return;
+            }
         };
         let charge_ah = sign * (end.charge_as - start.charge_as) / 3600.0;
         if charge_ah <= 0.0 || charge_ah < config.min_swing * rated_capacity_ah {
@@ -153,6 +153,7 @@ impl Learner {
                 charge_ah,
                 swing: sign * (a.soc - b.soc),
                 swing_std: (a.soc_variance + b.soc_variance).sqrt(),
+                end_soc: b.soc,
                 duration_s,
                 mean_current_a: sign * charge_ah * 3600.0 / duration_s,
                 mean_temperature_c: (temperature_s > 0.0)

@@ -69,7 +69,13 @@ impl TransitionDetector {
 
     /// Confirms a candidate that has held long enough by `time`.
     pub fn poll(&mut self, config: &TransitionConfig, time: Timestamp) -> Option<ModeChange> {
-        let candidate = self.candidate.filter(|c| time.since(c.since) >= config.min_duration_s)?;
+        self.candidate.filter(|candidate| time.since(candidate.since) >= config.min_duration_s)?;
+        self.settle()
+    }
+
+    /// Confirms the candidate at once: what came before is over, whatever its duration.
+    pub fn settle(&mut self) -> Option<ModeChange> {
+        let candidate = self.candidate?;
         let from = std::mem::replace(&mut self.mode, candidate.mode);
         self.candidate = None;
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
