@@ -10,9 +10,8 @@ use super::noise::Stream;
 use super::scenario::Settings;
 use super::sensor::{Sensor, SensorError};
 use super::truth::Pack;
-use crate::can::decode::{Channel, SensorIndex};
 use crate::cell::CellModel;
-use crate::quantity::{CellIndex, Timestamp};
+use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 /// Longest step of the truth while nobody measures, s: the tables and the temperature are followed this finely.
 const ASLEEP_STEP_S: f64 = 60.0;
@@ -112,7 +111,7 @@ impl Simulation {
         self.started = true;
         let dt_s = self.settings.current_period_ns as f64 * 1e-9;
         loop {
-            if self.settings.duration_s.is_some_and(|end_s| self.time.secs() >= end_s) {
+            if self.settings.duration_s.is_some_and(|end_s| self.time.secs() + 0.5 * dt_s >= end_s) {
                 return None;
             }
             match self.course.next(&mut self.pack, dt_s) {

@@ -48,6 +48,8 @@ pub struct Settings {
     pub duration_s: Option<f64>,
     /// Ends when the weakest cell would fall below this capacity, Ah; 0 = never.
     pub end_capacity_ah: f64,
+    /// Cycling scenarios: SOC at which charging and discharging start.
+    pub soc_window: (f64, f64),
     /// Random walk: loads between two reference measurements.
     pub walk_steps: u32,
 }
@@ -96,6 +98,7 @@ impl Settings {
             cycles: None,
             duration_s: None,
             end_capacity_ah: 0.25 * scale,
+            soc_window: (0.30, 0.90),
             walk_steps: 1500,
         };
         match scenario {

@@ -5,10 +5,6 @@ use super::super::scenario::Settings;
 use super::super::truth::Pack;
 use super::Demand;
 
-/// SOC at which charging starts (both sources).
-const LOW_SOC: f64 = 0.30;
-/// SOC at which discharging starts.
-const HIGH_SOC: f64 = 0.90;
 /// Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
 const PAPER_CURRENT_A: f64 = 1.325;
 /// Charging current of the example, A for 30 Ah (it says constant, not how much; half the capacity per hour).
@@ -50,12 +46,13 @@ impl Load {
     }
 }
 
-/// Discharge to [`LOW_SOC`], charge to [`HIGH_SOC`], age, again.
+/// Discharge to the low SOC, charge to the high one, age, again.
 #[derive(Debug, Clone)]
 pub(crate) struct CycleCourse {
     load: Load,
     charge_a: f64,
     charging: bool,
+    soc_window: (f64, f64),
     cycles: Option<u32>,
     loss_ah: f64,
     end_capacity_ah: f64,
@@ -77,6 +74,7 @@ impl CycleCourse {
             load,
             charge_a,
             charging: false,
+            soc_window: settings.soc_window,
             cycles: settings.cycles,
             loss_ah: settings.pack.ageing.capacity_loss_ah_per_cycle,
             end_capacity_ah: settings.end_capacity_ah,
@@ -84,13 +82,13 @@ impl CycleCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        if self.charging && pack.highest_soc() >= HIGH_SOC {
+        if self.charging && pack.highest_soc() >= self.soc_window.1 {
             if self.is_last_cycle(pack) {
                 return Demand::Finished;
             }
             pack.complete_cycle();
             self.charging = false;
-        } else if !self.charging && pack.lowest_soc() <= LOW_SOC {
+        } else if !self.charging && pack.lowest_soc() <= self.soc_window.0 {
             self.charging = true;
         }
         Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
