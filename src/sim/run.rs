@@ -30,16 +30,6 @@ impl Wiring {
     pub fn single() -> Self {
         Self { strings: 1, temperature_at: vec![Some(CellIndex(0))] }
     }
-
-    /// From the sensor that serves each cell; a sensor sits on the first cell it serves.
-    pub fn of(sample: &crate::sample::SampleConfig) -> Self {
-        let sensors = sample.sensor_of_cell.iter().flatten().map(|s| s.0 + 1).max().unwrap_or(0);
-        let cell_of = |sensor| {
-            let cell = sample.sensor_of_cell.iter().position(|s| *s == Some(SensorIndex(sensor)))?;
-            Some(CellIndex(u16::try_from(cell).ok()?))
-        };
-        Self { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
-    }
 }
 
 /// One sampling moment.
