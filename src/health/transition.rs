@@ -58,12 +58,19 @@ impl TransitionDetector {
     pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> Observed {
         let change = self.poll(config, time);
         let seen = self.classify(config, current_a);
-        let candidate_begins = seen != self.mode && self.candidate.is_none_or(|candidate| candidate.mode != seen);
-        if seen == self.mode {
-            self.candidate = None;
-        } else if candidate_begins {
-            self.candidate = Some(Candidate { mode: seen, since: time });
-        }
+        let idle = |mode| matches!(mode, Mode::Rest | Mode::Unknown);
+        let mut candidate_begins = false;
+        self.candidate = match self.candidate {
+            _ if seen == self.mode => None,
+            // A load that ended and then a sensor that fell silent: the mode was left once, when the load ended.
+            Some(before) if before.mode == seen || (idle(before.mode) && idle(seen)) => {
+                Some(Candidate { mode: seen, since: before.since })
+            }
+            _ => {
+                candidate_begins = true;
+                Some(Candidate { mode: seen, since: time })
+            }
+        };
         Observed { change, candidate_begins }
     }
 

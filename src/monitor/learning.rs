@@ -54,14 +54,17 @@ impl Monitor {
         if half_cycle.mode == Mode::Charge && slot.tapered {
             slot.full_soc = half_cycle.end_soc;
         }
-        slot.usable = self.config.health.usable.as_ref().map(|config| {
-            usable_capacity(&self.config.model, config, &slot.estimator, update.capacity, slot.full_soc)
-        });
+        // What a discharge will deliver is restated by discharges: a charge leaves the resistance of charging.
+        let restate = half_cycle.mode == Mode::Discharge || slot.usable.is_none();
+        if let Some(config) = self.config.health.usable.as_ref().filter(|_| restate) {
+            let capacity = update.capacity;
+            slot.usable = Some(usable_capacity(&self.config.model, config, &slot.estimator, capacity, slot.full_soc));
+        }
         let usable_ah = slot.usable.map(|usable| usable.mean);
         out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
         out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
         self.observe_alarm(Rule::CapacityLow, Some(cell), Some(update.capacity.mean), true, out);
-        self.observe_alarm(Rule::UsableCapacityLow, Some(cell), usable_ah, true, out);
+        self.observe_alarm(Rule::UsableCapacityLow, Some(cell), usable_ah, restate, out);
     }
 
     /// Notes that a charge has tapered off at the highest voltage: what it leaves is "full".
