@@ -1,1 +1,4 @@
-//! (being built)
+//! Files and sockets: logs in every form, journals, result files, CAN interfaces.
+
+pub mod candump;
+pub mod ticks;
