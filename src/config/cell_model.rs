@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::document::{Document, Faults, Place};
 use super::schema::Presence::{Optional, Required};
-use super::schema::{SectionInfo, Walk, section};
+use super::schema::{Section as _, SectionInfo, Walk, section};
 use super::setting::Allowed::{Above, Between, NotEmpty};
 use super::{ConfigFaults, ReadFile, read_text};
 use crate::cell::{Branch, CellModel, MAX_BRANCHES, Table, Thermal};
@@ -100,13 +100,16 @@ pub(crate) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let tables = walk.one::<Tables>();
     let branches = walk.many::<BranchTables>();
     let thermal = walk.optional::<ThermalKeys>();
-    let written = walk.count("tables.branches");
+    let written = walk.count(BranchTables::PATH);
     if let Some(head) = &head {
         check_head(head, faults);
     }
     let tables = tables?;
     check_tables(&tables, faults);
-    check_branches(&tables, &branches, written, faults);
+    if let Some(written) = written {
+        check_branch_count(&tables.place, written, faults);
+    }
+    check_branches(&tables, &branches, faults);
     Some(model(head?, tables, branches, thermal))
 }
 
@@ -159,11 +162,14 @@ fn check_tables(tables: &Tables, faults: &mut Faults) {
     }
 }
 
-fn check_branches(tables: &Tables, branches: &[BranchTables], written: usize, faults: &mut Faults) {
+fn check_branch_count(place: &Place, written: usize, faults: &mut Faults) {
     if written == 0 || written > MAX_BRANCHES {
         let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
-        tables.place.note(faults, "branches", &what);
+        place.note(faults, "branches", &what);
     }
+}
+
+fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Faults) {
     for branch in branches {
         check_shape(&branch.place, "r_ohm", &branch.r_ohm, tables, faults);
         check_shape(&branch.place, "c_farad", &branch.c_farad, tables, faults);

@@ -5,7 +5,7 @@ use super::keys::{
     Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output, Pack,
     PackVoltageInput, Recharge, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
-use super::schema::Walk;
+use super::schema::{Section as _, Walk};
 use crate::alarm::{Rule, RuleConfig};
 use crate::can::decode::SensorIndex;
 use crate::cell::{CellModel, EstimatorConfig};
@@ -17,8 +17,14 @@ use crate::sample::{Limits, SampleConfig, VoltageSource};
 #[derive(Debug)]
 pub(crate) struct Raw {
     pub(crate) file: String,
+    /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
+    pub(crate) broken: bool,
     pub(crate) pack: Option<Pack>,
+    /// `pack.cell_model`, also when another key of `[pack]` is faulty: that file's faults are told with the rest.
+    pub(crate) cell_model: Option<String>,
     pub(crate) interfaces: Vec<Interface>,
+    /// Whether every `[[interface]]` that is written is in `interfaces`; otherwise names cannot be judged.
+    pub(crate) interfaces_whole: bool,
     pub(crate) input: Option<Input>,
     pub(crate) current: Option<CurrentInput>,
     pub(crate) cell_voltage: Option<CellVoltageInput>,
@@ -44,10 +50,14 @@ impl Raw {
     /// Reads every table; faults of single keys and unknown keys are noted.
     pub(crate) fn read(document: &Document<'_>, faults: &mut Faults) -> Self {
         let mut walk = Walk::new(document, SECTIONS, faults);
+        let interfaces: Vec<Interface> = walk.many();
         Self {
             file: document.file.clone(),
+            broken: walk.broken,
             pack: walk.one(),
-            interfaces: walk.many(),
+            cell_model: walk.text("pack.cell_model"),
+            interfaces_whole: !walk.broken && Some(interfaces.len()) == walk.count(Interface::PATH),
+            interfaces,
             input: walk.one(),
             current: walk.one(),
             voltages_written: (walk.has::<CellVoltageInput>(), walk.has::<PackVoltageInput>()),

@@ -27,7 +27,7 @@ pub(crate) fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
 }
 
 fn interfaces(raw: &Raw, faults: &mut Faults) {
-    if raw.interfaces.is_empty() {
+    if raw.interfaces.is_empty() && raw.interfaces_whole {
         faults.add(&raw.file, 1, "interface is missing, must be at least one table [[interface]]");
     }
     if let Some(one_too_many) = raw.interfaces.get(MAX_INTERFACES) {
@@ -48,6 +48,9 @@ fn interfaces(raw: &Raw, faults: &mut Faults) {
     let cells = raw.cell_voltage.iter().map(|s| s.source());
     let pack = raw.pack_voltage.iter().map(|s| s.source());
     let temperatures = raw.temperatures.iter().map(|s| s.source());
+    if !raw.interfaces_whole {
+        return;
+    }
     for source in current.chain(cells).chain(pack).chain(temperatures) {
         match source.interface {
             Some(name) => known_interface(name, source.place, "interface", &raw.interfaces, faults),
@@ -72,6 +75,7 @@ fn names(interfaces: &[Interface]) -> String {
 
 fn voltages(raw: &Raw, faults: &mut Faults) {
     match raw.voltages_written {
+        (false, false) if raw.broken => {}
         (false, false) => {
             let line = raw.input.as_ref().map_or(1, |input| input.place.line);
             faults.add(&raw.file, line, "input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]");
@@ -173,7 +177,7 @@ fn output(raw: &Raw, faults: &mut Faults) {
     let Some(output) = raw.output.as_ref().filter(|output| raw.output_written && output.enabled) else {
         return;
     };
-    for name in output.interfaces.iter().flatten() {
+    for name in output.interfaces.iter().flatten().filter(|_| raw.interfaces_whole) {
         known_interface(name, &output.place, "interfaces", &raw.interfaces, faults);
     }
     let ids = [("status_id", output.status_id), ("health_id", output.health_id), ("alarm_id", output.alarm_id)];

@@ -10,6 +10,8 @@ use toml::de::{DeTable, DeValue};
 
 /// Longest piece of the file quoted in a fault, characters: enough to recognise it, short enough for one line.
 const MAX_QUOTE: usize = 48;
+/// Faults of syntax told one by one; more than these mean a file of another kind.
+const MAX_SYNTAX_FAULTS: usize = 10;
 
 /// Everything found wrong, in files of any kind.
 #[derive(Debug, Default)]
@@ -54,6 +56,8 @@ impl Faults {
 pub(crate) struct Document<'t> {
     /// As people named it.
     pub(crate) file: String,
+    /// Whether the syntax is broken somewhere: what is missing may then stand in the broken part.
+    pub(crate) broken: bool,
     text: &'t str,
     root: DeTable<'t>,
 }
@@ -63,10 +67,14 @@ impl<'t> Document<'t> {
     /// the file is still checked.
     pub(crate) fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
         let (root, errors) = DeTable::parse_recoverable(text);
-        let document = Self { file: file.to_owned(), text, root: root.into_inner() };
-        for error in errors {
+        let document = Self { file: file.to_owned(), broken: !errors.is_empty(), text, root: root.into_inner() };
+        for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
             let line = error.span().map_or(0, |span| document.line(&span));
             faults.add(file, line, error.message().trim().replace('\n', ", "));
+        }
+        if let Some(error) = errors.get(MAX_SYNTAX_FAULTS) {
+            let line = error.span().map_or(0, |span| document.line(&span));
+            faults.add(file, line, format!("and {} more faults of syntax from here", errors.len() - MAX_SYNTAX_FAULTS));
         }
         document
     }

@@ -10,14 +10,19 @@ use crate::monitor::MonitorConfig;
 pub mod cell_model;
 mod convert;
 mod cross;
+mod describe;
 mod document;
 mod keys;
+mod pattern;
 mod reference;
+mod resolve;
 mod schema;
 mod setting;
 
+pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
 pub use reference::reference;
+use resolve::Databases;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -59,33 +64,41 @@ pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
 /// # Errors
 /// Every fault found, not only the first.
 pub fn load_with(path: &Path, read: ReadFile<'_>) -> Result<Config, ConfigFaults> {
+    read_all(path, read).map(|(config, _)| config)
+}
+
+/// Reads and checks a configuration, and says what it means.
+///
+/// # Errors
+/// Every fault found, not only the first.
+pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
+    read_all(path, &read_file).map(|(_, description)| description)
+}
+
+fn read_all(path: &Path, read: ReadFile<'_>) -> Result<(Config, Description), ConfigFaults> {
     let mut faults = Faults::default();
-    let config = read_config(path, read, &mut faults);
-    match config {
-        Some(config) if faults.is_empty() => Ok(config),
+    match read_config(path, read, &mut faults) {
+        Some(good) if faults.is_empty() => Ok(good),
         // A part that could not be made without anything said would be a fault of this program: never silent.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", path.display())])),
         _ => Err(ConfigFaults(faults.into_lines())),
     }
 }
 
-fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Config> {
+fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
     let text = read_text(path, read, faults)?;
     let document = Document::parse(&path.display().to_string(), &text, faults);
     let raw = convert::Raw::read(&document, faults);
-    let model = raw.pack.as_ref().and_then(|pack| {
-        let named = beside(path, &pack.cell_model);
-        cell_model::load_with(&named, read, faults)
-    });
+    let model = raw.cell_model.as_ref().and_then(|named| cell_model::load_with(&beside(path, named), read, faults));
     cross::check(&raw, model.as_ref(), faults);
-    let found = convert::Ranges {
-        current_a: convert::UNLIMITED,
-        voltage_v: convert::UNLIMITED,
-        temperature_c: convert::UNLIMITED,
-    };
+    let databases = Databases::load(path, &raw.input.as_ref()?.dbc, read, faults)?;
+    let found = resolve::resolve(&raw, &databases, faults);
+    let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let monitor = convert::monitor(&raw, model?, &found)?;
-    Some(Config { path: path.to_owned(), interfaces, monitor })
+    let monitor = convert::monitor(&raw, model?, &ranges)?;
+    let config = Config { path: path.to_owned(), interfaces, monitor };
+    let description = describe::describe(&raw, &config, &found, Vec::new());
+    Some((config, description))
 }
 
 /// `named`, relative to the folder of `path`.
@@ -111,3 +124,6 @@ fn read_text(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Str
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

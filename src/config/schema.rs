@@ -45,12 +45,15 @@ pub(crate) struct Key {
 impl Key {
     /// The range for people; empty when anything of the type goes.
     pub(crate) fn range(&self) -> String {
-        if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" | ") }
+        if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
     /// What must be written, type included.
     pub(crate) fn must_be(&self) -> String {
         let range = self.range();
+        if self.allowed == Allowed::NotEmpty {
+            return format!("must be {} that is not empty", self.kind);
+        }
         let unit = if self.unit.is_empty() { String::new() } else { format!(" ({})", self.unit) };
         match (self.choices.is_empty(), range.is_empty()) {
             (false, _) => format!("must be {range}"),
@@ -62,7 +65,7 @@ impl Key {
     /// What must be written, for a value of the right type.
     fn must_be_in_range(&self) -> String {
         match self.range() {
-            range if range.is_empty() => self.must_be(),
+            range if range.is_empty() || self.allowed == Allowed::NotEmpty => self.must_be(),
             range => format!("must be {range}"),
         }
     }
@@ -127,6 +130,7 @@ macro_rules! section {
     }) => {
         $(#[doc = $about])+
         #[derive(Debug, Clone)]
+        #[allow(dead_code, reason = "some keys are for people only, and not every table is checked again at its place")]
         pub(crate) struct $name {
             /// Where it stands in the file.
             pub(crate) place: $crate::config::document::Place,
@@ -161,6 +165,7 @@ pub(crate) use section;
 /// Reads the keys of one table.
 pub(crate) struct TableReader<'a> {
     document: &'a Document<'a>,
+    broken: bool,
     table: Option<&'a DeTable<'a>>,
     /// Where the table stands.
     pub(crate) place: Place,
@@ -199,6 +204,7 @@ impl TableReader<'_> {
                 let value = DeValue::parse(text).ok()?;
                 T::read(&value, &key.allowed).ok()
             }
+            Presence::Required if self.broken => None,
             Presence::Required => {
                 let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
                 self.faults.add(&self.document.file, self.place.line, text);
@@ -211,13 +217,16 @@ impl TableReader<'_> {
 /// Reads the declared tables of one document.
 pub(crate) struct Walk<'a> {
     document: &'a Document<'a>,
+    /// Whether syntax or tables are broken somewhere, so that what is not found may still be there: then nothing
+    /// is called missing.
+    pub(crate) broken: bool,
     faults: &'a mut Faults,
 }
 
 impl<'a> Walk<'a> {
     /// A walk that has checked the document for unknown keys.
     pub(crate) fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
-        let mut walk = Self { document, faults };
+        let mut walk = Self { document, broken: document.broken, faults };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
@@ -262,12 +271,18 @@ impl<'a> Walk<'a> {
         self.find(S::PATH).is_some()
     }
 
-    /// How many tables `[[path]]` are written.
-    pub(crate) fn count(&self, path: &str) -> usize {
+    /// How many tables `[[path]]` are written; `None` when something else stands there.
+    pub(crate) fn count(&self, path: &str) -> Option<usize> {
         match self.find(path).map(Spanned::get_ref) {
-            Some(DeValue::Array(items)) => items.len(),
-            _ => 0,
+            None => Some(0),
+            Some(DeValue::Array(items)) => Some(items.len()),
+            Some(_) => None,
         }
+    }
+
+    /// The text at a full path, whatever else its table says.
+    pub(crate) fn text(&self, path: &str) -> Option<String> {
+        self.find(path)?.get_ref().as_str().map(str::to_owned)
     }
 
     fn find(&self, path: &str) -> Option<&'a Spanned<DeValue<'a>>> {
@@ -283,7 +298,7 @@ impl<'a> Walk<'a> {
     fn read<S: Section>(&mut self, path: &str, line: usize, table: Option<&'a DeTable<'a>>) -> Option<S> {
         let nothing = DeTable::new();
         let place = self.document.place(path, line, table.unwrap_or(&nothing));
-        S::read(&mut TableReader { document: self.document, table, place, faults: self.faults })
+        S::read(&mut TableReader { document: self.document, broken: self.broken, table, place, faults: self.faults })
     }
 
     /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema,
@@ -321,6 +336,7 @@ impl<'a> Walk<'a> {
                 }
             }
             other => {
+                self.broken = true;
                 let found = match other {
                     DeValue::Table(_) => format!("[{schema}]"),
                     DeValue::Array(items) if items.iter().any(|item| item.get_ref().is_table()) => {
