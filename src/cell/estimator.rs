@@ -15,8 +15,8 @@
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
 //! Effect: the sample rate does not change the result.
 //!
-//! A reading beyond the gate moves nothing. When every reading has been beyond it for a whole consistency
-//! window, the filter has lost its cell: SOC and branches start again from the voltage, resistance and capacity are kept.
+//! A reading beyond the gate moves nothing. When every reading has been beyond it for `lost_after_s`, the filter
+//! has lost its cell: SOC and branches start again from the voltage, resistance and capacity are kept.
 
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use super::circuit::{self, BranchAt};
 use super::config::{CapacityState, EstimatorConfig};
 use super::model::{CellModel, MAX_BRANCHES, Place};
-use crate::filter::{Belief, FilterError, Gaussian, Spread, Update};
+use crate::filter::{Belief, FilterError, Gaussian, Noise, Spread, Update};
 
 /// A variance that stands for "known": small against any noise, large against rounding.
 const KNOWN_VARIANCE: f64 = 1e-12;
@@ -32,8 +32,17 @@ const KNOWN_VARIANCE: f64 = 1e-12;
 /// Variance of a SOC of which nothing is known: uniform over 0 to 1.
 const UNKNOWN_SOC_VARIANCE: f64 = 1.0 / 12.0;
 
-/// Longest time whose information one voltage reading may stand for, s: sparser readings are no better than this.
-const MAX_INFORMATION_S: f64 = 30.0;
+/// Longest time for which the resistance walks between two readings, s: it does not age in a gap.
+const MAX_WALK_S: f64 = 600.0;
+
+/// Readings beyond the gate in a row before the filter may be called lost: one or two can be glitches.
+const MIN_REJECTED: u32 = 3;
+
+/// The same when the first came right after a gap: a record is missing, most likely.
+const MIN_REJECTED_AFTER_GAP: u32 = 2;
+
+/// Largest standard deviation a load that may have gone on through a gap adds to the SOC, fraction.
+const MAX_GAP_LOAD_STD: f64 = 0.3;
 
 /// What happened to the cell since its last voltage reading, and that reading.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -71,9 +80,16 @@ pub struct CellEstimator {
     capacity: Belief,
     log_resistance: Belief,
     temperature_c: Option<f64>,
+    last_current_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     mean_nis: f64,
-    since_accepted_s: f64,
+    /// Time the next voltage reading speaks for, s: since the last one that was used.
+    information_s: f64,
+    /// Readings beyond the gate in a row, and since how long, s.
+    rejected: u32,
+    rejected_s: f64,
+    /// Whether the first of them came right after a gap: then the gap, not the sensor, is to blame.
+    rejected_after_gap: bool,
 }
 
 /// One filter per number of branches: N = branches + 3.
@@ -108,8 +124,12 @@ impl CellEstimator {
             capacity: Belief { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
             log_resistance: Belief { mean: 0.0, variance: (log_std * log_std).max(KNOWN_VARIANCE) },
             temperature_c: None,
+            last_current_a: 0.0,
             mean_nis: 0.0,
-            since_accepted_s: 0.0,
+            information_s: config.max_information_s,
+            rejected: 0,
+            rejected_s: 0.0,
+            rejected_after_gap: false,
         }
     }
 
@@ -134,13 +154,15 @@ impl CellEstimator {
         if self.filter.is_none() {
             self.start(model, config, step);
         } else if let Some(filter) = &mut self.filter {
-            each!(filter, x => predict(x, model, config, step, temperature_c))?;
+            let gap_load_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
         }
-        self.since_accepted_s += step.measured_s + step.unmeasured_s;
+        self.information_s += step.measured_s + step.unmeasured_s;
+        self.last_current_a = step.current_a.unwrap_or(self.last_current_a);
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
-        let information_s = self.since_accepted_s.clamp(1e-3, MAX_INFORMATION_S);
-        let variance = square(config.voltage_noise_v) + square(config.model_error_v_sqrt_s) / information_s;
-        let update = each!(filter, x => update(x, model, config, step.voltage_v, current_a, temperature_c, variance))?;
+        let information_s = self.information_s.clamp(1e-3, config.max_information_s);
+        let reading = Reading { voltage_v: step.voltage_v, current_a, temperature_c, information_s };
+        let update = each!(filter, x => update(x, model, config, &reading))?;
         self.watch(config, step, &update);
         Ok(Some(update))
     }
@@ -148,15 +170,24 @@ impl CellEstimator {
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
     fn watch(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
-        let forget = 1.0 - libm::exp(-elapsed_s.max(1e-3) / config.consistency_window_s);
-        self.mean_nis += forget * (update.test_ratio() - self.mean_nis);
+        let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency_window_s);
+        self.mean_nis += forget * (update.test_ratio - self.mean_nis);
         if update.accepted {
-            self.since_accepted_s = 0.0;
+            (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
+        } else {
+            // The time before the first of them is not part of the run.
+            if self.rejected == 0 {
+                (self.rejected_s, self.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
+            } else {
+                self.rejected_s += elapsed_s;
+            }
+            self.rejected += 1;
         }
     }
 
     fn lost(&self, config: &EstimatorConfig) -> bool {
-        self.since_accepted_s > config.consistency_window_s && self.mean_nis > square(config.gate_sigma)
+        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
+        long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
     }
 
     /// Starts SOC and branches from the voltage at hand; keeps what was learned of resistance and capacity.
@@ -175,14 +206,19 @@ impl CellEstimator {
         });
         let soc = Belief { mean: soc, variance: square(config.initial_soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = square(config.initial_branch_std_v).max(KNOWN_VARIANCE);
-        let (log_r, capacity) = (self.log_resistance, self.capacity);
+        let kept = Kept {
+            log_resistance: self.log_resistance,
+            capacity: self.capacity,
+            covariance: self.capacity_resistance_covariance(),
+        };
         self.filter = Some(match model.branches.len() {
-            1 => Filter::One(fresh(soc, branch_variance, log_r, capacity)),
-            2 => Filter::Two(fresh(soc, branch_variance, log_r, capacity)),
-            _ => Filter::Three(fresh(soc, branch_variance, log_r, capacity)),
+            1 => Filter::One(fresh(soc, branch_variance, &kept)),
+            2 => Filter::Two(fresh(soc, branch_variance, &kept)),
+            _ => Filter::Three(fresh(soc, branch_variance, &kept)),
         });
         self.mean_nis = 0.0;
-        self.since_accepted_s = 0.0;
+        self.information_s = config.max_information_s;
+        (self.rejected, self.rejected_s) = (0, 0.0);
     }
 
     /// The sensor's value, or the thermal model's from the last known one.
@@ -201,14 +237,12 @@ impl CellEstimator {
         circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s)
     }
 
-    /// Forgets how long ago things were: the record goes on after a gap of unknown length. Branches may or
-    /// may not have relaxed; SOC is as uncertain as after an hour of the configured gap current.
-    pub fn handle_unknown_gap(&mut self, config: &EstimatorConfig) {
+    /// The record goes on after a gap of unknown length: branches may or may not have relaxed, and of the SOC
+    /// nothing is sure.
+    pub fn handle_unknown_gap(&mut self) {
         let Some(filter) = &mut self.filter else { return };
-        let capacity_ah = each!(filter, x => x.mean[capacity_index(x)]);
-        let soc_variance = square(config.gap_current_std_a / capacity_ah);
         each!(filter, x => {
-            x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], soc_variance);
+            x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
             for i in 1..log_resistance_index(x) {
                 x.mean[i] *= 0.5;
                 x.covariance[(i, i)] += square(x.mean[i]);
@@ -298,13 +332,22 @@ fn marginal<const N: usize>(x: &Gaussian<N>, i: usize) -> Belief {
     Belief { mean: x.mean[i], variance: x.covariance[(i, i)] }
 }
 
-fn fresh<const N: usize>(soc: Belief, branch_variance: f64, log_r: Belief, capacity: Belief) -> Gaussian<N> {
+/// What a reset keeps.
+struct Kept {
+    log_resistance: Belief,
+    capacity: Belief,
+    covariance: f64,
+}
+
+fn fresh<const N: usize>(soc: Belief, branch_variance: f64, kept: &Kept) -> Gaussian<N> {
     let mut mean = SVector::zeros();
     let mut variance = SVector::<f64, N>::repeat(branch_variance);
     (mean[0], variance[0]) = (soc.mean, soc.variance);
-    (mean[N - 2], variance[N - 2]) = (log_r.mean, log_r.variance);
-    (mean[N - 1], variance[N - 1]) = (capacity.mean, capacity.variance);
-    Gaussian { mean, covariance: SMatrix::from_diagonal(&variance) }
+    (mean[N - 2], variance[N - 2]) = (kept.log_resistance.mean, kept.log_resistance.variance);
+    (mean[N - 1], variance[N - 1]) = (kept.capacity.mean, kept.capacity.variance);
+    let mut covariance = SMatrix::from_diagonal(&variance);
+    (covariance[(N - 2, N - 1)], covariance[(N - 1, N - 2)]) = (kept.covariance, kept.covariance);
+    Gaussian { mean, covariance }
 }
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> Spread {
@@ -317,34 +360,42 @@ fn predict<const N: usize>(
     config: &EstimatorConfig,
     step: &CellStep,
     temperature_c: f64,
+    gap_load_a: f64,
 ) -> Result<(), FilterError> {
     if step.measured_s > 0.0 || step.charge_as != 0.0 {
-        let charge_as = step.charge_as;
-        predict_part(x, model, config, temperature_c, step.measured_s, charge_as, 0.0)?;
+        let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[N - 1]);
+        let variance = square(config.soc_noise_per_sqrt_s) * step.measured_s
+            + square(config.charge_noise_per_sqrt_soc) * moved_soc;
+        propagate(x, model, config, temperature_c, step.measured_s, step.charge_as)?;
+        x.covariance[(0, 0)] += variance;
     }
     if step.unmeasured_s > 0.0 {
-        // Nobody knows the current of that time: none assumed, with the configured deviation.
-        let gap_as = config.gap_current_std_a * step.unmeasured_s;
-        predict_part(x, model, config, temperature_c, step.unmeasured_s, 0.0, gap_as)?;
+        // Nobody knows the current of that time: none assumed, but a load beside the gap may have gone on in it.
+        propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
+        let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[N - 1]);
+        let load_std = if gap_load_a > config.gap_rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
+        let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s + square(load_std) / 3.0;
+        x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
     }
     Ok(())
 }
 
-fn predict_part<const N: usize>(
+/// The circuit's equations over `dt_s`, with the noise of branches and resistance; the caller adds the SOC's.
+fn propagate<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
     config: &EstimatorConfig,
     temperature_c: f64,
     dt_s: f64,
     charge_as: f64,
-    charge_std_as: f64,
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let f = |x: &SVector<f64, N>| {
-        let place = model.place(x[0], temperature_c);
-        let ratio = libm::exp(x[N - 2]);
         let mut next = *x;
         next[0] = circuit::soc_after(x[0], charge_as, x[N - 1]);
+        // The branch's parameters at the middle of the step's SOC.
+        let place = model.place(0.5 * (x[0] + next[0]), temperature_c);
+        let ratio = libm::exp(x[N - 2]);
         for i in 0..N - 3 {
             let branch = BranchAt::new(model, i, &place, ratio);
             next[1 + i] = branch.voltage_after(config.discretisation, x[1 + i], mean_current_a, dt_s);
@@ -352,10 +403,7 @@ fn predict_part<const N: usize>(
         next
     };
     let q = process_noise::<N>(model, config, &model.place(x.mean[0], temperature_c), dt_s);
-    x.predict(&spread::<N>(config), f, &q)?;
-    let gap_variance = square(charge_std_as / (3600.0 * x.mean[N - 1]));
-    x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], gap_variance);
-    Ok(())
+    x.predict(&spread::<N>(config), f, &q)
 }
 
 /// Covariance the random walks gain in `dt_s`; the capacity's is added at transitions.
@@ -366,32 +414,43 @@ fn process_noise<const N: usize>(
     dt_s: f64,
 ) -> SMatrix<f64, N, N> {
     let mut q = SMatrix::zeros();
-    q[(0, 0)] = square(config.soc_noise_per_sqrt_s) * dt_s;
     for i in 0..N - 3 {
         // Noise fed into a decaying branch: bounded by tau/2 however long the step.
         let half_tau_s = 0.5 * model.branch_tau_s(i, place);
         let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
         q[(1 + i, 1 + i)] = square(config.branch_noise_v_per_sqrt_s) * effective_s;
     }
-    q[(N - 2, N - 2)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s;
+    q[(N - 2, N - 2)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s.min(MAX_WALK_S);
     q
+}
+
+/// A voltage reading with what is needed to predict it.
+struct Reading {
+    voltage_v: f64,
+    current_a: f64,
+    temperature_c: f64,
+    information_s: f64,
 }
 
 fn update<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
     config: &EstimatorConfig,
-    voltage_v: f64,
-    current_a: f64,
-    temperature_c: f64,
-    variance: f64,
+    reading: &Reading,
 ) -> Result<Update, FilterError> {
     let h = |x: &SVector<f64, N>| {
-        let place = model.place(x[0], temperature_c);
+        let place = model.place(x[0], reading.temperature_c);
         let branches_v: f64 = (1..N - 2).fold(0.0, |sum, i| sum + x[i]);
-        circuit::terminal_v(model, &place, libm::exp(x[N - 2]), branches_v, current_a)
+        circuit::terminal_v(model, &place, libm::exp(x[N - 2]), branches_v, reading.current_a)
     };
-    x.update(&spread::<N>(config), voltage_v, h, variance, config.gate_sigma)
+    let slope_v = model.ocv_slope_v(&model.place(x.mean[0], reading.temperature_c));
+    let sensor_variance = square(config.voltage_noise_v);
+    let noise = Noise {
+        variance: sensor_variance + square(config.model_error_v_sqrt_s) / reading.information_s,
+        gate_variance: sensor_variance + square(config.gate_model_error_v) + square(config.gate_soc_error * slope_v),
+        gate_sigma: config.gate_sigma,
+    };
+    x.update(&spread::<N>(config), reading.voltage_v, h, &noise)
 }
 
 /// The estimator's state as a document.
@@ -405,8 +464,12 @@ pub struct CellState {
     capacity: Belief,
     log_resistance: Belief,
     temperature_c: Option<f64>,
+    last_current_a: f64,
     mean_nis: f64,
-    since_accepted_s: f64,
+    information_s: f64,
+    rejected: u32,
+    rejected_s: f64,
+    rejected_after_gap: bool,
 }
 
 impl CellEstimator {
@@ -422,8 +485,12 @@ impl CellEstimator {
             capacity: self.capacity,
             log_resistance: self.log_resistance,
             temperature_c: self.temperature_c,
+            last_current_a: self.last_current_a,
             mean_nis: self.mean_nis,
-            since_accepted_s: self.since_accepted_s,
+            information_s: self.information_s,
+            rejected: self.rejected,
+            rejected_s: self.rejected_s,
+            rejected_after_gap: self.rejected_after_gap,
         }
     }
 
@@ -441,8 +508,12 @@ impl CellEstimator {
             capacity: state.capacity,
             log_resistance: state.log_resistance,
             temperature_c: state.temperature_c,
+            last_current_a: state.last_current_a,
             mean_nis: state.mean_nis,
-            since_accepted_s: state.since_accepted_s,
+            information_s: state.information_s,
+            rejected: state.rejected,
+            rejected_s: state.rejected_s,
+            rejected_after_gap: state.rejected_after_gap,
         })
     }
 }
@@ -453,3 +524,6 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
         covariance: SMatrix::from_column_slice(&state.covariance),
     })
 }
+
+#[cfg(test)]
+mod tests;

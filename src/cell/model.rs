@@ -111,6 +111,14 @@ impl CellModel {
         self.ocv_v.at(place, place.beyond_s)
     }
 
+    /// Slope of the open-circuit voltage over SOC, V per unit of SOC.
+    pub fn ocv_slope_v(&self, place: &Place) -> f64 {
+        let rise = |row: &[f64]| row[place.s + 1] - row[place.s];
+        let low = rise(&self.ocv_v.values[place.t]);
+        let high = if place.along_t == 0.0 { low } else { rise(&self.ocv_v.values[place.t + 1]) };
+        (low + place.along_t * (high - low)) / (self.soc[place.s + 1] - self.soc[place.s])
+    }
+
     /// Series resistance of a new cell, ohm.
     pub fn r0_ohm(&self, place: &Place) -> f64 {
         self.r0_ohm.at(place, place.along_s)

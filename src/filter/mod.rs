@@ -4,4 +4,4 @@ pub mod linear;
 pub mod unscented;
 
 pub use linear::{Belief, Measurement};
-pub use unscented::{FilterError, Gaussian, Spread, Update};
+pub use unscented::{FilterError, Gaussian, Noise, Spread, Update};

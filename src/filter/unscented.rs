@@ -50,22 +50,29 @@ impl Spread {
     }
 }
 
+/// Variances of one scalar measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Noise {
+    /// Variance the filter weighs the measurement with.
+    pub variance: f64,
+    /// Variance of a single reading's error for the gate; differs from `variance` where that one stands for
+    /// information per time rather than for a reading's size.
+    pub gate_variance: f64,
+    /// Gate width in standard deviations.
+    pub gate_sigma: f64,
+}
+
 /// What an update did.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
     /// Measured minus predicted.
     pub innovation: f64,
-    /// Predicted variance of the innovation, measurement noise included.
+    /// Predicted variance of the innovation: state and [`Noise::variance`].
     pub innovation_variance: f64,
+    /// innovation^2 over its variance with [`Noise::gate_variance`]: beyond gate_sigma^2 it is an outlier.
+    pub test_ratio: f64,
     /// Whether the innovation passed the gate and the state was moved.
     pub accepted: bool,
-}
-
-impl Update {
-    /// Normalised innovation squared: innovation^2 / its variance.
-    pub fn test_ratio(&self) -> f64 {
-        self.innovation * self.innovation / self.innovation_variance
-    }
 }
 
 /// The sigma points in pairs: centre, then plus and minus along each column of the factor.
@@ -117,8 +124,8 @@ impl<const N: usize> Gaussian<N> {
         self.set(mean, p)
     }
 
-    /// Takes in the scalar measurement `z` = `h`(x) + noise of variance `r`. An innovation beyond
-    /// `gate_sigma` standard deviations is reported and moves nothing.
+    /// Takes in the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported and
+    /// moves nothing.
     ///
     /// # Errors
     /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
@@ -127,8 +134,7 @@ impl<const N: usize> Gaussian<N> {
         spread: &Spread,
         z: f64,
         h: impl Fn(&SVector<f64, N>) -> f64,
-        r: f64,
-        gate_sigma: f64,
+        noise: &Noise,
     ) -> Result<Update, FilterError> {
         let points = self.points(spread)?;
         let centre = h(&points.centre);
@@ -139,24 +145,26 @@ impl<const N: usize> Gaussian<N> {
             predicted += y * spread.others;
         }
         // The centre's own offset from the mean is zero, so it adds to the variance only.
-        let mut variance = r + spread.covariance_0 * (centre - predicted) * (centre - predicted);
+        let mut spread_variance = spread.covariance_0 * (centre - predicted) * (centre - predicted);
         let mut cross = SVector::<f64, N>::zeros();
         for (x, y) in points.plus.iter().chain(&points.minus).zip(plus.iter().chain(&minus)) {
             let dy = y - predicted;
-            variance += spread.others * dy * dy;
+            spread_variance += spread.others * dy * dy;
             cross += (x - self.mean) * (spread.others * dy);
         }
         let innovation = z - predicted;
-        if !(innovation.is_finite() && variance.is_finite() && variance > 0.0) {
+        let variance = spread_variance + noise.variance;
+        let test_ratio = innovation * innovation / (spread_variance + noise.gate_variance);
+        if !(test_ratio.is_finite() && variance.is_finite() && variance > 0.0) {
             return Err(FilterError::NotFinite);
         }
-        let accepted = innovation * innovation <= gate_sigma * gate_sigma * variance;
+        let accepted = test_ratio <= noise.gate_sigma * noise.gate_sigma;
         if accepted {
             let mut p = self.covariance;
             add_outer(&mut p, &cross, -1.0 / variance);
             self.set(self.mean + cross * (innovation / variance), p)?;
         }
-        Ok(Update { innovation, innovation_variance: variance, accepted })
+        Ok(Update { innovation, innovation_variance: variance, test_ratio, accepted })
     }
 
     fn set(&mut self, mean: SVector<f64, N>, covariance: SMatrix<f64, N, N>) -> Result<(), FilterError> {
@@ -190,6 +198,10 @@ mod tests {
     use super::*;
     use nalgebra::{matrix, vector};
 
+    fn noise(variance: f64, gate_sigma: f64) -> Noise {
+        Noise { variance, gate_variance: variance, gate_sigma }
+    }
+
     fn start() -> Gaussian<2> {
         Gaussian { mean: vector![1.0, -0.5], covariance: matrix![0.04, 0.01; 0.01, 0.09] }
     }
@@ -206,7 +218,7 @@ mod tests {
         assert!((ukf.mean - x).norm() < 1e-14);
         assert!((ukf.covariance - p).norm() < 1e-14);
 
-        let update = ukf.update(&spread, z, |x| (h * x)[0], r, 5.0).expect("update");
+        let update = ukf.update(&spread, z, |x| (h * x)[0], &noise(r, 5.0)).expect("update");
         let s = (h * p * h.transpose())[0] + r;
         let k = p * h.transpose() / s;
         assert!((update.innovation_variance - s).abs() < 1e-14);
@@ -218,9 +230,9 @@ mod tests {
     fn an_outlier_is_reported_and_moves_nothing() {
         let spread = Spread::new(2, 1.0, 2.0, 0.0);
         let mut ukf = start();
-        let update = ukf.update(&spread, 8.4, |x| x[0], 1e-3, 5.0).expect("update");
+        let update = ukf.update(&spread, 8.4, |x| x[0], &noise(1e-3, 5.0)).expect("update");
         assert!(!update.accepted);
-        assert!(update.test_ratio() > 25.0);
+        assert!(update.test_ratio > 25.0);
         assert_eq!(ukf, start());
     }
 
@@ -233,7 +245,7 @@ mod tests {
         assert_eq!(ukf.predict(&spread, |x| *x, &SMatrix::zeros()), Err(FilterError::NotPositiveDefinite));
         assert_eq!(ukf, before);
         let mut ukf = start();
-        assert_eq!(ukf.update(&spread, f64::NAN, |x| x[0], 1e-3, 5.0), Err(FilterError::NotFinite));
+        assert_eq!(ukf.update(&spread, f64::NAN, |x| x[0], &noise(1e-3, 5.0)), Err(FilterError::NotFinite));
         assert_eq!(ukf, start());
     }
 
@@ -258,7 +270,7 @@ mod tests {
             truth += 0.1 * normal();
             let z = truth + 0.5 * normal();
             ukf.predict(&spread, |x| *x, &matrix![0.01]).expect("predict");
-            sum += ukf.update(&spread, z, |x| x[0], 0.25, 50.0).expect("update").test_ratio();
+            sum += ukf.update(&spread, z, |x| x[0], &noise(0.25, 50.0)).expect("update").test_ratio;
         }
         let mean_nis = sum / f64::from(n);
         assert!((mean_nis - 1.0).abs() < 3.0 * (2.0 / f64::from(n)).sqrt(), "mean NIS {mean_nis}");

@@ -27,6 +27,8 @@ pub struct HalfCycle {
     pub swing: f64,
     /// Its standard deviation; the errors of both ends taken as independent.
     pub swing_std: f64,
+    /// SOC at its end, fraction.
+    pub end_soc: f64,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
@@ -74,6 +76,8 @@ pub struct Learner {
     prior: Vec<Belief>,
     /// Event filter's belief.
     capacity: Vec<Belief>,
+    /// Time without current since the last half-cycle, s.
+    rest_s: f64,
 }
 
 impl Learner {
@@ -85,6 +89,7 @@ impl Learner {
             candidate: None,
             prior: vec![initial_capacity; cells],
             capacity: vec![initial_capacity; cells],
+            rest_s: 0.0,
         }
     }
 
@@ -98,6 +103,11 @@ impl Learner {
         }
     }
 
+    /// All cells have learned from the half-cycle at hand.
+    pub fn finish(&mut self) {
+        self.rest_s = 0.0;
+    }
+
     /// A mode that may follow the present one begins here.
     pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
@@ -107,10 +117,10 @@ impl Learner {
 
     /// The mode that began at the candidate mark is confirmed: the marks of the mode that ended, or `None`
     /// when there are not two yet.
-    fn close(&mut self) -> Option<(Mark, &Mark)> {
+    fn close(&mut self) -> Option<(Mark, Mark)> {
         let end = self.candidate.take()?;
-        let start = self.start.replace(end)?;
-        self.start.as_ref().map(|end| (start, end))
+        let start = self.start.replace(end.clone())?;
+        Some((start, end))
     }
 
     /// Completes the mode `from`. Appends each cell's half-cycle to `half_cycles` in cell order when it was a
@@ -126,7 +136,10 @@ impl Learner {
         let sign = match from {
             Mode::Discharge => 1.0,
             Mode::Charge => -1.0,
-            Mode::Rest | Mode::Unknown => return,
+            Mode::Rest | Mode::Unknown => {
+                self.rest_s += end.time.since(start.time);
+                return;
+            }
         };
         let charge_ah = sign * (end.charge_as - start.charge_as) / 3600.0;
         if charge_ah <= 0.0 || charge_ah < config.min_swing * rated_capacity_ah {
@@ -140,6 +153,7 @@ impl Learner {
                 charge_ah,
                 swing: sign * (a.soc - b.soc),
                 swing_std: (a.soc_variance + b.soc_variance).sqrt(),
+                end_soc: b.soc,
                 duration_s,
                 mean_current_a: sign * charge_ah * 3600.0 / duration_s,
                 mean_temperature_c: (temperature_s > 0.0)
@@ -186,7 +200,11 @@ impl Learner {
         }
         self.capacity[cell] = belief;
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
-        estimator.widen_capacity(config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles);
+        let rest_days = (self.rest_s / 86_400.0).min(1.0);
+        estimator.widen_capacity(
+            config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
+                + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days,
+        );
         self.prior[cell] = estimator.capacity();
         measurement
     }

@@ -58,18 +58,31 @@ impl TransitionDetector {
     pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> Observed {
         let change = self.poll(config, time);
         let seen = self.classify(config, current_a);
-        let candidate_begins = seen != self.mode && self.candidate.is_none_or(|candidate| candidate.mode != seen);
-        if seen == self.mode {
-            self.candidate = None;
-        } else if candidate_begins {
-            self.candidate = Some(Candidate { mode: seen, since: time });
-        }
+        let idle = |mode| matches!(mode, Mode::Rest | Mode::Unknown);
+        let mut candidate_begins = false;
+        self.candidate = match self.candidate {
+            _ if seen == self.mode => None,
+            // A load that ended and then a sensor that fell silent: the mode was left once, when the load ended.
+            Some(before) if before.mode == seen || (idle(before.mode) && idle(seen)) => {
+                Some(Candidate { mode: seen, since: before.since })
+            }
+            _ => {
+                candidate_begins = true;
+                Some(Candidate { mode: seen, since: time })
+            }
+        };
         Observed { change, candidate_begins }
     }
 
     /// Confirms a candidate that has held long enough by `time`.
     pub fn poll(&mut self, config: &TransitionConfig, time: Timestamp) -> Option<ModeChange> {
-        let candidate = self.candidate.filter(|c| time.since(c.since) >= config.min_duration_s)?;
+        self.candidate.filter(|candidate| time.since(candidate.since) >= config.min_duration_s)?;
+        self.settle()
+    }
+
+    /// Confirms the candidate at once: what came before is over, whatever its duration.
+    pub fn settle(&mut self) -> Option<ModeChange> {
+        let candidate = self.candidate?;
         let from = std::mem::replace(&mut self.mode, candidate.mode);
         self.candidate = None;
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
