@@ -524,3 +524,6 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
         covariance: SMatrix::from_column_slice(&state.covariance),
     })
 }
+
+#[cfg(test)]
+mod tests;
