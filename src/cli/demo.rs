@@ -40,6 +40,8 @@ const MAX_CYCLES: u32 = 14;
 const CYCLES_AFTER: u32 = 1;
 /// Samples between two looks at the live row.
 const LIVE_SAMPLES: u64 = 400;
+/// Time of the bus when the demo starts: a Unix time, as in any log.
+const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
 /// Longer holes between frames are time asleep, s; the demo has none.
 const SLEEP_GAP_S: f64 = 30.0;
 
@@ -55,7 +57,9 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load_with(Path::new("demo.toml"), &read_built_in)?;
     let mut demo = Demo::new(config, args.seed)?;
-    println!("one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; cell -> frames -> monitor -> frames -> consumer");
+    println!(
+        "packwatch demo: one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; cell -> frames -> monitor -> frames -> consumer"
+    );
     demo.live();
     demo.close()
 }
@@ -83,6 +87,8 @@ struct Demo {
     consumer: Consumer,
     interfaces: Vec<String>,
     rated_ah: f64,
+    /// Capacity in the present cycle; a completed one has already cost the pack its loss.
+    true_capacity_ah: f64,
     out: Outputs,
     table: Table,
     raised: Vec<Raised>,
@@ -101,6 +107,7 @@ impl Demo {
         settings.cycles = Some(MAX_CYCLES);
         Ok(Self {
             rated_ah: model.rated_capacity_ah,
+            true_capacity_ah: model.capacity_ah,
             sim: Simulation::new(model, settings, Wiring::single()),
             encoder: InputEncoder::new(&config.monitor.input),
             interfaces: config.interfaces.into_iter().map(|i| i.name).collect(),
@@ -128,9 +135,10 @@ impl Demo {
                 }
             }
             frames.clear();
+            self.true_capacity_ah = self.sim.pack().lowest_capacity_ah();
             self.encoder.encode(self.sim.readings(), &mut frames);
             for (bus, frame) in &frames {
-                self.feed(moment.time, *bus, frame);
+                self.feed(START.plus_nanos(moment.time.nanos()), *bus, frame);
             }
             samples += 1;
             if samples.is_multiple_of(LIVE_SAMPLES) {
@@ -153,7 +161,7 @@ impl Demo {
 
     /// Takes what the core sent: every frame goes to the consumer, frames of newly raised alarms are kept.
     fn collect(&mut self) {
-        let (cycle, true_capacity_ah) = (self.sim.pack().cycles() + 1, self.sim.pack().lowest_capacity_ah());
+        let (cycle, true_capacity_ah) = (self.sim.pack().cycles() + 1, self.true_capacity_ah);
         for sent in &self.out.frames {
             self.frames_out += 1;
             self.consumer.receive(&sent.frame);
@@ -191,7 +199,7 @@ impl Demo {
             soc: estimate.map(|e| (e.soc, e.soc_std)),
             true_soc: truth.soc,
             capacity_ah: (capacity.mean, capacity.std()),
-            true_capacity_ah: truth.capacity_ah,
+            true_capacity_ah: self.true_capacity_ah,
             soh: capacity.mean / self.rated_ah,
             recharge_period_s: self.monitor.recharge_period_s(),
             alarms,
@@ -200,7 +208,10 @@ impl Demo {
 
     /// The alarm frames as an ECU receives them, and what happened.
     fn close(&self) -> Result<(), Failure> {
-        println!("\n{} frames in, {} out; alarm frames, decoded with config/packwatch.dbc:", self.frames_in, self.frames_out);
+        println!(
+            "\n{} frames in, {} out; alarm frames, decoded with config/packwatch.dbc:",
+            self.frames_in, self.frames_out
+        );
         for raised in &self.raised {
             let interface = self.interfaces.get(raised.bus.index()).map_or("?", String::as_str);
             let mut line = Vec::new();

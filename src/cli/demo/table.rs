@@ -9,6 +9,9 @@ use crate::quantity::Mode;
 /// Pause after each redraw, so that an eye can follow what takes a machine a fraction of a second.
 const FRAME_TIME: Duration = Duration::from_millis(20);
 
+/// Back to the line's start and nothing behind it.
+const ERASE_LINE: &str = "\r\x1b[K";
+
 /// What a row shows.
 pub(super) struct Row {
     pub(super) cycle: u32,
@@ -31,9 +34,10 @@ pub(super) struct Table {
     has_head: bool,
 }
 
-const HEAD: &str = "\
-              |        SOC, %        |      capacity, Ah      | SOH  | recharge |
-cycle    time | estimate +- std true | estimate +- std  true  |   %  | period s | mode       alarms";
+const HEAD: [&str; 2] = [
+    "              |        SOC, %         |       capacity, Ah       |  SOH | recharge |",
+    "cycle    time |   est. +-  std   true |     est. +-   std   true |    % | period s | mode       alarms",
+];
 
 impl Table {
     pub(super) fn new() -> Self {
@@ -41,39 +45,40 @@ impl Table {
     }
 
     /// A row that stays.
-    pub(super) fn keep(&mut self, row: &Row) {
-        self.head();
-        let start = if self.live { "\r\x1b[K" } else { "" };
-        println!("{start}{}", text(row));
+    pub(super) fn keep(&mut self, row: &Row) -> io::Result<()> {
+        self.head()?;
+        let start = if self.live { ERASE_LINE } else { "" };
+        writeln!(io::stdout(), "{start}{}", text(row))
     }
 
     /// The live row; nothing without a terminal.
-    pub(super) fn redraw(&mut self, row: &Row) {
+    pub(super) fn redraw(&mut self, row: &Row) -> io::Result<()> {
         if !self.live {
-            return;
+            return Ok(());
         }
-        self.head();
-        print!("\r\x1b[K{}", text(row));
-        let _ = io::stdout().flush(); // a terminal that is gone shows nothing either way
+        self.head()?;
+        write!(io::stdout(), "{ERASE_LINE}{}", text(row))?;
+        io::stdout().flush()?;
         std::thread::sleep(FRAME_TIME);
+        Ok(())
     }
 
     /// Removes the live row.
-    pub(super) fn close(&mut self) {
-        if self.live {
-            print!("\r\x1b[K");
-        }
+    pub(super) fn close(&self) -> io::Result<()> {
+        if self.live { write!(io::stdout(), "{ERASE_LINE}") } else { Ok(()) }
     }
 
-    fn head(&mut self) {
+    fn head(&mut self) -> io::Result<()> {
         if !std::mem::replace(&mut self.has_head, true) {
-            println!("{HEAD}");
+            HEAD.iter().try_for_each(|line| writeln!(io::stdout(), "{line}"))?;
         }
+        Ok(())
     }
 }
 
 fn text(row: &Row) -> String {
-    let soc = row.soc.map_or("       -       ".to_owned(), |(soc, std)| format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std));
+    let soc =
+        row.soc.map_or("       -       ".to_owned(), |(soc, std)| format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std));
     let recharge = row.recharge_period_s.map_or("-".to_owned(), |s| format!("{s:.0}"));
     let mode = match row.mode {
         Mode::Unknown => "unknown",

@@ -159,7 +159,9 @@ impl Changes {
         settings.cell_period_ns = self.cell_period.map_or(settings.cell_period_ns, ns);
         if settings.cell_period_ns % settings.current_period_ns != 0 {
             let (cell, current) = (settings.cell_period_ns / 1_000_000, settings.current_period_ns / 1_000_000);
-            return Err(Failure::new(format!("--cell-period {cell}, must be a multiple of the current's {current} ms")));
+            return Err(Failure::new(format!(
+                "--cell-period {cell}, must be a multiple of the current's {current} ms"
+            )));
         }
         Ok(())
     }
