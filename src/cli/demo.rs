@@ -7,6 +7,7 @@
 mod consumer;
 mod table;
 
+use std::io::{self, Write};
 use std::path::Path;
 
 use super::Failure;
@@ -57,16 +58,13 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load_with(Path::new("demo.toml"), &read_built_in)?;
     let mut demo = Demo::new(config, args.seed)?;
-    println!(
-        "packwatch demo: one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; cell -> frames -> monitor -> frames -> consumer"
-    );
-    demo.live();
-    demo.close()
+    demo.tell().map_err(|error| Failure::new(format!("standard output: {error}")))?;
+    demo.verdict()
 }
 
-fn read_built_in(path: &Path) -> std::io::Result<Vec<u8>> {
+fn read_built_in(path: &Path) -> io::Result<Vec<u8>> {
     let found = FILES.iter().find(|(name, _)| Path::new(name) == path);
-    found.map(|(_, text)| text.as_bytes().to_vec()).ok_or_else(|| std::io::ErrorKind::NotFound.into())
+    found.map(|(_, text)| text.as_bytes().to_vec()).ok_or_else(|| io::ErrorKind::NotFound.into())
 }
 
 /// An alarm that was raised, as it was at that moment.
@@ -122,13 +120,21 @@ impl Demo {
         })
     }
 
+    /// The whole demo on standard output, but for its last line.
+    fn tell(&mut self) -> io::Result<()> {
+        let chain = "cell -> frames -> monitor -> frames -> consumer";
+        writeln!(io::stdout(), "one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; {chain}")?;
+        self.live()?;
+        self.show_alarm_frames()
+    }
+
     /// The cell's life, until a little after both alarms or [`MAX_CYCLES`].
-    fn live(&mut self) {
+    fn live(&mut self) -> io::Result<()> {
         let (mut samples, mut cycles) = (0_u64, 0);
         let mut frames = Vec::new();
         while let Some(moment) = self.sim.advance() {
             if self.sim.pack().cycles() != cycles {
-                self.table.keep(&self.row(&moment, cycles));
+                self.table.keep(&self.row(&moment, cycles))?;
                 cycles = self.sim.pack().cycles();
                 if self.is_complete() {
                     break;
@@ -142,10 +148,10 @@ impl Demo {
             }
             samples += 1;
             if samples.is_multiple_of(LIVE_SAMPLES) {
-                self.table.redraw(&self.row(&moment, cycles));
+                self.table.redraw(&self.row(&moment, cycles))?;
             }
         }
-        self.table.close();
+        self.table.close()
     }
 
     /// One frame from the bus, after the ticks before it.
@@ -206,32 +212,37 @@ impl Demo {
         }
     }
 
-    /// The alarm frames as an ECU receives them, and what happened.
-    fn close(&self) -> Result<(), Failure> {
-        println!(
-            "\n{} frames in, {} out; alarm frames, decoded with config/packwatch.dbc:",
-            self.frames_in, self.frames_out
-        );
+    /// The alarm frames as an ECU receives them.
+    fn show_alarm_frames(&self) -> io::Result<()> {
+        let mut out = io::stdout();
+        let (frames_in, frames_out, unknown) = (self.frames_in, self.frames_out, self.consumer.unknown_frames());
+        writeln!(out, "\n{frames_in} frames in, {frames_out} out, {unknown} of them unknown to config/packwatch.dbc")?;
+        writeln!(out, "alarms as they went out, decoded with that file:")?;
         for raised in &self.raised {
             let interface = self.interfaces.get(raised.bus.index()).map_or("?", String::as_str);
-            let mut line = Vec::new();
-            candump::write_line(&mut line, raised.time, StampDigits::Micros, interface, &raised.frame)
-                .map_err(|e| Failure::new(e.to_string()))?;
-            print!("{}", String::from_utf8_lossy(&line));
-            println!("  {}", self.consumer.explain(&raised.frame));
+            candump::write_line(&mut out, raised.time, StampDigits::Micros, interface, &raised.frame)?;
+            writeln!(out, "    {}", self.consumer.explain(&raised.frame))?;
         }
+        Ok(())
+    }
+
+    /// What happened, in one line; an error when an alarm did not come or came in frames nobody can read.
+    fn verdict(&self) -> Result<(), Failure> {
+        let unknown = self.consumer.unknown_frames();
         match (self.first(Rule::CapacityLow), self.first(Rule::RechargePeriodLow)) {
-            (Some(capacity), Some(recharge)) => {
-                println!(
-                    "\ncapacity alarm raised in cycle {} (true capacity {:.2} Ah), recharge-period alarm in cycle {}",
+            (Some(capacity), Some(recharge)) if unknown == 0 => {
+                let line = format!(
+                    "capacity alarm raised in cycle {} (true capacity {:.2} Ah), recharge-period alarm in cycle {}",
                     capacity.cycle, capacity.true_capacity_ah, recharge.cycle
                 );
-                Ok(())
+                writeln!(io::stdout(), "\n{line}").map_err(|error| Failure::new(format!("standard output: {error}")))
             }
             (capacity, recharge) => {
                 let word = |found: Option<&Raised>| if found.is_some() { "raised" } else { "missing" };
                 let (capacity, recharge) = (word(capacity), word(recharge));
-                Err(Failure::new(format!("capacity alarm {capacity}, recharge-period alarm {recharge}")))
+                Err(Failure::new(format!(
+                    "capacity alarm {capacity}, recharge-period alarm {recharge}, {unknown} frames unknown to their DBC"
+                )))
             }
         }
     }
