@@ -7,10 +7,10 @@ use super::keys::{
 };
 use super::schema::{Section as _, Walk};
 use crate::alarm::{Rule, RuleConfig};
-use crate::can::decode::SensorIndex;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::monitor::MonitorConfig;
+use crate::quantity::SensorIndex;
 use crate::sample::{Limits, SampleConfig, VoltageSource};
 
 /// The tables of a file; `None` = not there, or faulty (and noted).
@@ -87,13 +87,15 @@ pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges) -> Option
     let rated_ah = model.rated_capacity_ah;
     let rules: Option<Vec<_>> = raw.alarms.iter().map(|alarm| rule(alarm, rated_ah)).collect();
     Some(MonitorConfig {
+        input: crate::can::decode::InputMap::default(),
+        output: None,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
         health: HealthConfig {
             transition: transition(raw.transition.as_ref()?, rated_ah * f64::from(pack.strings)),
             capacity: capacity(raw.capacity.as_ref()?, rated_ah),
             recharge: recharge(raw.recharge.as_ref()?),
-            usable: raw.usable.as_ref().map(usable),
+            usable: raw.usable.as_ref().map(|keys| usable(keys, rated_ah)),
         },
         rules: rules?,
         model,
@@ -190,13 +192,18 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
         initial_capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * initial_capacity_ah),
         initial_log_resistance_std: keys.initial_log_resistance_std,
         soc_noise_per_sqrt_s: keys.soc_noise_per_sqrt_s,
+        charge_noise_per_sqrt_soc: keys.charge_noise_per_sqrt_soc,
         branch_noise_v_per_sqrt_s: keys.branch_noise_v_per_sqrt_s,
         log_resistance_noise_per_sqrt_s: keys.log_resistance_noise_per_sqrt_s,
+        gap_noise_per_sqrt_s: keys.gap_noise_per_sqrt_s,
+        gap_rest_current_a: keys.gap_rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
         voltage_noise_v: keys.voltage_noise_v,
         model_error_v_sqrt_s: keys.model_error_v_sqrt_s,
-        current_offset_std_a: keys.current_offset_std_a,
-        gap_current_std_a: keys.gap_current_std_a,
+        max_information_s: keys.max_information_s,
         gate_sigma: keys.gate_sigma,
+        gate_model_error_v: keys.gate_model_error_v,
+        gate_soc_error: keys.gate_soc_error,
+        lost_after_s: keys.lost_after_s,
         consistency_window_s: keys.consistency_window_s,
         consistency_limit: keys.consistency_limit,
     }
@@ -223,6 +230,7 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     CapacityConfig {
         method,
         noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(usual_noise_ah),
+        noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah),
         current_gain_std: keys.current_gain_std,
     }
 }
@@ -231,12 +239,12 @@ fn recharge(keys: &Recharge) -> RechargeConfig {
     RechargeConfig { from_soc: keys.from_soc, to_soc: keys.to_soc }
 }
 
-fn usable(keys: &Usable) -> UsableConfig {
+fn usable(keys: &Usable, rated_ah: f64) -> UsableConfig {
     UsableConfig {
         current_a: keys.current_a,
         temperature_c: keys.temperature_c,
         cutoff_v: keys.cutoff_v,
-        full_soc: keys.full_soc,
+        taper_current_a: keys.taper_current_a.unwrap_or(rated_ah / 20.0),
     }
 }
 

@@ -10,8 +10,8 @@ use super::resolve::{Resolved, channel_words};
 use super::{Config, InterfaceConfig};
 use crate::alarm::{Rule, RuleConfig, Severity};
 use crate::can::dbc::Message;
-use crate::can::decode::Channel;
 use crate::can::signal::{ByteOrder, ValueType};
+use crate::quantity::Channel;
 use crate::sample::VoltageSource;
 
 /// What a good configuration means.

@@ -228,27 +228,37 @@ section! {
         /// SOC to start from. Without it: from the first voltage through the open-circuit voltage curve.
         initial_soc: Option<f64>, "fraction", Between(0.0, 1.0), Optional;
         /// Standard deviation of the first SOC.
-        initial_soc_std: f64, "fraction", Above(0.0, 1.0), Default("0.1");
+        initial_soc_std: f64, "fraction", Above(0.0, 1.0), Default("0.3");
         /// Standard deviation of the first branch voltages.
-        initial_branch_std_v: f64, "V", Between(0.0, 10.0), Default("0.02");
+        initial_branch_std_v: f64, "V", Between(0.0, 10.0), Default("0.05");
         /// Standard deviation of the logarithm of the resistance relative to new, at the start.
         initial_log_resistance_std: f64, "", Between(0.0, 5.0), Default("0.2");
         /// Process noise of the SOC.
-        soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1e-5");
+        soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("3e-5");
+        /// Process noise of the SOC per charge moved: errors of the current reading.
+        charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
-        branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-4");
+        branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the logarithm of the resistance: how fast a cell may age.
-        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("2e-5");
+        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("3e-4");
+        /// Process noise of the SOC while nobody measures the current (asleep).
+        gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
+        /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. Without it: the rated capacity over 50 h (C/50), per cell.
+        gap_rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this.
-        model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.1");
-        /// Standard deviation of a constant offset of the current sensor, per cell.
-        current_offset_std_a: f64, "A", DEVIATION, Default("0.01");
-        /// Standard deviation of the current assumed possible while nobody measured (asleep), per cell.
-        gap_current_std_a: f64, "A", DEVIATION, Default("0.02");
+        model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Longest time one voltage reading may speak for: readings further apart are no better than this.
+        max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
         /// A voltage further from its prediction than this many standard deviations moves nothing.
         gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
+        /// Error of the cell model a single reading may show (standard deviation), for the gate and the consistency monitor.
+        gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
+        /// The same as an error along the open-circuit voltage curve.
+        gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
+        /// When every reading has been beyond the gate for this long, the filter has lost its cell and starts again from the voltage.
+        lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
         /// Window over which the filter's consistency is judged.
         consistency_window_s: f64, "s", Above(0.0, 1e9), Default("600.0");
         /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected).
@@ -281,6 +291,8 @@ section! {
         nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1");
         /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.2 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional;
+        /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 1 % of the rated capacity.
+        noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;
         /// Standard deviation of the current sensor's gain: no capacity is known better than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
     }
@@ -305,8 +317,8 @@ section! {
         temperature_c: f64, "degrees C", TEMPERATURE_C, Required;
         /// Voltage under load at which the discharge ends.
         cutoff_v: f64, "V", Above(0.0, 100.0), Required;
-        /// SOC at which the charger calls the cell full (1 = full open-circuit voltage).
-        full_soc: f64, "fraction", Above(0.0, 1.0), Default("1.0");
+        /// A charge whose current, per cell, has fallen to this at the cell model's highest voltage ended full: the SOC it left is where the next usable capacity starts. Without it: the rated capacity over 20 h (C/20).
+        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
     }
 }
 

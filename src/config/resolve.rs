@@ -13,8 +13,7 @@ use super::pattern::Pattern;
 use super::schema::did_you_mean;
 use super::{ReadFile, beside};
 use crate::can::dbc::{Database, Message, Signal};
-use crate::can::decode::{Channel, SensorIndex};
-use crate::quantity::{BusIndex, CellIndex};
+use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 /// Most cell numbers named in one fault.
 const MAX_NAMED_CELLS: usize = 8;

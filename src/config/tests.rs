@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 
 use super::*;
-use crate::can::decode::SensorIndex;
 use crate::health::CapacityMethod;
+use crate::quantity::SensorIndex;
 use crate::sample::VoltageSource;
 
 const DBC: &str = r#"VERSION ""
