@@ -1,6 +1,6 @@
 //! `packwatch demo`: a short ageing life on an in-process bus, ending in alarms. Needs no CAN, no root, no file.
 //!
-//! A simulated cell loses 0.1 Ah per cycle. Its sensors' readings become frames of `config/demo.dbc`; the frames go
+//! A simulated cell loses 0.1 Ah per cycle. Its sensors' readings become frames of `config/measured.dbc`; the frames go
 //! through the same core as live ones; what the core sends is read by a consumer that knows nothing but
 //! `config/packwatch.dbc`. Exit code 0 when both a capacity and a recharge-period alarm were raised, else 1.
 
@@ -26,7 +26,7 @@ use table::{Row, Table};
 /// Files built into the binary, by the path the configuration calls them.
 const FILES: [(&str, &str); 3] = [
     ("demo.toml", include_str!("../../config/demo.toml")),
-    ("demo.dbc", include_str!("../../config/demo.dbc")),
+    ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
 /// What the receiving ECU knows.

@@ -5,6 +5,7 @@
 //! at the pace of a 1 Mbit/s bus, and closer where many have to fit between two samples.
 
 mod output;
+mod player;
 mod settings;
 
 use std::path::PathBuf;
@@ -17,6 +18,7 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
 use crate::sim::{Moment, Settings, Simulation, Wiring};
 use output::{LogWriter, TruthWriter};
+use player::Player;
 
 /// Time between frames sent together, ns: a classic frame of 8 bytes at 1 Mbit/s.
 const FRAME_SPACING_NS: i64 = 130_000;
@@ -30,8 +32,14 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     /// Candump log to write; compressed when the name ends in .gz; - for standard output
-    #[arg(short, long, value_name = "LOG")]
-    out: PathBuf,
+    #[arg(short, long, value_name = "LOG", required_unless_present = "to", conflicts_with = "to")]
+    out: Option<PathBuf>,
+    /// Play the frames onto this CAN interface instead
+    #[arg(long, value_name = "INTERFACE")]
+    to: Option<String>,
+    /// How many times faster than real time frames are played; 0 = as fast as the bus takes them
+    #[arg(long, default_value_t = 1.0, value_parser = settings::non_negative, requires = "to")]
+    speed: f64,
     /// CSV to write the true state to; compressed when the name ends in .gz
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
@@ -59,7 +67,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let settings = settings_for(args, &config)?;
     let monitor = &config.monitor;
     let mut sim = Simulation::new(monitor.model.clone(), settings, wiring(&monitor.sample));
-    let mut log = LogWriter::create(&args.out, config.interfaces.iter().map(|i| i.name.clone()).collect())?;
+    let mut sink = Sink::open(args, &config)?;
     let mut truth = match &args.truth {
         Some(path) => Some(TruthWriter::create(path, monitor.model.branches.len(), args.truth_period)?),
         None => None,
@@ -69,7 +77,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut tally = Tally::default();
     while let Some(moment) = sim.advance() {
         for (time, bus, frame) in frames.of(&sim, &moment) {
-            log.write(time, bus, frame)?;
+            sink.write(time, bus, frame)?;
             tally.frames += 1;
         }
         if let Some(truth) = &mut truth {
@@ -78,10 +86,46 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         tally.moments += 1;
         tally.end_s = moment.time.secs();
     }
-    log.finish()?;
+    sink.finish()?;
     truth.map_or(Ok(()), TruthWriter::finish)?;
     eprintln!("{}", summary(&sim, &tally));
     Ok(())
+}
+
+/// Where the frames go.
+enum Sink {
+    Log(LogWriter),
+    Bus(Player),
+}
+
+impl Sink {
+    fn open(args: &Args, config: &Config) -> Result<Self, Failure> {
+        match (&args.to, &args.out) {
+            (Some(interface), _) => {
+                let fd = config.interfaces.iter().any(|interface| interface.fd);
+                Ok(Self::Bus(Player::open(interface, fd, args.speed)?))
+            }
+            (None, Some(path)) => {
+                let names = config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+                Ok(Self::Log(LogWriter::create(path, names)?))
+            }
+            (None, None) => Err(Failure::new("neither --out nor --to, one must be given")),
+        }
+    }
+
+    fn write(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) -> Result<(), Failure> {
+        match self {
+            Self::Log(log) => log.write(time, bus, frame),
+            Self::Bus(player) => player.play(time, frame),
+        }
+    }
+
+    fn finish(self) -> Result<(), Failure> {
+        match self {
+            Self::Log(log) => log.finish(),
+            Self::Bus(_) => Ok(()),
+        }
+    }
 }
 
 /// The scenario's defaults for the configured cell, with what the command line changes.

@@ -33,7 +33,7 @@ impl Consumer {
             let signal = self.message(frame)?.signal(name)?;
             signal.layout.plan().ok()?.decode(frame.data()).ok()
         };
-        value("AlarmRule") == Some(f64::from(rule as u8)) && value("AlarmState") == Some(1.0)
+        value("Rule") == Some(f64::from(rule as u8)) && value("State") == Some(1.0)
     }
 
     /// Every signal of the frame in words: `Message: Signal value unit, ...`.

@@ -176,7 +176,8 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
     checked(text, "above 0", |x| x > 0.0)
 }
 
-fn non_negative(text: &str) -> Result<f64, String> {
+/// Parses a number of 0 or more.
+pub(super) fn non_negative(text: &str) -> Result<f64, String> {
     checked(text, "0 or more", |x| x >= 0.0)
 }
 
