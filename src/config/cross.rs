@@ -96,6 +96,9 @@ fn temperatures(pack: &Pack, raw: &Raw, faults: &mut Faults) {
             let text = format!("{} is one too many, must be one: the pack is estimated as one cell", sensor.place.path);
             faults.add(&sensor.place.file, sensor.place.line, text);
         }
+        for sensor in raw.temperatures.iter().filter(|sensor| sensor.cells.is_some()) {
+            sensor.place.fault(faults, "cells", "must not be given: the pack is estimated as one cell");
+        }
         return;
     }
     for (index, sensor) in raw.temperatures.iter().enumerate() {
@@ -179,19 +182,5 @@ fn output(raw: &Raw, faults: &mut Faults) {
     };
     for name in output.interfaces.iter().flatten().filter(|_| raw.interfaces_whole) {
         known_interface(name, &output.place, "interfaces", &raw.interfaces, faults);
-    }
-    let ids = [("status_id", output.status_id), ("health_id", output.health_id), ("alarm_id", output.alarm_id)];
-    if ids.iter().all(|(_, id)| id.is_none()) {
-        let text = "output has no identifier, must have status_id, health_id or alarm_id, or enabled = false";
-        faults.add(&output.place.file, output.place.line, text);
-    }
-    for (index, (key, id)) in ids.iter().enumerate() {
-        let Some(id) = id else { continue };
-        if !output.extended && *id > 0x7FF {
-            output.place.fault(faults, key, "must be 0 to 0x7FF, or output.extended = true");
-        }
-        if let Some((other, _)) = ids[..index].iter().find(|(_, other)| *other == Some(*id)) {
-            output.place.fault(faults, key, &format!("must differ from output.{other}"));
-        }
     }
 }

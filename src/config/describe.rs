@@ -281,8 +281,11 @@ fn alarm(rule: &RuleConfig, rated_ah: f64) -> String {
         false => String::new(),
     };
     let mut words = format!("{severity} when {what} is {side} {}{unit}{of_rated}", round(rule.threshold));
-    if rule.debounce_s > 0.0 || rule.debounce_events > 1 {
-        words.push_str(&format!(" for {} s and {} values", rule.debounce_s, rule.debounce_events));
+    if rule.debounce_s > 0.0 {
+        words.push_str(&format!(" for {} s", rule.debounce_s));
+    }
+    if rule.debounce_events > 1 {
+        words.push_str(&format!(" in {} values one after the other", rule.debounce_events));
     }
     words.push_str(&format!(", cleared at {}{unit}", round(clear)));
     words

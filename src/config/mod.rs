@@ -13,6 +13,7 @@ mod cross;
 mod describe;
 mod document;
 mod keys;
+mod output;
 mod pattern;
 mod reference;
 mod resolve;
@@ -91,13 +92,15 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let raw = convert::Raw::read(&document, faults);
     let model = raw.cell_model.as_ref().and_then(|named| cell_model::load_with(&beside(path, named), read, faults));
     cross::check(&raw, model.as_ref(), faults);
-    let databases = Databases::load(path, &raw.input.as_ref()?.dbc, read, faults)?;
-    let found = resolve::resolve(&raw, &databases, faults);
+    let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
+    let databases = Databases::load(path, names, read, faults);
+    let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
+    output::check(&raw, &found, faults);
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
     let monitor = convert::monitor(&raw, model?, &ranges)?;
     let config = Config { path: path.to_owned(), interfaces, monitor };
-    let description = describe::describe(&raw, &config, &found, Vec::new());
+    let description = describe::describe(&raw, &config, &found, output::uses(&raw));
     Some((config, description))
 }
 

@@ -66,6 +66,7 @@ fn fits(pieces: &[Piece], name: &str, cell: Option<u32>) -> Option<Option<u32>> 
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 mod tests {
     use super::*;
 

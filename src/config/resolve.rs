@@ -44,14 +44,15 @@ pub(crate) struct Resolved<'d> {
 }
 
 impl Databases {
-    /// Reads the files; `None` when one is unusable (noted), for then names cannot be looked up.
+    /// Reads the files; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
     pub(crate) fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
         let mut files = Vec::new();
         for name in names {
             let path = beside(config, name);
             files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
         }
-        files.into_iter().collect::<Option<Vec<_>>>().map(|files| Self { files })
+        let files = files.into_iter().collect::<Option<Vec<_>>>()?;
+        (!files.is_empty()).then_some(Self { files })
     }
 
     fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {

@@ -34,10 +34,11 @@ impl fmt::Display for Allowed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::Any => Ok(()),
+            Self::Between(low, high) if low == high => write!(f, "{low}"),
             Self::Between(low, f64::INFINITY) => write!(f, "{low} or more"),
             Self::Between(low, high) => write!(f, "{low} to {high}"),
             Self::Above(low, f64::INFINITY) => write!(f, "above {low}"),
-            Self::Above(low, high) => write!(f, "above {low}, to {high}"),
+            Self::Above(low, high) => write!(f, "above {low} and at most {high}"),
             Self::NotEmpty => write!(f, "not empty"),
         }
     }

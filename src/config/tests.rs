@@ -1,5 +1,7 @@
 //! Files good and bad: the faults are part of the program's face, so they are compared word for word.
 
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -162,7 +164,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         (
             "cells = 4",
             "cells = 4\nrated_capacity_ah = 0",
-            "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0, to 100000",
+            "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0 and at most 100000",
         ),
         ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
         ("[[interface]]", "[interface]", "pack.toml:4: interface = [interface], must be tables [[interface]]"),
@@ -189,7 +191,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
         (
             "\"charge\"",
             "\"charge\"\nscale = 0",
-            "pack.toml:11: input.current.scale = 0, must be above 0, to 1000000000",
+            "pack.toml:11: input.current.scale = 0, must be above 0 and at most 1000000000",
         ),
         (
             "\"charge\"",
@@ -298,6 +300,10 @@ fn single_faults_of_appended_tables() {
             "pack.toml:17: output.interfaces = [\"can7\"], must be can0",
         ),
         (
+            "[output]\nhealth_id = 0x110\n",
+            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has it",
+        ),
+        (
             "[[interface]]\nname = \"can0\"\n",
             "pack.toml:16: interface[2].name = \"can0\", must be unique, is also the name in line 5",
         ),
@@ -361,7 +367,7 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
         "pack.toml:3: pack.x is not a known key",
         "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
         "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",
-        "cell.toml:4: capacity_ah = 0, must be above 0, to 100000",
+        "cell.toml:4: capacity_ah = 0, must be above 0 and at most 100000",
         "cell.toml:10: tables.soc = [0, 0.5, 0.5], must begin with 0 and end with 1",
         "cell.toml:10: tables.soc: 0.5 follows 0.5, must rise strictly",
         "pack.dbc:9: identifier 4000, must be 0 to 2047, or have bit 31 set for an extended one",
@@ -372,9 +378,13 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
 #[test]
 fn faults_of_a_cell_model() {
     let table: &[(&str, &str, &str)] = &[
-        ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1 to 1"),
+        ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
         ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a text that is not empty"),
-        ("capacity_ah = 1.9", "capacity_ah = -1.9", "cell.toml:4: capacity_ah = -1.9, must be above 0, to 100000"),
+        (
+            "capacity_ah = 1.9",
+            "capacity_ah = -1.9",
+            "cell.toml:4: capacity_ah = -1.9, must be above 0 and at most 100000",
+        ),
         (
             "voltage_max_v = 4.2",
             "voltage_max_v = 2.5",
@@ -387,7 +397,7 @@ fn faults_of_a_cell_model() {
         ),
         ("[3.0, 3.6, 4.1]", "[3.0, 3.6]", "cell.toml:12: tables.ocv_v: row 1 has 2 values, must be 3, one per soc"),
         ("[[3.0, 3.6, 4.1], ", "[", "cell.toml:12: tables.ocv_v: 1 rows, must be 2, one per temperature_c"),
-        ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0, to 100"),
+        ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0 and at most 100"),
         ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be above 0"),
         ("[[100, 100, 100]", "[[100, 0, 100]", "cell.toml:16: tables.branches[1].c_farad = 0, must be above 0"),
         (
@@ -403,7 +413,7 @@ fn faults_of_a_cell_model() {
         (
             "[provenance]",
             "[thermal]\nheat_capacity_j_per_k = 1\nresistance_k_per_w = 0\n[provenance]",
-            "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0, to 1000000000",
+            "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
         ),
         ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
     ];
@@ -458,7 +468,7 @@ fn the_reference_page_is_the_one_in_the_repository() {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig::with_cases(300))]
+    #![proptest_config(ProptestConfig::with_cases(2000))]
 
     /// Pieces cut out, doubled, swapped or overwritten: faults or a configuration, never a panic, never an empty list.
     #[test]

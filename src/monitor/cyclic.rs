@@ -145,7 +145,7 @@ impl Monitor {
     fn status_frame(&self) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
         let pack = self.pack.as_ref();
-        Some(output.plan.status(&StatusFields {
+        output.plan.status(&StatusFields {
             soc: pack.map(|pack| pack.soc),
             soc_std: pack.map(|pack| pack.soc_std),
             mode: self.detector.mode(),
@@ -153,7 +153,7 @@ impl Monitor {
             highest_severity: self.alarms.highest_severity().map_or(0, |severity| severity as u8),
             active_alarms: self.alarms.count(),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-        }))
+        })
     }
 
     /// Health of the pack: its weakest cell's capacity, as an estimate only once a half-cycle has taught something.
@@ -186,7 +186,7 @@ impl Monitor {
         let Some(output) = &self.config.output else { return };
         let fields = self.health_fields();
         for page in 0..output.plan.health_pages() {
-            self.send(Some(output.plan.health(page, &fields)), out);
+            self.send(output.plan.health(page, &fields), out);
         }
     }
 
@@ -204,14 +204,14 @@ impl Monitor {
 
     fn alarm_frame(&self, alarm: &AlarmChange) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
-        Some(output.plan.alarm(&AlarmFields {
+        output.plan.alarm(&AlarmFields {
             rule: alarm.rule as u8,
             state: if alarm.active { 1 } else { 2 },
             severity: alarm.severity as u8,
             cell: alarm.cell,
             value: alarm.value,
             threshold: Some(alarm.threshold),
-        }))
+        })
     }
 }
 
