@@ -51,7 +51,7 @@ impl Cycle {
 
 fn live(config: MonitorConfig, settings: Settings) -> Vec<Cycle> {
     let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
-    let mut encoder = InputEncoder::new(&config.input);
+    let encoder = InputEncoder::new(&config.input);
     let mut monitor = Monitor::new(config);
     let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, 30.0), Outputs::default(), Vec::new());
     let (mut cycles, mut cycle, mut completed) = (Vec::new(), Cycle::default(), 0);

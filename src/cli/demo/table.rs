@@ -77,8 +77,10 @@ impl Table {
 }
 
 fn text(row: &Row) -> String {
-    let soc =
-        row.soc.map_or("       -       ".to_owned(), |(soc, std)| format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std));
+    let soc = match row.soc {
+        Some((soc, std)) => format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std),
+        None => format!("{:>6}{:8}", "-", ""),
+    };
     let recharge = row.recharge_period_s.map_or("-".to_owned(), |s| format!("{s:.0}"));
     let mode = match row.mode {
         Mode::Unknown => "unknown",
