@@ -5,6 +5,7 @@ pub mod csv_log;
 pub mod journal;
 pub mod lines;
 pub mod log;
+pub mod player;
 pub mod result_file;
 pub mod stamp;
 pub mod ticks;
