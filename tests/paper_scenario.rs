@@ -18,13 +18,13 @@ use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 /// Cycles in which the filters may still settle from what they start with.
 const SETTLING_CYCLES: usize = 3;
 /// Largest |SOC error| allowed while the true capacity is above [`LATE_LIFE_AH`]; the paper's figures: 0.05.
-const MAX_SOC_ERROR: f64 = 0.05;
+const MAX_SOC_ERROR: f64 = 0.01;
 /// The same from there to the end; the paper's figures: 0.20.
-const MAX_SOC_ERROR_LATE: f64 = 0.20;
+const MAX_SOC_ERROR_LATE: f64 = 0.02;
 /// Below this the 10 mA offset and the loss of up to a fifth of the capacity in one cycle weigh heavily, Ah.
 const LATE_LIFE_AH: f64 = 1.0;
-/// Largest |capacity error| at a cycle's end, Ah: one cycle's loss late, and as much again.
-const MAX_CAPACITY_ERROR_AH: f64 = 0.10;
+/// Largest |capacity error| at a cycle's end, Ah: about one cycle's loss.
+const MAX_CAPACITY_ERROR_AH: f64 = 0.06;
 /// Smallest share of cycles whose true capacity lies within two stated standard deviations.
 const MIN_COVERAGE: f64 = 0.90;
 

@@ -11,10 +11,10 @@ mod settings;
 use std::path::PathBuf;
 
 use super::Failure;
-use crate::can::Frame;
 use crate::can::encode::InputEncoder;
+use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
-use crate::quantity::{BusIndex, CellIndex, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
 use crate::sim::{Moment, Settings, Simulation, Wiring};
 use output::{LogWriter, TruthWriter};
@@ -160,9 +160,10 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
 }
 
-/// Makes the frames of a moment.
+/// Makes the frames of a moment, those with the current first: the voltages have its drop in them.
 struct Frames {
     encoder: InputEncoder,
+    with_current: Vec<(BusIndex, CanId)>,
     made: Vec<(BusIndex, Frame)>,
     start: Timestamp,
     period_ns: i64,
@@ -170,12 +171,16 @@ struct Frames {
 
 impl Frames {
     fn new(encoder: InputEncoder, settings: &Settings, start: Timestamp) -> Self {
-        Self { encoder, made: Vec::new(), start, period_ns: settings.current_period_ns }
+        let mut made = Vec::new();
+        encoder.encode(&[(Channel::Current, Some(0.0))], &mut made);
+        let with_current = made.iter().map(|(bus, frame)| (*bus, frame.id())).collect();
+        Self { encoder, with_current, made, start, period_ns: settings.current_period_ns }
     }
 
     fn of(&mut self, sim: &Simulation, moment: &Moment) -> impl Iterator<Item = (Timestamp, BusIndex, &Frame)> {
         self.made.clear();
         self.encoder.encode(sim.readings(), &mut self.made);
+        self.made.sort_by_key(|(bus, frame)| !self.with_current.contains(&(*bus, frame.id())));
         let count = i64::try_from(self.made.len()).unwrap_or(i64::MAX - 1);
         let spacing_ns = FRAME_SPACING_NS.min(self.period_ns / (count + 1));
         let first = self.start.plus_nanos(moment.time.nanos());
