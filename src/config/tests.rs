@@ -284,16 +284,12 @@ fn single_faults_of_appended_tables() {
             "pack.toml:19: alarm[2].rule = \"input_missing\", must differ in severity from the same rule in line 15",
         ),
         (
-            "[output]\n",
-            "pack.toml:15: output has no identifier, must have status_id, health_id or alarm_id, or enabled = false",
-        ),
-        (
             "[output]\nstatus_id = 0x800\n",
             "pack.toml:16: output.status_id = 0x800, must be 0 to 0x7FF, or output.extended = true",
         ),
         (
             "[output]\nstatus_id = 1\nalarm_id = 1\n",
-            "pack.toml:17: output.alarm_id = 1, must differ from output.status_id",
+            "pack.toml:17: output.alarm_id = 1, alarm and status frame would both be 001, must differ",
         ),
         (
             "[output]\nstatus_id = 1\ninterfaces = [\"can7\"]\n",
@@ -301,7 +297,7 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[output]\nhealth_id = 0x110\n",
-            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has it",
+            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has 110",
         ),
         (
             "[[interface]]\nname = \"can0\"\n",

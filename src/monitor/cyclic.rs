@@ -148,10 +148,10 @@ impl Monitor {
         Some(output.plan.status(&StatusFields {
             soc: pack.map(|pack| pack.soc),
             soc_std: pack.map(|pack| pack.soc_std),
-            mode: self.detector.mode(),
+            mode: Some(self.detector.mode()),
             validity: self.validity() as u8,
-            highest_severity: self.alarms.highest_severity().map_or(0, |severity| severity as u8),
-            active_alarms: self.alarms.count(),
+            highest_severity: Some(self.alarms.highest_severity().map_or(0, |severity| severity as u8)),
+            active_alarms: u16::try_from(self.alarms.count()).ok(),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
         }))
     }
@@ -206,8 +206,9 @@ impl Monitor {
         let output = self.config.output.as_ref()?;
         Some(output.plan.alarm(&AlarmFields {
             rule: alarm.rule as u8,
-            state: if alarm.active { 1 } else { 2 },
-            severity: alarm.severity as u8,
+            state: Some(if alarm.active { 1 } else { 2 }),
+            severity: Some(alarm.severity as u8),
+            test: false,
             cell: alarm.cell,
             value: alarm.value,
             threshold: Some(alarm.threshold),
