@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 
 use super::*;
+use crate::can::{CanId, Frame};
 use crate::health::CapacityMethod;
-use crate::quantity::SensorIndex;
+use crate::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex};
 use crate::sample::VoltageSource;
 
 const DBC: &str = r#"VERSION ""
@@ -132,6 +133,55 @@ fn a_relative_threshold_is_of_the_rated_capacity() {
     let rated = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 4");
     let config = good(&format!("{rated}{alarm}"));
     assert_eq!((config.monitor.rules[0].threshold, config.monitor.model.rated_capacity_ah), (3.0, 4.0));
+}
+
+fn decoded(config: &Config, id: u16, payload: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> {
+    let frame = Frame::classic(CanId::Standard(id), payload).unwrap();
+    let mut readings = Vec::new();
+    config.monitor.input.decode(BusIndex(0), &frame, |reading| readings.push((reading.channel, reading.value)));
+    readings
+}
+
+#[test]
+fn readings_have_our_sign_scale_and_cells() {
+    let pack = pack_with("\"charge\"", "\"charge\"\nscale = 0.5\nnot_available = [0x7FFF]")
+        .replace("Status.Temperature\"", "Status.Temperature\"\noffset = -1");
+    let config = good(&pack);
+    let temperature = Channel::Temperature(SensorIndex(0));
+    let status = decoded(&config, 0x100, &[100, 0, 0, 0, 65, 0, 0, 0]);
+    assert_eq!(status, [(Channel::Current, Ok(-5.0)), (temperature, Ok(24.0))]);
+    for code in [[0xFF, 0x7F], [0x00, 0x80]] {
+        let status = decoded(&config, 0x100, &[code[0], code[1], 0, 0, 65, 0, 0, 0]);
+        assert_eq!(status[0], (Channel::Current, Err(Fault::NotAvailable)), "configured, or in the DBC's value table");
+    }
+    let second_page = decoded(&config, 0x110, &[1, 0xE8, 0x03, 0xD0, 0x07, 0, 0, 0]);
+    let (cell_3, cell_4) = (Channel::CellVoltage(CellIndex(2)), Channel::CellVoltage(CellIndex(3)));
+    assert_eq!(second_page, [(cell_3, Ok(1.0)), (cell_4, Ok(2.0))]);
+    assert!(decoded(&config, 0x120, &[0; 8]).is_empty(), "a message nobody configured");
+}
+
+#[test]
+fn nothing_is_sent_unless_configured() {
+    assert!(good(PACK).monitor.output.is_none());
+    assert!(good(&format!("{PACK}[output]\nenabled = false\nstatus_id = 5\n")).monitor.output.is_none());
+}
+
+#[test]
+fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
+    let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 1.0));
+    let text = "[output]\nextended = true\nstatus_id = 0x18FF_0001\nstatus_period_ms = 100\n";
+    let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
+    assert_eq!((output.status_period_s, output.alarm_period_s), (0.1, 1.0));
+}
+
+#[test]
+fn an_output_dbc_must_have_the_daemons_messages() {
+    let all = faults(&format!("{PACK}[output]\ndbc = \"twin.dbc\"\n"));
+    assert_eq!(all[0], "pack.toml:16: output.dbc = \"twin.dbc\", message PACKWATCH_Status is missing");
+    assert_eq!(all.len(), 3);
 }
 
 #[test]
