@@ -145,9 +145,13 @@ fn pack(config: &Config) -> Vec<String> {
     let bare = (1..).zip(&sample.sensor_of_cell).filter(|(_, sensor)| sensor.is_none()).map(|(cell, _)| cell);
     let bare: Vec<u16> = bare.collect();
     if !bare.is_empty() {
-        let (ambient_c, cells) = (sample.ambient_c, cell_list(&bare));
+        let ambient_c = sample.ambient_c;
+        let cells = match bare.len() == usize::from(sample.cells) {
+            true => String::new(),
+            false => format!(" for cells {}", cell_list(&bare)),
+        };
         let from = if config.monitor.model.thermal.is_some() { "from the thermal model round" } else { "taken as" };
-        words.push(format!("no temperature sensor for cells {cells}: {from} {ambient_c} degrees C"));
+        words.push(format!("no temperature sensor{cells}: {from} {ambient_c} degrees C"));
     }
     words.push("a positive current is a discharge in everything reported".to_owned());
     words

@@ -193,7 +193,13 @@ fn numbers_may_be_hex_or_have_underscores() {
     assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
 }
 
-/// Each edit of the good file and the whole of what is said about it.
+/// Each edit of the good file (from, to) and the whole of what is said about it.
+fn each_edit_gives(table: &[(&str, &str, &str)]) {
+    for (from, to, fault) in table {
+        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
+    }
+}
+
 #[test]
 fn single_faults_name_file_line_key_found_and_allowed() {
     let table: &[(&str, &str, &str)] = &[
@@ -231,6 +237,13 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "dbc = [\"pack.dbc\", 7]",
             "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
         ),
+    ];
+    each_edit_gives(table);
+}
+
+#[test]
+fn single_faults_of_signals_name_what_the_dbc_has() {
+    let table: &[(&str, &str, &str)] = &[
         ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
         ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
         (
@@ -294,9 +307,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, like \"1-12, 15\"",
         ),
     ];
-    for (from, to, fault) in table {
-        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
-    }
+    each_edit_gives(table);
 }
 
 #[test]
