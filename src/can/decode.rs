@@ -6,6 +6,7 @@ use crate::can::dbc::{Message, Signal};
 use crate::can::signal::{LayoutFault, SignalPlan};
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{BusIndex, Fault};
+
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 
 /// One multiplexor a bound signal depends on: the selector's code must lie in one of the ranges (ends included).

@@ -151,7 +151,7 @@ impl Monitor {
             mode: Some(self.detector.mode()),
             validity: self.validity() as u8,
             highest_severity: Some(self.alarms.highest_severity().map_or(0, |severity| severity as u8)),
-            active_alarms: u16::try_from(self.alarms.count()).ok(),
+            active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
         }))
     }

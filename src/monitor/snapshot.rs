@@ -11,7 +11,7 @@ use crate::quantity::Timestamp;
 use crate::sample::SamplerState;
 
 /// Layout version of [`Snapshot`].
-pub const SNAPSHOT_VERSION: u32 = 1;
+const SNAPSHOT_VERSION: u32 = 1;
 
 /// State of a [`Monitor`] at one moment.
 #[derive(Debug, Clone, Serialize, Deserialize)]
