@@ -54,7 +54,7 @@ fn show(description: &Description, page: &mut String) {
     page.push_str(&format!("{}: good\n", description.file));
     page.push_str(&format!("\ncell\n  {}\n", description.cell));
     list("pack", &description.pack, page);
-    page.push_str(&format!("\ninterfaces\n"));
+    page.push_str("\ninterfaces\n");
     for interface in &description.interfaces {
         let kind = if interface.fd { "classic and FD" } else { "classic" };
         let ids = match interface.filter_ids.len() {
@@ -63,12 +63,12 @@ fn show(description: &Description, page: &mut String) {
         };
         page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }
-    page.push_str(&format!("\nsignals\n"));
+    page.push_str("\nsignals\n");
     table(&description.signals.iter().map(signal).collect::<Vec<_>>(), page);
     list("plausible readings", &description.limits, page);
-    page.push_str(&format!("\noutputs\n"));
+    page.push_str("\noutputs\n");
     if description.outputs.is_empty() {
-        page.push_str(&format!("  nothing is sent\n"));
+        page.push_str("  nothing is sent\n");
     }
     table(&description.outputs.iter().map(output).collect::<Vec<_>>(), page);
     if description.alarms.is_empty() {
