@@ -3,6 +3,7 @@
 //! Opens everything the configuration names. Good: the meaning on standard output, exit 0. Bad: every fault,
 //! one a line, on standard error, exit 78.
 
+use std::io::Write as _;
 use std::path::PathBuf;
 
 use super::Failure;
@@ -25,51 +26,62 @@ pub(crate) struct Args {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Some(file) = &args.file else {
-        print!("{}", crate::config::reference());
-        return Ok(());
+        return print(&crate::config::reference());
     };
     let description = crate::config::describe(file)?;
     if args.json {
         let json = serde_json::to_string_pretty(&description);
-        println!("{}", json.map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?);
+        let json = json.map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?;
+        print(&(json + "\n"))
     } else {
-        show(&description);
+        let mut page = String::new();
+        show(&description, &mut page);
+        print(&page)
     }
-    Ok(())
 }
 
-fn show(description: &Description) {
-    println!("{}: good", description.file);
-    println!("\ncell\n  {}", description.cell);
-    list("pack", &description.pack);
-    println!("\ninterfaces");
+/// Writes to standard output; a reader that has seen enough (`| head`) is no failure.
+fn print(text: &str) -> Result<(), Failure> {
+    match std::io::stdout().lock().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Failure::new(format!("standard output cannot be written: {error}")))
+        }
+        Ok(()) | Err(_) => Ok(()),
+    }
+}
+
+fn show(description: &Description, page: &mut String) {
+    page.push_str(&format!("{}: good\n", description.file));
+    page.push_str(&format!("\ncell\n  {}\n", description.cell));
+    list("pack", &description.pack, page);
+    page.push_str("\ninterfaces\n");
     for interface in &description.interfaces {
         let kind = if interface.fd { "classic and FD" } else { "classic" };
         let ids = match interface.filter_ids.len() {
             0 => "nothing is read".to_owned(),
             _ => format!("kernel filter {}", interface.filter_ids.join(" ")),
         };
-        println!("  {}: {kind}, {ids}", interface.name);
+        page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }
-    println!("\nsignals");
-    table(&description.signals.iter().map(signal).collect::<Vec<_>>());
-    list("plausible readings", &description.limits);
-    println!("\noutputs");
+    page.push_str("\nsignals\n");
+    table(&description.signals.iter().map(signal).collect::<Vec<_>>(), page);
+    list("plausible readings", &description.limits, page);
+    page.push_str("\noutputs\n");
     if description.outputs.is_empty() {
-        println!("  nothing is sent");
+        page.push_str("  nothing is sent\n");
     }
-    table(&description.outputs.iter().map(output).collect::<Vec<_>>());
+    table(&description.outputs.iter().map(output).collect::<Vec<_>>(), page);
     if description.alarms.is_empty() {
-        list("alarms", &["none".to_owned()]);
+        list("alarms", &["none".to_owned()], page);
     } else {
-        list("alarms", &description.alarms);
+        list("alarms", &description.alarms, page);
     }
 }
 
-fn list(heading: &str, lines: &[String]) {
-    println!("\n{heading}");
+fn list(heading: &str, lines: &[String], page: &mut String) {
+    page.push_str(&format!("\n{heading}\n"));
     for line in lines {
-        println!("  {line}");
+        page.push_str(&format!("  {line}\n"));
     }
 }
 
@@ -117,12 +129,12 @@ fn output(output: &OutputUse) -> Vec<String> {
 }
 
 /// Rows with their columns aligned.
-fn table(rows: &[Vec<String>]) {
+fn table(rows: &[Vec<String>], page: &mut String) {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
     let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
     for row in rows {
         let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
-        println!("  {}", cells.join("  ").trim_end());
+        page.push_str(&format!("  {}\n", cells.join("  ").trim_end()));
     }
 }
