@@ -78,9 +78,7 @@ fn log_options(args: &Args, config: &Config) -> LogOptions {
             cells: sample.cells,
             pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
         },
-        encode_row: Box::new(move |values, frames| {
-            encoder.encode(values, frames);
-        }),
+        encode_row: Box::new(move |values, frames| encoder.encode(values, frames)),
     }
 }
 
@@ -117,9 +115,5 @@ fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
 }
 
 fn print_summary(args: &Args, summary: &Summary) -> io::Result<()> {
-    if args.json {
-        report::json(summary)
-    } else {
-        report::table(summary, args.results_on_stdout())
-    }
+    if args.json { report::json(summary) } else { report::table(summary, args.results_on_stdout()) }
 }

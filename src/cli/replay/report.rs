@@ -87,6 +87,7 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
         ("frames the recorder lost", log.dropped_frames),
         ("stamps backwards", log.time_backwards),
         ("unknown gaps", log.unknown_gaps),
+        ("values no frame carries", log.uncarried_values),
     ];
     rows.extend(counted.into_iter().filter(|&(_, count)| count > 0).map(|(name, count)| (name, count.to_string())));
     if !log.foreign.is_empty() {
@@ -129,7 +130,11 @@ fn write_cells(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
         return writeln!(out, "no estimate was made");
     }
     let with_std = |value: f64, std: f64, digits: usize| format!("{value:.digits$} +/- {std:.digits$}");
-    writeln!(out, "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}", "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x")?;
+    writeln!(
+        out,
+        "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}",
+        "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x"
+    )?;
     for cell in summary.cells.iter().take(MAX_SHOWN_CELLS) {
         let usable = cell.usable_capacity_ah.zip(cell.usable_capacity_std_ah);
         writeln!(
