@@ -78,9 +78,7 @@ fn log_options(args: &Args, config: &Config) -> LogOptions {
             cells: sample.cells,
             pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
         },
-        encode_row: Box::new(move |values, frames| {
-            encoder.encode(values, frames);
-        }),
+        encode_row: Box::new(move |values, frames| encoder.encode(values, frames)),
     }
 }
 

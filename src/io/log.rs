@@ -30,8 +30,8 @@ const MAX_FOREIGN_NAMES: usize = 64;
 #[error("{0}")]
 pub struct LogError(pub String);
 
-/// Turns one CSV row's values into the frames that would have carried them.
-pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>)>;
+/// Turns one CSV row's values into the frames that would have carried them; gives how many values no frame could carry.
+pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
 /// How logs are to be read.
 pub struct LogOptions {
@@ -151,6 +151,8 @@ pub struct LogCounts {
     pub time_backwards: u64,
     /// Parts with an unknown gap before them.
     pub unknown_gaps: u64,
+    /// CSV values that no input frame could carry (out of the signal's range, or no such signal).
+    pub uncarried_values: u64,
 }
 
 /// Reads logs one after another.
@@ -249,19 +251,20 @@ impl LogSource {
             let more = match &mut open.form {
                 Form::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
                     Some(record) => {
-                        let (gap, record) = self.state.place(record);
+                        let (gap, time) = self.state.place(record.time());
+                        let record = record.at(time);
                         let Some(gap) = gap else { return Ok(Some(record)) };
                         self.queue.push_back(record);
                         return Ok(Some(gap));
                     }
                     None => false,
                 },
-                Form::Csv(log) => self.state.next_row(log, &open.name)?.is_some_and(|row| {
-                    let (gap, tick) = self.state.place(Record::Tick { time: row });
+                Form::Csv(log) => self.state.next_row(log, &open.name)?.is_some_and(|raw| {
+                    let (gap, time) = self.state.place(raw);
                     self.queue.extend(gap);
-                    (self.encode_row)(&log.values, &mut self.frames);
+                    let uncarried = (self.encode_row)(&log.values, &mut self.frames);
+                    self.state.counts.uncarried_values += uncarried as u64;
                     self.state.counts.frames += self.frames.len() as u64;
-                    let time = tick.time();
                     self.queue.extend(self.frames.drain(..).map(|(bus, frame)| Record::Frame { time, bus, frame }));
                     true
                 }),
@@ -435,9 +438,8 @@ impl State {
         }
     }
 
-    /// Puts a record on the common clock; a gap to go before it, where one is needed.
-    fn place(&mut self, record: Record) -> (Option<Record>, Record) {
-        let raw = record.time();
+    /// A file's own stamp on the common clock; a gap to go before it, where one is needed.
+    fn place(&mut self, raw: Timestamp) -> (Option<Record>, Timestamp) {
         let mut gap = false;
         if std::mem::take(&mut self.fresh) {
             self.shift_ns = 0;
@@ -453,6 +455,6 @@ impl State {
         }
         self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
         self.counts.unknown_gaps += u64::from(gap);
-        (gap.then_some(Record::UnknownGap { time }), record.at(time))
+        (gap.then_some(Record::UnknownGap { time }), time)
     }
 }

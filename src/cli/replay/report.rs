@@ -87,6 +87,7 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
         ("frames the recorder lost", log.dropped_frames),
         ("stamps backwards", log.time_backwards),
         ("unknown gaps", log.unknown_gaps),
+        ("values no frame carries", log.uncarried_values),
     ];
     rows.extend(counted.into_iter().filter(|&(_, count)| count > 0).map(|(name, count)| (name, count.to_string())));
     if !log.foreign.is_empty() {
