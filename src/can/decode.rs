@@ -1,34 +1,159 @@
 //! The plan that turns input frames into readings.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::{CellIndex, Fault};
+use crate::can::dbc::{Message, Signal};
+use crate::can::signal::{LayoutFault, SignalPlan};
+use crate::can::{CanId, Frame, FrameKind};
+use crate::quantity::{BusIndex, CellIndex, Fault};
 
-/// Which temperature sensor, in the order of the configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(transparent)]
-pub struct SensorIndex(pub u16);
+pub use crate::quantity::{Channel, Reading, SensorIndex};
 
-/// What a configured signal feeds. The order is the order in which the readings of one frame are
-/// handed on: a voltage triggers the estimator, so current and temperature of the same frame come first.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Channel {
-    /// Pack current, A, positive = discharge after the configured sign.
-    Current,
-    /// A temperature sensor, degrees C.
-    Temperature(SensorIndex),
-    /// Total pack voltage, V.
-    PackVoltage,
-    /// One cell's voltage, V.
-    CellVoltage(CellIndex),
+/// One multiplexor a bound signal depends on: the selector's code must lie in one of the ranges (ends included).
+#[derive(Debug, Clone, PartialEq)]
+pub struct MuxTest {
+    /// Where the selector is.
+    pub plan: SignalPlan,
+    /// Codes for which the signal is there.
+    pub ranges: Vec<(u64, u64)>,
 }
 
-/// One value taken from a frame, in the program's units and sign, or why there is none.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reading {
+/// One configured signal: where it comes from and what it means.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Binding {
+    /// Interface.
+    pub bus: BusIndex,
+    /// Message.
+    pub id: CanId,
+    /// Payload length the DBC states (used when frames are made, not when they are read).
+    pub len_bytes: u16,
+    /// The signal.
+    pub plan: SignalPlan,
+    /// All must hold; empty = always there.
+    pub mux: Vec<MuxTest>,
     /// What it feeds.
     pub channel: Channel,
-    /// The value, or the fault that makes it unusable.
-    pub value: Result<f64, Fault>,
+    /// Applied after the DBC's factor and offset: value x scale + offset (a current whose bus counts charging
+    /// positive has scale -1).
+    pub scale: f64,
+    /// See `scale`.
+    pub offset: f64,
+    /// Raw codes (the signal's bits) that mean "not available".
+    pub not_available: Vec<u64>,
+    /// Allowed values after scale and offset, both ends included.
+    pub range: (f64, f64),
+}
+
+impl Binding {
+    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" as the value
+    /// table says. The caller changes what the configuration changes.
+    ///
+    /// # Errors
+    /// When the layout of the signal or of one of its multiplexors cannot be read.
+    pub fn new(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Result<Self, LayoutFault> {
+        let selectors = signal.multiplex.conditions.iter().filter_map(|condition| {
+            let selector = message.signals.get(condition.selector)?;
+            Some(selector.layout.plan().map(|plan| MuxTest { plan, ranges: condition.ranges.clone() }))
+        });
+        Ok(Self {
+            bus,
+            id: message.id,
+            len_bytes: message.len_bytes,
+            plan: signal.layout.plan()?,
+            mux: selectors.collect::<Result<_, _>>()?,
+            channel,
+            scale: 1.0,
+            offset: 0.0,
+            not_available: signal.not_available_codes(),
+            range: (f64::NEG_INFINITY, f64::INFINITY),
+        })
+    }
+
+    /// Whether the payload carries the signal.
+    fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
+        for test in &self.mux {
+            let code = test.plan.raw(payload)?;
+            if !test.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code)) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// The value in the program's unit and sign, or why there is none.
+    pub(crate) fn value(&self, payload: &[u8]) -> Result<f64, Fault> {
+        if !self.not_available.is_empty() && self.not_available.contains(&self.plan.raw(payload)?) {
+            return Err(Fault::NotAvailable);
+        }
+        let value = self.plan.decode(payload)? * self.scale + self.offset;
+        if value >= self.range.0 && value <= self.range.1 { Ok(value) } else { Err(Fault::OutOfRange) }
+    }
+}
+
+/// All configured signals, found by interface and identifier.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct InputMap {
+    /// Sorted by message, then channel.
+    bindings: Vec<Binding>,
+    /// Per interface, sorted by identifier: where in `bindings` the message's signals are.
+    messages: Vec<Vec<(CanId, Range<usize>)>>,
+}
+
+impl InputMap {
+    /// Sorts the bindings by message and channel.
+    pub fn new(mut bindings: Vec<Binding>) -> Self {
+        bindings.sort_by_key(|binding| (binding.bus, binding.id, binding.channel));
+        let mut messages: Vec<Vec<(CanId, Range<usize>)>> = Vec::new();
+        for (index, binding) in bindings.iter().enumerate() {
+            if messages.len() <= binding.bus.index() {
+                messages.resize(binding.bus.index() + 1, Vec::new());
+            }
+            let Some(ids) = messages.get_mut(binding.bus.index()) else { continue };
+            match ids.last_mut() {
+                Some((id, range)) if *id == binding.id => range.end = index + 1,
+                _ => ids.push((binding.id, index..index + 1)),
+            }
+        }
+        Self { bindings, messages }
+    }
+
+    /// Hands the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those
+    /// that are there. When a selector cannot be read, every signal that depends on it is a short frame. Frames
+    /// that are not configured, and remote frames, give nothing.
+    #[inline]
+    pub fn decode(&self, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
+        let Some(ids) = self.messages.get(bus.index()) else { return };
+        let Ok(found) = ids.binary_search_by_key(&frame.id(), |(id, _)| *id) else { return };
+        if frame.kind() == FrameKind::Remote {
+            return;
+        }
+        for binding in &self.bindings[ids[found].1.clone()] {
+            let value = match binding.holds(frame.data()) {
+                Ok(false) => continue,
+                Ok(true) => binding.value(frame.data()),
+                Err(fault) => Err(fault),
+            };
+            each(Reading { channel: binding.channel, value });
+        }
+    }
+
+    /// Identifiers configured on an interface, ascending, for kernel filters.
+    pub fn ids(&self, bus: BusIndex) -> Vec<CanId> {
+        self.messages.get(bus.index()).map(|ids| ids.iter().map(|(id, _)| *id).collect()).unwrap_or_default()
+    }
+
+    /// Every configured channel, ascending, each once.
+    pub fn channels(&self) -> Vec<Channel> {
+        let mut channels: Vec<_> = self.bindings.iter().map(|binding| binding.channel).collect();
+        channels.sort_unstable();
+        channels.dedup();
+        channels
+    }
+
+    /// The bindings, sorted by interface, identifier and channel.
+    pub fn bindings(&self) -> &[Binding] {
+        &self.bindings
+    }
 }
