@@ -27,7 +27,9 @@ impl Timestamp {
     /// From seconds since the clock's origin, rounded to the nearest nanosecond; saturates at the ends
     /// of the range (292 years), NaN gives the origin.
     pub fn from_secs(seconds: f64) -> Self {
-        Self((seconds * 1e9).round() as i64)
+        // Whole seconds apart: their product with 1e9 would not fit a float's 53 bits.
+        let whole = seconds.floor();
+        Self((whole as i64).saturating_mul(1_000_000_000).saturating_add(((seconds - whole) * 1e9).round() as i64))
     }
 
     /// Nanoseconds since the clock's origin.
@@ -84,6 +86,33 @@ impl BusIndex {
     }
 }
 
+/// Which temperature sensor, in the order of the configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct SensorIndex(pub u16);
+
+impl SensorIndex {
+    /// As an index into per-sensor arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// What a configured signal feeds. The order is the order in which the readings of one frame are
+/// handed on: a voltage triggers the estimator, so current and temperature of the same frame come first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Channel {
+    /// Pack current, A, positive = discharge after the configured sign.
+    Current,
+    /// A temperature sensor, degrees C.
+    Temperature(SensorIndex),
+    /// Total pack voltage, V.
+    PackVoltage,
+    /// One cell's voltage, V.
+    CellVoltage(CellIndex),
+}
+
 /// Why a reading cannot be used. A bad reading is data, not an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -102,6 +131,15 @@ pub enum Fault {
     Stuck,
     /// No value for longer than the configured age.
     Stale,
+}
+
+/// One value taken from a frame, in the program's units and sign, or why there is none.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// What it feeds.
+    pub channel: Channel,
+    /// The value, or the fault that makes it unusable.
+    pub value: Result<f64, Fault>,
 }
 
 /// What the cells do, by the sign of the current after dead band, hysteresis and minimum duration.

@@ -1,4 +1,15 @@
 //! Rules over named values: debounce, hysteresis, severity. Sees values with age and validity, no estimator.
+//!
+//! In: a rule's value per cell or per pack, in the rule's unit, or `None` when it is not known. Out: alarms
+//! raised and cleared. Promise: an unknown value neither raises nor clears; memory is bounded by rules x cells.
+//! * [`machine`] holds the life of one alarm as a transition table;
+//! * [`engine`] holds one such machine per rule and cell.
+
+pub mod engine;
+pub mod machine;
+
+pub use engine::{ActiveAlarm, AlarmChange, AlarmEngine, AlarmState};
+pub use machine::State;
 
 use serde::{Deserialize, Serialize};
 
@@ -19,6 +30,74 @@ pub enum Rule {
     InputImplausible = 5,
     /// The estimator's innovations contradict its own covariance; the value is the mean normalised innovation squared.
     EstimateUntrusted = 6,
+}
+
+/// What a rule is about: the pack as a whole, its cells, or both.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scope {
+    /// One value for the pack.
+    Pack,
+    /// One value per cell.
+    Cell,
+    /// One value per cell, and one for what belongs to no cell (the pack's current, say).
+    Both,
+}
+
+/// Which side of a threshold is bad.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Direction {
+    /// Raised below the threshold.
+    Below,
+    /// Raised above it.
+    Above,
+}
+
+impl Rule {
+    /// Every rule, in wire order.
+    pub const ALL: [Self; 6] = [
+        Self::CapacityLow,
+        Self::UsableCapacityLow,
+        Self::RechargePeriodLow,
+        Self::InputMissing,
+        Self::InputImplausible,
+        Self::EstimateUntrusted,
+    ];
+
+    /// Pack, cells or both.
+    pub const fn scope(self) -> Scope {
+        match self {
+            Self::CapacityLow | Self::UsableCapacityLow | Self::EstimateUntrusted => Scope::Cell,
+            Self::RechargePeriodLow => Scope::Pack,
+            Self::InputMissing | Self::InputImplausible => Scope::Both,
+        }
+    }
+
+    /// Whether the rule has a value for each cell.
+    pub const fn is_per_cell(self) -> bool {
+        match self.scope() {
+            Scope::Pack => false,
+            Scope::Cell | Scope::Both => true,
+        }
+    }
+
+    /// Which side of its threshold is bad.
+    pub const fn direction(self) -> Direction {
+        match self {
+            Self::CapacityLow | Self::UsableCapacityLow | Self::RechargePeriodLow => Direction::Below,
+            Self::InputMissing | Self::InputImplausible | Self::EstimateUntrusted => Direction::Above,
+        }
+    }
+
+    /// Whether a value stays true until the next one, so that the time debounce may run out between them.
+    ///
+    /// What was learned at a transition does: a capacity is not less low because no cycle has ended since.
+    /// What is measured all the time does not: if no new consistency figure comes, the old one proves nothing.
+    pub const fn holds_between_values(self) -> bool {
+        match self {
+            Self::CapacityLow | Self::UsableCapacityLow | Self::RechargePeriodLow => true,
+            Self::InputMissing | Self::InputImplausible | Self::EstimateUntrusted => false,
+        }
+    }
 }
 
 /// How bad, as on the wire.

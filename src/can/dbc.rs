@@ -1,1 +1,402 @@
 //! DBC text to messages and signals.
+//!
+//! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages with their signals,
+//! multiplexing resolved into conditions on raw selector codes, value tables, units and cycle times.
+//!
+//! A file that is not a DBC, an identifier out of range, a name defined twice or multiplexing that cannot be resolved is
+//! a [`DbcError`] with its line. A signal that reaches past its message's end stays (decoding it gives
+//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame)), and a layout that nothing can read stays too: it is
+//! refused when somebody wants to use it ([`SignalLayout::plan`]).
+
+use std::collections::HashMap;
+
+use crate::can::CanId;
+use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
+
+/// Multiplexors that may hang one below the other; deeper nesting is taken for a loop.
+const MAX_MULTIPLEX_DEPTH: usize = 8;
+
+/// Name of the pseudo message in which editors keep signals without a message.
+const ORPHANS: &str = "VECTOR__INDEPENDENT_SIG_MSG";
+
+/// Why a text is not a usable DBC.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("line {line}: {what}")]
+pub struct DbcError {
+    /// Counted from 1.
+    pub line: usize,
+    /// What is wrong, what was found, what is allowed.
+    pub what: String,
+}
+
+/// Messages of one DBC, in the file's order.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Database {
+    /// The messages.
+    pub messages: Vec<Message>,
+}
+
+/// One message.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Message {
+    /// Identifier; extended when the DBC's bit 31 is set.
+    pub id: CanId,
+    /// Unique in its database.
+    pub name: String,
+    /// Payload length the DBC states, bytes.
+    pub len_bytes: u16,
+    /// In the file's order.
+    pub signals: Vec<Signal>,
+    /// `GenMsgCycleTime` (or its default), when above 0.
+    pub cycle_time_ms: Option<u32>,
+    /// `CM_ BO_`.
+    pub comment: Option<String>,
+}
+
+/// One signal.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Signal {
+    /// Unique in its message.
+    pub name: String,
+    /// Place and scaling.
+    pub layout: SignalLayout,
+    /// As written, may be empty.
+    pub unit: String,
+    /// When the signal is in the payload.
+    pub multiplex: Multiplex,
+    /// Whether other signals' presence depends on this one.
+    pub is_multiplexor: bool,
+    /// `VAL_`: raw value (signed for signed signals) and its name.
+    pub values: Vec<(i64, String)>,
+    /// `CM_ SG_`.
+    pub comment: Option<String>,
+}
+
+/// When a signal is in the payload: when all conditions hold; without conditions always.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Multiplex {
+    /// Outermost multiplexor first.
+    pub conditions: Vec<MuxCondition>,
+}
+
+/// One multiplexor's part of the condition.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MuxCondition {
+    /// Index of the multiplexor in its message's `signals`.
+    pub selector: usize,
+    /// Raw codes, both ends included; one of the ranges must hold the selector's code.
+    pub ranges: Vec<(u64, u64)>,
+}
+
+impl Database {
+    /// Reads the text of a DBC.
+    ///
+    /// # Errors
+    /// The first thing wrong, with its line.
+    pub fn parse(text: &str) -> Result<Self, DbcError> {
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+        // The grammar wants every statement closed by a line end.
+        let closed = if text.ends_with('\n') { text.to_owned() } else { format!("{text}\n") };
+        check_identifiers(&closed)?;
+        let dbc = can_dbc::Dbc::try_from(closed.as_str()).map_err(|error| grammar_fault(&error))?;
+        let details = Details::new(&dbc);
+        let messages = dbc.messages.iter().filter(|message| message.name != ORPHANS);
+        let messages: Result<Vec<_>, _> =
+            messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
+        let database = Self { messages: messages? };
+        database.check_names().map_err(|fault| fault.at(&closed))?;
+        Ok(database)
+    }
+
+    /// Reads a DBC file's bytes: UTF-8, or Latin-1 where they are not UTF-8 (a DBC does not state its encoding).
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn parse_bytes(bytes: &[u8]) -> Result<Self, DbcError> {
+        match std::str::from_utf8(bytes) {
+            Ok(text) => Self::parse(text),
+            Err(_) => Self::parse(&bytes.iter().copied().map(char::from).collect::<String>()),
+        }
+    }
+
+    /// The message of that name.
+    pub fn message(&self, name: &str) -> Option<&Message> {
+        self.messages.iter().find(|message| message.name == name)
+    }
+
+    /// The signal of that full name, `Message.Signal`, with its message.
+    pub fn signal(&self, full_name: &str) -> Option<(&Message, &Signal)> {
+        let (message, signal) = full_name.split_once('.')?;
+        let message = self.message(message)?;
+        Some((message, message.signal(signal)?))
+    }
+
+    fn check_names(&self) -> Result<(), Misfit> {
+        let mut messages = HashMap::new();
+        for message in &self.messages {
+            if messages.insert(message.name.as_str(), message.id).is_some() {
+                let what = format!("message {} is defined twice, names must be unique", message.name);
+                return Err(Misfit { message: message.name.clone(), signal: None, what });
+            }
+            let mut signals = HashMap::new();
+            for signal in &message.signals {
+                if signals.insert(signal.name.as_str(), ()).is_some() {
+                    let what = format!("signal {}.{} is defined twice", message.name, signal.name);
+                    return Err(Misfit { message: message.name.clone(), signal: Some(signal.name.clone()), what });
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Message {
+    /// The signal of that name.
+    pub fn signal(&self, name: &str) -> Option<&Signal> {
+        self.signals.iter().find(|signal| signal.name == name)
+    }
+}
+
+impl Signal {
+    /// Raw codes (the signal's bits) that its value table calls "not available", "signal not available", "n/a" or
+    /// "SNA", whatever the case and with `_` for blanks.
+    pub fn not_available_codes(&self) -> Vec<u64> {
+        let mask = u64::MAX >> (64 - u32::from(self.layout.length_bits.clamp(1, 64)));
+        let says_so = |name: &str| {
+            let name = name.trim().to_ascii_lowercase().replace('_', " ");
+            matches!(name.as_str(), "not available" | "signal not available" | "n/a" | "sna")
+        };
+        self.values.iter().filter(|(_, name)| says_so(name)).map(|(code, _)| code.cast_unsigned() & mask).collect()
+    }
+}
+
+/// Something wrong with a message or signal, before its line is known.
+struct Misfit {
+    message: String,
+    signal: Option<String>,
+    what: String,
+}
+
+impl Misfit {
+    /// Finds the last place where the text defines the message (and signal).
+    fn at(self, text: &str) -> DbcError {
+        let (mut line, mut inside) = (1, false);
+        for (number, content) in (1..).zip(text.lines()) {
+            let mut words = content.split([' ', '\t', ':']).filter(|word| !word.is_empty());
+            match (words.next(), words.next(), words.next()) {
+                (Some("BO_"), _, Some(name)) => {
+                    inside = name == self.message;
+                    if inside {
+                        line = number;
+                    }
+                }
+                (Some("SG_"), Some(name), _) if inside && Some(name) == self.signal.as_deref() => line = number,
+                _ => {}
+            }
+        }
+        DbcError { line, what: self.what }
+    }
+}
+
+fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
+    match error {
+        can_dbc::DbcError::Pest(error) => {
+            // The report's last line says what was expected; the lines before it draw the place.
+            let report = error.to_string();
+            let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= ")).unwrap_or("not a DBC");
+            let place = error_place(&report);
+            DbcError { line: place, what: format!("found \"{}\": {expected}", error.line().trim()) }
+        }
+        other => DbcError { line: 1, what: other.to_string() },
+    }
+}
+
+/// The line in pest's report, which opens ` --> line:column`.
+fn error_place(report: &str) -> usize {
+    let place = report.lines().next().and_then(|first| first.split("--> ").nth(1));
+    place.and_then(|place| place.split(':').next()).and_then(|line| line.trim().parse().ok()).unwrap_or(1)
+}
+
+/// Identifiers without the extended bit must have 11 bits (the grammar crate would cut off what is too much).
+fn check_identifiers(text: &str) -> Result<(), DbcError> {
+    for (line, content) in (1..).zip(text.lines()) {
+        let Some(rest) = content.trim_start().strip_prefix("BO_ ") else { continue };
+        let Some(Ok(id)) = rest.split_whitespace().next().map(str::parse::<u64>) else { continue };
+        if id > 0x7FF && id & 0x8000_0000 == 0 || id > 0xFFFF_FFFF {
+            let what = format!("identifier {id}, must be 0 to 2047, or have bit 31 set for an extended one");
+            return Err(DbcError { line, what });
+        }
+    }
+    Ok(())
+}
+
+/// What a DBC says about signals outside their definition, by message and signal.
+struct Details<'a> {
+    comments: HashMap<(can_dbc::MessageId, &'a str), &'a str>,
+    values: HashMap<(can_dbc::MessageId, &'a str), &'a [can_dbc::ValDescription]>,
+    floats: HashMap<(can_dbc::MessageId, &'a str), can_dbc::SignalExtendedValueType>,
+    multiplex: HashMap<(can_dbc::MessageId, &'a str), Vec<&'a can_dbc::ExtendedMultiplex>>,
+}
+
+impl<'a> Details<'a> {
+    fn new(dbc: &'a can_dbc::Dbc) -> Self {
+        let mut details = Self {
+            comments: HashMap::new(),
+            values: HashMap::new(),
+            floats: HashMap::new(),
+            multiplex: HashMap::new(),
+        };
+        for comment in &dbc.comments {
+            if let can_dbc::Comment::Signal { message_id, name, comment } = comment {
+                details.comments.insert((*message_id, name), comment);
+            }
+        }
+        for values in &dbc.value_descriptions {
+            if let can_dbc::ValueDescription::Signal { message_id, name, value_descriptions } = values {
+                details.values.insert((*message_id, name), value_descriptions);
+            }
+        }
+        for kind in &dbc.signal_extended_value_type_list {
+            details.floats.insert((kind.message_id, &kind.signal_name), kind.signal_extended_value_type);
+        }
+        for entry in &dbc.extended_multiplex {
+            details.multiplex.entry((entry.message_id, &entry.signal_name)).or_default().push(entry);
+        }
+        details
+    }
+}
+
+fn read_message(dbc: &can_dbc::Dbc, details: &Details, message: &can_dbc::Message) -> Result<Message, Misfit> {
+    let misfit = |what: String| Misfit { message: message.name.clone(), signal: None, what };
+    let id = match message.id {
+        can_dbc::MessageId::Standard(id) => CanId::standard(u32::from(id)),
+        can_dbc::MessageId::Extended(id) => CanId::extended(id),
+    };
+    let id = id.ok_or_else(|| misfit(format!("message {}: identifier out of range", message.name)))?;
+    // Longer than a frame is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
+    let len_bytes = u16::try_from(message.size)
+        .map_err(|_| misfit(format!("message {}: length {}, must be 0 to 65535", message.name, message.size)))?;
+    let signals: Result<Vec<_>, _> =
+        message.signals.iter().map(|signal| read_signal(details, message, signal)).collect();
+    Ok(Message {
+        id,
+        name: message.name.clone(),
+        len_bytes,
+        signals: signals?,
+        cycle_time_ms: cycle_time_ms(dbc.resolved_message_attribute(message.id, "GenMsgCycleTime")),
+        comment: dbc.message_comment(message.id).map(str::to_owned),
+    })
+}
+
+fn cycle_time_ms(value: Option<&can_dbc::AttributeValue>) -> Option<u32> {
+    let whole = match value? {
+        can_dbc::AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
+        can_dbc::AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
+        // Editors that export every number as a float write 100.0 as 100: read its digits.
+        can_dbc::AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
+        can_dbc::AttributeValue::String(ms) => ms.parse().ok(),
+    };
+    whole.filter(|ms| *ms > 0)
+}
+
+fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::Signal) -> Result<Signal, Misfit> {
+    let misfit = |what: String| Misfit {
+        message: message.name.clone(),
+        signal: Some(signal.name.clone()),
+        what: format!("signal {}.{}: {what}", message.name, signal.name),
+    };
+    let bits = |name: &str, n: u64| u16::try_from(n).map_err(|_| misfit(format!("{name} {n}, must be 0 to 65535")));
+    let key = (message.id, signal.name.as_str());
+    let layout = SignalLayout {
+        start_bit: bits("start bit", signal.start_bit)?,
+        length_bits: bits("length", signal.size)?,
+        byte_order: match signal.byte_order {
+            can_dbc::ByteOrder::LittleEndian => ByteOrder::LittleEndian,
+            can_dbc::ByteOrder::BigEndian => ByteOrder::BigEndian,
+        },
+        value_type: match (details.floats.get(&key), signal.value_type) {
+            (Some(can_dbc::SignalExtendedValueType::IEEEfloat32Bit), _) => ValueType::Float32,
+            (Some(can_dbc::SignalExtendedValueType::IEEEdouble64bit), _) => ValueType::Float64,
+            (_, can_dbc::ValueType::Signed) => ValueType::Signed,
+            (_, can_dbc::ValueType::Unsigned) => ValueType::Unsigned,
+        },
+        factor: signal.factor,
+        offset: signal.offset,
+        minimum: number(&signal.min),
+        maximum: number(&signal.max),
+    };
+    let values = details.values.get(&key).copied().unwrap_or_default();
+    Ok(Signal {
+        name: signal.name.clone(),
+        layout,
+        unit: signal.unit.clone(),
+        multiplex: Multiplex { conditions: conditions(details, message, signal, 0).map_err(misfit)? },
+        is_multiplexor: is_multiplexor(signal),
+        values: values.iter().map(|value| (value.id, value.description.clone())).collect(),
+        comment: details.comments.get(&key).map(|comment| (*comment).to_owned()),
+    })
+}
+
+fn number(value: &can_dbc::NumericValue) -> f64 {
+    match *value {
+        can_dbc::NumericValue::Uint(value) => crate::can::signal::float_of(value),
+        can_dbc::NumericValue::Int(value) => crate::can::signal::float_of_signed(value),
+        can_dbc::NumericValue::Double(value) => value,
+    }
+}
+
+fn is_multiplexor(signal: &can_dbc::Signal) -> bool {
+    use can_dbc::MultiplexIndicator as Indicator;
+    match signal.multiplexer_indicator {
+        Indicator::Multiplexor | Indicator::MultiplexorAndMultiplexedSignal(_) => true,
+        Indicator::MultiplexedSignal(_) | Indicator::Plain => false,
+    }
+}
+
+/// The chain of conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names parent and
+/// ranges and overrules the number after `m`; without it the parent is the message's only `M`.
+fn conditions(
+    details: &Details,
+    message: &can_dbc::Message,
+    signal: &can_dbc::Signal,
+    depth: usize,
+) -> Result<Vec<MuxCondition>, String> {
+    use can_dbc::MultiplexIndicator as Indicator;
+    if depth > MAX_MULTIPLEX_DEPTH {
+        return Err(format!("multiplexors nested more than {MAX_MULTIPLEX_DEPTH} deep, or in a loop"));
+    }
+    let entries = details.multiplex.get(&(message.id, signal.name.as_str()));
+    let (selector, ranges) = match (entries.map(Vec::as_slice), signal.multiplexer_indicator) {
+        (Some([entry]), _) => {
+            let ranges = entry.mappings.iter().map(|range| (range.min_value, range.max_value)).collect();
+            (position(message, &entry.multiplexor_signal_name)?, ranges)
+        }
+        (Some(_), _) => return Err("more than one SG_MUL_VAL_ line, one is allowed".to_owned()),
+        (None, Indicator::Plain | Indicator::Multiplexor) => return Ok(Vec::new()),
+        (None, Indicator::MultiplexedSignal(code) | Indicator::MultiplexorAndMultiplexedSignal(code)) => {
+            (only_multiplexor(message)?, vec![(code, code)])
+        }
+    };
+    let parent = message.signals.get(selector).ok_or("multiplexor not found")?;
+    let mut chain = conditions(details, message, parent, depth + 1)?;
+    chain.push(MuxCondition { selector, ranges });
+    Ok(chain)
+}
+
+fn position(message: &can_dbc::Message, name: &str) -> Result<usize, String> {
+    let found = message.signals.iter().position(|signal| signal.name == name);
+    found.ok_or_else(|| format!("SG_MUL_VAL_ names multiplexor {name}, which the message does not have"))
+}
+
+fn only_multiplexor(message: &can_dbc::Message) -> Result<usize, String> {
+    let plain = |signal: &can_dbc::Signal| signal.multiplexer_indicator == can_dbc::MultiplexIndicator::Multiplexor;
+    let mut candidates = message.signals.iter().enumerate().filter(|(_, signal)| plain(signal));
+    match (candidates.next(), candidates.next()) {
+        (Some((index, _)), None) => Ok(index),
+        (None, _) => Err("multiplexed, but the message has no multiplexor (M)".to_owned()),
+        (Some(_), Some(_)) => Err("multiplexed by one of several multiplexors, SG_MUL_VAL_ must say which".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests;

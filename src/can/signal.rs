@@ -1,1 +1,445 @@
 //! Signal layouts: where a number sits in a payload, and how to get it out and in.
+//!
+//! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended)
+//! and physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout compiled once;
+//! reading is then load, shift, shift, multiply-add. Signals have 1 to 64 bits at any position of payloads of up to
+//! 64 bytes.
+//!
+//! Bad input is data: a payload too short gives [`Fault::ShortFrame`], NaN or infinity [`Fault::NotFinite`], a value
+//! outside the DBC's range [`Fault::OutOfRange`]. Writing rounds to the nearest code and saturates.
+
+use crate::can::MAX_DATA;
+use crate::quantity::Fault;
+
+/// Bits a payload can have at most.
+const MAX_BITS: u16 = 512;
+const _: () = assert!(MAX_DATA * 8 == MAX_BITS as usize);
+
+/// Order of a signal's bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ByteOrder {
+    /// Least significant byte first (`@1` in a DBC); the start bit is the least significant bit.
+    LittleEndian,
+    /// Most significant byte first (`@0`); the start bit is the most significant bit.
+    BigEndian,
+}
+
+/// How a signal's bits make a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ValueType {
+    /// Unsigned integer.
+    Unsigned,
+    /// Two's complement.
+    Signed,
+    /// IEEE 754 single (`SIG_VALTYPE_ 1`), 32 bits.
+    Float32,
+    /// IEEE 754 double (`SIG_VALTYPE_ 2`), 64 bits.
+    Float64,
+}
+
+/// A signal's place and meaning, as written in a DBC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SignalLayout {
+    /// DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 its most significant, bit 8 starts byte 1.
+    pub start_bit: u16,
+    /// 1 to 64.
+    pub length_bits: u16,
+    /// Order of bytes.
+    pub byte_order: ByteOrder,
+    /// Kind of number.
+    pub value_type: ValueType,
+    /// Physical units per code; not 0.
+    pub factor: f64,
+    /// Physical value of code 0.
+    pub offset: f64,
+    /// Smallest physical value; with `maximum` both 0 means "not stated".
+    pub minimum: f64,
+    /// Largest physical value.
+    pub maximum: f64,
+}
+
+/// Why a layout cannot be read or written.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum LayoutFault {
+    /// Too few or too many bits.
+    #[error("length is {0} bits, must be 1 to 64")]
+    Length(u16),
+    /// Reaches past the longest payload there is.
+    #[error("reaches to bit {0} of the payload, must end within 512 bits (64 bytes)")]
+    Outside(u32),
+    /// An IEEE float of another size.
+    #[error("IEEE float of {found} bits, must be {allowed}")]
+    FloatLength {
+        /// In the layout.
+        found: u16,
+        /// 32 or 64.
+        allowed: u16,
+    },
+    /// Zero or not finite.
+    #[error("factor is {0}, must be finite and not 0")]
+    Factor(f64),
+    /// Not finite.
+    #[error("offset is {0}, must be finite")]
+    Offset(f64),
+    /// The range excludes every value.
+    #[error("range is [{0}|{1}], the first must not be above the second")]
+    Range(f64, f64),
+}
+
+/// A layout compiled for reading and writing.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SignalPlan {
+    /// First byte of the eight-byte window that is loaded.
+    window: u8,
+    /// Bytes the payload must have.
+    bytes_needed: u8,
+    /// The signal touches nine bytes: the window is widened to sixteen.
+    wide: bool,
+    byte_order: ByteOrder,
+    value_type: ValueType,
+    /// Shift that brings the signal's top bit to the word's top.
+    up: u8,
+    /// Shift that then brings its lowest bit to the word's bottom; 64 - length.
+    down: u8,
+    factor: f64,
+    offset: f64,
+    /// Physical limits with half a code of room, so that rounding in factor and offset never refuses a code on the limit.
+    low: f64,
+    high: f64,
+    /// Codes (sign-extended) within both the DBC's range and the bits.
+    low_code: i128,
+    high_code: i128,
+}
+
+/// `code` as a float: exact up to 2^53, rounded to nearest above.
+pub(crate) fn float_of(code: u64) -> f64 {
+    code as f64
+}
+
+/// `code` as a float: exact within +-2^53, rounded to nearest beyond.
+pub(crate) fn float_of_signed(code: i64) -> f64 {
+    code as f64
+}
+
+/// A whole float as an integer; saturates at the ends of `i128`, NaN gives 0.
+fn integer_of(whole: f64) -> i128 {
+    whole as i128
+}
+
+/// The lowest 64 bits of a two's complement number.
+fn low_64(code: i128) -> u64 {
+    let bytes = code.to_le_bytes();
+    u64::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3], bytes[4], bytes[5], bytes[6], bytes[7]])
+}
+
+impl SignalLayout {
+    /// Position of the first and last bit, counted in the order of the wire's bytes: within a byte from bit 0 up for
+    /// little-endian signals, from bit 7 down for big-endian ones.
+    fn span(&self) -> (u32, u32) {
+        let start = u32::from(self.start_bit);
+        let first = match self.byte_order {
+            ByteOrder::LittleEndian => start,
+            ByteOrder::BigEndian => start - start % 8 + (7 - start % 8),
+        };
+        (first, first + u32::from(self.length_bits) - 1)
+    }
+
+    /// Whether minimum and maximum say anything (`[0|0]` does not).
+    pub fn has_range(&self) -> bool {
+        self.minimum != 0.0 || self.maximum != 0.0
+    }
+
+    fn check(&self) -> Result<(), LayoutFault> {
+        if !(1..=64).contains(&self.length_bits) {
+            return Err(LayoutFault::Length(self.length_bits));
+        }
+        let (_, last) = self.span();
+        if last >= u32::from(MAX_BITS) {
+            return Err(LayoutFault::Outside(last));
+        }
+        let allowed = match self.value_type {
+            ValueType::Unsigned | ValueType::Signed => self.length_bits,
+            ValueType::Float32 => 32,
+            ValueType::Float64 => 64,
+        };
+        if self.length_bits != allowed {
+            return Err(LayoutFault::FloatLength { found: self.length_bits, allowed });
+        }
+        if !self.factor.is_finite() || self.factor == 0.0 {
+            return Err(LayoutFault::Factor(self.factor));
+        }
+        if !self.offset.is_finite() {
+            return Err(LayoutFault::Offset(self.offset));
+        }
+        if self.minimum.is_nan() || self.maximum.is_nan() || self.minimum > self.maximum {
+            return Err(LayoutFault::Range(self.minimum, self.maximum));
+        }
+        Ok(())
+    }
+
+    /// Smallest and largest code the bits can hold.
+    fn representable(&self) -> (i128, i128) {
+        match self.value_type {
+            ValueType::Signed => (-(1_i128 << (self.length_bits - 1)), (1_i128 << (self.length_bits - 1)) - 1),
+            ValueType::Unsigned | ValueType::Float32 | ValueType::Float64 => (0, (1_i128 << self.length_bits) - 1),
+        }
+    }
+
+    /// Smallest and largest code within the bits and the stated range; only the bits when no code lies in the range.
+    fn code_limits(&self) -> (i128, i128) {
+        /// Share of a code by which rounding in the DBC's decimal numbers may miss a whole code.
+        const ROUNDING: f64 = 1e-6;
+        let (lowest, highest) = self.representable();
+        if !self.has_range() {
+            return (lowest, highest);
+        }
+        let a = (self.minimum - self.offset) / self.factor;
+        let b = (self.maximum - self.offset) / self.factor;
+        let low = integer_of((a.min(b) - ROUNDING).ceil()).max(lowest);
+        let high = integer_of((a.max(b) + ROUNDING).floor()).min(highest);
+        if low <= high { (low, high) } else { (lowest, highest) }
+    }
+
+    /// Physical limits widened by half a code (floats: by 1e-6 of the range's ends).
+    fn physical_limits(&self) -> (f64, f64) {
+        if !self.has_range() {
+            // Still refuses what factor and offset make infinite.
+            return (f64::MIN, f64::MAX);
+        }
+        let room = match self.value_type {
+            ValueType::Unsigned | ValueType::Signed => self.factor.abs() / 2.0,
+            ValueType::Float32 | ValueType::Float64 => 1e-6 * self.minimum.abs().max(self.maximum.abs()),
+        };
+        (self.minimum - room, self.maximum + room)
+    }
+
+    /// Compiles the layout.
+    ///
+    /// # Errors
+    /// When no payload can carry it, or factor, offset or range make no sense.
+    pub fn plan(&self) -> Result<SignalPlan, LayoutFault> {
+        self.check()?;
+        let (first, last) = self.span();
+        let (first_byte, last_byte) = (first / 8, last / 8);
+        let wide = last_byte - first_byte == 8;
+        let window = if wide { first_byte } else { last_byte.saturating_sub(7) };
+        let in_window = first - 8 * window;
+        let length = u32::from(self.length_bits);
+        let word = if wide { 128 } else { 64 };
+        let up = match self.byte_order {
+            ByteOrder::LittleEndian => word - (in_window + length),
+            ByteOrder::BigEndian => in_window,
+        };
+        let (low, high) = self.physical_limits();
+        let (low_code, high_code) = self.code_limits();
+        // Each number was checked above to be below 128.
+        let small = |n: u32| u8::try_from(n).unwrap_or(u8::MAX);
+        Ok(SignalPlan {
+            window: small(window),
+            bytes_needed: small(last_byte + 1),
+            wide,
+            byte_order: self.byte_order,
+            value_type: self.value_type,
+            up: small(up),
+            down: small(64 - length),
+            factor: self.factor,
+            offset: self.offset,
+            low,
+            high,
+            low_code,
+            high_code,
+        })
+    }
+}
+
+impl SignalPlan {
+    /// Bytes a payload must have to carry the signal.
+    pub fn bytes_needed(&self) -> usize {
+        usize::from(self.bytes_needed)
+    }
+
+    /// Length of the signal in bits, 1 to 64.
+    pub fn length_bits(&self) -> u32 {
+        64 - u32::from(self.down)
+    }
+
+    /// Kind of number.
+    pub fn value_type(&self) -> ValueType {
+        self.value_type
+    }
+
+    /// The code with every bit set: the customary "not available" of an unsigned signal.
+    pub fn all_ones(&self) -> u64 {
+        u64::MAX >> self.down
+    }
+
+    /// The signal's bits, lowest bit first, without sign extension.
+    ///
+    /// # Errors
+    /// [`Fault::ShortFrame`] when the payload ends before the signal does.
+    #[inline]
+    pub fn raw(&self, payload: &[u8]) -> Result<u64, Fault> {
+        Ok(self.lifted(payload)? >> self.down)
+    }
+
+    /// The signal's bits at the top of a word, zeros below.
+    #[inline]
+    fn lifted(&self, payload: &[u8]) -> Result<u64, Fault> {
+        if payload.len() < self.bytes_needed() {
+            return Err(Fault::ShortFrame);
+        }
+        if self.wide {
+            return Ok(self.lifted_wide(payload));
+        }
+        let from = usize::from(self.window);
+        let bytes = match payload.get(from..from + 8) {
+            Some(bytes) => <[u8; 8]>::try_from(bytes).unwrap_or_default(),
+            None => padded(payload, from),
+        };
+        let word = match self.byte_order {
+            ByteOrder::LittleEndian => u64::from_le_bytes(bytes),
+            ByteOrder::BigEndian => u64::from_be_bytes(bytes),
+        };
+        Ok(word << self.up)
+    }
+
+    /// As `lifted`, for a signal of 58 to 64 bits that touches nine bytes.
+    #[cold]
+    fn lifted_wide(&self, payload: &[u8]) -> u64 {
+        let bytes: [u8; 16] = padded(payload, usize::from(self.window));
+        let word = match self.byte_order {
+            ByteOrder::LittleEndian => u128::from_le_bytes(bytes),
+            ByteOrder::BigEndian => u128::from_be_bytes(bytes),
+        };
+        let top = (word << self.up) >> 64;
+        // Lossless: 64 bits are left after the shift; bits below the signal go with the shift by `down`.
+        u64::try_from(top).unwrap_or(u64::MAX)
+    }
+
+    /// The physical value, in the DBC's unit, without looking at the DBC's range.
+    ///
+    /// # Errors
+    /// [`Fault::ShortFrame`], [`Fault::NotFinite`].
+    #[inline]
+    pub fn physical(&self, payload: &[u8]) -> Result<f64, Fault> {
+        let lifted = self.lifted(payload)?;
+        let number = match self.value_type {
+            ValueType::Unsigned => float_of(lifted >> self.down),
+            ValueType::Signed => float_of_signed(lifted.cast_signed() >> self.down),
+            ValueType::Float32 | ValueType::Float64 => self.ieee(lifted >> self.down)?,
+        };
+        Ok(number * self.factor + self.offset)
+    }
+
+    fn ieee(&self, code: u64) -> Result<f64, Fault> {
+        let number = match u32::try_from(code) {
+            Ok(code) if self.value_type == ValueType::Float32 => f64::from(f32::from_bits(code)),
+            _ => f64::from_bits(code),
+        };
+        if number.is_finite() { Ok(number) } else { Err(Fault::NotFinite) }
+    }
+
+    /// The physical value, in the DBC's unit, checked against the DBC's range (`[0|0]` is no range). A code on the
+    /// limit is inside it, however factor and offset round.
+    ///
+    /// # Errors
+    /// [`Fault::ShortFrame`], [`Fault::NotFinite`], [`Fault::OutOfRange`].
+    #[inline]
+    pub fn decode(&self, payload: &[u8]) -> Result<f64, Fault> {
+        let value = self.physical(payload)?;
+        if value >= self.low && value <= self.high { Ok(value) } else { Err(Fault::OutOfRange) }
+    }
+
+    /// The code nearest to a physical value, saturated at the ends of what the bits and the DBC's range allow.
+    /// `None` for NaN.
+    pub fn code(&self, value: f64) -> Option<u64> {
+        match self.value_type {
+            ValueType::Unsigned | ValueType::Signed => self.integer_code(value, self.low_code, self.high_code),
+            ValueType::Float32 | ValueType::Float64 => self.ieee_code(value.clamp(self.low, self.high)),
+        }
+    }
+
+    /// As [`Self::code`], but saturated only at what the bits can hold: a value outside the DBC's range stays
+    /// outside it, so that its reader sees the fault.
+    pub fn code_beyond_range(&self, value: f64) -> Option<u64> {
+        let bits = self.length_bits();
+        match self.value_type {
+            ValueType::Unsigned => self.integer_code(value, 0, (1_i128 << bits) - 1),
+            ValueType::Signed => self.integer_code(value, -(1_i128 << (bits - 1)), (1_i128 << (bits - 1)) - 1),
+            ValueType::Float32 | ValueType::Float64 => self.ieee_code(value),
+        }
+    }
+
+    fn integer_code(&self, value: f64, low: i128, high: i128) -> Option<u64> {
+        if value.is_nan() {
+            return None;
+        }
+        let code = integer_of(((value - self.offset) / self.factor).round());
+        Some(low_64(code.clamp(low, high)) & self.all_ones())
+    }
+
+    fn ieee_code(&self, value: f64) -> Option<u64> {
+        if value.is_nan() {
+            return None;
+        }
+        let number = ((value - self.offset) / self.factor).clamp(f64::MIN, f64::MAX);
+        match self.value_type {
+            ValueType::Float32 => {
+                let number = number.clamp(f64::from(f32::MIN), f64::from(f32::MAX));
+                // Rounds to the nearest single; the clamp keeps it finite.
+                Some(u64::from((number as f32).to_bits()))
+            }
+            ValueType::Float64 | ValueType::Unsigned | ValueType::Signed => Some(number.to_bits()),
+        }
+    }
+
+    /// Writes a physical value: rounds to the nearest code, saturates at the ends of what the bits and the DBC's
+    /// range allow (infinities too). Other bits of the payload stay as they are.
+    ///
+    /// # Errors
+    /// [`Fault::ShortFrame`] when the payload ends before the signal does, [`Fault::NotFinite`] for NaN; the payload
+    /// is then unchanged.
+    pub fn encode(&self, payload: &mut [u8], value: f64) -> Result<(), Fault> {
+        let code = self.code(value).ok_or(Fault::NotFinite)?;
+        self.encode_raw(payload, code)
+    }
+
+    /// Writes the signal's bits.
+    ///
+    /// # Errors
+    /// [`Fault::ShortFrame`] when the payload ends before the signal does, [`Fault::OutOfRange`] when `code` has more
+    /// bits than the signal; the payload is then unchanged.
+    pub fn encode_raw(&self, payload: &mut [u8], code: u64) -> Result<(), Fault> {
+        if payload.len() < self.bytes_needed() {
+            return Err(Fault::ShortFrame);
+        }
+        if code > self.all_ones() {
+            return Err(Fault::OutOfRange);
+        }
+        let from = usize::from(self.window);
+        let word = if self.wide { 128 } else { 64 };
+        let place = |bits: u64| u128::from(bits) << (word - self.length_bits() - u32::from(self.up));
+        let bytes = |word: u128| match (self.byte_order, self.wide) {
+            (ByteOrder::LittleEndian, _) => word.to_le_bytes(),
+            (ByteOrder::BigEndian, true) => word.to_be_bytes(),
+            (ByteOrder::BigEndian, false) => (word << 64).to_be_bytes(),
+        };
+        let (keep, put) = (bytes(place(self.all_ones())), bytes(place(code)));
+        for (byte, (mask, bits)) in payload.iter_mut().skip(from).zip(keep.into_iter().zip(put)) {
+            *byte = (*byte & !mask) | bits;
+        }
+        Ok(())
+    }
+}
+
+/// `N` bytes of the payload from `from` on, zeros where it ends earlier.
+fn padded<const N: usize>(payload: &[u8], from: usize) -> [u8; N] {
+    let mut bytes = [0; N];
+    for (to, byte) in bytes.iter_mut().zip(payload.iter().skip(from)) {
+        *to = *byte;
+    }
+    bytes
+}
+
+#[cfg(test)]
+mod tests;

@@ -45,20 +45,31 @@ pub struct EstimatorConfig {
     pub initial_log_resistance_std: f64,
     /// SOC process noise, fraction per sqrt(s).
     pub soc_noise_per_sqrt_s: f64,
+    /// SOC process noise per charge moved, fraction per sqrt(SOC): errors of the current reading.
+    pub charge_noise_per_sqrt_soc: f64,
     /// Branch voltage process noise, V per sqrt(s).
     pub branch_noise_v_per_sqrt_s: f64,
     /// ln(resistance) process noise, per sqrt(s).
     pub log_resistance_noise_per_sqrt_s: f64,
+    /// SOC process noise while nobody measures the current, fraction per sqrt(s).
+    pub gap_noise_per_sqrt_s: f64,
+    /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. A per cell.
+    pub gap_rest_current_a: f64,
     /// White part of a voltage reading's error, V (sensor noise), per sample.
     pub voltage_noise_v: f64,
     /// Slow model error expressed as information per second: standard deviation of a 1 s average, V.
     pub model_error_v_sqrt_s: f64,
-    /// Standard deviation of a constant current-sensor offset, A per cell.
-    pub current_offset_std_a: f64,
-    /// Current assumed possible in a gap nobody measured, standard deviation, A per cell.
-    pub gap_current_std_a: f64,
+    /// Longest time one voltage reading may speak for, s: readings further apart are no better than this.
+    pub max_information_s: f64,
     /// A voltage innovation beyond this many standard deviations moves nothing.
     pub gate_sigma: f64,
+    /// Model error a single reading may show, V (standard deviation): for the gate and the consistency monitor,
+    /// where the information-per-second variance would let anything through at high sample rates.
+    pub gate_model_error_v: f64,
+    /// The same as an error along the OCV curve, fraction of SOC.
+    pub gate_soc_error: f64,
+    /// When every reading has been beyond the gate for this long, the filter has lost its cell and starts again, s.
+    pub lost_after_s: f64,
     /// Window of the consistency monitor, s.
     pub consistency_window_s: f64,
     /// Mean normalised innovation squared above which the estimate is not to be trusted.

@@ -34,6 +34,9 @@ pub struct CapacityConfig {
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
     pub noise_ah_per_cycle: f64,
+    /// Process noise of rest: standard deviation gained in a day without current (capacity comes back), Ah; at
+    /// most one day counts per half-cycle. Not used by `Nominal`.
+    pub noise_ah_per_rest_day: f64,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
     pub current_gain_std: f64,
 }
@@ -56,8 +59,9 @@ pub struct UsableConfig {
     pub temperature_c: f64,
     /// Voltage under load at which discharge ends, V.
     pub cutoff_v: f64,
-    /// SOC the charger leaves when it calls the cell full (1 = full open-circuit voltage), fraction.
-    pub full_soc: f64,
+    /// A charge whose current has fallen to this (per cell, A) at the model's highest voltage ended full: the SOC
+    /// it left is where the next usable capacity starts. Until then, SOC 1.
+    pub taper_current_a: f64,
 }
 
 /// Everything about learning at transitions.

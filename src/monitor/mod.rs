@@ -1,89 +1,362 @@
 //! The core's one face: inputs in, outputs out. Never reads a clock, a file or a socket, and never logs.
+//!
+//! Inputs come in the order in which they happened; the same inputs give the same outputs, byte for byte.
+//! Frames become readings, readings become samples, each voltage sample steps its cell's estimator; a
+//! charge/discharge transition runs the capacity filters; values go to the alarm rules; ticks send the cyclic
+//! frames. Bad input is an event and a count, never a panic.
+
+mod cyclic;
+mod learning;
+mod output;
+mod snapshot;
 mod types;
+
+pub use output::OutputConfig;
+pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
-use serde::{Deserialize, Serialize};
+use cyclic::Schedule;
+use snapshot::PendingRestore;
 
-use crate::quantity::Timestamp;
+use crate::alarm::{AlarmChange, AlarmEngine, Rule, RuleConfig};
+use crate::can::Frame;
+use crate::can::decode::InputMap;
+use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
+use crate::filter::Belief;
+use crate::health::{HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
+use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
+
+/// Without any input, not even a tick, for this long, the computer was asleep, s: 500 ticks.
+const ASLEEP_S: f64 = 5.0;
+
+/// Steps back in time up to this are frames of several interfaces merged out of order, s; beyond, the record's
+/// clock was set back.
+const MERGE_TOLERANCE_S: f64 = 1.0;
 
 /// Everything the core must know, already checked.
 #[derive(Debug, Clone)]
 pub struct MonitorConfig {
+    /// What input frames mean.
+    pub input: InputMap,
     /// Sample stage.
-    pub sample: crate::sample::SampleConfig,
+    pub sample: SampleConfig,
     /// Cell model.
-    pub model: crate::cell::CellModel,
+    pub model: CellModel,
     /// Estimator.
-    pub estimator: crate::cell::EstimatorConfig,
+    pub estimator: EstimatorConfig,
     /// Learning at transitions.
-    pub health: crate::health::HealthConfig,
+    pub health: HealthConfig,
     /// Alarm rules.
-    pub rules: Vec<crate::alarm::RuleConfig>,
+    pub rules: Vec<RuleConfig>,
+    /// What is sent, when and where; `None` = the daemon only listens.
+    pub output: Option<OutputConfig>,
 }
 
-/// State of a [`Monitor`] at one moment, as a versioned serde document.
-#[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Snapshot {
-    /// Layout version.
-    pub version: u32,
-    /// When it was taken, on the clock of the inputs.
-    pub time: Timestamp,
+/// One cell's estimator and what it has consumed of the pack's totals.
+#[derive(Debug, Clone)]
+struct CellSlot {
+    estimator: CellEstimator,
+    /// Sampler totals at the last step; `None` before the first.
+    consumed: Option<Consumed>,
+    latest: Option<Estimate>,
+    trusted: bool,
+    /// SOC the last full charge left; 1 until one was seen.
+    full_soc: f64,
+    /// Whether the present charge has tapered off at the highest voltage.
+    tapered: bool,
+    usable: Option<Belief>,
+    updated_in_round: bool,
 }
 
-/// Why a snapshot cannot be used.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum RestoreError {
-    /// Written by another version.
-    #[error("snapshot version {found}, this program reads {allowed}")]
-    Version {
-        /// In the file.
-        found: u32,
-        /// Readable here.
-        allowed: u32,
-    },
-    /// Taken with another number of cells or branches.
-    #[error("snapshot is for {found}, the configuration has {allowed}")]
-    Shape {
-        /// In the file.
-        found: String,
-        /// Configured.
-        allowed: String,
-    },
+/// Totals of the sampler a cell has already taken in.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+struct Consumed {
+    time: Timestamp,
+    charge_as: f64,
+    unmeasured_s: f64,
 }
 
 /// The pure core.
 #[derive(Debug)]
-pub struct Monitor {}
+pub struct Monitor {
+    config: MonitorConfig,
+    /// Time of the first and of the latest input.
+    started: Option<Timestamp>,
+    now: Timestamp,
+    /// Inputs that came with a time before `now`.
+    time_backwards: u64,
+    sampler: Sampler,
+    cells: Vec<CellSlot>,
+    detector: TransitionDetector,
+    learner: Learner,
+    recharge: RechargeTimer,
+    recharge_period_s: Option<f64>,
+    pack: Option<PackState>,
+    /// Cells with a new estimate since the pack's values were last combined.
+    updated_cells: usize,
+    alarms: AlarmEngine,
+    schedule: Schedule,
+    pending: Option<PendingRestore>,
+    scratch: Scratch,
+}
+
+/// Lists that live only within one input, kept for their memory.
+#[derive(Debug, Default)]
+struct Scratch {
+    readings: Vec<Reading>,
+    signal_changes: Vec<SignalChange>,
+    alarm_changes: Vec<AlarmChange>,
+    half_cycles: Vec<HalfCycle>,
+}
 
 impl Monitor {
     /// A monitor that knows nothing yet.
     pub fn new(config: MonitorConfig) -> Self {
-        let _ = config;
-        Self {}
+        let cells = usize::from(config.sample.cells);
+        let slot = CellSlot {
+            estimator: CellEstimator::new(&config.estimator),
+            consumed: None,
+            latest: None,
+            trusted: true,
+            full_soc: 1.0,
+            tapered: false,
+            usable: None,
+            updated_in_round: false,
+        };
+        Self {
+            sampler: Sampler::new(config.sample.clone()),
+            learner: Learner::new(cells, slot.estimator.capacity()),
+            alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
+            cells: vec![slot; cells],
+            started: None,
+            now: Timestamp::ZERO,
+            time_backwards: 0,
+            detector: TransitionDetector::default(),
+            recharge: RechargeTimer::default(),
+            recharge_period_s: None,
+            pack: None,
+            updated_cells: 0,
+            schedule: Schedule::default(),
+            pending: None,
+            scratch: Scratch::default(),
+            config,
+        }
     }
 
     /// Takes one input; appends what comes of it to `out`.
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
-        let _ = (input, out);
-    }
-
-    /// The state, to be stored.
-    pub fn snapshot(&self) -> Snapshot {
-        Snapshot { version: 1, time: Timestamp::ZERO }
-    }
-
-    /// Takes up a stored state at time `now`, `away_s` seconds after it was taken: its time stamps are
-    /// moved onto the present clock, and the time away is a gap like any other.
-    ///
-    /// # Errors
-    /// When the snapshot's version or shape does not fit.
-    pub fn restore(&mut self, snapshot: &Snapshot, now: Timestamp, away_s: f64) -> Result<(), RestoreError> {
-        let _ = (snapshot, now, away_s);
-        Ok(())
+        self.advance(input.time(), out);
+        match input {
+            Input::Frame { bus, frame, .. } => self.handle_frame(bus, frame, out),
+            Input::Tick { .. } => self.handle_tick(out),
+            Input::Bus { bus, event, .. } => {
+                let kind = EventKind::Bus { bus, what: event };
+                out.events.push(Event { time: self.now, kind });
+            }
+            Input::UnknownGap { .. } => self.handle_unknown_gap(out),
+        }
     }
 
     /// The latest estimate of every cell, for live tables; `None` before its first.
-    pub fn latest(&self) -> &[Option<Estimate>] {
-        &[]
+    pub fn latest(&self) -> impl Iterator<Item = Option<&Estimate>> {
+        self.cells.iter().map(|cell| cell.latest.as_ref())
+    }
+
+    /// The pack as its limiting cells make it; `None` before every cell has an estimate.
+    pub fn pack(&self) -> Option<&PackState> {
+        self.pack.as_ref()
+    }
+
+    /// Charge, rest or discharge.
+    pub fn mode(&self) -> Mode {
+        self.detector.mode()
+    }
+
+    /// The last recorded recharge period, s.
+    pub fn recharge_period_s(&self) -> Option<f64> {
+        self.recharge_period_s
+    }
+
+    /// Usable capacity of a cell after its last half-cycle.
+    pub fn usable_capacity(&self, cell: CellIndex) -> Option<Belief> {
+        self.cells.get(cell.index())?.usable
+    }
+
+    /// Published capacity of a cell.
+    pub fn capacity(&self, cell: CellIndex) -> Belief {
+        self.learner.capacity(&self.config.health.capacity, cell.index())
+    }
+
+    /// Inputs whose time was before that of an earlier one.
+    pub fn time_backwards(&self) -> u64 {
+        self.time_backwards
+    }
+
+    /// Alarms that are raised now.
+    pub fn alarms(&self) -> &AlarmEngine {
+        &self.alarms
+    }
+
+    /// Moves the clock to an input's time: never back, and with an eye on time asleep.
+    fn advance(&mut self, time: Timestamp, out: &mut Outputs) {
+        let Some(_) = self.started else {
+            (self.started, self.now) = (Some(time), time);
+            self.schedule.restart(time);
+            self.apply_pending(time);
+            return;
+        };
+        let elapsed_s = time.since(self.now);
+        if elapsed_s < 0.0 {
+            self.time_backwards += 1;
+            if elapsed_s < -MERGE_TOLERANCE_S {
+                out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds: -elapsed_s } });
+                self.now = time;
+                self.handle_unknown_gap(out);
+            }
+            return;
+        }
+        if elapsed_s > ASLEEP_S {
+            out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(elapsed_s) } });
+            self.observe_current(None, out);
+            self.alarms.handle_gap();
+            self.recharge.interrupt();
+            self.schedule.restart(time);
+        }
+        self.now = time;
+    }
+
+    /// The clock goes on at `now`, but how far that is from before nobody knows.
+    fn handle_unknown_gap(&mut self, out: &mut Outputs) {
+        out.events.push(Event { time: self.now, kind: EventKind::Gap { seconds: None } });
+        self.observe_current(None, out);
+        if let Some(change) = self.detector.settle() {
+            self.complete_mode(change, out);
+        }
+        self.sampler.handle_gap(self.now);
+        self.alarms.handle_gap();
+        self.recharge.interrupt();
+        self.schedule.restart(self.now);
+        for cell in &mut self.cells {
+            cell.estimator.handle_unknown_gap();
+            cell.consumed = None;
+        }
+    }
+
+    fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        let mut readings = std::mem::take(&mut self.scratch.readings);
+        self.config.input.decode(bus, frame, |reading| readings.push(reading));
+        for reading in readings.drain(..) {
+            let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
+            self.report_signals(out);
+            if reading.channel == Channel::Current {
+                self.observe_current(self.sampler.pack_current_a(self.now), out);
+            }
+            if let Some(sample) = sample {
+                self.step_cell(&sample, out);
+            }
+        }
+        self.scratch.readings = readings;
+    }
+
+    fn report_signals(&mut self, out: &mut Outputs) {
+        for change in self.scratch.signal_changes.drain(..) {
+            let channel = change.channel;
+            let kind = match change.state {
+                Err(fault) => EventKind::SignalBad { channel, fault },
+                Ok(bad_readings) => EventKind::SignalGood { channel, bad_readings },
+            };
+            out.events.push(Event { time: self.now, kind });
+        }
+    }
+
+    /// One voltage reading of one cell: what happened since its last one, then the estimator.
+    fn step_cell(&mut self, sample: &CellSample, out: &mut Outputs) {
+        let index = sample.cell.index();
+        let slot = &mut self.cells[index];
+        let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
+        if let Some(before) = slot.consumed {
+            charge_as = sample.charge_as - before.charge_as;
+            unmeasured_s = sample.unmeasured_s - before.unmeasured_s;
+            measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
+        }
+        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
+        slot.consumed = Some(Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured });
+        let step = CellStep {
+            measured_s,
+            charge_as,
+            unmeasured_s,
+            current_a: sample.current_a,
+            temperature_c: sample.temperature_c,
+            ambient_c: self.config.sample.ambient_c,
+            voltage_v: sample.voltage_v,
+        };
+        let result = slot.estimator.step(&self.config.model, &self.config.estimator, &step);
+        let Some(soc) = slot.estimator.soc() else { return };
+        if result.reset {
+            out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
+        }
+        self.learner.observe(index, soc, sample.temperature_c, measured_s);
+        self.note_taper(sample);
+        self.judge_trust(sample.cell, out);
+        let capacity = self.capacity(sample.cell);
+        let slot = &mut self.cells[index];
+        let estimate = estimate_of(sample, &slot.estimator, soc, capacity, result.update);
+        if out.want_estimates {
+            out.estimates.push(estimate);
+        }
+        slot.latest = Some(estimate);
+        self.close_round(index, out);
+    }
+
+    /// Whether the filter's innovations agree with its covariance; told on change.
+    fn judge_trust(&mut self, cell: CellIndex, out: &mut Outputs) {
+        let slot = &mut self.cells[cell.index()];
+        let mean_nis = slot.estimator.mean_nis();
+        let trusted = mean_nis <= self.config.estimator.consistency_limit;
+        if trusted != slot.trusted {
+            slot.trusted = trusted;
+            out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
+        }
+        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Some(mean_nis), true, out);
+    }
+
+    /// Once every cell has a new estimate, or one has its second: the pack's values.
+    fn close_round(&mut self, index: usize, out: &mut Outputs) {
+        let second = std::mem::replace(&mut self.cells[index].updated_in_round, true);
+        self.updated_cells += usize::from(!second);
+        if second || self.updated_cells == self.cells.len() {
+            self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
+            self.updated_cells = 0;
+            self.combine_pack(out);
+        }
+    }
+}
+
+fn estimate_of(
+    sample: &CellSample,
+    estimator: &CellEstimator,
+    soc: Belief,
+    capacity: Belief,
+    update: Option<crate::filter::Update>,
+) -> Estimate {
+    let log_resistance = estimator.log_resistance();
+    let resistance_ratio = libm::exp(log_resistance.mean);
+    Estimate {
+        time: sample.time,
+        cell: sample.cell,
+        soc: soc.mean,
+        soc_std: soc.std(),
+        branch_v: estimator.branch_v(),
+        capacity_ah: capacity.mean,
+        capacity_std_ah: capacity.std(),
+        resistance_ratio,
+        resistance_ratio_std: resistance_ratio * log_resistance.std(),
+        innovation_v: update.map_or(f64::NAN, |u| u.innovation),
+        innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
+        accepted: update.is_some_and(|u| u.accepted),
+        voltage_v: sample.voltage_v,
+        current_a: sample.current_a.unwrap_or(f64::NAN),
+        temperature_c: estimator.temperature_c().unwrap_or(f64::NAN),
     }
 }

@@ -1,6 +1,6 @@
 //! Settings of the sample stage: what a plausible value is, how old it may be, which sensor serves which cell.
 
-use crate::can::decode::SensorIndex;
+use crate::quantity::SensorIndex;
 
 /// Limits on one kind of reading. A value outside them is a bad reading and moves no estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -1,0 +1,175 @@
+//! Scenarios over the whole engine; the single machine's table is tested beside it.
+
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+
+fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_events: u32) -> RuleConfig {
+    RuleConfig { rule, threshold, hysteresis, debounce_s, debounce_events, severity: Severity::Warning }
+}
+
+fn at(seconds: f64) -> Timestamp {
+    Timestamp::from_secs(seconds)
+}
+
+const CELL: Option<CellIndex> = Some(CellIndex(0));
+
+#[test]
+fn noise_around_the_threshold_for_24_hours_gives_one_raise_and_one_clear() {
+    let mut engine = AlarmEngine::new(vec![rule(Rule::EstimateUntrusted, 3.0, 0.5, 5.0, 3)], 1);
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut changes = Vec::new();
+    let mut crossings = 0;
+    let mut was_beyond = false;
+    for second in 0..24 * 3600 {
+        // Six hours well, twelve hours on the threshold, six hours well; noise +/- 0.4 all the time.
+        let mean = if (6 * 3600..18 * 3600).contains(&second) { 3.0 } else { 1.5 };
+        let value = mean + rng.random_range(-0.4..0.4);
+        crossings += u32::from((value > 3.0) != was_beyond);
+        was_beyond = value > 3.0;
+        engine.observe(at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), true, &mut changes);
+    }
+    assert!(crossings > 10_000, "the noise must cross the threshold all the time, it did {crossings} times");
+    assert_eq!(changes.iter().map(|change| change.active).collect::<Vec<_>>(), [true, false]);
+    assert_eq!(engine.count(), 0);
+}
+
+#[test]
+fn input_lost_while_active_keeps_the_alarm_without_a_value() {
+    let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.05, 0.0, 1)], 2);
+    let mut changes = Vec::new();
+    engine.observe(at(0.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    assert_eq!(changes.len(), 1);
+    engine.observe(at(10.0), Rule::CapacityLow, CELL, None, true, &mut changes);
+    engine.poll(at(1e6), &mut changes);
+    assert_eq!(changes.len(), 1, "neither cleared nor raised again");
+    let alarms: Vec<_> = engine.active().collect();
+    assert_eq!((alarms.len(), alarms[0].value, alarms[0].raised), (1, None, at(0.0)));
+}
+
+#[test]
+fn unknown_values_alone_raise_nothing() {
+    let mut engine = AlarmEngine::new(Rule::ALL.map(|r| rule(r, 1.0, 0.0, 0.0, 1)).to_vec(), 4);
+    let mut changes = Vec::new();
+    for r in Rule::ALL {
+        for cell in [None, CELL] {
+            engine.observe(at(0.0), r, cell, None, true, &mut changes);
+            engine.observe(at(1.0), r, cell, Some(f64::NAN), true, &mut changes);
+        }
+    }
+    engine.poll(at(100.0), &mut changes);
+    assert_eq!(changes, []);
+}
+
+#[test]
+fn a_learned_value_holds_while_time_debounce_runs_out_and_a_measured_one_does_not() {
+    let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 30.0, 1), rule(Rule::EstimateUntrusted, 3.0, 0.0, 30.0, 1)];
+    let mut engine = AlarmEngine::new(rules, 1);
+    let mut changes = Vec::new();
+    engine.observe(at(0.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    engine.observe(at(0.0), Rule::EstimateUntrusted, CELL, Some(9.0), true, &mut changes);
+    engine.poll(at(29.9), &mut changes);
+    assert_eq!(changes, []);
+    engine.poll(at(30.0), &mut changes);
+    engine.poll(at(99.0), &mut changes);
+    assert_eq!(changes.iter().map(|change| change.rule).collect::<Vec<_>>(), [Rule::CapacityLow]);
+}
+
+#[test]
+fn a_gap_does_not_count_for_measured_values() {
+    let mut engine = AlarmEngine::new(vec![rule(Rule::InputMissing, 5.0, 0.0, 10.0, 1)], 1);
+    let mut changes = Vec::new();
+    engine.observe(at(0.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    engine.handle_gap();
+    engine.observe(at(1000.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    assert_eq!(changes, []);
+    engine.observe(at(1010.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    assert_eq!(changes.len(), 1);
+}
+
+#[test]
+fn poll_raises_every_alarm_that_is_due_in_one_call() {
+    let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 1.0, 1)], 5);
+    let mut changes = Vec::new();
+    for cell in 0..5 {
+        engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), true, &mut changes);
+    }
+    engine.poll(at(1.0), &mut changes);
+    let cells: Vec<_> = changes.iter().map(|change| change.cell.map(|cell| cell.0)).collect();
+    assert_eq!(cells, [Some(0), Some(1), Some(2), Some(3), Some(4)]);
+}
+
+#[test]
+fn active_alarms_are_listed_by_rule_then_cell_whatever_the_order_of_raising() {
+    let mut engine = AlarmEngine::new(
+        vec![
+            rule(Rule::InputMissing, 5.0, 0.0, 0.0, 1),
+            RuleConfig { severity: Severity::Severe, ..rule(Rule::CapacityLow, 1.2, 0.0, 0.0, 1) },
+            rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1),
+        ],
+        3,
+    );
+    let mut changes = Vec::new();
+    engine.observe(at(0.0), Rule::InputMissing, Some(CellIndex(1)), Some(6.0), true, &mut changes);
+    engine.observe(at(0.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    assert_eq!(engine.highest_severity(), Some(Severity::Warning));
+    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(1.3), true, &mut changes);
+    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(0)), Some(1.1), true, &mut changes);
+    let listed: Vec<_> = engine.active().map(|a| (a.rule, a.severity, a.cell.map(|cell| cell.0))).collect();
+    assert_eq!(
+        listed,
+        [
+            (Rule::CapacityLow, Severity::Warning, Some(0)),
+            (Rule::CapacityLow, Severity::Warning, Some(2)),
+            (Rule::CapacityLow, Severity::Severe, Some(0)),
+            (Rule::InputMissing, Severity::Warning, None),
+            (Rule::InputMissing, Severity::Warning, Some(1)),
+        ]
+    );
+    assert_eq!((engine.count(), engine.highest_severity()), (5, Some(Severity::Severe)));
+}
+
+#[test]
+fn values_of_rules_and_cells_not_watched_are_passed_over() {
+    let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 2);
+    let mut changes = Vec::new();
+    engine.observe(at(0.0), Rule::CapacityLow, None, Some(0.0), true, &mut changes);
+    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), true, &mut changes);
+    engine.observe(at(0.0), Rule::RechargePeriodLow, None, Some(0.0), true, &mut changes);
+    assert_eq!(changes, []);
+    assert_eq!(engine.state(Rule::CapacityLow, Some(CellIndex(1))), Some(State::Inactive));
+    assert_eq!(engine.state(Rule::RechargePeriodLow, None), None);
+}
+
+#[test]
+fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
+    let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 10.0, 2), rule(Rule::RechargePeriodLow, 900.0, 0.0, 0.0, 1)];
+    let mut first = AlarmEngine::new(rules.clone(), 2);
+    let mut changes = Vec::new();
+    first.observe(at(0.0), Rule::RechargePeriodLow, None, Some(800.0), true, &mut changes);
+    first.observe(at(5.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    let text = serde_json::to_string(&first.snapshot()).expect("serialises");
+    let mut state: AlarmState = serde_json::from_str(&text).expect("reads back");
+    assert_eq!(state, first.snapshot());
+    state.rebase(1_000_000_000_000);
+    let mut second = AlarmEngine::new(rules, 2);
+    assert_eq!(second.restore(&state), 0);
+    assert_eq!(second.active().next().map(|a| a.raised), Some(at(1000.0)));
+    changes.clear();
+    second.observe(at(1014.9), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    assert_eq!(changes, []);
+    second.poll(at(1015.0), &mut changes);
+    assert_eq!(changes.len(), 1);
+}
+
+#[test]
+fn alarms_of_rules_no_longer_configured_are_counted_on_restore() {
+    let mut first = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 4);
+    for cell in 0..4 {
+        first.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), true, &mut Vec::new());
+    }
+    let mut fewer_cells = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 3);
+    assert_eq!(fewer_cells.restore(&first.snapshot()), 1);
+    assert_eq!(fewer_cells.count(), 3);
+}

@@ -1,0 +1,129 @@
+use super::*;
+
+const HEAD: &str = "VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n";
+
+fn parse(body: &str) -> Result<Database, DbcError> {
+    Database::parse(&format!("{HEAD}{body}"))
+}
+
+#[test]
+fn messages_and_signals_come_with_all_their_details() {
+    let db = parse(
+        r#"BO_ 2147484672 Ext: 64 X
+ SG_ F : 0|32@1- (1,0) [0|0] "V" X
+ SG_ S : 39|8@0- (0.5,-3) [-10|10] "A" X
+BO_ 256 Std: 8 X
+CM_ BO_ 256 "a message";
+CM_ SG_ 2147484672 S "a signal";
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 256 100;
+VAL_ 2147484672 S -1 "Not_Available" 1 "one" ;
+SIG_VALTYPE_ 2147484672 F : 1;
+"#,
+    )
+    .unwrap();
+    let (message, f) = db.signal("Ext.F").unwrap();
+    assert_eq!((message.id, message.len_bytes, message.cycle_time_ms), (CanId::Extended(1024), 64, None));
+    assert_eq!((f.layout.value_type, f.unit.as_str()), (ValueType::Float32, "V"));
+    let (_, s) = db.signal("Ext.S").unwrap();
+    assert_eq!(
+        s.layout,
+        SignalLayout {
+            start_bit: 39,
+            length_bits: 8,
+            byte_order: ByteOrder::BigEndian,
+            value_type: ValueType::Signed,
+            factor: 0.5,
+            offset: -3.0,
+            minimum: -10.0,
+            maximum: 10.0
+        }
+    );
+    assert_eq!(s.not_available_codes(), [0xFF]);
+    assert_eq!(s.comment.as_deref(), Some("a signal"));
+    let std = db.message("Std").unwrap();
+    assert_eq!(
+        (std.id, std.cycle_time_ms, std.comment.as_deref()),
+        (CanId::Standard(256), Some(100), Some("a message"))
+    );
+    assert!(db.signal("Std.F").is_none() && db.signal("Ext").is_none() && db.message("ext").is_none());
+}
+
+#[test]
+fn nested_multiplexing_becomes_a_chain_of_conditions() {
+    let db = parse(
+        r#"BO_ 1 M: 8 X
+ SG_ Inner m2M : 8|8@1+ (1,0) [0|0] "" X
+ SG_ Outer M : 0|8@1+ (1,0) [0|0] "" X
+ SG_ Deep m0 : 16|8@1+ (1,0) [0|0] "" X
+ SG_ Plain : 24|8@1+ (1,0) [0|0] "" X
+SG_MUL_VAL_ 1 Inner Outer 2-2;
+SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
+"#,
+    )
+    .unwrap();
+    let deep = &db.signal("M.Deep").unwrap().1.multiplex.conditions;
+    assert_eq!(
+        deep,
+        &[
+            MuxCondition { selector: 1, ranges: vec![(2, 2)] },
+            MuxCondition { selector: 0, ranges: vec![(0, 3), (7, 9)] }
+        ]
+    );
+    assert!(db.signal("M.Plain").unwrap().1.multiplex.conditions.is_empty());
+    assert!(db.signal("M.Inner").unwrap().1.is_multiplexor);
+}
+
+#[test]
+fn faults_name_the_line() {
+    let line_and_text = |body: &str| {
+        let error = parse(body).unwrap_err();
+        (error.line, error.to_string())
+    };
+    let (line, text) = line_and_text("BO_ 1 A: 8 X\n SG_ Broken : 0|8@1+ (1,0 [0|0] \"\" X\n");
+    assert_eq!(line, 6, "{text}");
+    assert!(text.contains("SG_ Broken"), "{text}");
+    let (line, text) = line_and_text("BO_ 1 A: 8 X\nBO_ 4096 B: 8 X\n");
+    assert_eq!((line, text.contains("4096")), (6, true));
+    let (line, text) = line_and_text("BO_ 1 A: 8 X\nBO_ 2 A: 8 X\n");
+    assert_eq!((line, text.contains("twice")), (6, true));
+    let signal = " SG_ S m1 : 0|8@1+ (1,0) [0|0] \"\" X\n";
+    let (line, text) = line_and_text(&format!("BO_ 1 A: 8 X\n{signal}"));
+    assert_eq!((line, text.contains("no multiplexor")), (6, true));
+    let (line, text) =
+        line_and_text(&format!("BO_ 1 A: 8 X\n{}{}", signal.replace("m1 ", ""), signal.replace("m1 ", "")));
+    assert_eq!((line, text.contains("A.S is defined twice")), (7, true));
+}
+
+#[test]
+fn multiplexors_in_a_loop_are_refused() {
+    let error = parse(
+        r#"BO_ 1 M: 8 X
+ SG_ A m0M : 0|8@1+ (1,0) [0|0] "" X
+ SG_ B m0M : 8|8@1+ (1,0) [0|0] "" X
+SG_MUL_VAL_ 1 A B 0-0;
+SG_MUL_VAL_ 1 B A 0-0;
+"#,
+    );
+    assert!(error.unwrap_err().what.contains("in a loop"));
+}
+
+#[test]
+fn latin_1_bytes_are_read() {
+    let bytes = [HEAD.as_bytes(), b"BO_ 1 A: 8 X\n SG_ T : 0|8@1+ (1,0) [0|0] \"\xB0C\" X"].concat();
+    let db = Database::parse_bytes(&bytes).unwrap();
+    assert_eq!(db.signal("A.T").unwrap().1.unit, "\u{b0}C");
+}
+
+#[test]
+fn any_text_never_panics() {
+    let mut text = format!("{HEAD}BO_ 1 A: 8 X\n SG_ T M : 0|8@1+ (1,0) [0|0] \"\" X\nSG_MUL_VAL_ 1 T T 0-0;\n");
+    assert!(Database::parse(&text).is_err(), "a multiplexor of itself");
+    while text.pop().is_some() {
+        let _ = Database::parse(&text);
+    }
+    for bad in ["", "\u{feff}", "hello", "BO_", "BO_ 99999999999999999999 A: 8 X", "\0\0"] {
+        let _ = Database::parse(bad);
+    }
+}

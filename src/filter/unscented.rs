@@ -1,0 +1,278 @@
+//! The unscented Kalman filter with additive noise and a scalar measurement.
+//!
+//! State x of N numbers with covariance P. Sigma points x, x +/- sqrt(N + lambda) L_i with L the lower
+//! Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000),
+//! equations 15. Predict: every point through f, mean and covariance of the images plus Q. Update: the
+//! points are **redrawn** from the predicted mean and covariance, then every point through h. (Reusing the
+//! propagated points instead, as some packages do, differs by up to 3e-4 of SOC on drive data.)
+//!
+//! Promises: the covariance that comes out is symmetric; a factorisation that fails or a number that is not
+//! finite is an error, nothing is repaired in silence. Sums are plain loops in a fixed order, so that every
+//! machine gives the same bits.
+
+use nalgebra::{SMatrix, SVector};
+
+/// Mean and covariance of N numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Gaussian<const N: usize> {
+    /// Mean.
+    pub mean: SVector<f64, N>,
+    /// Covariance, symmetric and positive definite.
+    pub covariance: SMatrix<f64, N, N>,
+}
+
+/// Why a step could not be made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum FilterError {
+    /// The covariance has no Cholesky factor.
+    #[error("covariance is not positive definite")]
+    NotPositiveDefinite,
+    /// A NaN or an infinity came out.
+    #[error("a number is not finite")]
+    NotFinite,
+}
+
+/// How the sigma points are spread, and their weights, for N states.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Spread {
+    scale: f64,
+    mean_0: f64,
+    covariance_0: f64,
+    others: f64,
+}
+
+impl Spread {
+    /// From alpha (0 to 1], beta and kappa, for `n` states; `n` + `kappa` must be positive.
+    pub fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
+        let total = alpha * alpha * (n as f64 + kappa); // n + lambda
+        let mean_0 = (total - n as f64) / total;
+        Self { scale: total.sqrt(), mean_0, covariance_0: mean_0 + 1.0 - alpha * alpha + beta, others: 0.5 / total }
+    }
+}
+
+/// Variances of one scalar measurement.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Noise {
+    /// Variance the filter weighs the measurement with.
+    pub variance: f64,
+    /// Variance of a single reading's error for the gate; differs from `variance` where that one stands for
+    /// information per time rather than for a reading's size.
+    pub gate_variance: f64,
+    /// Gate width in standard deviations.
+    pub gate_sigma: f64,
+}
+
+/// What an update did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Update {
+    /// Measured minus predicted.
+    pub innovation: f64,
+    /// Predicted variance of the innovation: state and [`Noise::variance`].
+    pub innovation_variance: f64,
+    /// innovation^2 over its variance with [`Noise::gate_variance`]: beyond gate_sigma^2 it is an outlier.
+    pub test_ratio: f64,
+    /// Whether the innovation passed the gate and the state was moved.
+    pub accepted: bool,
+}
+
+/// The sigma points in pairs: centre, then plus and minus along each column of the factor.
+struct Points<const N: usize> {
+    centre: SVector<f64, N>,
+    plus: [SVector<f64, N>; N],
+    minus: [SVector<f64, N>; N],
+}
+
+impl<const N: usize> Gaussian<N> {
+    fn points(&self, spread: &Spread) -> Result<Points<N>, FilterError> {
+        let factor = self.covariance.cholesky().ok_or(FilterError::NotPositiveDefinite)?;
+        let columns: [SVector<f64, N>; N] = std::array::from_fn(|i| factor.l_dirty().column(i).into_owned());
+        let offset = |i: usize| {
+            let mut column = columns[i] * spread.scale;
+            column.iter_mut().take(i).for_each(|above| *above = 0.0); // l_dirty keeps the old upper half
+            column
+        };
+        Ok(Points {
+            centre: self.mean,
+            plus: std::array::from_fn(|i| self.mean + offset(i)),
+            minus: std::array::from_fn(|i| self.mean - offset(i)),
+        })
+    }
+
+    /// Moves the state through `f` and adds the process noise covariance `q`.
+    ///
+    /// # Errors
+    /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
+    pub fn predict(
+        &mut self,
+        spread: &Spread,
+        f: impl Fn(&SVector<f64, N>) -> SVector<f64, N>,
+        q: &SMatrix<f64, N, N>,
+    ) -> Result<(), FilterError> {
+        let points = self.points(spread)?;
+        let centre = f(&points.centre);
+        let plus = points.plus.map(|x| f(&x));
+        let minus = points.minus.map(|x| f(&x));
+        let mut mean = centre * spread.mean_0;
+        for x in plus.iter().chain(&minus) {
+            mean += x * spread.others;
+        }
+        let mut p = *q;
+        add_outer(&mut p, &(centre - mean), spread.covariance_0);
+        for x in plus.iter().chain(&minus) {
+            add_outer(&mut p, &(x - mean), spread.others);
+        }
+        self.set(mean, p)
+    }
+
+    /// Takes in the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported and
+    /// moves nothing.
+    ///
+    /// # Errors
+    /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
+    pub fn update(
+        &mut self,
+        spread: &Spread,
+        z: f64,
+        h: impl Fn(&SVector<f64, N>) -> f64,
+        noise: &Noise,
+    ) -> Result<Update, FilterError> {
+        let points = self.points(spread)?;
+        let centre = h(&points.centre);
+        let plus = points.plus.map(|x| h(&x));
+        let minus = points.minus.map(|x| h(&x));
+        let mut predicted = centre * spread.mean_0;
+        for y in plus.iter().chain(&minus) {
+            predicted += y * spread.others;
+        }
+        // The centre's own offset from the mean is zero, so it adds to the variance only.
+        let mut spread_variance = spread.covariance_0 * (centre - predicted) * (centre - predicted);
+        let mut cross = SVector::<f64, N>::zeros();
+        for (x, y) in points.plus.iter().chain(&points.minus).zip(plus.iter().chain(&minus)) {
+            let dy = y - predicted;
+            spread_variance += spread.others * dy * dy;
+            cross += (x - self.mean) * (spread.others * dy);
+        }
+        let innovation = z - predicted;
+        let variance = spread_variance + noise.variance;
+        let test_ratio = innovation * innovation / (spread_variance + noise.gate_variance);
+        if !(test_ratio.is_finite() && variance.is_finite() && variance > 0.0) {
+            return Err(FilterError::NotFinite);
+        }
+        let accepted = test_ratio <= noise.gate_sigma * noise.gate_sigma;
+        if accepted {
+            let mut p = self.covariance;
+            add_outer(&mut p, &cross, -1.0 / variance);
+            self.set(self.mean + cross * (innovation / variance), p)?;
+        }
+        Ok(Update { innovation, innovation_variance: variance, test_ratio, accepted })
+    }
+
+    fn set(&mut self, mean: SVector<f64, N>, covariance: SMatrix<f64, N, N>) -> Result<(), FilterError> {
+        let finite = mean.iter().chain(covariance.iter()).all(|v| v.is_finite());
+        if !finite {
+            return Err(FilterError::NotFinite);
+        }
+        if (0..N).any(|i| covariance[(i, i)] <= 0.0) {
+            return Err(FilterError::NotPositiveDefinite);
+        }
+        *self = Self { mean, covariance };
+        Ok(())
+    }
+}
+
+/// p += weight d d', filled symmetrically.
+fn add_outer<const N: usize>(p: &mut SMatrix<f64, N, N>, d: &SVector<f64, N>, weight: f64) {
+    for i in 0..N {
+        for j in 0..=i {
+            let term = weight * d[i] * d[j];
+            p[(i, j)] += term;
+            if i != j {
+                p[(j, i)] += term;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{matrix, vector};
+
+    fn noise(variance: f64, gate_sigma: f64) -> Noise {
+        Noise { variance, gate_variance: variance, gate_sigma }
+    }
+
+    fn start() -> Gaussian<2> {
+        Gaussian { mean: vector![1.0, -0.5], covariance: matrix![0.04, 0.01; 0.01, 0.09] }
+    }
+
+    #[test]
+    fn a_linear_model_gives_the_kalman_filter() {
+        let spread = Spread::new(2, 0.5, 2.0, 1.0);
+        let f = matrix![1.0, 0.1; 0.0, 0.9];
+        let q = matrix![1e-3, 0.0; 0.0, 2e-3];
+        let (h, r, z) = (matrix![1.0, 0.4], 0.02, 1.3);
+        let mut ukf = start();
+        ukf.predict(&spread, |x| f * x, &q).expect("predict");
+        let (x, p) = (f * start().mean, f * start().covariance * f.transpose() + q);
+        assert!((ukf.mean - x).norm() < 1e-14);
+        assert!((ukf.covariance - p).norm() < 1e-14);
+
+        let update = ukf.update(&spread, z, |x| (h * x)[0], &noise(r, 5.0)).expect("update");
+        let s = (h * p * h.transpose())[0] + r;
+        let k = p * h.transpose() / s;
+        assert!((update.innovation_variance - s).abs() < 1e-14);
+        assert!((ukf.mean - (x + k * (z - (h * x)[0]))).norm() < 1e-13);
+        assert!((ukf.covariance - (p - k * s * k.transpose())).norm() < 1e-13);
+    }
+
+    #[test]
+    fn an_outlier_is_reported_and_moves_nothing() {
+        let spread = Spread::new(2, 1.0, 2.0, 0.0);
+        let mut ukf = start();
+        let update = ukf.update(&spread, 8.4, |x| x[0], &noise(1e-3, 5.0)).expect("update");
+        assert!(!update.accepted);
+        assert!(update.test_ratio > 25.0);
+        assert_eq!(ukf, start());
+    }
+
+    #[test]
+    fn a_bad_covariance_is_an_error_and_changes_nothing() {
+        let spread = Spread::new(2, 1.0, 2.0, 0.0);
+        let mut ukf = start();
+        ukf.covariance[(0, 0)] = -1.0;
+        let before = ukf;
+        assert_eq!(ukf.predict(&spread, |x| *x, &SMatrix::zeros()), Err(FilterError::NotPositiveDefinite));
+        assert_eq!(ukf, before);
+        let mut ukf = start();
+        assert_eq!(ukf.update(&spread, f64::NAN, |x| x[0], &noise(1e-3, 5.0)), Err(FilterError::NotFinite));
+        assert_eq!(ukf, start());
+    }
+
+    #[test]
+    fn noise_that_matches_the_model_gives_consistent_innovations() {
+        // Random walk observed in noise, both drawn by a small fixed generator: mean NIS must be 1 within 3 sigma.
+        let spread = Spread::new(1, 1.0, 2.0, 0.0);
+        let mut seed = 0x2545_F491_4F6C_DD1D_u64;
+        let mut normal = || {
+            // Sum of 12 uniforms minus 6: variance 1, near enough to Gaussian for a variance test.
+            (0..12).fold(-6.0, |sum, _| {
+                seed ^= seed << 13;
+                seed ^= seed >> 7;
+                seed ^= seed << 17;
+                sum + (seed >> 11) as f64 / (1u64 << 53) as f64
+            })
+        };
+        let mut ukf = Gaussian { mean: vector![0.0], covariance: matrix![1.0] };
+        let (mut truth, mut sum) = (0.0, 0.0);
+        let n = 20_000;
+        for _ in 0..n {
+            truth += 0.1 * normal();
+            let z = truth + 0.5 * normal();
+            ukf.predict(&spread, |x| *x, &matrix![0.01]).expect("predict");
+            sum += ukf.update(&spread, z, |x| x[0], &noise(0.25, 50.0)).expect("update").test_ratio;
+        }
+        let mean_nis = sum / f64::from(n);
+        assert!((mean_nis - 1.0).abs() < 3.0 * (2.0 / f64::from(n)).sqrt(), "mean NIS {mean_nis}");
+    }
+}

@@ -1,0 +1,160 @@
+//! Charge, rest or discharge, from the pack's current: dead band, hysteresis, minimum duration.
+//!
+//! Input: pack current in A (positive = discharge), `None` when it is stale. Output: a change of mode, told
+//! when the new mode has held for its minimum duration, dated from when it began.
+
+use serde::{Deserialize, Serialize};
+
+use super::TransitionConfig;
+use crate::quantity::{Mode, Timestamp};
+
+/// A mode that has not yet held long enough.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Candidate {
+    mode: Mode,
+    since: Timestamp,
+}
+
+/// A confirmed change.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ModeChange {
+    /// Mode left.
+    pub from: Mode,
+    /// Mode entered.
+    pub to: Mode,
+    /// When the new mode began.
+    pub since: Timestamp,
+}
+
+/// What one observation did.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Observed {
+    /// A mode that had held long enough by this time.
+    pub change: Option<ModeChange>,
+    /// A new candidate begins here: the caller marks its state.
+    pub candidate_begins: bool,
+}
+
+/// The detector.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct TransitionDetector {
+    mode: Mode,
+    candidate: Option<Candidate>,
+}
+
+impl Default for TransitionDetector {
+    fn default() -> Self {
+        Self { mode: Mode::Unknown, candidate: None }
+    }
+}
+
+impl TransitionDetector {
+    /// The confirmed mode.
+    pub fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Takes the current at `time`. A candidate that has matured by then is confirmed first.
+    pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> Observed {
+        let change = self.poll(config, time);
+        let seen = self.classify(config, current_a);
+        let idle = |mode| matches!(mode, Mode::Rest | Mode::Unknown);
+        let mut candidate_begins = false;
+        self.candidate = match self.candidate {
+            _ if seen == self.mode => None,
+            // A load that ended and then a sensor that fell silent: the mode was left once, when the load ended.
+            Some(before) if before.mode == seen || (idle(before.mode) && idle(seen)) => {
+                Some(Candidate { mode: seen, since: before.since })
+            }
+            _ => {
+                candidate_begins = true;
+                Some(Candidate { mode: seen, since: time })
+            }
+        };
+        Observed { change, candidate_begins }
+    }
+
+    /// Confirms a candidate that has held long enough by `time`.
+    pub fn poll(&mut self, config: &TransitionConfig, time: Timestamp) -> Option<ModeChange> {
+        self.candidate.filter(|candidate| time.since(candidate.since) >= config.min_duration_s)?;
+        self.settle()
+    }
+
+    /// Confirms the candidate at once: what came before is over, whatever its duration.
+    pub fn settle(&mut self) -> Option<ModeChange> {
+        let candidate = self.candidate?;
+        let from = std::mem::replace(&mut self.mode, candidate.mode);
+        self.candidate = None;
+        Some(ModeChange { from, to: candidate.mode, since: candidate.since })
+    }
+
+    /// Mode of a current, seen from the present mode: to enter charge or discharge takes the hysteresis on top of the dead band.
+    fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
+        let Some(current_a) = current_a else { return Mode::Unknown };
+        let enter = config.dead_band_a + config.hysteresis_a;
+        let edge = |mode| if self.mode == mode { config.dead_band_a } else { enter };
+        if current_a > edge(Mode::Discharge) {
+            Mode::Discharge
+        } else if current_a < -edge(Mode::Charge) {
+            Mode::Charge
+        } else {
+            Mode::Rest
+        }
+    }
+
+    /// Moves stored stamps onto another clock.
+    pub fn rebase(&mut self, by_nanos: i64) {
+        if let Some(candidate) = &mut self.candidate {
+            candidate.since = candidate.since.plus_nanos(by_nanos);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CONFIG: TransitionConfig =
+        TransitionConfig { dead_band_a: 0.1, hysteresis_a: 0.05, min_duration_s: 2.0, min_swing: 0.0 };
+
+    fn run(samples: &[(f64, Option<f64>)]) -> Vec<ModeChange> {
+        let mut detector = TransitionDetector::default();
+        samples.iter().filter_map(|&(t, i)| detector.observe(&CONFIG, Timestamp::from_secs(t), i).change).collect()
+    }
+
+    #[test]
+    fn a_mode_counts_after_its_minimum_duration_and_is_dated_from_its_beginning() {
+        let changes =
+            run(&[(0.0, Some(1.0)), (1.0, Some(1.0)), (2.0, Some(1.0)), (3.0, Some(-1.0)), (5.5, Some(-1.0))]);
+        let modes: Vec<_> = changes.iter().map(|c| (c.from, c.to, c.since.secs())).collect();
+        assert_eq!(modes, [(Mode::Unknown, Mode::Discharge, 0.0), (Mode::Discharge, Mode::Charge, 3.0)]);
+    }
+
+    #[test]
+    fn a_short_burst_of_regeneration_is_no_transition() {
+        let changes = run(&[(0.0, Some(1.0)), (2.0, Some(1.0)), (3.0, Some(-5.0)), (4.0, Some(1.0)), (9.0, Some(1.0))]);
+        assert_eq!(changes.len(), 1);
+    }
+
+    #[test]
+    fn current_between_dead_band_and_hysteresis_keeps_the_mode_it_has() {
+        let mut detector = TransitionDetector::default();
+        let mut mode_after = |t, i| {
+            detector.observe(&CONFIG, Timestamp::from_secs(t), Some(i));
+            detector.poll(&CONFIG, Timestamp::from_secs(t + 2.0));
+            detector.mode()
+        };
+        assert_eq!(mode_after(0.0, 0.12), Mode::Rest);
+        assert_eq!(mode_after(10.0, 0.2), Mode::Discharge);
+        assert_eq!(mode_after(20.0, 0.12), Mode::Discharge);
+        assert_eq!(mode_after(30.0, 0.08), Mode::Rest);
+        assert_eq!(mode_after(40.0, -0.2), Mode::Charge);
+        assert_eq!(mode_after(50.0, f64::MIN_POSITIVE), Mode::Rest);
+    }
+
+    #[test]
+    fn a_stale_current_is_unknown_not_rest() {
+        let changes = run(&[(0.0, Some(1.0)), (2.0, Some(1.0)), (3.0, None), (6.0, None)]);
+        assert_eq!(changes.last().map(|c| c.to), Some(Mode::Unknown));
+    }
+}

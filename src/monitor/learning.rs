@@ -1,0 +1,130 @@
+//! Transitions and what follows from them: half-cycles, capacities, usable capacities, recharge periods, and the
+//! pack's values.
+
+use super::{CellSlot, Event, EventKind, Monitor, Outputs};
+use crate::alarm::Rule;
+use crate::filter::Belief;
+use crate::health::usable::usable_capacity;
+use crate::health::{CapacityUpdate, CellShare, HalfCycle, ModeChange, pack};
+use crate::quantity::{CellIndex, Mode};
+use crate::sample::CellSample;
+
+/// Below the model's highest voltage by this, a charge is in its constant-voltage part, V.
+const TAPER_BAND_V: f64 = 0.03;
+
+impl Monitor {
+    /// Takes the pack current into the mode detector; `None` = stale.
+    pub(super) fn observe_current(&mut self, current_a: Option<f64>, out: &mut Outputs) {
+        let observed = self.detector.observe(&self.config.health.transition, self.now, current_a);
+        if let Some(change) = observed.change {
+            self.complete_mode(change, out);
+        }
+        if observed.candidate_begins {
+            let (charge_as, _) = self.sampler.counted(self.now);
+            self.learner.mark_candidate(self.now, charge_as);
+        }
+    }
+
+    /// A mode is over: its half-cycle, if it was one, teaches every cell.
+    pub(super) fn complete_mode(&mut self, change: ModeChange, out: &mut Outputs) {
+        out.events.push(Event { time: self.now, kind: EventKind::Mode { from: change.from, to: change.to } });
+        let mut half_cycles = std::mem::take(&mut self.scratch.half_cycles);
+        let rated_ah = self.config.model.rated_capacity_ah;
+        self.learner.complete(&self.config.health.transition, rated_ah, change.from, &mut half_cycles);
+        for (index, half_cycle) in half_cycles.iter().enumerate() {
+            self.learn_cell(index, half_cycle, out);
+        }
+        if !half_cycles.is_empty() {
+            self.learner.finish();
+            half_cycles.clear();
+        }
+        self.scratch.half_cycles = half_cycles;
+        if change.to == Mode::Charge {
+            self.cells.iter_mut().for_each(|cell| cell.tapered = false);
+        }
+    }
+
+    fn learn_cell(&mut self, index: usize, half_cycle: &HalfCycle, out: &mut Outputs) {
+        let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
+        let slot = &mut self.cells[index];
+        if slot.latest.is_none() {
+            return;
+        }
+        let update = self.learner.learn(&self.config.health.capacity, index, &mut slot.estimator, half_cycle);
+        if half_cycle.mode == Mode::Charge && slot.tapered {
+            slot.full_soc = half_cycle.end_soc;
+        }
+        // What a discharge will deliver is restated by discharges: a charge leaves the resistance of charging.
+        let restate = half_cycle.mode == Mode::Discharge || slot.usable.is_none();
+        if let Some(config) = self.config.health.usable.as_ref().filter(|_| restate) {
+            let capacity = update.capacity;
+            slot.usable = Some(usable_capacity(&self.config.model, config, &slot.estimator, capacity, slot.full_soc));
+        }
+        let usable_ah = slot.usable.map(|usable| usable.mean);
+        out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
+        out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
+        self.observe_alarm(Rule::CapacityLow, Some(cell), Some(update.capacity.mean), true, out);
+        self.observe_alarm(Rule::UsableCapacityLow, Some(cell), usable_ah, restate, out);
+    }
+
+    /// Notes that a charge has tapered off at the highest voltage: what it leaves is "full".
+    pub(super) fn note_taper(&mut self, sample: &CellSample) {
+        let (Some(usable), Some(current_a)) = (&self.config.health.usable, sample.current_a) else { return };
+        let charging = current_a < 0.0 && -current_a <= usable.taper_current_a;
+        if charging && sample.voltage_v >= self.config.model.voltage_max_v - TAPER_BAND_V {
+            self.cells[sample.cell.index()].tapered = true;
+        }
+    }
+
+    /// The pack's values from its cells', and the recharge period they make.
+    pub(super) fn combine_pack(&mut self, out: &mut Outputs) {
+        let config = &self.config.health;
+        let shares = self.cells.iter().enumerate().filter_map(|(index, slot)| {
+            let estimate = slot.latest.as_ref()?;
+            let capacity = self.learner.capacity(&config.capacity, index);
+            Some(CellShare {
+                cell: estimate.cell,
+                soc: estimate.soc,
+                soc_std: estimate.soc_std,
+                capacity_ah: capacity.mean,
+                capacity_std_ah: capacity.std(),
+            })
+        });
+        self.pack = pack::combine(shares).filter(|_| self.cells.iter().all(|slot| slot.latest.is_some()));
+        let Some(pack) = self.pack else { return };
+        if let Some(seconds) = self.recharge.observe(&config.recharge, self.now, self.detector.mode(), pack.soc) {
+            self.recharge_period_s = Some(seconds);
+            out.events.push(Event { time: self.now, kind: EventKind::RechargePeriod { seconds } });
+            self.observe_alarm(Rule::RechargePeriodLow, None, Some(seconds), true, out);
+        }
+    }
+}
+
+fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
+    EventKind::HalfCycle {
+        cell,
+        mode: half_cycle.mode,
+        charge_ah: half_cycle.charge_ah,
+        swing: half_cycle.swing,
+        swing_std: half_cycle.swing_std,
+        duration_s: half_cycle.duration_s,
+        mean_current_a: half_cycle.mean_current_a,
+        mean_temperature_c: half_cycle.mean_temperature_c,
+    }
+}
+
+fn capacity_event(cell: CellIndex, slot: &CellSlot, update: &CapacityUpdate) -> EventKind {
+    let log_resistance = slot.estimator.log_resistance();
+    let resistance_ratio = libm::exp(log_resistance.mean);
+    EventKind::Capacity {
+        cell,
+        measured_ah: update.measurement.map(|z| z.value),
+        measured_std_ah: update.measurement.map(|z| z.variance.sqrt()),
+        capacity_ah: update.capacity.mean,
+        capacity_std_ah: update.capacity.std(),
+        usable_capacity_ah: slot.usable.map(|usable| usable.mean),
+        usable_capacity_std_ah: slot.usable.as_ref().map(Belief::std),
+        resistance_ratio,
+        resistance_ratio_std: resistance_ratio * log_resistance.std(),
+    }
+}

@@ -1,0 +1,19 @@
+//! What is sent, when and where.
+
+use crate::can::encode::OutputPlan;
+use crate::quantity::BusIndex;
+
+/// The daemon's outgoing frames.
+#[derive(Debug, Clone)]
+pub struct OutputConfig {
+    /// Layouts and identifiers.
+    pub plan: OutputPlan,
+    /// Interfaces they go out on.
+    pub buses: Vec<BusIndex>,
+    /// Period of the status frame, s.
+    pub status_period_s: f64,
+    /// Period of the health frame (all its pages), s.
+    pub health_period_s: f64,
+    /// Period of the alarm frame while alarms are raised, one alarm each time in turn, s.
+    pub alarm_period_s: f64,
+}

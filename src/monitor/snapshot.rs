@@ -1,0 +1,170 @@
+//! The Monitor's state as a versioned document, and how it is taken up again.
+
+use serde::{Deserialize, Serialize};
+
+use super::{CellSlot, Consumed, Monitor};
+use crate::alarm::AlarmState;
+use crate::cell::{CellEstimator, CellState};
+use crate::filter::Belief;
+use crate::health::{Learner, RechargeTimer, TransitionDetector};
+use crate::quantity::Timestamp;
+use crate::sample::SamplerState;
+
+/// Layout version of [`Snapshot`].
+const SNAPSHOT_VERSION: u32 = 1;
+
+/// State of a [`Monitor`] at one moment.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Snapshot {
+    /// Layout version.
+    pub version: u32,
+    /// When it was taken, on the clock of the inputs.
+    pub time: Timestamp,
+    cells: Vec<CellDocument>,
+    sampler: SamplerState,
+    detector: TransitionDetector,
+    learner: Learner,
+    recharge: RechargeTimer,
+    recharge_period_s: Option<f64>,
+    alarms: AlarmState,
+}
+
+#[derive(Debug, Clone, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct CellDocument {
+    estimator: CellState,
+    consumed: Option<Consumed>,
+    trusted: bool,
+    full_soc: f64,
+    tapered: bool,
+    usable: Option<Belief>,
+}
+
+/// Why a snapshot cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RestoreError {
+    /// Written by another version.
+    #[error("snapshot version {found}, this program reads {allowed}")]
+    Version {
+        /// In the file.
+        found: u32,
+        /// Readable here.
+        allowed: u32,
+    },
+    /// Taken with another configuration.
+    #[error("snapshot is of {found}, the configuration has {allowed}")]
+    Shape {
+        /// In the file.
+        found: String,
+        /// Configured.
+        allowed: String,
+    },
+}
+
+/// A restore that waits for the first input, whose time is "now".
+#[derive(Debug)]
+pub(super) struct PendingRestore {
+    snapshot: Box<Snapshot>,
+    away_s: Option<f64>,
+}
+
+impl Monitor {
+    /// The state, to be stored.
+    pub fn snapshot(&self) -> Snapshot {
+        Snapshot {
+            version: SNAPSHOT_VERSION,
+            time: self.now,
+            cells: self.cells.iter().map(CellSlot::document).collect(),
+            sampler: self.sampler.snapshot(),
+            detector: self.detector.clone(),
+            learner: self.learner.clone(),
+            recharge: self.recharge.clone(),
+            recharge_period_s: self.recharge_period_s,
+            alarms: self.alarms.snapshot(),
+        }
+    }
+
+    /// Takes up a stored state in a monitor that has had no input yet. The first input's time is "now": the
+    /// snapshot was taken `away_s` seconds before it (`None`: as long before as the two stamps say), its stamps
+    /// are moved onto the present clock, and the time away is a gap like any other.
+    ///
+    /// # Errors
+    /// When the snapshot's version or shape does not fit.
+    pub fn restore(&mut self, snapshot: Snapshot, away_s: Option<f64>) -> Result<(), RestoreError> {
+        if snapshot.version != SNAPSHOT_VERSION {
+            return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
+        }
+        let branches = self.config.model.branches.len();
+        let fits = snapshot.cells.len() == self.cells.len()
+            && snapshot.learner.fits(self.cells.len())
+            && self.sampler.fits(&snapshot.sampler)
+            && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
+        if !fits {
+            return Err(RestoreError::Shape {
+                found: format!("{} cells, or another number of branches", snapshot.cells.len()),
+                allowed: format!("{} cells of {branches} branches", self.cells.len()),
+            });
+        }
+        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away_s });
+        Ok(())
+    }
+
+    /// Takes the waiting snapshot up at the first input's time.
+    pub(super) fn apply_pending(&mut self, now: Timestamp) {
+        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return };
+        let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
+        let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
+        snapshot.rebase(by_nanos);
+        let branches = self.config.model.branches.len();
+        for (slot, document) in self.cells.iter_mut().zip(&snapshot.cells) {
+            slot.take_up(document, branches);
+        }
+        // Checked in `restore`.
+        let _ = self.sampler.restore(&snapshot.sampler);
+        self.detector = snapshot.detector;
+        self.learner = snapshot.learner;
+        self.recharge = snapshot.recharge;
+        self.recharge_period_s = snapshot.recharge_period_s;
+        self.alarms.restore(&snapshot.alarms);
+    }
+}
+
+impl Snapshot {
+    /// Moves every stamp by `by_nanos`.
+    fn rebase(&mut self, by_nanos: i64) {
+        self.time = self.time.plus_nanos(by_nanos);
+        for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {
+            consumed.time = consumed.time.plus_nanos(by_nanos);
+        }
+        self.sampler.rebase(by_nanos);
+        self.detector.rebase(by_nanos);
+        self.learner.rebase(by_nanos);
+        self.recharge.rebase(by_nanos);
+        self.alarms.rebase(by_nanos);
+    }
+}
+
+impl CellSlot {
+    fn document(&self) -> CellDocument {
+        CellDocument {
+            estimator: self.estimator.snapshot(),
+            consumed: self.consumed,
+            trusted: self.trusted,
+            full_soc: self.full_soc,
+            tapered: self.tapered,
+            usable: self.usable,
+        }
+    }
+
+    fn take_up(&mut self, document: &CellDocument, branches: usize) {
+        if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
+            self.estimator = estimator;
+        }
+        self.consumed = document.consumed;
+        self.trusted = document.trusted;
+        self.full_soc = document.full_soc;
+        self.tapered = document.tapered;
+        self.usable = document.usable;
+    }
+}

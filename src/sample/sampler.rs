@@ -1,0 +1,362 @@
+//! One signal per configured channel, the charge counter, and the samples made of them.
+//!
+//! A sample is made when a good voltage arrives: with the current and temperature that are fresh at that
+//! moment, and the charge and unmeasured time counted up to it. A bad voltage makes none. What comes for a
+//! channel that feeds nothing is counted ([`Sampler::unused_readings`]).
+//!
+//! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records
+//! lie together and not field by field. Nothing is allocated per reading.
+
+use serde::{Deserialize, Serialize};
+
+use super::charge::{ChargeCounter, Totals};
+use super::config::{Limits, SampleConfig, VoltageSource};
+use super::signal::Signal;
+use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp};
+
+/// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
+/// sensor at rest, below any load under which a voltage or temperature has to move.
+pub const FLOW_SHARE: f64 = 0.01;
+
+/// Everything a cell's update needs, at the time of its voltage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellSample {
+    /// Time of the voltage reading.
+    pub time: Timestamp,
+    /// Which cell.
+    pub cell: CellIndex,
+    /// Cell voltage, V.
+    pub voltage_v: f64,
+    /// Cell current, A, positive = discharge; `None` = the last good one is too old.
+    pub current_a: Option<f64>,
+    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it by
+    /// what the current did between its last reading and `time`.
+    pub charge_as: f64,
+    /// Time so far without a usable current, s: charge of unknown size went by in it.
+    pub unmeasured_s: f64,
+    /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
+    pub temperature_c: Option<f64>,
+}
+
+/// A signal turned bad (`Err`: why) or good again (`Ok`: after so many bad readings).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SignalChange {
+    /// Which signal.
+    pub channel: Channel,
+    /// What it is now.
+    pub state: Result<u64, Fault>,
+}
+
+/// State of a [`Sampler`], to be stored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SamplerState {
+    signals: Vec<Signal>,
+    charge: ChargeCounter,
+    began: Option<Timestamp>,
+    latest: Timestamp,
+    unused_readings: u64,
+}
+
+impl SamplerState {
+    /// Moves every stamp by `by_nanos`, onto another clock.
+    pub fn rebase(&mut self, by_nanos: i64) {
+        self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));
+        self.charge.rebase(by_nanos);
+        self.began = self.began.map(|stamp| stamp.plus_nanos(by_nanos));
+        self.latest = self.latest.plus_nanos(by_nanos);
+    }
+}
+
+/// A stored state has another number of signals than the configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("sample state has {found} signals, the configuration has {allowed}")]
+pub struct SamplerShape {
+    /// Stored.
+    pub found: usize,
+    /// Configured.
+    pub allowed: usize,
+}
+
+/// The sample stage.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    config: SampleConfig,
+    /// Temperature sensors that serve a cell.
+    sensors: usize,
+    flow_a: f64,
+    state: SamplerState,
+    /// Before this no signal can become stale; `None` = not known.
+    next_stale: Option<Timestamp>,
+}
+
+impl Sampler {
+    /// A sampler that has heard nothing yet.
+    pub fn new(config: SampleConfig) -> Self {
+        let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
+        let voltages = match config.voltage_source {
+            VoltageSource::Cells => usize::from(config.cells),
+            VoltageSource::PackTotal { .. } => 1,
+        };
+        let state = SamplerState {
+            signals: vec![Signal::default(); 1 + sensors + voltages],
+            charge: ChargeCounter::default(),
+            began: None,
+            latest: Timestamp::ZERO,
+            unused_readings: 0,
+        };
+        let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
+        Self { config, sensors, flow_a, state, next_stale: None }
+    }
+
+    /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
+    pub fn handle_reading(
+        &mut self,
+        time: Timestamp,
+        reading: Reading,
+        changes: &mut Vec<SignalChange>,
+    ) -> Option<CellSample> {
+        let time = self.pass(time);
+        let channel = reading.channel;
+        let Some(slot) = self.slot(channel) else {
+            self.state.unused_readings += 1;
+            return None;
+        };
+        let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
+        let limits = self.limits(channel);
+        let value = reading.value.map(|value| value / self.divisor(channel));
+        let judged = self.state.signals[slot].handle(time, value, &limits, should_move_s(channel, &totals));
+        if let Some(state) = judged.change {
+            changes.push(SignalChange { channel, state });
+            self.next_stale = None;
+        }
+        let value = judged.value.ok()?;
+        match channel {
+            Channel::Current => {
+                self.state.charge.handle_current(time, value, limits.max_age_s, self.flow_a);
+                None
+            }
+            Channel::Temperature(_) => None,
+            Channel::PackVoltage => Some(self.sample(time, CellIndex(0), value, totals)),
+            Channel::CellVoltage(cell) => Some(self.sample(time, cell, value, totals)),
+        }
+    }
+
+    /// Judges the ages at `now`; signals that have become stale go to `changes`.
+    pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<SignalChange>) {
+        let now = self.pass(now);
+        if self.next_stale.is_some_and(|next| now <= next) {
+            return;
+        }
+        let began = self.state.began.unwrap_or(now);
+        let mut next = Timestamp::from_nanos(i64::MAX);
+        for slot in 0..self.state.signals.len() {
+            let channel = self.channel(slot);
+            let limits = self.limits(channel);
+            let signal = &mut self.state.signals[slot];
+            if let Some(state) = signal.poll(now, began, &limits) {
+                changes.push(SignalChange { channel, state });
+            }
+            if !signal.is_bad() {
+                next = next.min(signal.stale_from(began, &limits));
+            }
+        }
+        self.next_stale = Some(next);
+    }
+
+    /// The record goes on at `time` after a gap of unknown length: no value is fresh, no charge is counted
+    /// over it, ages start anew.
+    pub fn handle_gap(&mut self, time: Timestamp) {
+        self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
+        self.state.signals.iter_mut().for_each(Signal::handle_gap);
+        self.state.began = Some(time);
+        self.state.latest = time;
+        self.next_stale = None;
+    }
+
+    /// Pack current, A, positive = discharge, when its last good reading is fresh.
+    pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
+        self.state.signals[0].fresh(now, &self.config.current)
+    }
+
+    /// Current of one cell, A: the pack's shared equally by the strings.
+    pub fn cell_current_a(&self, now: Timestamp) -> Option<f64> {
+        self.pack_current_a(now).map(|current| current / self.strings())
+    }
+
+    /// When the last good current came.
+    pub fn current_at(&self) -> Option<Timestamp> {
+        self.state.signals[0].good_at()
+    }
+
+    /// Charge (As, per cell) and unmeasured time (s) up to `now`, as in [`CellSample`].
+    pub fn counted(&self, now: Timestamp) -> (f64, f64) {
+        let totals = self.state.charge.totals_at(now, self.config.current.max_age_s);
+        (totals.charge_as / self.strings(), totals.unmeasured_s)
+    }
+
+    /// Temperature of a cell, degrees C, when its sensor's last good reading is fresh.
+    pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
+        let sensor = (*self.config.sensor_of_cell.get(cell.index())?)?;
+        self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
+    }
+
+    /// Age of the last good value, s; from the start when there is none yet. `None` = the channel feeds nothing.
+    pub fn age_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        self.slot(channel).map(|slot| self.since(self.state.signals[slot].good_at(), now))
+    }
+
+    /// Time since anything came on the channel, good or bad, s (the value of the rule `input_missing`).
+    pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        self.slot(channel).map(|slot| self.since(self.state.signals[slot].heard_at(), now))
+    }
+
+    /// The channel nothing has come on for longest, and for how long, s.
+    pub fn worst_age(&self, now: Timestamp) -> (Channel, f64) {
+        let silences = self.channels().map(|channel| (channel, self.silence_s(channel, now).unwrap_or(0.0)));
+        worst(silences).unwrap_or((Channel::Current, 0.0))
+    }
+
+    /// Share of bad readings on a channel, fraction, forgotten over about
+    /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = nothing came yet.
+    pub fn bad_share(&self, channel: Channel) -> Option<f64> {
+        self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
+    }
+
+    /// The channel with the largest share of bad readings; `None` = nothing came yet.
+    pub fn worst_bad_share(&self) -> Option<(Channel, f64)> {
+        worst(self.channels().filter_map(|channel| self.bad_share(channel).map(|share| (channel, share))))
+    }
+
+    /// The channels that feed something: current, sensors, voltages.
+    pub fn channels(&self) -> impl Iterator<Item = Channel> + '_ {
+        (0..self.state.signals.len()).map(|slot| self.channel(slot))
+    }
+
+    /// How many channels feed something.
+    pub fn channel_count(&self) -> usize {
+        self.state.signals.len()
+    }
+
+    /// Whether any signal is bad or stale.
+    pub fn any_bad(&self) -> bool {
+        self.state.signals.iter().any(Signal::is_bad)
+    }
+
+    /// Whether a stored state is of this many signals.
+    pub fn fits(&self, state: &SamplerState) -> bool {
+        state.signals.len() == self.state.signals.len()
+    }
+
+    /// Readings that came for channels that feed nothing.
+    pub fn unused_readings(&self) -> u64 {
+        self.state.unused_readings
+    }
+
+    /// What is to be stored.
+    pub fn snapshot(&self) -> SamplerState {
+        self.state.clone()
+    }
+
+    /// Takes up a stored state (rebased by the caller): the time away is unmeasured like any other hole.
+    ///
+    /// # Errors
+    /// When it has another number of signals; the present state is kept.
+    pub fn restore(&mut self, state: &SamplerState) -> Result<(), SamplerShape> {
+        let (found, allowed) = (state.signals.len(), self.state.signals.len());
+        if found != allowed {
+            return Err(SamplerShape { found, allowed });
+        }
+        self.state.clone_from(state);
+        self.next_stale = None;
+        Ok(())
+    }
+
+    fn sample(&self, time: Timestamp, cell: CellIndex, voltage_v: f64, totals: Totals) -> CellSample {
+        CellSample {
+            time,
+            cell,
+            voltage_v,
+            current_a: self.cell_current_a(time),
+            charge_as: totals.charge_as / self.strings(),
+            unmeasured_s: totals.unmeasured_s,
+            temperature_c: self.temperature_c(cell, time),
+        }
+    }
+
+    /// Notes that time has come to `time`; the latest time, should it have gone back.
+    fn pass(&mut self, time: Timestamp) -> Timestamp {
+        if self.state.began.is_none() {
+            self.state.began = Some(time);
+            self.state.latest = time;
+            self.state.charge.begin(time);
+        }
+        self.state.latest = self.state.latest.max(time);
+        self.state.latest
+    }
+
+    fn since(&self, stamp: Option<Timestamp>, now: Timestamp) -> f64 {
+        stamp.or(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
+    }
+
+    fn strings(&self) -> f64 {
+        f64::from(self.config.strings.max(1))
+    }
+
+    /// What a reading is divided by to become a cell's: a total voltage is shared by the cells in series.
+    fn divisor(&self, channel: Channel) -> f64 {
+        match (channel, self.config.voltage_source) {
+            (Channel::PackVoltage, VoltageSource::PackTotal { series }) => f64::from(series.max(1)),
+            (Channel::PackVoltage, VoltageSource::Cells)
+            | (Channel::Current | Channel::Temperature(_) | Channel::CellVoltage(_), _) => 1.0,
+        }
+    }
+
+    fn limits(&self, channel: Channel) -> Limits {
+        match channel {
+            Channel::Current => self.config.current,
+            Channel::Temperature(_) => self.config.temperature,
+            Channel::PackVoltage | Channel::CellVoltage(_) => self.config.voltage,
+        }
+    }
+
+    fn slot(&self, channel: Channel) -> Option<usize> {
+        let voltage = 1 + self.sensors;
+        match (channel, self.config.voltage_source) {
+            (Channel::Current, _) => Some(0),
+            (Channel::Temperature(sensor), _) => (sensor.index() < self.sensors).then(|| 1 + sensor.index()),
+            (Channel::PackVoltage, VoltageSource::PackTotal { .. }) => Some(voltage),
+            (Channel::CellVoltage(cell), VoltageSource::Cells) => {
+                (cell.0 < self.config.cells).then(|| voltage + cell.index())
+            }
+            (Channel::PackVoltage, VoltageSource::Cells)
+            | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. }) => None,
+        }
+    }
+
+    /// The channel in a place of [`Sampler::channels`].
+    pub fn channel(&self, slot: usize) -> Channel {
+        let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
+        match (slot, self.config.voltage_source) {
+            (0, _) => Channel::Current,
+            (slot, _) if slot <= self.sensors => Channel::Temperature(SensorIndex(narrow(slot - 1))),
+            (_, VoltageSource::PackTotal { .. }) => Channel::PackVoltage,
+            (slot, VoltageSource::Cells) => Channel::CellVoltage(CellIndex(narrow(slot - 1 - self.sensors))),
+        }
+    }
+}
+
+/// The clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
+/// on purpose, so only discharging counts for it; temperature and current should move while current flows.
+fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
+    match channel {
+        Channel::Current | Channel::Temperature(_) => totals.flowing_s,
+        Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
+    }
+}
+
+fn worst(values: impl Iterator<Item = (Channel, f64)>) -> Option<(Channel, f64)> {
+    values.reduce(|worst, next| if next.1 > worst.1 { next } else { worst })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,290 @@
+//! Scenarios over the whole sample stage; the charge counter's arithmetic is tested beside it.
+
+use super::*;
+
+fn at(seconds: f64) -> Timestamp {
+    Timestamp::from_secs(seconds)
+}
+
+fn limits(min: f64, max: f64, max_age_s: f64) -> Limits {
+    Limits { min, max, max_rate_per_s: None, stuck_after_s: None, max_age_s }
+}
+
+fn config() -> SampleConfig {
+    SampleConfig {
+        cells: 2,
+        voltage_source: VoltageSource::Cells,
+        strings: 1,
+        current: limits(-10.0, 10.0, 2.0),
+        voltage: limits(2.0, 4.5, 5.0),
+        temperature: limits(-40.0, 85.0, 30.0),
+        sensor_of_cell: vec![Some(SensorIndex(0)), None],
+        ambient_c: 20.0,
+    }
+}
+
+const CELL: Channel = Channel::CellVoltage(CellIndex(0));
+const SENSOR: Channel = Channel::Temperature(SensorIndex(0));
+
+/// A sampler and what it told.
+struct Bench {
+    sampler: Sampler,
+    changes: Vec<SignalChange>,
+}
+
+impl Bench {
+    fn new(config: SampleConfig) -> Self {
+        Self { sampler: Sampler::new(config), changes: Vec::new() }
+    }
+
+    fn give(&mut self, time: f64, channel: Channel, value: Result<f64, Fault>) -> Option<CellSample> {
+        self.sampler.handle_reading(at(time), Reading { channel, value }, &mut self.changes)
+    }
+
+    fn ok(&mut self, time: f64, channel: Channel, value: f64) -> Option<CellSample> {
+        self.give(time, channel, Ok(value))
+    }
+
+    fn states(&self) -> Vec<Result<u64, Fault>> {
+        self.changes.iter().map(|change| change.state).collect()
+    }
+}
+
+#[test]
+fn a_sample_carries_what_is_fresh_at_the_time_of_its_voltage() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, SENSOR, 25.0);
+    bench.ok(0.0, Channel::Current, 2.0);
+    bench.ok(1.0, Channel::Current, 4.0);
+    let sample = bench.ok(1.5, CELL, 3.7).expect("a good voltage makes a sample");
+    assert_eq!(sample.charge_as, 5.0, "3 As by trapezoid and half a second of 4 A");
+    assert_eq!(
+        (sample.cell, sample.time, sample.voltage_v, sample.current_a, sample.temperature_c, sample.unmeasured_s),
+        (CellIndex(0), at(1.5), 3.7, Some(4.0), Some(25.0), 0.0)
+    );
+    let other = bench.ok(1.5, Channel::CellVoltage(CellIndex(1)), 3.6).expect("a sample");
+    assert_eq!((other.cell, other.temperature_c), (CellIndex(1), None), "no sensor serves cell 1");
+}
+
+#[test]
+fn values_too_old_to_use_are_left_out_and_the_hole_is_unmeasured() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, SENSOR, 25.0);
+    bench.ok(0.0, Channel::Current, 1.0);
+    let sample = bench.ok(40.0, CELL, 3.7).expect("a sample");
+    assert_eq!((sample.current_a, sample.temperature_c), (None, None));
+    assert_eq!((sample.charge_as, sample.unmeasured_s), (2.0, 38.0));
+    bench.ok(50.0, Channel::Current, 9.0);
+    let sample = bench.ok(51.0, CELL, 3.7).expect("a sample");
+    assert_eq!((sample.charge_as, sample.unmeasured_s), (2.0 + 9.0, 48.0));
+}
+
+#[test]
+fn measured_glitches_make_no_sample_and_are_told_once() {
+    // As in the NASA files: samples of 8.4 V, and empty fields.
+    let mut bench = Bench::new(config());
+    assert!(bench.ok(0.0, CELL, 3.9).is_some());
+    assert_eq!(bench.ok(1.0, CELL, 8.393), None);
+    assert_eq!(bench.give(2.0, CELL, Err(Fault::NotAvailable)), None);
+    assert_eq!(bench.ok(3.0, CELL, f64::NAN), None);
+    assert!(bench.ok(4.0, CELL, 3.9).is_some());
+    assert_eq!(bench.states(), [Err(Fault::OutOfRange), Ok(3)]);
+    assert_eq!(bench.sampler.bad_share(CELL), Some(0.6));
+    assert_eq!(bench.sampler.worst_bad_share(), Some((CELL, 0.6)));
+}
+
+#[test]
+fn a_bad_current_is_neither_used_nor_integrated() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, Channel::Current, 1.0);
+    for (time, bad) in [(0.5, Ok(500.0)), (1.0, Ok(f64::NAN)), (1.2, Err(Fault::ShortFrame))] {
+        bench.give(time, Channel::Current, bad);
+    }
+    bench.ok(2.0, Channel::Current, 1.0);
+    let sample = bench.ok(2.0, CELL, 3.7).expect("a sample");
+    assert_eq!((sample.charge_as, sample.current_a), (2.0, Some(1.0)));
+}
+
+#[test]
+fn a_jump_is_refused_and_a_step_that_stays_is_accepted() {
+    let mut config = config();
+    config.voltage.max_rate_per_s = Some(0.1);
+    let mut bench = Bench::new(config);
+    assert!(bench.ok(0.0, CELL, 3.9).is_some());
+    assert!(bench.ok(1.0, CELL, 3.3).is_none(), "one jump");
+    assert!(bench.ok(2.0, CELL, 3.9).is_some(), "and back");
+    assert!(bench.ok(3.0, CELL, 3.3).is_none());
+    assert!(bench.ok(4.0, CELL, 3.31).is_none());
+    assert!(bench.ok(5.0, CELL, 3.32).is_some(), "the third that agrees");
+    assert!(bench.ok(6.0, CELL, 3.33).is_some());
+    assert_eq!(bench.states(), [Err(Fault::RateTooHigh), Ok(1), Err(Fault::RateTooHigh), Ok(2)]);
+}
+
+#[test]
+fn jumps_that_do_not_agree_are_never_accepted() {
+    let mut config = config();
+    config.voltage.max_rate_per_s = Some(0.01);
+    let mut bench = Bench::new(config);
+    assert!(bench.ok(0.0, CELL, 3.9).is_some());
+    for step in 1..20 {
+        let value = if step % 2 == 0 { 3.0 } else { 2.5 };
+        assert!(bench.ok(f64::from(step), CELL, value).is_none(), "step {step}");
+    }
+}
+
+#[test]
+fn two_readings_with_one_stamp_are_no_infinite_rate() {
+    let mut config = config();
+    config.voltage.max_rate_per_s = Some(10.0);
+    let mut bench = Bench::new(config);
+    assert!(bench.ok(0.0, CELL, 3.900).is_some());
+    assert!(bench.ok(0.0, CELL, 3.905).is_some());
+}
+
+/// Current and a voltage once a second; the first second whose voltage was refused.
+fn first_stuck_second(current_a: f64, voltage: impl Fn(u32) -> f64) -> Option<u32> {
+    let mut config = config();
+    config.voltage.stuck_after_s = Some(60.0);
+    let mut bench = Bench::new(config);
+    (0..600).find(|&second| {
+        bench.ok(f64::from(second), Channel::Current, current_a);
+        bench.ok(f64::from(second), CELL, voltage(second)).is_none()
+    })
+}
+
+#[test]
+fn a_voltage_that_rests_under_load_is_stuck_and_one_at_rest_or_held_by_a_charger_is_not() {
+    assert_eq!(first_stuck_second(2.0, |_| 3.7), Some(60));
+    assert_eq!(first_stuck_second(0.01, |_| 3.7), None, "rest");
+    assert_eq!(first_stuck_second(-2.0, |_| 4.2), None, "constant-voltage charge");
+    assert_eq!(first_stuck_second(2.0, |second| 3.7 - 0.001 * f64::from(second / 50)), None, "moves every 50 s");
+}
+
+#[test]
+fn a_stuck_signal_is_good_again_when_it_moves() {
+    let mut config = config();
+    config.voltage.stuck_after_s = Some(5.0);
+    let mut bench = Bench::new(config);
+    for second in 0..10 {
+        bench.ok(f64::from(second), Channel::Current, 1.0);
+        bench.ok(f64::from(second), CELL, 3.7);
+    }
+    assert!(bench.ok(10.0, CELL, 3.69).is_some());
+    assert_eq!(bench.states(), [Err(Fault::Stuck), Ok(5)]);
+}
+
+#[test]
+fn silence_turns_a_signal_stale_once_each_at_its_own_age() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, Channel::Current, 1.0);
+    bench.ok(0.0, CELL, 3.7);
+    let mut told = Vec::new();
+    for tenth in 0..=400 {
+        let now = f64::from(tenth) / 10.0;
+        bench.sampler.poll(at(now), &mut bench.changes);
+        told.extend(bench.changes.drain(..).map(|change| (now, change.channel, change.state)));
+    }
+    let stale = Err(Fault::Stale);
+    let never_heard = Channel::CellVoltage(CellIndex(1));
+    assert_eq!(
+        told,
+        [(2.1, Channel::Current, stale), (5.1, CELL, stale), (5.1, never_heard, stale), (30.1, SENSOR, stale)]
+    );
+    assert!(bench.ok(41.0, CELL, 3.7).is_some());
+    assert_eq!(bench.states(), [Ok(0)]);
+    bench.changes.clear();
+    bench.sampler.poll(at(46.5), &mut bench.changes);
+    assert_eq!(bench.states(), [stale], "and stale again");
+}
+
+#[test]
+fn ages_tell_good_values_from_anything_heard() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, CELL, 3.7);
+    bench.ok(0.0, Channel::Current, 1.0);
+    bench.ok(0.0, Channel::CellVoltage(CellIndex(1)), 3.7);
+    bench.ok(4.0, CELL, 9.9);
+    bench.ok(9.0, SENSOR, 25.0);
+    bench.ok(9.0, Channel::Current, 1.0);
+    let now = at(10.0);
+    assert_eq!(bench.sampler.age_s(CELL, now), Some(10.0));
+    assert_eq!(bench.sampler.silence_s(CELL, now), Some(6.0));
+    assert_eq!(bench.sampler.worst_age(now), (Channel::CellVoltage(CellIndex(1)), 10.0));
+    assert_eq!(bench.sampler.age_s(Channel::PackVoltage, now), None);
+}
+
+#[test]
+fn an_unknown_gap_is_not_integrated_and_leaves_nothing_fresh() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, SENSOR, 25.0);
+    bench.ok(0.0, Channel::Current, 3.0);
+    let before = bench.ok(1.0, CELL, 3.7).expect("a sample");
+    bench.sampler.handle_gap(at(1.0));
+    let after = bench.ok(1.0, CELL, 4.1).expect("a sample");
+    assert_eq!((after.charge_as, after.unmeasured_s), (before.charge_as, before.unmeasured_s));
+    assert_eq!((after.current_a, after.temperature_c), (None, None));
+}
+
+#[test]
+fn strings_share_the_current_and_a_total_voltage_is_shared_by_the_cells() {
+    let mut config = config();
+    config.cells = 1;
+    config.strings = 2;
+    config.voltage_source = VoltageSource::PackTotal { series: 96 };
+    let mut bench = Bench::new(config);
+    bench.ok(0.0, Channel::Current, 8.0);
+    bench.ok(1.0, Channel::Current, 8.0);
+    let sample = bench.ok(1.0, Channel::PackVoltage, 96.0 * 3.5).expect("a sample");
+    assert_eq!((sample.voltage_v, sample.current_a, sample.charge_as), (3.5, Some(4.0), 4.0));
+    assert_eq!(bench.sampler.pack_current_a(at(1.0)), Some(8.0));
+    assert_eq!(bench.sampler.counted(at(1.0)), (4.0, 0.0));
+    assert!(bench.ok(2.0, Channel::PackVoltage, 900.0).is_none(), "9.4 V per cell");
+}
+
+#[test]
+fn readings_that_feed_nothing_are_counted() {
+    let mut bench = Bench::new(config());
+    for channel in [Channel::PackVoltage, Channel::CellVoltage(CellIndex(2)), Channel::Temperature(SensorIndex(1))] {
+        assert!(bench.ok(0.0, channel, 3.7).is_none());
+    }
+    assert_eq!(bench.sampler.unused_readings(), 3);
+    assert_eq!(bench.changes, []);
+}
+
+#[test]
+fn time_that_goes_back_is_taken_as_the_latest() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, Channel::Current, 1.0);
+    bench.ok(2.0, Channel::Current, 1.0);
+    let sample = bench.ok(1.0, CELL, 3.7).expect("a sample");
+    assert_eq!((sample.time, sample.charge_as), (at(2.0), 2.0));
+}
+
+#[test]
+fn a_restored_sampler_counts_the_time_away_as_unmeasured() {
+    let mut bench = Bench::new(config());
+    bench.ok(0.0, Channel::Current, 1.0);
+    bench.ok(1.0, CELL, 3.7);
+    let text = serde_json::to_string(&bench.sampler.snapshot()).expect("serialises");
+    let mut state: SamplerState = serde_json::from_str(&text).expect("reads back");
+    assert_eq!(state, bench.sampler.snapshot());
+    state.rebase(1_000_000_000_000);
+    let mut restored = Bench::new(config());
+    restored.sampler.restore(&state).expect("same shape");
+    restored.ok(1100.0, Channel::Current, 1.0);
+    let sample = restored.ok(1100.0, CELL, 3.7).expect("a sample");
+    assert_eq!((sample.charge_as, sample.unmeasured_s), (2.0, 98.0));
+    let mut other = Sampler::new(SampleConfig { cells: 3, ..config() });
+    assert_eq!(other.restore(&state), Err(SamplerShape { found: 4, allowed: 5 }));
+}
+
+#[test]
+fn every_slot_is_found_again_through_its_channel() {
+    let mut config = config();
+    config.cells = 1024;
+    config.sensor_of_cell = (0..1024).map(|cell| Some(SensorIndex(cell / 12))).collect();
+    let sampler = Sampler::new(config);
+    let slots: Vec<_> = sampler.channels().map(|channel| sampler.slot(channel)).collect();
+    assert_eq!(slots.len(), 1 + 86 + 1024);
+    assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
+}
