@@ -1,8 +1,29 @@
 //! The TOML configuration: as written, then checked; every fault at once, with file, line, key, found and allowed.
+//!
+//! `keys` says what each key is, `schema` and `setting` read them, `cross` checks what concerns several keys,
+//! `convert` makes the settings the other modules take, `cell_model` does the same for cell files.
 
 use std::path::{Path, PathBuf};
 
 use crate::monitor::MonitorConfig;
+
+pub mod cell_model;
+mod convert;
+mod cross;
+mod describe;
+mod document;
+mod keys;
+mod output;
+mod pattern;
+mod reference;
+mod resolve;
+mod schema;
+mod setting;
+
+pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
+use document::{Document, Faults};
+pub use reference::reference;
+use resolve::Databases;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -28,10 +49,84 @@ pub struct InterfaceConfig {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConfigFaults(pub Vec<String>);
 
+/// How a file's bytes are had: from the disk, or (demo, tests) from memory.
+pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
+
 /// Reads and checks a configuration with everything it names (DBC files, cell model; paths are relative to it).
 ///
 /// # Errors
 /// Every fault found, not only the first.
 pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
-    Err(ConfigFaults(vec![format!("{}: not built yet", path.display())]))
+    load_with(path, &read_file)
 }
+
+/// As [`load`], with the files had through `read`.
+///
+/// # Errors
+/// Every fault found, not only the first.
+pub fn load_with(path: &Path, read: ReadFile<'_>) -> Result<Config, ConfigFaults> {
+    read_all(path, read).map(|(config, _)| config)
+}
+
+/// Reads and checks a configuration, and says what it means.
+///
+/// # Errors
+/// Every fault found, not only the first.
+pub fn describe(path: &Path) -> Result<Description, ConfigFaults> {
+    read_all(path, &read_file).map(|(_, description)| description)
+}
+
+fn read_all(path: &Path, read: ReadFile<'_>) -> Result<(Config, Description), ConfigFaults> {
+    let mut faults = Faults::default();
+    match read_config(path, read, &mut faults) {
+        Some(good) if faults.is_empty() => Ok(good),
+        // A part that could not be made without anything said would be a fault of this program: never silent.
+        None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", path.display())])),
+        _ => Err(ConfigFaults(faults.into_lines())),
+    }
+}
+
+fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
+    let text = read_text(path, read, faults)?;
+    let document = Document::parse(&path.display().to_string(), &text, faults);
+    let raw = convert::Raw::read(&document, faults);
+    let model = raw.cell_model.as_ref().and_then(|named| cell_model::load_with(&beside(path, named), read, faults));
+    cross::check(&raw, model.as_ref(), faults);
+    let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
+    let databases = Databases::load(path, names, read, faults);
+    let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
+    output::check(&raw, &found, faults);
+    let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
+    let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
+    let monitor = convert::monitor(&raw, model?, &ranges)?;
+    let config = Config { path: path.to_owned(), interfaces, monitor };
+    let description = describe::describe(&raw, &config, &found, output::uses(&raw));
+    Some((config, description))
+}
+
+/// `named`, relative to the folder of `path`.
+fn beside(path: &Path, named: &str) -> PathBuf {
+    path.parent().unwrap_or(Path::new("")).join(named)
+}
+
+fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
+    std::fs::read(path)
+}
+
+/// The file as UTF-8 text, or `None` with a fault noted.
+fn read_text(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<String> {
+    let file = path.display().to_string();
+    let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
+    match String::from_utf8(bytes) {
+        Ok(text) => Some(text),
+        Err(error) => {
+            let good = error.utf8_error().valid_up_to();
+            let line = 1 + error.as_bytes()[..good].iter().filter(|&&b| b == b'\n').count();
+            faults.add(&file, line, "is not UTF-8 text");
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,391 @@
+//! Every key of the configuration file: meaning, type, unit, range and default, once.
+//!
+//! A new key is one line here and one where `convert` turns it into a setting. The reference page
+//! (`config/REFERENCE.md`) and every fault's "must be" come from these lines.
+
+use super::schema::Presence::{Default, Optional, Required};
+use super::schema::{SectionInfo, section};
+use super::setting::Allowed::{Above, Any, Between, NotEmpty};
+use super::setting::{CellRanges, choice};
+use crate::alarm::{Rule, Severity};
+use crate::cell::{CapacityState, Discretisation};
+use crate::quantity::MAX_CELLS;
+
+/// Coldest and hottest temperature anybody may configure, degrees C.
+const TEMPERATURE_C: super::setting::Allowed = Between(-100.0, 200.0);
+/// Standard deviations and densities.
+const DEVIATION: super::setting::Allowed = Between(0.0, 1e6);
+
+/// Which way a positive current flows on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Positive {
+    /// Into the pack.
+    Charge,
+    /// Out of the pack.
+    Discharge,
+}
+
+/// Where the capacity measurement of a half-cycle comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Method {
+    /// Charge over the swing the voltages tell.
+    Swing,
+    /// Charge over a nominal swing.
+    Nominal,
+}
+
+choice!(Positive { "charge" => Self::Charge, "discharge" => Self::Discharge });
+choice!(Method { "swing" => Self::Swing, "nominal" => Self::Nominal });
+choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
+choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
+choice!(Severity { "info" => Self::Info, "warning" => Self::Warning, "severe" => Self::Severe });
+choice!(Rule {
+    "capacity_low" => Self::CapacityLow,
+    "usable_capacity_low" => Self::UsableCapacityLow,
+    "recharge_period_low" => Self::RechargePeriodLow,
+    "input_missing" => Self::InputMissing,
+    "input_implausible" => Self::InputImplausible,
+    "estimate_untrusted" => Self::EstimateUntrusted,
+});
+
+section! {
+    /// The pack: how many cells, how they are connected, and which cell they are.
+    Pack at "pack" {
+        /// Cells in series. Parallel cells that share one voltage tap count as one.
+        cells: u16, "", Between(1.0, MAX_CELLS as f64), Required;
+        /// Parallel strings; the pack current is taken to be shared by them equally.
+        strings: u16, "", Between(1.0, 1024.0), Default("1");
+        /// Cell model file, relative to this file.
+        cell_model: String, "", NotEmpty, Required;
+        /// Capacity on the label of one cell, which SOH is relative to. Without it: the cell model's.
+        rated_capacity_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+        /// Capacity to start from when nothing was learned yet, per cell. Without it: the cell model's `capacity_ah`.
+        initial_capacity_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+        /// Standard deviation of the capacity to start from. Without it: 10 % of that capacity.
+        initial_capacity_std_ah: Option<f64>, "Ah", Above(0.0, 1e5), Optional;
+        /// Temperature of the surroundings, used where no sensor says otherwise.
+        ambient_c: f64, "degrees C", TEMPERATURE_C, Default("25.0");
+    }
+}
+
+section! {
+    /// A CAN interface, in the order in which the program counts them.
+    Interface at "interface" {
+        /// Kernel name, at most 15 characters.
+        name: String, "", NotEmpty, Required;
+        /// Whether CAN FD frames are accepted and may be sent.
+        fd: bool, "", Any, Default("false");
+    }
+}
+
+section! {
+    /// What is read from the buses. One of `[input.cell_voltage]` and `[input.pack_voltage]` is needed, and `[input.current]`.
+    Input at "input" {
+        /// DBC files that describe the signals named below, relative to this file.
+        dbc: Vec<String>, "", NotEmpty, Required;
+    }
+}
+
+/// Declares a table that names a signal on a bus; every such table has these keys.
+macro_rules! signal_section {
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
+        section! {
+            $(#[doc = $about])+
+            $name at $path {
+                /// `Message.Signal` of one of the DBC files; in `[input.cell_voltage]` a pattern, see there.
+                signal: String, "", NotEmpty, Required;
+                /// Interface the signal comes on. Needed when there are several.
+                interface: Option<String>, "", NotEmpty, Optional;
+                /// Factor from the DBC's unit to this program's, after the DBC's own factor (0.001 for a DBC in milli-units).
+                scale: f64, $unit, Above(0.0, 1e9), Default("1.0");
+                /// Raw codes that mean "not available", besides those the DBC's value table calls so.
+                not_available: Vec<u64>, "", Any, Default("[]");
+                $($keys)*
+            }
+        }
+
+        impl $name {
+            /// What all signal tables have in common.
+            pub(crate) fn source(&self) -> SignalSource<'_> {
+                SignalSource {
+                    place: &self.place,
+                    signal: &self.signal,
+                    interface: self.interface.as_deref(),
+                    scale: self.scale,
+                    not_available: &self.not_available,
+                }
+            }
+        }
+    };
+}
+
+/// What every table that names a signal says.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SignalSource<'a> {
+    /// Where it stands.
+    pub(crate) place: &'a super::document::Place,
+    /// `Message.Signal`, or a pattern.
+    pub(crate) signal: &'a str,
+    /// Interface name, when given.
+    pub(crate) interface: Option<&'a str>,
+    /// DBC unit to ours.
+    pub(crate) scale: f64,
+    /// Raw codes that mean "not available".
+    pub(crate) not_available: &'a [u64],
+}
+
+signal_section! {
+    /// The pack current.
+    CurrentInput at "input.current", "A per unit of the DBC" {
+        /// What a positive value on the bus means. Buses differ, so there is no default; inside, and in everything this program reports, positive is discharge.
+        positive: Positive, "", Any, Required;
+    }
+}
+
+signal_section! {
+    /// One voltage per cell. `{n}` in `signal` stands for the cell's number, `{m}` for any number, in message and signal name:
+    /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must be found exactly once; multiplexed signals are welcome.
+    CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
+        /// Number of the first cell in the names.
+        first: u16, "", Between(0.0, 60000.0), Default("1");
+    }
+}
+
+signal_section! {
+    /// The pack's total voltage, for a pack that publishes no cell voltages: `pack.cells` equal cells are assumed and estimated as one.
+    PackVoltageInput at "input.pack_voltage", "V per unit of the DBC" {}
+}
+
+signal_section! {
+    /// A temperature sensor.
+    TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
+        /// Cells this sensor serves. Without it: all cells.
+        cells: Option<CellRanges>, "", Any, Optional;
+    }
+}
+
+section! {
+    /// What a plausible pack current is. A reading outside moves no estimate and is counted.
+    CurrentLimits at "limits.current" {
+        /// Largest plausible discharge current of the pack. Without it: what the DBC gives.
+        max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
+        /// Largest plausible charge current of the pack, written positive. Without it: what the DBC gives.
+        max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
+        /// Fastest plausible change. Without it: not checked.
+        max_rate_a_per_s: Option<f64>, "A/s", Above(0.0, 1e9), Optional;
+        /// A reading that has not moved at all for this long is stuck. Without it: not checked (a parked pack's current may well stand still).
+        stuck_after_s: Option<f64>, "s", Above(0.0, 1e9), Optional;
+        /// A reading older than this is stale: estimates go on without it, their deviation grows, and they say so.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("1.0");
+    }
+}
+
+section! {
+    /// What a plausible cell voltage is; a total voltage is divided by `pack.cells` first.
+    VoltageLimits at "limits.voltage" {
+        /// Smallest plausible voltage of a cell. Without it: what the DBC gives, but at least half the cell model's `voltage_min_v`.
+        min_v: Option<f64>, "V", Between(0.0, 1e3), Optional;
+        /// Largest plausible voltage of a cell. Without it: what the DBC gives, but at most the cell model's `voltage_max_v` and 0.5 V.
+        max_v: Option<f64>, "V", Above(0.0, 1e3), Optional;
+        /// Fastest plausible change. Without it: not checked.
+        max_rate_v_per_s: Option<f64>, "V/s", Above(0.0, 1e6), Optional;
+        /// A reading that has not moved at all for this long, while the current has, is stuck. Without it: not checked.
+        stuck_after_s: Option<f64>, "s", Above(0.0, 1e9), Optional;
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("2.0");
+    }
+}
+
+section! {
+    /// What a plausible temperature is.
+    TemperatureLimits at "limits.temperature" {
+        /// Lowest plausible temperature. Without it: what the DBC gives, but at least -60.
+        min_c: Option<f64>, "degrees C", TEMPERATURE_C, Optional;
+        /// Highest plausible temperature. Without it: what the DBC gives, but at most 150.
+        max_c: Option<f64>, "degrees C", TEMPERATURE_C, Optional;
+        /// Fastest plausible change. Without it: not checked.
+        max_rate_c_per_s: Option<f64>, "degrees C/s", Above(0.0, 1e6), Optional;
+        /// A reading that has not moved at all for this long, while the current has, is stuck. Without it: not checked.
+        stuck_after_s: Option<f64>, "s", Above(0.0, 1e9), Optional;
+        /// A reading older than this is stale; the thermal model, if the cell has one, takes over.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0");
+    }
+}
+
+section! {
+    /// The unscented Kalman filter of each cell. Noises are densities, per square root of a second, so that the sample rate does not change the result.
+    Estimator at "estimator" {
+        /// Spread of the sigma points.
+        alpha: f64, "", Above(0.0, 1.0), Default("1.0");
+        /// Prior knowledge of the distribution; 2 for a Gaussian one.
+        beta: f64, "", Between(0.0, 10.0), Default("2.0");
+        /// Secondary scaling of the sigma points.
+        kappa: f64, "", Between(0.0, 10.0), Default("0.0");
+        /// How the circuit is stepped: exactly, or by forward Euler as in the paper.
+        discretisation: Discretisation, "", Any, Default("\"exact\"");
+        /// Whether the filter carries the capacity as a state, or holds the learned one as in the paper.
+        capacity_state: CapacityState, "", Any, Default("\"joint\"");
+        /// SOC to start from. Without it: from the first voltage through the open-circuit voltage curve.
+        initial_soc: Option<f64>, "fraction", Between(0.0, 1.0), Optional;
+        /// Standard deviation of the first SOC.
+        initial_soc_std: f64, "fraction", Above(0.0, 1.0), Default("0.3");
+        /// Standard deviation of the first branch voltages.
+        initial_branch_std_v: f64, "V", Between(0.0, 10.0), Default("0.05");
+        /// Standard deviation of the logarithm of the resistance relative to new, at the start.
+        initial_log_resistance_std: f64, "", Between(0.0, 5.0), Default("0.2");
+        /// Process noise of the SOC.
+        soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("3e-5");
+        /// Process noise of the SOC per charge moved: errors of the current reading.
+        charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
+        /// Process noise of the branch voltages.
+        branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
+        /// Process noise of the logarithm of the resistance: how fast a cell may age.
+        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("3e-4");
+        /// Process noise of the SOC while nobody measures the current (asleep).
+        gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
+        /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. Without it: the rated capacity over 50 h (C/50), per cell.
+        gap_rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
+        /// Standard deviation of the voltage sensor's noise.
+        voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
+        /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this.
+        model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Longest time one voltage reading may speak for: readings further apart are no better than this.
+        max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
+        /// A voltage further from its prediction than this many standard deviations moves nothing.
+        gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
+        /// Error of the cell model a single reading may show (standard deviation), for the gate and the consistency monitor.
+        gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
+        /// The same as an error along the open-circuit voltage curve.
+        gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
+        /// When every reading has been beyond the gate for this long, the filter has lost its cell and starts again from the voltage.
+        lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
+        /// Window over which the filter's consistency is judged.
+        consistency_window_s: f64, "s", Above(0.0, 1e9), Default("600.0");
+        /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected).
+        consistency_limit: f64, "", Above(0.0, 1e9), Default("4.0");
+    }
+}
+
+section! {
+    /// When the pack charges, rests or discharges.
+    Transition at "transition" {
+        /// Pack current up to which the pack rests. Without it: the rated capacity of all strings over 50 h (C/50).
+        dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
+        /// The current must be this far beyond the dead band's edge for a mode to change. Without it: half the dead band.
+        hysteresis_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
+        /// A new mode must hold this long before it counts.
+        min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
+        /// Half-cycles that move less than this part of the rated capacity are joined to their neighbours.
+        min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
+    }
+}
+
+section! {
+    /// The capacity filter, which runs at each transition.
+    Capacity at "capacity" {
+        /// Charge over the SOC swing the voltages tell (variance from the swing's uncertainty), or over a nominal swing as in the paper.
+        method: Method, "", Any, Default("\"swing\"");
+        /// Swing assumed by method "nominal".
+        nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6");
+        /// Measurement variance of method "nominal".
+        nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1");
+        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.2 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
+        noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional;
+        /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 1 % of the rated capacity.
+        noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;
+        /// Standard deviation of the current sensor's gain: no capacity is known better than this.
+        current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
+    }
+}
+
+section! {
+    /// The SOC window whose charging time is the recharge period.
+    Recharge at "recharge" {
+        /// Lower SOC.
+        from_soc: f64, "fraction", Between(0.0, 1.0), Default("0.3");
+        /// Upper SOC.
+        to_soc: f64, "fraction", Between(0.0, 1.0), Default("0.9");
+    }
+}
+
+section! {
+    /// The load at which usable capacity is stated; without this table it is not reported.
+    Usable at "usable" {
+        /// Discharge current, per cell.
+        current_a: f64, "A", Above(0.0, 1e6), Required;
+        /// Cell temperature.
+        temperature_c: f64, "degrees C", TEMPERATURE_C, Required;
+        /// Voltage under load at which the discharge ends.
+        cutoff_v: f64, "V", Above(0.0, 100.0), Required;
+        /// A charge whose current, per cell, has fallen to this at the cell model's highest voltage ended full: the SOC it left is where the next usable capacity starts. Without it: the rated capacity over 20 h (C/20).
+        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
+    }
+}
+
+section! {
+    /// An alarm. `capacity_low` and `usable_capacity_low` compare Ah per cell, `recharge_period_low` s, `input_missing` the age in s,
+    /// `input_implausible` the share of bad readings, `estimate_untrusted` the mean normalised innovation squared.
+    Alarm at "alarm" {
+        /// What it is about.
+        rule: Rule, "", Any, Required;
+        /// Raised when the value is below this (`*_low`) or above it (the others), in the rule's unit. Required, except where `threshold_of_rated` says it.
+        threshold: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
+        /// The threshold as a part of the rated capacity, for `capacity_low` and `usable_capacity_low`.
+        threshold_of_rated: Option<f64>, "fraction", Above(0.0, 2.0), Optional;
+        /// Cleared when the value is back on the healthy side by this much. Without it: 2 % of the threshold.
+        hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
+        /// Must hold this long before it is raised, and be healthy this long before it clears.
+        debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
+        /// Must hold for this many new values before it is raised or cleared.
+        debounce_events: u32, "", Between(1.0, 1e6), Default("1");
+        /// How bad it is.
+        severity: Severity, "", Any, Default("\"warning\"");
+    }
+}
+
+section! {
+    /// What the daemon sends. It transmits only the frames whose identifiers are given here.
+    Output at "output" {
+        /// Whether anything is sent at all.
+        enabled: bool, "", Any, Default("true");
+        /// Interfaces to send on. Without it: all.
+        interfaces: Option<Vec<String>>, "", NotEmpty, Optional;
+        /// DBC that lays the frames out, relative to this file. Without it: the built-in `packwatch.dbc`.
+        dbc: Option<String>, "", NotEmpty, Optional;
+        /// Identifier of the status frame. Without it: not sent.
+        status_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+        /// Identifier of the health frame. Without it: not sent.
+        health_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+        /// Identifier of the alarm frame. Without it: not sent.
+        alarm_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+        /// Whether these identifiers have 29 bits.
+        extended: bool, "", Any, Default("false");
+        /// Period of the status frame.
+        status_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("100");
+        /// Period of the health frame.
+        health_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("1000");
+        /// Period at which an active alarm is repeated; a change is sent at once.
+        alarm_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("1000");
+    }
+}
+
+/// Every table of the configuration, in the order of the reference page.
+pub(crate) const SECTIONS: &[SectionInfo] = &[
+    SectionInfo::one::<Pack>(),
+    SectionInfo::many::<Interface>(),
+    SectionInfo::one::<Input>(),
+    SectionInfo::one::<CurrentInput>(),
+    SectionInfo::one::<CellVoltageInput>(),
+    SectionInfo::one::<PackVoltageInput>(),
+    SectionInfo::many::<TemperatureInput>(),
+    SectionInfo::one::<CurrentLimits>(),
+    SectionInfo::one::<VoltageLimits>(),
+    SectionInfo::one::<TemperatureLimits>(),
+    SectionInfo::one::<Estimator>(),
+    SectionInfo::one::<Transition>(),
+    SectionInfo::one::<Capacity>(),
+    SectionInfo::one::<Recharge>(),
+    SectionInfo::one::<Usable>(),
+    SectionInfo::many::<Alarm>(),
+    SectionInfo::one::<Output>(),
+];

@@ -1,0 +1,497 @@
+//! Files good and bad: the faults are part of the program's face, so they are compared word for word.
+
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::health::CapacityMethod;
+use crate::quantity::SensorIndex;
+use crate::sample::VoltageSource;
+
+const DBC: &str = r#"VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 256 Status: 8 A
+ SG_ Current : 0|16@1- (0.1,0) [-300|500] "A" A
+ SG_ Total : 16|16@1+ (0.1,0) [0|100] "V" A
+ SG_ Temperature : 32|8@1+ (1,-40) [-40|100] "degC" A
+BO_ 272 Cells: 8 A
+ SG_ Page M : 0|8@1+ (1,0) [0|1] "" A
+ SG_ CellVoltage1 m0 : 8|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage2 m0 : 24|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage3 m1 : 8|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage4 m1 : 24|16@1+ (0.001,0) [0|0] "mV" A
+BO_ 288 Long: 12 A
+ SG_ Current : 0|16@1- (0.1,0) [0|0] "A" A
+VAL_ 256 Current -32768 "not available" ;
+"#;
+
+const CELL: &str = r#"format = 1
+name = "test"
+rated_capacity_ah = 2.0
+capacity_ah = 1.9
+voltage_min_v = 2.5
+voltage_max_v = 4.2
+[provenance]
+anything = ["goes", 1]
+[tables]
+soc = [0, 0.5, 1]
+temperature_c = [10, 30]
+ocv_v = [[3.0, 3.6, 4.1], [3.0, 3.6, 4.2]]
+r0_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+[[tables.branches]]
+r_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+c_farad = [[100, 100, 100], [100, 100, 100]]
+"#;
+
+/// Line 1 is `[pack]`.
+const PACK: &str = r#"[pack]
+cells = 4
+cell_model = "cell.toml"
+[[interface]]
+name = "can0"
+[input]
+dbc = ["pack.dbc"]
+[input.current]
+signal = "Status.Current"
+positive = "charge"
+[input.cell_voltage]
+signal = "Cells.CellVoltage{n}"
+[[input.temperature]]
+signal = "Status.Temperature"
+"#;
+
+fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> {
+    let files = HashMap::from([("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC)]);
+    let read = |path: &Path| match path.to_str().and_then(|name| files.get(name)) {
+        Some(text) => Ok(text.as_bytes().to_vec()),
+        None => Err(std::io::ErrorKind::NotFound.into()),
+    };
+    load_with(&PathBuf::from("pack.toml"), &read).map_err(|faults| faults.0)
+}
+
+fn good(pack: &str) -> Config {
+    load_texts(pack, CELL, DBC).unwrap()
+}
+
+fn faults(pack: &str) -> Vec<String> {
+    load_texts(pack, CELL, DBC).unwrap_err()
+}
+
+/// The test configuration with `from` replaced, which must be there.
+fn pack_with(from: &str, to: &str) -> String {
+    assert!(PACK.contains(from), "{from}");
+    PACK.replacen(from, to, 1)
+}
+
+#[test]
+fn a_good_file_becomes_settings_with_defaults() {
+    let config = good(PACK);
+    let monitor = &config.monitor;
+    assert_eq!(config.interfaces, [InterfaceConfig { name: "can0".to_owned(), fd: false }]);
+    assert_eq!((monitor.sample.cells, monitor.sample.voltage_source), (4, VoltageSource::Cells));
+    assert_eq!(monitor.sample.sensor_of_cell, [Some(SensorIndex(0)); 4]);
+    assert_eq!((monitor.estimator.initial_capacity_ah, monitor.estimator.initial_capacity_std_ah), (1.9, 0.19));
+    assert_eq!((monitor.health.recharge.from_soc, monitor.health.recharge.to_soc), (0.3, 0.9));
+    assert_eq!(monitor.health.transition.dead_band_a, 0.04, "C/50 of the label's 2 Ah");
+    assert_eq!(monitor.health.capacity.method, CapacityMethod::Swing);
+    assert_eq!((monitor.health.usable, monitor.rules.len()), (None, 0));
+}
+
+#[test]
+fn limits_come_from_the_dbc_in_our_sign_and_the_cell_model() {
+    let sample = good(PACK).monitor.sample;
+    assert_eq!((sample.current.min, sample.current.max), (-500.0, 300.0), "the bus counts charge positive");
+    assert_eq!((sample.voltage.min, sample.voltage.max), (1.25, 4.7), "[0|0] in the DBC gives no range");
+    assert_eq!((sample.temperature.min, sample.temperature.max), (-40.0, 100.0));
+    let sample = good(&format!("{PACK}[limits.current]\nmax_charge_a = 20\n")).monitor.sample;
+    assert_eq!((sample.current.min, sample.current.max), (-20.0, 300.0));
+}
+
+#[test]
+fn a_total_voltage_means_one_cell_of_a_series() {
+    let pack = pack_with(
+        "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"",
+        "[input.pack_voltage]\nsignal = \"Status.Total\"",
+    );
+    let sample = good(&pack).monitor.sample;
+    assert_eq!((sample.cells, sample.voltage_source), (1, VoltageSource::PackTotal { series: 4 }));
+    assert_eq!(sample.voltage.max, 4.7, "100 V by four cells is more than the cell model allows");
+    assert_eq!(sample.sensor_of_cell, [Some(SensorIndex(0))]);
+}
+
+#[test]
+fn a_relative_threshold_is_of_the_rated_capacity() {
+    let alarm = "[[alarm]]\nrule = \"capacity_low\"\nthreshold_of_rated = 0.75\n";
+    assert_eq!(good(&format!("{PACK}{alarm}")).monitor.rules[0].threshold, 1.5);
+    let rated = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 4");
+    let config = good(&format!("{rated}{alarm}"));
+    assert_eq!((config.monitor.rules[0].threshold, config.monitor.model.rated_capacity_ah), (3.0, 4.0));
+}
+
+#[test]
+fn numbers_may_be_hex_or_have_underscores() {
+    let output =
+        "[output]\nstatus_id = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
+    let config = good(&format!("{PACK}{output}"));
+    assert_eq!(config.monitor.estimator.consistency_window_s, 1000.0);
+    assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
+}
+
+/// Each edit of the good file and the whole of what is said about it.
+#[test]
+fn single_faults_name_file_line_key_found_and_allowed() {
+    let table: &[(&str, &str, &str)] = &[
+        ("cells = 4", "cells = 0", "pack.toml:2: pack.cells = 0, must be 1 to 1024"),
+        ("cells = 4", "cells = -1", "pack.toml:2: pack.cells = -1, must be 1 to 1024"),
+        (
+            "cells = 4",
+            "cells = 99999999999999999999",
+            "pack.toml:2: pack.cells = 99999999999999999999, must be 1 to 1024",
+        ),
+        ("cells = 4", "cells = 4.0", "pack.toml:2: pack.cells = 4.0, must be a whole number, 1 to 1024"),
+        ("cells = 4", "cells = \"four\"", "pack.toml:2: pack.cells = \"four\", must be a whole number, 1 to 1024"),
+        ("cells = 4\n", "", "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024"),
+        ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
+        ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
+        ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
+        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: duplicate key"),
+        (
+            "cells = 4",
+            "cells = 4\nrated_capacity_ah = 0",
+            "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0 and at most 100000",
+        ),
+        ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
+        ("[[interface]]", "[interface]", "pack.toml:4: interface = [interface], must be tables [[interface]]"),
+        ("[input]", "[[input]]", "pack.toml:6: input = [[input]], must be one table [input]"),
+        (
+            "\"can0\"",
+            "\"a name too long to be one\"",
+            "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without blank or /",
+        ),
+        ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
+        ("dbc = [\"pack.dbc\"]", "dbc = []", "pack.toml:7: input.dbc = [], must be a list of texts that is not empty"),
+        (
+            "dbc = [\"pack.dbc\"]",
+            "dbc = [\"pack.dbc\", 7]",
+            "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
+        ),
+        ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
+        ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
+        (
+            "\"charge\"",
+            "\"charge\"\ninterface = \"can1\"",
+            "pack.toml:11: input.current.interface = \"can1\", must be can0",
+        ),
+        (
+            "\"charge\"",
+            "\"charge\"\nscale = 0",
+            "pack.toml:11: input.current.scale = 0, must be above 0 and at most 1000000000",
+        ),
+        (
+            "\"charge\"",
+            "\"charge\"\nnot_available = [0x1_0000]",
+            "pack.toml:11: input.current.not_available = [0x1_0000], must be 0 to 0xFFFF, the codes of Status.Current",
+        ),
+        (
+            "Status.Current",
+            "Status.Curent",
+            "pack.toml:9: input.current.signal = \"Status.Curent\", must be a signal (Message.Signal) of pack.dbc, did you mean Status.Current",
+        ),
+        (
+            "Status.Current",
+            "Long.Current",
+            "pack.toml:9: input.current.signal = \"Long.Current\", message Long has 12 bytes, must have fd = true on its interface",
+        ),
+        (
+            "Status.Current",
+            "Status.Temperature",
+            "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", must not be used twice, is also pack current",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage1",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must have {n} in place of the cell's number",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage{x}",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{x}\", must have {n} (cell's number) and {m} (any number) as its only braces",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage{n}\"\nfirst = 3\ninterface = \"can0",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give every cell a signal, none for number 5, 6",
+        ),
+        (
+            "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"\n",
+            "",
+            "pack.toml:6: input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]",
+        ),
+        (
+            "Status.Temperature\"",
+            "Status.Temperature\"\ncells = \"3-5\"",
+            "pack.toml:15: input.temperature[1].cells = \"3-5\", must be within 1 to 4 (pack.cells)",
+        ),
+        (
+            "Status.Temperature\"",
+            "Status.Temperature\"\ncells = \"4-3\"",
+            "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, like \"1-12, 15\"",
+        ),
+    ];
+    for (from, to, fault) in table {
+        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
+    }
+}
+
+#[test]
+fn single_faults_of_appended_tables() {
+    let table: &[(&str, &str)] = &[
+        ("[pak]\n", "pack.toml:15: pak is not a known key, did you mean pack"),
+        ("[recharge]\nto_soc = 0.3\n", "pack.toml:16: recharge.to_soc = 0.3, must be above recharge.from_soc = 0.3"),
+        (
+            "[recharge]\nfrom_soc = 0.95\n",
+            "pack.toml:16: recharge.from_soc = 0.95, must be below recharge.to_soc = 0.9",
+        ),
+        (
+            "[limits.voltage]\nmin_v = 4\nmax_v = 3\n",
+            "pack.toml:17: limits.voltage.max_v = 3, must be above 4, the smallest",
+        ),
+        ("[limits.amps]\n", "pack.toml:15: limits.amps is not a known key"),
+        (
+            "[usable]\ncurrent_a = 2\ntemperature_c = 24\ncutoff_v = 4.2\n",
+            "pack.toml:18: usable.cutoff_v = 4.2, must be below the cell model's voltage_max_v = 4.2",
+        ),
+        (
+            "[[alarm]]\nrule = \"capacity_low\"\n",
+            "pack.toml:15: alarm[1].threshold is not set, must be given, in the rule's unit",
+        ),
+        (
+            "[[alarm]]\nrule = \"usable_capacity_low\"\nthreshold = 1\n",
+            "pack.toml:16: alarm[1].rule = \"usable_capacity_low\", must have a table [usable] that states the load",
+        ),
+        (
+            "[[alarm]]\nrule = \"input_missing\"\nthreshold_of_rated = 1\n",
+            "pack.toml:17: alarm[1].threshold_of_rated = 1, must be threshold: this rule does not compare a capacity",
+        ),
+        (
+            "[[alarm]]\nrule = \"input_missing\"\nthreshold = 1\n[[alarm]]\nrule = \"input_missing\"\nthreshold = 2\n",
+            "pack.toml:19: alarm[2].rule = \"input_missing\", must differ in severity from the same rule in line 15",
+        ),
+        (
+            "[output]\n",
+            "pack.toml:15: output has no identifier, must have status_id, health_id or alarm_id, or enabled = false",
+        ),
+        (
+            "[output]\nstatus_id = 0x800\n",
+            "pack.toml:16: output.status_id = 0x800, must be 0 to 0x7FF, or output.extended = true",
+        ),
+        (
+            "[output]\nstatus_id = 1\nalarm_id = 1\n",
+            "pack.toml:17: output.alarm_id = 1, must differ from output.status_id",
+        ),
+        (
+            "[output]\nstatus_id = 1\ninterfaces = [\"can7\"]\n",
+            "pack.toml:17: output.interfaces = [\"can7\"], must be can0",
+        ),
+        (
+            "[output]\nhealth_id = 0x110\n",
+            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has it",
+        ),
+        (
+            "[[interface]]\nname = \"can0\"\n",
+            "pack.toml:16: interface[2].name = \"can0\", must be unique, is also the name in line 5",
+        ),
+    ];
+    for (text, fault) in table {
+        let all = faults(&format!("{PACK}{text}"));
+        assert!(all.contains(&(*fault).to_owned()), "{text}: {all:#?}");
+        assert!(all.len() == 1 || text.starts_with("[[interface]]"), "{text}: {all:#?}");
+    }
+}
+
+#[test]
+fn broken_syntax_hides_no_other_fault_and_invents_none() {
+    let pack = pack_with("cells = 4", "cells = = 4").replace("\"charge\"", "\"in\"").replace("[input]", "[inp");
+    let expected = [
+        "pack.toml:2: extra `=`, expected nothing",
+        "pack.toml:6: unclosed table, expected `]`",
+        "pack.toml:10: input.current.positive = \"in\", must be charge or discharge",
+    ];
+    let all = faults(&pack);
+    for fault in expected {
+        assert!(all.contains(&fault.to_owned()), "{all:#?}");
+    }
+    assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
+    let all = load_texts(PACK, DBC, DBC).unwrap_err();
+    assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more faults of syntax from here"));
+}
+
+#[test]
+fn with_several_interfaces_each_signal_says_which() {
+    let all = faults(&format!("{PACK}[[interface]]\nname = \"can1\"\n"));
+    let expected = [
+        "pack.toml:8: input.current.interface is not set, must be can0 or can1",
+        "pack.toml:11: input.cell_voltage.interface is not set, must be can0 or can1",
+        "pack.toml:13: input.temperature[1].interface is not set, must be can0 or can1",
+    ];
+    assert_eq!(all, expected);
+}
+
+#[test]
+fn a_signal_in_two_dbc_files_is_ambiguous() {
+    let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
+    assert_eq!(
+        all[0],
+        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one DBC file, is in pack.dbc and twin.dbc"
+    );
+    let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give each cell one signal, \
+                1 is Cells.CellVoltage1 and Cells.CellVoltage1";
+    assert!(all.contains(&cell.to_owned()), "{all:#?}");
+}
+
+#[test]
+fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
+    let pack =
+        pack_with("cells = 4", "cells = 0\nx = 1").replace("\"charge\"", "\"in\"") + "[recharge]\nto_soc = 0.1\n";
+    let cell = CELL.replace("capacity_ah = 1.9", "capacity_ah = 0").replace("[0, 0.5, 1]", "[0, 0.5, 0.5]");
+    let dbc = DBC.replace("BO_ 272 Cells: 8 A", "BO_ 4000 Cells: 8 A");
+    let all = load_texts(&pack, &cell, &dbc).unwrap_err();
+    let expected = [
+        "pack.toml:2: pack.cells = 0, must be 1 to 1024",
+        "pack.toml:3: pack.x is not a known key",
+        "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
+        "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",
+        "cell.toml:4: capacity_ah = 0, must be above 0 and at most 100000",
+        "cell.toml:10: tables.soc = [0, 0.5, 0.5], must begin with 0 and end with 1",
+        "cell.toml:10: tables.soc: 0.5 follows 0.5, must rise strictly",
+        "pack.dbc:9: identifier 4000, must be 0 to 2047, or have bit 31 set for an extended one",
+    ];
+    assert_eq!(all, expected);
+}
+
+#[test]
+fn faults_of_a_cell_model() {
+    let table: &[(&str, &str, &str)] = &[
+        ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
+        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a text that is not empty"),
+        (
+            "capacity_ah = 1.9",
+            "capacity_ah = -1.9",
+            "cell.toml:4: capacity_ah = -1.9, must be above 0 and at most 100000",
+        ),
+        (
+            "voltage_max_v = 4.2",
+            "voltage_max_v = 2.5",
+            "cell.toml:6: voltage_max_v = 2.5, must be above voltage_min_v = 2.5",
+        ),
+        (
+            "[3.0, 3.6, 4.1]",
+            "[3.0, 3.6, 3.6]",
+            "cell.toml:12: tables.ocv_v: 3.6 follows 3.6 at 10 degrees C, must rise strictly with soc",
+        ),
+        ("[3.0, 3.6, 4.1]", "[3.0, 3.6]", "cell.toml:12: tables.ocv_v: row 1 has 2 values, must be 3, one per soc"),
+        ("[[3.0, 3.6, 4.1], ", "[", "cell.toml:12: tables.ocv_v: 1 rows, must be 2, one per temperature_c"),
+        ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0 and at most 100"),
+        ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be above 0"),
+        ("[[100, 100, 100]", "[[100, 0, 100]", "cell.toml:16: tables.branches[1].c_farad = 0, must be above 0"),
+        (
+            "c_farad = [[100, 100, 100], ",
+            "c_farad = [",
+            "cell.toml:16: tables.branches[1].c_farad: 1 rows, must be 2, one per temperature_c",
+        ),
+        (
+            "temperature_c = [10, 30]",
+            "temperature_c = [30, 10]",
+            "cell.toml:11: tables.temperature_c: 10 follows 30, must rise strictly",
+        ),
+        (
+            "[provenance]",
+            "[thermal]\nheat_capacity_j_per_k = 1\nresistance_k_per_w = 0\n[provenance]",
+            "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
+        ),
+        ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
+    ];
+    for (from, to, fault) in table {
+        assert!(CELL.contains(from), "{from}");
+        assert_eq!(load_texts(PACK, &CELL.replacen(from, to, 1), DBC).unwrap_err(), [*fault], "{from} -> {to}");
+    }
+    let branch = "[[tables.branches]]\nr_ohm = [[1, 1, 1], [1, 1, 1]]\nc_farad = [[1, 1, 1], [1, 1, 1]]\n";
+    let four = load_texts(PACK, &format!("{CELL}{}", branch.repeat(3)), DBC).unwrap_err();
+    assert_eq!(four, ["cell.toml:14: tables.branches: 4 tables [[tables.branches]], must be 1 to 3"]);
+    let none = load_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
+    assert_eq!(none, ["cell.toml:9: tables.branches: 0 tables [[tables.branches]], must be 1 to 3"]);
+}
+
+#[test]
+fn text_that_is_not_utf_8_is_refused_with_its_line() {
+    let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
+    assert_eq!(load_with(Path::new("pack.toml"), &read).unwrap_err().0, ["pack.toml:2: is not UTF-8 text"]);
+}
+
+#[test]
+fn every_default_is_a_value_its_key_allows() {
+    use super::schema::Presence;
+    for info in keys::SECTIONS.iter().chain(cell_model::SECTIONS) {
+        for key in info.keys.unwrap_or(&[]) {
+            assert!(!key.about.trim().is_empty() && key.about.trim().ends_with('.'), "{}.{}", info.path, key.name);
+            if key.presence == Presence::Optional {
+                assert!(
+                    key.about.contains("ithout it")
+                        || info.path.is_empty()
+                        || key.about.contains("Needed")
+                        || key.about.contains("threshold"),
+                    "{}.{} says what holds without it",
+                    info.path,
+                    key.name
+                );
+            }
+        }
+    }
+    // The good file leaves every default in place: one that could not be read would have failed it.
+    good(PACK);
+}
+
+#[test]
+fn the_reference_page_is_the_one_in_the_repository() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/REFERENCE.md");
+    let page = std::fs::read_to_string(path).unwrap();
+    assert!(page == reference(), "write it anew: packwatch check --reference > config/REFERENCE.md");
+    for key in keys::SECTIONS.iter().chain(cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
+        assert!(page.contains(&format!("| `{}` |", key.name)), "{}", key.name);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2000))]
+
+    /// Pieces cut out, doubled, swapped or overwritten: faults or a configuration, never a panic, never an empty list.
+    #[test]
+    fn any_mutilated_file_gives_faults_or_a_configuration(
+        edits in prop::collection::vec((0..3_usize, any::<prop::sample::Index>(), 0..24_usize, any::<prop::sample::Index>()), 1..6),
+    ) {
+        const SCRAPS: [&str; 14] = [
+            "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
+        ];
+        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nthreshold = 1\n[output]\nstatus_id = 1\n");
+        let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
+        for (file, place, length, scrap) in edits {
+            let text = &mut texts[file];
+            let from = place.index(text.len() + 1);
+            let to = (from + length).min(text.len());
+            text.splice(from..to, SCRAPS[scrap.index(SCRAPS.len())].chars());
+        }
+        let texts = texts.map(|chars| chars.into_iter().collect::<String>());
+        if let Err(faults) = load_texts(&texts[0], &texts[1], &texts[2]) {
+            prop_assert!(!faults.is_empty());
+            for fault in faults {
+                prop_assert!(!fault.contains('\n') && !fault.contains("not usable"), "{fault}");
+            }
+        }
+    }
+}
