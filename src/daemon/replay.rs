@@ -1,0 +1,590 @@
+//! The replay loop: records in, the core stepped, results written, a summary at the end.
+//!
+//! Promise: the same logs and configuration give the same result files, byte for byte; a journal gives what the run
+//! that wrote it gave. Plain logs and CSV get the ticks of [`Ticks`]; journals carry their own. Wall time is read
+//! only to pace (`speed`) and to report.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use serde::Serialize;
+
+use crate::can::Frame;
+use crate::cell::MAX_BRANCHES;
+use crate::io::candump::{self, StampDigits};
+use crate::io::log::{LogCounts, LogError, LogSource, Record};
+use crate::io::result_file::ResultFile;
+use crate::io::ticks::Ticks;
+use crate::monitor::{
+    Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS, Transmit,
+};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
+
+/// Records between two looks at the clock for the progress report.
+const REPORT_EVERY: u64 = 4096;
+/// Raised alarms listed one by one in the summary; all are counted.
+const MAX_LISTED_ALARMS: usize = 1000;
+
+/// A moment of the log as the user gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum When {
+    /// A stamp on the log's own clock.
+    At(Timestamp),
+    /// Nanoseconds after the log's first record.
+    After(i64),
+}
+
+impl When {
+    fn resolve(self, first: Timestamp) -> Timestamp {
+        match self {
+            Self::At(time) => time,
+            Self::After(nanos) => first.plus_nanos(nanos),
+        }
+    }
+}
+
+/// How to replay.
+#[derive(Debug)]
+pub struct Settings {
+    /// Times real time; `None` = as fast as possible.
+    pub speed: Option<f64>,
+    /// Records before this are left out.
+    pub from: Option<When>,
+    /// Records after this are left out.
+    pub until: Option<When>,
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub sleep_gap_s: f64,
+    /// Whether a snapshot is wanted.
+    pub snapshot: bool,
+    /// When it is taken; `None` = at the end.
+    pub snapshot_at: Option<When>,
+    /// State to start from.
+    pub restore: Option<Snapshot>,
+    /// Names of the interfaces, for the frames that would be sent.
+    pub interfaces: Vec<String>,
+}
+
+/// Files that results go to.
+#[derive(Debug, Default)]
+pub struct Sinks {
+    /// CSV, a row per estimate.
+    pub estimates: Option<ResultFile>,
+    /// A JSON document per line and event.
+    pub events: Option<ResultFile>,
+    /// candump lines of what would be sent.
+    pub frames: Option<ResultFile>,
+}
+
+/// Why a replay ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// A log cannot be read on.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// A result cannot be written.
+    #[error(transparent)]
+    Write(#[from] io::Error),
+    /// The snapshot does not fit.
+    #[error(transparent)]
+    Restore(#[from] RestoreError),
+    /// The moment of the snapshot lies beyond the log.
+    #[error("no snapshot taken: the log ends at {end_s} s, before the moment asked for")]
+    SnapshotNotReached {
+        /// The log's last stamp.
+        end_s: f64,
+    },
+}
+
+/// For the progress bar.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress {
+    /// Bytes of the logs read.
+    pub bytes: u64,
+    /// Frames handed to the core.
+    pub frames: u64,
+    /// Times real time so far.
+    pub times_real_time: f64,
+}
+
+/// A cell at the end.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CellSummary {
+    /// Counted from 0.
+    pub cell: u16,
+    /// Fraction.
+    pub soc: f64,
+    /// Fraction.
+    pub soc_std: f64,
+    /// Ah.
+    pub capacity_ah: f64,
+    /// Ah.
+    pub capacity_std_ah: f64,
+    /// Ah, after the last capacity update; `None` = unknown.
+    pub usable_capacity_ah: Option<f64>,
+    /// Ah.
+    pub usable_capacity_std_ah: Option<f64>,
+    /// Relative to new.
+    pub resistance_ratio: f64,
+    /// Relative to new.
+    pub resistance_ratio_std: f64,
+}
+
+/// What a replay came to.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Summary {
+    /// What was read.
+    #[serde(flatten)]
+    pub log: LogCounts,
+    /// Records outside `from` and `until`.
+    pub skipped_records: u64,
+    /// Ticks handed to the core.
+    pub ticks: u64,
+    /// Estimates made (counted only when written).
+    pub estimates: u64,
+    /// Frames that would be sent.
+    pub frames_out: u64,
+    /// Bad readings of signals that came back to good.
+    pub bad_readings: u64,
+    /// Events by kind.
+    pub events: BTreeMap<&'static str, u64>,
+    /// The first 1,000 alarms raised.
+    pub alarms_raised: Vec<Event>,
+    /// The cells at the end.
+    pub cells: Vec<CellSummary>,
+    /// First stamp, s.
+    pub first_s: Option<f64>,
+    /// Last stamp, s.
+    pub last_s: Option<f64>,
+    /// Time awake within the record, s: holes longer than the sleep gap do not count.
+    pub awake_s: f64,
+    /// Wall time, s.
+    pub wall_s: f64,
+    /// Awake time over wall time.
+    pub times_real_time: f64,
+    /// Peak resident memory, KiB, where the system tells.
+    pub peak_memory_kib: Option<u64>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// Replays `source` through a monitor that has had no input; gives the summary and the snapshot, if one was wanted.
+///
+/// # Errors
+/// When a log cannot be read, a result cannot be written, or a snapshot does not fit or was not reached.
+pub fn run(
+    source: &mut LogSource,
+    monitor: Monitor,
+    sinks: Sinks,
+    settings: Settings,
+    report: &mut dyn FnMut(Progress),
+) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+    let mut replay = Replay::new(monitor, sinks, settings)?;
+    let mut records: u64 = 0;
+    while let Some(record) = source.next()? {
+        if !replay.take(&record, source.carries_ticks())? {
+            break;
+        }
+        records += 1;
+        if records.is_multiple_of(REPORT_EVERY) || replay.pace.speed.is_some() {
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            report(Progress { bytes, frames: source.counts().frames, times_real_time: replay.span.times_real_time() });
+        }
+    }
+    replay.finish(source.counts())
+}
+
+/// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
+///
+/// # Errors
+/// When a log cannot be read or `send` fails.
+pub fn play(
+    source: &mut LogSource,
+    settings: &Settings,
+    send: &mut dyn FnMut(BusIndex, &Frame) -> io::Result<()>,
+    report: &mut dyn FnMut(Progress),
+) -> Result<u64, ReplayError> {
+    let (mut span, mut pace, mut window) = (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
+    let mut sent = 0;
+    while let Some(record) = source.next()? {
+        match window.judge(record.time()) {
+            Place::Before => continue,
+            Place::After => break,
+            Place::Inside => {}
+        }
+        if span.advance(record.time()) || matches!(record, Record::UnknownGap { .. }) {
+            pace.rebase();
+        }
+        if let Record::Frame { time, bus, frame } = &record {
+            pace.wait(*time);
+            send(*bus, frame)?;
+            sent += 1;
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            report(Progress { bytes, frames: sent, times_real_time: span.times_real_time() });
+        }
+    }
+    Ok(sent)
+}
+
+/// The loop's state.
+struct Replay {
+    monitor: Monitor,
+    out: Outputs,
+    ticks: Ticks,
+    pace: Pace,
+    span: Span,
+    window: Window,
+    sinks: Sinks,
+    settings: Settings,
+    /// When the snapshot is due, once the first stamp is known.
+    snapshot_at: Option<Timestamp>,
+    snapshot: Option<Snapshot>,
+    summary: Summary,
+    usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+}
+
+impl Replay {
+    fn new(monitor: Monitor, mut sinks: Sinks, settings: Settings) -> io::Result<Self> {
+        if let Some(file) = &mut sinks.estimates {
+            write_estimates_header(file)?;
+        }
+        let out = Outputs { want_estimates: sinks.estimates.is_some(), ..Outputs::default() };
+        Ok(Self {
+            monitor,
+            out,
+            ticks: Ticks::new(TICK_PERIOD_MS, settings.sleep_gap_s),
+            pace: Pace::new(settings.speed),
+            span: Span::new(settings.sleep_gap_s),
+            window: Window::new(&settings),
+            sinks,
+            settings,
+            snapshot_at: None,
+            snapshot: None,
+            summary: Summary::default(),
+            usable: BTreeMap::new(),
+        })
+    }
+
+    /// One record; `false` when the rest of the log is not wanted.
+    fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
+        let time = record.time();
+        match self.window.judge(time) {
+            Place::Before => {
+                self.summary.skipped_records += 1;
+                return Ok(true);
+            }
+            Place::After => return Ok(false),
+            Place::Inside => {}
+        }
+        if self.span.first.is_none() {
+            self.begin(record)?;
+        }
+        let unknown_gap = matches!(record, Record::UnknownGap { .. });
+        if self.span.advance(time) || unknown_gap {
+            self.pace.rebase();
+        }
+        if unknown_gap || carries_ticks {
+            self.ticks.sleep();
+        } else {
+            self.ticks.advance(time);
+        }
+        self.make_ticks()?;
+        match record.input() {
+            Some(input) => self.feed(input)?,
+            None => {}
+        }
+        Ok(true)
+    }
+
+    /// The first record of all.
+    fn begin(&mut self, record: &Record) -> Result<(), ReplayError> {
+        let first = self.window.first.unwrap_or(record.time());
+        self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
+        let recorded = match record {
+            Record::Restore { away_s, .. } => Some(*away_s),
+            _ => None,
+        };
+        match (self.settings.restore.take(), recorded) {
+            (Some(snapshot), recorded) => self.monitor.restore(snapshot, recorded.flatten())?,
+            (None, Some(_)) => self.summary.notes.push(
+                "the recorded run began from a stored state: without --restore its results differ".to_owned(),
+            ),
+            (None, None) => {}
+        }
+        Ok(())
+    }
+
+    fn make_ticks(&mut self) -> Result<(), ReplayError> {
+        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+            self.feed(Input::Tick { time })?;
+        }
+        Ok(())
+    }
+
+    fn feed(&mut self, input: Input<'_>) -> Result<(), ReplayError> {
+        if self.snapshot_at.is_some_and(|at| input.time() > at) {
+            self.snapshot_at = None;
+            self.snapshot = Some(self.monitor.snapshot());
+        }
+        self.pace.wait(input.time());
+        self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
+        self.monitor.handle(input, &mut self.out);
+        self.write_out()?;
+        Ok(())
+    }
+
+    fn write_out(&mut self) -> io::Result<()> {
+        let out = &mut self.out;
+        if let Some(file) = &mut self.sinks.estimates {
+            self.summary.estimates += out.estimates.len() as u64;
+            out.estimates.iter().try_for_each(|estimate| write_estimate(file, estimate))?;
+        }
+        for event in &out.events {
+            note_event(&mut self.summary, &mut self.usable, event);
+            if let Some(file) = &mut self.sinks.events {
+                serde_json::to_writer(&mut *file, event)?;
+                file.write_all(b"\n")?;
+            }
+        }
+        self.summary.frames_out += out.frames.len() as u64;
+        if let Some(file) = &mut self.sinks.frames {
+            let interfaces = &self.settings.interfaces;
+            out.frames.iter().try_for_each(|transmit| write_frame(file, interfaces, transmit))?;
+        }
+        out.clear();
+        if self.pace.speed.is_some() {
+            self.sinks.flush()?;
+        }
+        Ok(())
+    }
+
+    fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+        self.ticks.sleep();
+        self.make_ticks()?;
+        if self.settings.snapshot && self.snapshot.is_none() {
+            // A moment within the last record's tick period was reached as well.
+            let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
+            let end_s = self.span.latest.map_or(f64::NAN, Timestamp::secs);
+            if !reached {
+                return Err(ReplayError::SnapshotNotReached { end_s });
+            }
+            self.snapshot = Some(self.monitor.snapshot());
+        }
+        for file in [self.sinks.estimates, self.sinks.events, self.sinks.frames].into_iter().flatten() {
+            file.finish()?;
+        }
+        let (span, mut summary) = (self.span, self.summary);
+        summary.log = counts.clone();
+        summary.cells = cell_summaries(&self.monitor, &self.usable);
+        summary.first_s = span.first.map(Timestamp::secs);
+        summary.last_s = span.latest.map(Timestamp::secs);
+        summary.awake_s = span.awake_s();
+        summary.wall_s = span.started.elapsed().as_secs_f64();
+        summary.times_real_time = span.times_real_time();
+        summary.peak_memory_kib = peak_memory_kib();
+        if counts.frames == 0 && !counts.foreign.is_empty() {
+            let names: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
+            let configured = self.settings.interfaces.join(", ");
+            summary.notes.push(format!("no frame used: the log has {}, configured is {configured}", names.join(", ")));
+        }
+        Ok((summary, self.snapshot))
+    }
+}
+
+impl Sinks {
+    /// At a pace somebody may be watching: nothing stays in a buffer.
+    fn flush(&mut self) -> io::Result<()> {
+        [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
+    }
+}
+
+fn cell_summaries(
+    monitor: &Monitor,
+    usable: &BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+) -> Vec<CellSummary> {
+    let of = |estimate: &Estimate| {
+        let (usable_capacity_ah, usable_capacity_std_ah) = usable.get(&estimate.cell).copied().unwrap_or_default();
+        CellSummary {
+            cell: estimate.cell.0,
+            soc: estimate.soc,
+            soc_std: estimate.soc_std,
+            capacity_ah: estimate.capacity_ah,
+            capacity_std_ah: estimate.capacity_std_ah,
+            usable_capacity_ah,
+            usable_capacity_std_ah,
+            resistance_ratio: estimate.resistance_ratio,
+            resistance_ratio_std: estimate.resistance_ratio_std,
+        }
+    };
+    monitor.latest().flatten().map(of).collect()
+}
+
+fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>, event: &Event) {
+    let name = match event.kind {
+        EventKind::Mode { .. } => "mode",
+        EventKind::HalfCycle { .. } => "half_cycle",
+        EventKind::Capacity { cell, usable_capacity_ah, usable_capacity_std_ah, .. } => {
+            usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
+            "capacity"
+        }
+        EventKind::RechargePeriod { .. } => "recharge_period",
+        EventKind::Alarm { active, .. } => {
+            if active && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
+                summary.alarms_raised.push(*event);
+            }
+            if active { "alarm_raised" } else { "alarm_cleared" }
+        }
+        EventKind::SignalBad { .. } => "signal_bad",
+        EventKind::SignalGood { bad_readings, .. } => {
+            summary.bad_readings += bad_readings;
+            "signal_good"
+        }
+        EventKind::Bus { .. } => "bus",
+        EventKind::Gap { .. } => "gap",
+        EventKind::TimeBackwards { .. } => "time_backwards",
+        EventKind::FilterReset { .. } => "filter_reset",
+        EventKind::Trust { .. } => "trust",
+    };
+    *summary.events.entry(name).or_default() += 1;
+}
+
+fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
+    write!(out, "time_s,cell,soc,soc_std")?;
+    (1..=MAX_BRANCHES).try_for_each(|n| write!(out, ",u{n}_v"))?;
+    writeln!(
+        out,
+        ",capacity_ah,capacity_std_ah,resistance_ratio,resistance_ratio_std,innovation_v,innovation_std_v,accepted,\
+         voltage_v,current_a,temperature_c"
+    )
+}
+
+/// One row; floats in the shortest form that reads back the same, nothing for NaN.
+fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::Result<()> {
+    let e = estimate;
+    let nanos = e.time.nanos();
+    let (sign, nanos) = (if nanos < 0 { "-" } else { "" }, nanos.unsigned_abs());
+    write!(out, "{sign}{}.{:09},{}", nanos / 1_000_000_000, nanos % 1_000_000_000, e.cell.0)?;
+    [e.soc, e.soc_std].into_iter().chain(e.branch_v).try_for_each(|value| write_value(out, value))?;
+    let filter = [
+        e.capacity_ah,
+        e.capacity_std_ah,
+        e.resistance_ratio,
+        e.resistance_ratio_std,
+        e.innovation_v,
+        e.innovation_std_v,
+    ];
+    filter.into_iter().try_for_each(|value| write_value(out, value))?;
+    write!(out, ",{}", e.accepted)?;
+    [e.voltage_v, e.current_a, e.temperature_c].into_iter().try_for_each(|value| write_value(out, value))?;
+    out.write_all(b"\n")
+}
+
+fn write_value(out: &mut impl Write, value: f64) -> io::Result<()> {
+    if value.is_nan() { out.write_all(b",") } else { write!(out, ",{value:?}") }
+}
+
+fn write_frame(out: &mut impl Write, interfaces: &[String], transmit: &Transmit) -> io::Result<()> {
+    let interface = interfaces.get(transmit.bus.index()).map_or("unknown", String::as_str);
+    candump::write_line(out, transmit.time, StampDigits::Nanos, interface, &transmit.frame)
+}
+
+/// Which records are wanted.
+struct Window {
+    from: Option<When>,
+    until: Option<When>,
+    /// The log's first stamp, wanted or not.
+    first: Option<Timestamp>,
+}
+
+enum Place {
+    Before,
+    Inside,
+    After,
+}
+
+impl Window {
+    fn new(settings: &Settings) -> Self {
+        Self { from: settings.from, until: settings.until, first: None }
+    }
+
+    fn judge(&mut self, time: Timestamp) -> Place {
+        let first = *self.first.get_or_insert(time);
+        if self.from.is_some_and(|from| time < from.resolve(first)) {
+            Place::Before
+        } else if self.until.is_some_and(|until| time > until.resolve(first)) {
+            Place::After
+        } else {
+            Place::Inside
+        }
+    }
+}
+
+/// How much time the record covers, and how long that took here.
+struct Span {
+    sleep_gap_s: f64,
+    first: Option<Timestamp>,
+    latest: Option<Timestamp>,
+    /// Nanoseconds, so that the sum of millions of steps is exact.
+    awake_ns: i64,
+    started: Instant,
+}
+
+impl Span {
+    fn new(sleep_gap_s: f64) -> Self {
+        Self { sleep_gap_s, first: None, latest: None, awake_ns: 0, started: Instant::now() }
+    }
+
+    /// Notes a record; whether it follows a hole.
+    fn advance(&mut self, time: Timestamp) -> bool {
+        self.first.get_or_insert(time);
+        let latest = *self.latest.get_or_insert(time);
+        let asleep = time.since(latest) > self.sleep_gap_s;
+        if time > latest {
+            self.latest = Some(time);
+            self.awake_ns += if asleep { 0 } else { time.nanos().saturating_sub(latest.nanos()) };
+        }
+        asleep
+    }
+
+    fn awake_s(&self) -> f64 {
+        self.awake_ns as f64 * 1e-9
+    }
+
+    fn times_real_time(&self) -> f64 {
+        self.awake_s() / self.started.elapsed().as_secs_f64().max(1e-9)
+    }
+}
+
+/// Holds the replay to a multiple of real time by deadlines, so that lateness does not add up.
+struct Pace {
+    speed: Option<f64>,
+    anchor: Option<(Instant, Timestamp)>,
+}
+
+impl Pace {
+    fn new(speed: Option<f64>) -> Self {
+        Self { speed, anchor: None }
+    }
+
+    /// Time starts anew with the next record: holes and unknown gaps are not waited out.
+    fn rebase(&mut self) {
+        self.anchor = None;
+    }
+
+    fn wait(&mut self, time: Timestamp) {
+        let Some(speed) = self.speed else { return };
+        let (began, origin) = *self.anchor.get_or_insert_with(|| (Instant::now(), time));
+        let due = Duration::try_from_secs_f64(time.since(origin) / speed).unwrap_or_default();
+        let ahead = due.saturating_sub(began.elapsed());
+        if !ahead.is_zero() {
+            std::thread::sleep(ahead);
+        }
+    }
+}
+
+/// VmHWM of /proc/self/status.
+fn peak_memory_kib() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()
+}

@@ -1,0 +1,207 @@
+//! Lines of a file, plain, gzip or zstd, read in large blocks and lent without copying.
+//!
+//! The compression is told by the content, never by the name. A line longer than the block is handed on as
+//! [`RawLine::TooLong`] and skipped to its end. Bytes taken from the file are counted for the progress bar.
+
+use std::fs::File;
+use std::io::{self, Cursor, Read};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// Bytes asked of the file or decompressor at once; also the longest line taken. A CAN XL line has 4,200.
+const BLOCK: usize = 256 * 1024;
+
+/// One line without its line feed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RawLine<'a> {
+    /// A whole line.
+    Whole(&'a [u8]),
+    /// The file's last line, which has no line feed: perhaps torn.
+    Last(&'a [u8]),
+    /// A line longer than 256 KiB; it was skipped.
+    TooLong,
+}
+
+/// Opens a log: `-` is standard input; gzip and zstd are unpacked. `read_bytes` counts what the file gave.
+///
+/// # Errors
+/// When the file cannot be opened or its first bytes cannot be read.
+pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
+    let raw: Box<dyn Read> = if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
+    let mut counted = Counted { inner: raw, bytes: Arc::clone(read_bytes) };
+    let mut magic = Vec::with_capacity(4);
+    (&mut counted).take(4).read_to_end(&mut magic)?;
+    let (gzip, zstd) = (magic.starts_with(&[0x1F, 0x8B]), magic == [0x28, 0xB5, 0x2F, 0xFD]);
+    let whole = Cursor::new(magic).chain(counted);
+    if gzip {
+        Ok(Box::new(flate2::bufread::MultiGzDecoder::new(io::BufReader::with_capacity(BLOCK, whole))))
+    } else if zstd {
+        Ok(Box::new(zstd::stream::read::Decoder::new(whole)?))
+    } else {
+        Ok(Box::new(whole))
+    }
+}
+
+struct Counted {
+    inner: Box<dyn Read>,
+    bytes: Arc<AtomicU64>,
+}
+
+impl Read for Counted {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.inner.read(buffer)?;
+        self.bytes.fetch_add(count as u64, Ordering::Relaxed);
+        Ok(count)
+    }
+}
+
+/// Reads a source line by line.
+pub struct Lines {
+    source: Box<dyn Read>,
+    buffer: Vec<u8>,
+    /// Unread part of the buffer.
+    start: usize,
+    end: usize,
+    number: u64,
+    ended: bool,
+}
+
+impl std::fmt::Debug for Lines {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Lines").field("number", &self.number).finish_non_exhaustive()
+    }
+}
+
+impl Lines {
+    /// Lines of `source`.
+    pub fn new(source: Box<dyn Read>) -> Self {
+        Self { source, buffer: vec![0; BLOCK], start: 0, end: 0, number: 0, ended: false }
+    }
+
+    /// Number of the line last handed out, from 1.
+    pub fn number(&self) -> u64 {
+        self.number
+    }
+
+    /// The next line, or `None` at the end.
+    ///
+    /// # Errors
+    /// Those of the source: a damaged compressed file, say.
+    pub fn next(&mut self) -> io::Result<Option<RawLine<'_>>> {
+        let mut searched = self.start;
+        let mut too_long = false;
+        loop {
+            if let Some(offset) = memchr::memchr(b'\n', &self.buffer[searched..self.end]) {
+                let line = self.start..searched + offset;
+                self.start = line.end + 1;
+                self.number += 1;
+                return Ok(Some(if too_long { RawLine::TooLong } else { RawLine::Whole(&self.buffer[line]) }));
+            }
+            if self.end - self.start == self.buffer.len() {
+                too_long = true;
+                self.start = self.end;
+            }
+            self.make_room();
+            searched = self.end;
+            if !self.fill()? {
+                return Ok(self.last(too_long));
+            }
+        }
+    }
+
+    /// The first line without taking it (the line feed stripped where there is one).
+    ///
+    /// # Errors
+    /// Those of the source.
+    pub fn peek(&mut self) -> io::Result<&[u8]> {
+        loop {
+            let unread = self.start..self.end;
+            if let Some(offset) = memchr::memchr(b'\n', &self.buffer[unread.clone()]) {
+                return Ok(&self.buffer[unread.start..unread.start + offset]);
+            }
+            if unread.len() == self.buffer.len() || !self.fill()? {
+                return Ok(&self.buffer[self.start..self.end]);
+            }
+        }
+    }
+
+    /// What is unread, then the rest of the source, as one reader.
+    pub fn into_reader(self) -> impl Read {
+        Cursor::new(self.buffer[self.start..self.end].to_vec()).chain(self.source)
+    }
+
+    fn make_room(&mut self) {
+        self.buffer.copy_within(self.start..self.end, 0);
+        self.end -= self.start;
+        self.start = 0;
+    }
+
+    /// Reads more; `false` at the end of the source.
+    fn fill(&mut self) -> io::Result<bool> {
+        if self.ended {
+            return Ok(false);
+        }
+        let count = loop {
+            match self.source.read(&mut self.buffer[self.end..]) {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => {
+                    self.ended = true;
+                    return Err(error);
+                }
+                Ok(count) => break count,
+            }
+        };
+        self.end += count;
+        self.ended = count == 0;
+        Ok(count > 0)
+    }
+
+    fn last(&mut self, too_long: bool) -> Option<RawLine<'_>> {
+        let line = self.start..self.end;
+        self.start = self.end;
+        if line.is_empty() && !too_long {
+            return None;
+        }
+        self.number += 1;
+        Some(if too_long { RawLine::TooLong } else { RawLine::Last(&self.buffer[line]) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn all(text: &[u8]) -> Vec<(usize, bool)> {
+        let mut lines = Lines::new(Box::new(Cursor::new(text.to_vec())));
+        let mut seen = Vec::new();
+        while let Some(line) = lines.next().expect("memory reads") {
+            seen.push(match line {
+                RawLine::Whole(bytes) => (bytes.len(), true),
+                RawLine::Last(bytes) => (bytes.len(), false),
+                RawLine::TooLong => (usize::MAX, false),
+            });
+        }
+        seen
+    }
+
+    #[test]
+    fn a_last_line_without_line_feed_is_told_apart() {
+        assert_eq!(all(b"ab\n\nc"), [(2, true), (0, true), (1, false)]);
+        assert_eq!(all(b""), []);
+    }
+
+    #[test]
+    fn a_line_longer_than_the_block_is_skipped_and_the_next_is_whole() {
+        let mut text = vec![b'x'; 3 * BLOCK + 5];
+        text.extend(b"\nshort\n");
+        assert_eq!(all(&text), [(usize::MAX, false), (5, true)]);
+    }
+
+    #[test]
+    fn lines_across_block_borders_are_whole() {
+        let text: Vec<u8> = (0..100_000).flat_map(|n| format!("{n}\n").into_bytes()).collect();
+        let lengths: Vec<_> = (0..100_000).map(|n| (n.to_string().len(), true)).collect();
+        assert_eq!(all(&text), lengths);
+    }
+}

@@ -1,0 +1,128 @@
+//! Files a command writes: complete or not at all, and every failure told.
+//!
+//! A regular file is written beside its place as `NAME.part` and renamed when it is complete; given up, nothing is
+//! left. `-` is standard output, and a device or pipe is written straight to.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+/// Bytes collected before the operating system is asked.
+const BUFFER: usize = 256 * 1024;
+
+/// A file being written.
+#[derive(Debug)]
+pub struct ResultFile {
+    path: PathBuf,
+    /// Where it is written until it is complete; `None` = in place.
+    part: Option<PathBuf>,
+    out: BufWriter<Target>,
+}
+
+#[derive(Debug)]
+enum Target {
+    Stdout(io::Stdout),
+    File(File),
+}
+
+impl Write for Target {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Self::Stdout(out) => out.write(bytes),
+            Self::File(out) => out.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Stdout(out) => out.flush(),
+            Self::File(out) => out.flush(),
+        }
+    }
+}
+
+impl ResultFile {
+    /// Begins to write `path`.
+    ///
+    /// # Errors
+    /// When it cannot be created; the message names it.
+    pub fn create(path: &Path) -> io::Result<Self> {
+        let (target, part) = if path == Path::new("-") {
+            (Target::Stdout(io::stdout()), None)
+        } else if fs::metadata(path).is_ok_and(|m| !m.is_file()) {
+            (Target::File(fs::OpenOptions::new().write(true).open(path).map_err(|e| named(path, e))?), None)
+        } else {
+            let mut part = path.as_os_str().to_owned();
+            part.push(".part");
+            (Target::File(File::create(&part).map_err(|e| named(path, e))?), Some(PathBuf::from(part)))
+        };
+        Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(BUFFER, target) })
+    }
+
+    /// Completes the file: everything written, on the disk, under its name.
+    ///
+    /// # Errors
+    /// Disk full and the like; the message names the file.
+    pub fn finish(mut self) -> io::Result<()> {
+        self.out.flush().map_err(|e| named(&self.path, e))?;
+        let Some(part) = self.part.as_ref() else { return Ok(()) };
+        if let Target::File(file) = self.out.get_ref() {
+            file.sync_data().map_err(|e| named(&self.path, e))?;
+        }
+        fs::rename(part, &self.path).map_err(|e| named(&self.path, e))?;
+        self.part = None;
+        Ok(())
+    }
+}
+
+impl Write for ResultFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.out.write(bytes).map_err(|e| named(&self.path, e))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.flush().map_err(|e| named(&self.path, e))
+    }
+}
+
+impl Drop for ResultFile {
+    fn drop(&mut self) {
+        if let Some(part) = &self.part {
+            // Given up: what is not complete is not left behind. A failure here has nobody to be told.
+            let _ = fs::remove_file(part);
+        }
+    }
+}
+
+/// The error with the file's name; its kind is kept, so that a closed pipe is still known as one.
+fn named(path: &Path, error: io::Error) -> io::Error {
+    if error.kind() == io::ErrorKind::Interrupted {
+        return error;
+    }
+    io::Error::new(error.kind(), format!("{}: cannot be written: {error}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_given_up_leaves_the_old_one_and_no_part() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("out.csv");
+        fs::write(&path, "old").expect("written");
+        let mut file = ResultFile::create(&path).expect("created");
+        file.write_all(b"new").expect("buffered");
+        drop(file);
+        assert_eq!(fs::read_to_string(&path).expect("readable"), "old");
+        assert_eq!(fs::read_dir(folder.path()).expect("readable").count(), 1);
+    }
+
+    #[test]
+    fn a_full_disk_is_an_error_that_names_the_file() {
+        let mut file = ResultFile::create(Path::new("/dev/full")).expect("opened");
+        file.write_all(b"x").expect("buffered");
+        let error = file.finish().expect_err("no room");
+        assert!(error.to_string().starts_with("/dev/full: cannot be written"), "{error}");
+    }
+}

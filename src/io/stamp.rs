@@ -1,0 +1,108 @@
+//! Points in time as people and tables write them: seconds, or ISO 8601 dates taken as UTC.
+
+use crate::quantity::Timestamp;
+
+/// Reads decimal seconds (`12.5`, `-3`, `1e3`) without losing digits; `None` when it is no finite number.
+pub fn parse_seconds(text: &[u8]) -> Option<Timestamp> {
+    let text = text.trim_ascii();
+    parse_exact(text).or_else(|| {
+        let value: f64 = std::str::from_utf8(text).ok()?.parse().ok()?;
+        value.is_finite().then(|| Timestamp::from_secs(value))
+    })
+}
+
+/// Digits with at most nine decimals, exact; `None` for every other form.
+fn parse_exact(text: &[u8]) -> Option<Timestamp> {
+    let (negative, digits) = match text.strip_prefix(b"-") {
+        Some(rest) => (true, rest),
+        None => (false, text),
+    };
+    let point = digits.iter().position(|&b| b == b'.').unwrap_or(digits.len());
+    let fraction = digits.get(point + 1..).unwrap_or_default();
+    if digits.is_empty() || point > 9 + 1 || fraction.len() > 9 || (point == 0 && fraction.is_empty()) {
+        return None;
+    }
+    let mut nanos: i64 = 0;
+    let padding = 9 - fraction.len();
+    for &byte in digits[..point].iter().chain(fraction) {
+        let digit = byte.checked_sub(b'0').filter(|&d| d < 10)?;
+        nanos = nanos.checked_mul(10)?.checked_add(i64::from(digit))?;
+    }
+    nanos = nanos.checked_mul(10i64.pow(padding as u32))?;
+    Some(Timestamp::from_nanos(if negative { -nanos } else { nanos }))
+}
+
+/// Reads `2008-04-02T13:08:17.921` (a space for the T, a final Z and missing seconds allowed) as UTC, or seconds.
+pub fn parse_stamp(text: &str) -> Option<Timestamp> {
+    let text = text.trim();
+    match text.split_once(['T', ' ']) {
+        Some((date, time)) => parse_iso(date, time.strip_suffix('Z').unwrap_or(time)),
+        None => parse_seconds(text.as_bytes()),
+    }
+}
+
+fn parse_iso(date: &str, time: &str) -> Option<Timestamp> {
+    let mut parts = date.splitn(3, '-').map(number);
+    let (year, month, day) = (parts.next()??, parts.next()??, parts.next()??);
+    let mut parts = time.splitn(3, ':');
+    let (hour, minute) = (number(parts.next()?)?, number(parts.next()?)?);
+    let seconds = parts.next().map_or(Some(Timestamp::ZERO), |s| parse_exact(s.as_bytes()))?;
+    let sensible = (1..=9999).contains(&year) && (1..=12).contains(&month) && (1..=days_in(year, month)).contains(&day);
+    if !sensible || hour > 23 || minute > 59 || !(0..61_000_000_000).contains(&seconds.nanos()) {
+        return None;
+    }
+    let whole = days_from_epoch(year, month, day) * 86_400 + hour * 3600 + minute * 60;
+    Some(seconds.plus_nanos(whole.checked_mul(1_000_000_000)?))
+}
+
+fn number(text: &str) -> Option<i64> {
+    text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
+}
+
+fn days_in(year: i64, month: i64) -> i64 {
+    match month {
+        4 | 6 | 9 | 11 => 30,
+        2 if year % 4 == 0 && (year % 100 != 0 || year % 400 == 0) => 29,
+        2 => 28,
+        _ => 31,
+    }
+}
+
+/// Days from 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years).
+fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
+    let shifted = if month <= 2 { year - 1 } else { year };
+    let (era, of_era) = (shifted.div_euclid(400), shifted.rem_euclid(400));
+    let of_year = (153 * ((month + 9) % 12) + 2) / 5 + day - 1;
+    era * 146_097 + of_era * 365 + of_era / 4 - of_era / 100 + of_year - 719_468
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_keep_every_digit() {
+        let nanos = |text: &str| parse_seconds(text.as_bytes()).map(Timestamp::nanos);
+        assert_eq!(nanos("1700000000.123456789"), Some(1_700_000_000_123_456_789));
+        assert_eq!(nanos("-0.5"), Some(-500_000_000));
+        assert_eq!(nanos(" 7597.875 "), Some(7_597_875_000_000));
+        assert_eq!(nanos("1e3"), Some(1_000_000_000_000));
+        assert_eq!(nanos(".5"), Some(500_000_000));
+        for bad in ["", "-", ".", "nan", "inf", "1.2.3", "12a", "--1"] {
+            assert_eq!(nanos(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn iso_stamps_are_utc() {
+        // From `date -u -d ... +%s`.
+        let secs = |text: &str| parse_stamp(text).map(|t| t.nanos() / 1_000_000);
+        assert_eq!(secs("2008-04-02T13:08:17.921"), Some(1_207_141_697_921));
+        assert_eq!(secs("1970-01-01 00:00"), Some(0));
+        assert_eq!(secs("2000-02-29T23:59:59Z"), Some(951_868_799_000));
+        assert_eq!(secs("1969-12-31T23:59:59"), Some(-1000));
+        for bad in ["2001-02-29T00:00:00", "2008-13-01T00:00:00", "2008-04-02T24:00:00", "2008-04-02T1:2:x", "T"] {
+            assert_eq!(secs(bad), None, "{bad}");
+        }
+    }
+}

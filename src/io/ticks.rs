@@ -1,0 +1,179 @@
+//! The ticks of a record that carries none: which moments between two records the core is told of.
+//!
+//! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
+//! says only when frames came, so the same ticks are made here, at multiples of the period: a tick at T comes after
+//! every record of T and before the first later one. The first record, and the first after a hole longer than the
+//! sleep gap, wake the recorder: one tick at that record's own time, and none inside the hole. Nothing follows the
+//! last record.
+//!
+//! The caller says when the core next cares ([`Ticks::pop`]'s `due`); ticks before that are skipped, which costs
+//! nothing and changes nothing.
+
+use crate::quantity::Timestamp;
+
+/// Makes ticks between records.
+#[derive(Debug, Clone)]
+pub struct Ticks {
+    period_ns: i64,
+    sleep_gap_ns: i64,
+    /// Stamp of the next tick.
+    next_ns: i64,
+    /// Ticks before this may be popped.
+    limit_ns: i64,
+    /// Latest record; `None` before the first and after [`Ticks::sleep`].
+    latest_ns: Option<i64>,
+    /// Where ticks go on once those before the hole are popped.
+    wake_ns: Option<i64>,
+}
+
+impl Ticks {
+    /// Ticks every `period_ms` (at least 1), none in holes longer than `sleep_gap_s`.
+    pub fn new(period_ms: u32, sleep_gap_s: f64) -> Self {
+        Self {
+            period_ns: i64::from(period_ms.max(1)) * 1_000_000,
+            sleep_gap_ns: (sleep_gap_s * 1e9) as i64,
+            next_ns: i64::MAX,
+            limit_ns: i64::MIN,
+            latest_ns: None,
+            wake_ns: None,
+        }
+    }
+
+    /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then hand the record on. Whether the
+    /// recorder was asleep before it (the first record, or one after a hole). A time before the latest makes no tick.
+    pub fn advance(&mut self, time: Timestamp) -> bool {
+        let time_ns = time.nanos();
+        let Some(latest_ns) = self.latest_ns else {
+            self.limit_ns = time_ns.min(self.limit_ns);
+            self.latest_ns = Some(time_ns);
+            self.wake_ns = Some(time_ns);
+            return true;
+        };
+        let asleep = time_ns.saturating_sub(latest_ns) > self.sleep_gap_ns;
+        if asleep {
+            self.limit_ns = latest_ns.saturating_add(1);
+            self.wake_ns = Some(time_ns);
+        } else {
+            self.limit_ns = self.limit_ns.max(time_ns);
+        }
+        self.latest_ns = Some(latest_ns.max(time_ns));
+        asleep
+    }
+
+    /// The record ends here, or goes on after an unknown gap: what is left up to the latest record may be popped,
+    /// and the next record wakes the recorder whatever its stamp.
+    pub fn sleep(&mut self) {
+        if let Some(latest_ns) = self.latest_ns.take() {
+            self.limit_ns = latest_ns.saturating_add(1);
+        }
+    }
+
+    /// The next tick that is due and that the core cares for: none before `due` (`None` = it cares for none).
+    pub fn pop(&mut self, due: Option<Timestamp>) -> Option<Timestamp> {
+        if self.next_ns < self.limit_ns {
+            let due_ns = due.map_or(self.limit_ns, |d| d.nanos().min(self.limit_ns));
+            if due_ns > self.next_ns {
+                self.next_ns = self.at_or_after(due_ns);
+            }
+        }
+        if self.next_ns < self.limit_ns {
+            let tick = self.next_ns;
+            self.next_ns = self.at_or_after(tick.saturating_add(1));
+            return Some(Timestamp::from_nanos(tick));
+        }
+        if let Some(wake_ns) = self.wake_ns.take() {
+            self.next_ns = wake_ns;
+            self.limit_ns = wake_ns;
+        }
+        None
+    }
+
+    fn at_or_after(&self, time_ns: i64) -> i64 {
+        let into = time_ns.rem_euclid(self.period_ns);
+        if into == 0 { time_ns } else { time_ns.saturating_add(self.period_ns - into) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const EVERY: Option<Timestamp> = Some(Timestamp::from_nanos(i64::MIN));
+
+    /// Ticks in ms made by records at `records` ms, `due` as given, ended properly.
+    fn ticks_ms(records: &[i64], due: Option<Timestamp>) -> Vec<i64> {
+        let mut ticks = Ticks::new(10, 30.0);
+        let mut made = Vec::new();
+        let mut drain = |ticks: &mut Ticks| {
+            while let Some(tick) = ticks.pop(due) {
+                made.push(tick.nanos() / 1_000_000);
+            }
+        };
+        for &record in records {
+            ticks.advance(Timestamp::from_nanos(record * 1_000_000));
+            drain(&mut ticks);
+        }
+        ticks.sleep();
+        drain(&mut ticks);
+        made
+    }
+
+    #[test]
+    fn ticks_are_aligned_and_end_with_the_last_record() {
+        assert_eq!(ticks_ms(&[3, 45], EVERY), [3, 10, 20, 30, 40]);
+        assert_eq!(ticks_ms(&[0, 20], EVERY), [0, 10, 20]);
+    }
+
+    #[test]
+    fn records_of_one_stamp_come_before_its_tick() {
+        assert_eq!(ticks_ms(&[10, 10, 10], EVERY), [10]);
+    }
+
+    #[test]
+    fn a_hole_costs_one_tick_at_its_end() {
+        assert_eq!(ticks_ms(&[0, 15, 40_000_003, 40_000_020], EVERY), [0, 10, 40_000_003, 40_000_010, 40_000_020]);
+    }
+
+    #[test]
+    fn records_further_apart_than_the_sleep_gap_get_one_tick_each() {
+        assert_eq!(ticks_ms(&[5, 60_005, 120_005], EVERY), [5, 60_005, 120_005]);
+    }
+
+    #[test]
+    fn a_record_back_in_time_makes_no_tick() {
+        assert_eq!(ticks_ms(&[20, 5, 20, 25], EVERY), [20]);
+    }
+
+    #[test]
+    fn after_an_unknown_gap_ticks_go_on_at_the_next_record() {
+        let mut ticks = Ticks::new(10, 30.0);
+        ticks.advance(Timestamp::from_nanos(100_000_000));
+        while ticks.pop(EVERY).is_some() {}
+        ticks.sleep();
+        assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(100_000_000)));
+        assert_eq!(ticks.pop(EVERY), None);
+        assert!(ticks.advance(Timestamp::from_nanos(7_000_000)));
+        assert_eq!(ticks.pop(EVERY), None);
+        ticks.advance(Timestamp::from_nanos(11_000_000));
+        assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(7_000_000)));
+        assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(10_000_000)));
+        assert_eq!(ticks.pop(EVERY), None);
+    }
+
+    #[test]
+    fn ticks_before_the_due_time_are_skipped() {
+        assert_eq!(ticks_ms(&[0, 45], Some(Timestamp::from_nanos(21_000_000))), [30, 40]);
+        assert_eq!(ticks_ms(&[0, 45], None), [0i64; 0]);
+    }
+
+    #[test]
+    fn skipping_leaves_the_grid_where_it_was() {
+        let mut ticks = Ticks::new(10, 30.0);
+        ticks.advance(Timestamp::from_nanos(3_000_000));
+        while ticks.pop(None).is_some() {}
+        ticks.advance(Timestamp::from_nanos(25_000_000));
+        assert_eq!(ticks.pop(None), None);
+        ticks.advance(Timestamp::from_nanos(45_000_000));
+        assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(30_000_000)));
+    }
+}
