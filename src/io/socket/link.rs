@@ -135,6 +135,12 @@ struct Open {
     pending: Option<Outgoing>,
 }
 
+/// Registers a socket with the runtime. Errors too: a removed interface makes the socket neither readable nor writable.
+#[expect(deprecated, reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives")]
+fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
+    AsyncFd::with_interest(socket, Interest::READABLE | Interest::WRITABLE | Interest::ERROR)
+}
+
 impl Link {
     /// A link, not yet running, and its sending end. Must be called inside the runtime.
     pub(crate) fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Received>) -> (Self, LinkOutput) {
@@ -181,7 +187,7 @@ impl Link {
         };
         let opened = RawSocket::open(&raw).and_then(|socket| {
             let error = socket.take_error()?;
-            Ok((AsyncFd::with_interest(socket, Interest::READABLE | Interest::WRITABLE | Interest::ERROR)?, error))
+            Ok((watch(socket)?, error))
         });
         let (socket, error) = match opened {
             Ok(opened) => opened,
