@@ -28,7 +28,6 @@ fn config() -> SampleConfig {
 }
 
 #[test]
-#[expect(clippy::print_stderr, reason = "a skipped test says so")]
 fn a_measured_life_loses_only_its_glitches_and_no_charge() {
     let Some(folder) = data_folder() else {
         eprintln!("skipped: no measured data (set PACKWATCH_DATA)");

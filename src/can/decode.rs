@@ -2,12 +2,10 @@
 
 use std::ops::Range;
 
-use serde::{Deserialize, Serialize};
-
 use crate::can::dbc::{Message, Signal};
 use crate::can::signal::{LayoutFault, SignalPlan};
 use crate::can::{CanId, Frame, FrameKind};
-use crate::quantity::{BusIndex, CellIndex, Fault};
+use crate::quantity::{BusIndex, Fault};
 
 pub use crate::quantity::{Channel, Reading, SensorIndex};
 

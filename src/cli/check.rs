@@ -84,6 +84,9 @@ fn signal(signal: &SignalUse) -> Vec<String> {
     if signal.scale.abs() != 1.0 {
         notes.push(format!("scaled by {}", signal.scale.abs()));
     }
+    if signal.added != 0.0 {
+        notes.push(format!("plus {}", signal.added));
+    }
     notes.extend(signal.serves.clone());
     if !signal.not_available.is_empty() {
         notes.push(format!("not available {}", signal.not_available.join(" ")));

@@ -1,12 +1,249 @@
-//! `packwatch demo`.
+//! `packwatch demo`: a short ageing life on an in-process bus, ending in alarms. Needs no CAN, no root, no file.
+//!
+//! A simulated cell loses 0.1 Ah per cycle. Its sensors' readings become frames of `config/measured.dbc`; the frames go
+//! through the same core as live ones; what the core sends is read by a consumer that knows nothing but
+//! `config/packwatch.dbc`. Exit code 0 when both a capacity and a recharge-period alarm were raised, else 1.
+
+mod consumer;
+mod table;
+
+use std::io::{self, Write};
+use std::path::Path;
 
 use super::Failure;
+use crate::alarm::Rule;
+use crate::can::Frame;
+use crate::can::encode::InputEncoder;
+use crate::config::{self, Config};
+use crate::io::candump::{self, StampDigits};
+use crate::io::ticks::Ticks;
+use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
+use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
+use consumer::Consumer;
+use table::{Row, Table};
+
+/// Files built into the binary, by the path the configuration calls them.
+const FILES: [(&str, &str); 3] = [
+    ("demo.toml", include_str!("../../config/demo.toml")),
+    ("measured.dbc", include_str!("../../config/measured.dbc")),
+    ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
+];
+/// What the receiving ECU knows.
+const OUTPUT_DBC: &str = include_str!("../../config/packwatch.dbc");
+/// What the cell loses per cycle, Ah: both alarms come within some ten cycles.
+const LOSS_AH_PER_CYCLE: f64 = 0.1;
+/// SOC range of the cycling; wider than the recharge window, so that every charge covers it.
+const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
+/// The demo gives up after this many cycles: at 1.2 Ah both alarms are overdue.
+const MAX_CYCLES: u32 = 14;
+/// Cycles shown after the last alarm.
+const CYCLES_AFTER: u32 = 1;
+/// Samples between two looks at the live row.
+const LIVE_SAMPLES: u64 = 400;
+/// Time of the bus when the demo starts: a Unix time, as in any log.
+const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
+/// Longer holes between frames are time asleep, s; the demo has none.
+const SLEEP_GAP_S: f64 = 30.0;
 
 /// Arguments of `demo`.
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+pub(crate) struct Args {
+    /// Seed of sensor noise
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
 
 /// Runs the command.
-pub(crate) fn run(_args: &Args) -> Result<(), Failure> {
-    Err(Failure::new("demo: not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let config = config::load_with(Path::new("demo.toml"), &read_built_in)?;
+    let mut demo = Demo::new(config, args.seed)?;
+    demo.tell().map_err(|error| Failure::new(format!("standard output: {error}")))?;
+    demo.verdict()
+}
+
+fn read_built_in(path: &Path) -> io::Result<Vec<u8>> {
+    let found = FILES.iter().find(|(name, _)| Path::new(name) == path);
+    found.map(|(_, text)| text.as_bytes().to_vec()).ok_or_else(|| io::ErrorKind::NotFound.into())
+}
+
+/// An alarm that was raised, as it was at that moment.
+struct Raised {
+    rule: Rule,
+    cycle: u32,
+    true_capacity_ah: f64,
+    time: Timestamp,
+    bus: BusIndex,
+    frame: Frame,
+}
+
+struct Demo {
+    sim: Simulation,
+    encoder: InputEncoder,
+    monitor: Monitor,
+    ticks: Ticks,
+    consumer: Consumer,
+    interfaces: Vec<String>,
+    rated_ah: f64,
+    /// Capacity in the present cycle; a completed one has already cost the pack its loss.
+    true_capacity_ah: f64,
+    out: Outputs,
+    table: Table,
+    raised: Vec<Raised>,
+    frames_in: u64,
+    frames_out: u64,
+}
+
+impl Demo {
+    fn new(config: Config, seed: u64) -> Result<Self, Failure> {
+        let model = config.monitor.model.clone();
+        let mut settings = Settings::of(Scenario::Paper, model.capacity_ah);
+        settings.seed = seed;
+        settings.soc_window = SOC_WINDOW;
+        settings.pack.initial_soc = SOC_WINDOW.1;
+        settings.pack.ageing.capacity_loss_ah_per_cycle = LOSS_AH_PER_CYCLE;
+        settings.cycles = Some(MAX_CYCLES);
+        Ok(Self {
+            rated_ah: model.rated_capacity_ah,
+            true_capacity_ah: model.capacity_ah,
+            sim: Simulation::new(model, settings, Wiring::single()),
+            encoder: InputEncoder::new(&config.monitor.input),
+            interfaces: config.interfaces.into_iter().map(|i| i.name).collect(),
+            monitor: Monitor::new(config.monitor),
+            ticks: Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S),
+            consumer: Consumer::new(OUTPUT_DBC)?,
+            out: Outputs::default(),
+            table: Table::new(),
+            raised: Vec::new(),
+            frames_in: 0,
+            frames_out: 0,
+        })
+    }
+
+    /// The whole demo on standard output, but for its last line.
+    fn tell(&mut self) -> io::Result<()> {
+        let chain = "cell -> frames -> monitor -> frames -> consumer";
+        writeln!(io::stdout(), "one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; {chain}")?;
+        self.live()?;
+        self.show_alarm_frames()
+    }
+
+    /// The cell's life, until a little after both alarms or [`MAX_CYCLES`].
+    fn live(&mut self) -> io::Result<()> {
+        let (mut samples, mut cycles) = (0_u64, 0);
+        let mut frames = Vec::new();
+        while let Some(moment) = self.sim.advance() {
+            if self.sim.pack().cycles() != cycles {
+                self.table.keep(&self.row(&moment, cycles))?;
+                cycles = self.sim.pack().cycles();
+                if self.is_complete() {
+                    break;
+                }
+            }
+            frames.clear();
+            self.true_capacity_ah = self.sim.pack().lowest_capacity_ah();
+            self.encoder.encode(self.sim.readings(), &mut frames);
+            for (bus, frame) in &frames {
+                self.feed(START.plus_nanos(moment.time.nanos()), *bus, frame);
+            }
+            samples += 1;
+            if samples.is_multiple_of(LIVE_SAMPLES) {
+                self.table.redraw(&self.row(&moment, cycles))?;
+            }
+        }
+        self.table.close()
+    }
+
+    /// One frame from the bus, after the ticks before it.
+    fn feed(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+        self.ticks.advance(time);
+        while let Some(tick) = self.ticks.pop(self.monitor.next_due()) {
+            self.monitor.handle(Input::Tick { time: tick }, &mut self.out);
+        }
+        self.monitor.handle(Input::Frame { time, bus, frame }, &mut self.out);
+        self.frames_in += 1;
+        self.collect();
+    }
+
+    /// Takes what the core sent: every frame goes to the consumer, frames of newly raised alarms are kept.
+    fn collect(&mut self) {
+        let (cycle, true_capacity_ah) = (self.sim.pack().cycles() + 1, self.true_capacity_ah);
+        for sent in &self.out.frames {
+            self.frames_out += 1;
+            self.consumer.receive(&sent.frame);
+        }
+        for event in &self.out.events {
+            let EventKind::Alarm { rule, active: true, .. } = event.kind else { continue };
+            let frame = self.out.frames.iter().find(|sent| self.consumer.is_alarm(&sent.frame, rule));
+            if let Some(sent) = frame {
+                let (time, bus, frame) = (sent.time, sent.bus, sent.frame);
+                self.raised.push(Raised { rule, cycle, true_capacity_ah, time, bus, frame });
+            }
+        }
+        self.out.clear();
+    }
+
+    fn first(&self, rule: Rule) -> Option<&Raised> {
+        self.raised.iter().find(|raised| raised.rule == rule)
+    }
+
+    fn is_complete(&self) -> bool {
+        let last = self.first(Rule::CapacityLow).zip(self.first(Rule::RechargePeriodLow));
+        last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + CYCLES_AFTER)
+    }
+
+    fn row(&self, moment: &Moment, cycles: u32) -> Row {
+        let truth = self.sim.pack().cells()[0];
+        let estimate = self.monitor.latest().next().flatten();
+        let capacity = self.monitor.capacity(CellIndex(0));
+        let mut alarms: Vec<Rule> = self.raised.iter().map(|raised| raised.rule).collect();
+        alarms.dedup();
+        Row {
+            cycle: cycles + 1,
+            hours: moment.time.secs() / 3600.0,
+            mode: self.monitor.mode(),
+            soc: estimate.map(|e| (e.soc, e.soc_std)),
+            true_soc: truth.soc,
+            capacity_ah: (capacity.mean, capacity.std()),
+            true_capacity_ah: self.true_capacity_ah,
+            soh: capacity.mean / self.rated_ah,
+            recharge_period_s: self.monitor.recharge_period_s(),
+            alarms,
+        }
+    }
+
+    /// The alarm frames as an ECU receives them.
+    fn show_alarm_frames(&self) -> io::Result<()> {
+        let mut out = io::stdout();
+        let (frames_in, frames_out, unknown) = (self.frames_in, self.frames_out, self.consumer.unknown_frames());
+        writeln!(out, "\n{frames_in} frames in, {frames_out} out, {unknown} of them unknown to config/packwatch.dbc")?;
+        writeln!(out, "alarms as they went out, decoded with that file:")?;
+        for raised in &self.raised {
+            let interface = self.interfaces.get(raised.bus.index()).map_or("?", String::as_str);
+            candump::write_line(&mut out, raised.time, StampDigits::Micros, interface, &raised.frame)?;
+            writeln!(out, "    {}", self.consumer.explain(&raised.frame))?;
+        }
+        Ok(())
+    }
+
+    /// What happened, in one line; an error when an alarm did not come or came in frames nobody can read.
+    fn verdict(&self) -> Result<(), Failure> {
+        let unknown = self.consumer.unknown_frames();
+        match (self.first(Rule::CapacityLow), self.first(Rule::RechargePeriodLow)) {
+            (Some(capacity), Some(recharge)) if unknown == 0 => {
+                let line = format!(
+                    "capacity alarm raised in cycle {} (true capacity {:.2} Ah), recharge-period alarm in cycle {}",
+                    capacity.cycle, capacity.true_capacity_ah, recharge.cycle
+                );
+                writeln!(io::stdout(), "\n{line}").map_err(|error| Failure::new(format!("standard output: {error}")))
+            }
+            (capacity, recharge) => {
+                let word = |found: Option<&Raised>| if found.is_some() { "raised" } else { "missing" };
+                let (capacity, recharge) = (word(capacity), word(recharge));
+                Err(Failure::new(format!(
+                    "capacity alarm {capacity}, recharge-period alarm {recharge}, {unknown} frames unknown to their DBC"
+                )))
+            }
+        }
+    }
 }

@@ -1,12 +1,121 @@
-//! `packwatch replay`.
+//! `packwatch replay`: records through the same core as live, or onto an interface.
+
+mod args;
+mod report;
+
+use std::io;
+use std::path::Path;
+
+pub(crate) use args::Args;
+use report::Bar;
 
 use super::Failure;
-
-/// Arguments of `replay`.
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+use crate::can::encode::InputEncoder;
+use crate::config::{self, Config};
+use crate::daemon::replay::{self, ReplayError, Settings, Sinks, Summary};
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::{LogOptions, LogSource};
+use crate::io::player::Player;
+use crate::io::result_file::ResultFile;
+use crate::monitor::{Monitor, Snapshot};
+use crate::sample::VoltageSource;
 
 /// Runs the command.
-pub(crate) fn run(_args: &Args) -> Result<(), Failure> {
-    Err(Failure::new("replay: not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    args.check()?;
+    let config = config::load(&args.config)?;
+    let mut source = LogSource::new(args.logs.clone(), log_options(args, &config));
+    let settings = settings(args, &config)?;
+    let result = match &args.to {
+        Some(interface) => play(args, &mut source, &settings, interface),
+        None => replay_all(args, &mut source, config, settings),
+    };
+    match result {
+        // The reader of our output has seen enough: no failure.
+        Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        result => result.map_err(|error| Failure::new(error.to_string())),
+    }
+}
+
+fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: Settings) -> Result<(), ReplayError> {
+    let sinks = Sinks {
+        estimates: create(args.estimates.as_deref())?,
+        events: create(args.events.as_deref())?,
+        frames: create(args.frames.as_deref())?,
+    };
+    let bar = Bar::new(&args.logs);
+    let monitor = Monitor::new(config.monitor);
+    let result = replay::run(source, monitor, sinks, settings, &mut |progress| bar.show(progress));
+    bar.clear();
+    let (summary, snapshot) = result?;
+    if let (Some(path), Some(snapshot)) = (&args.snapshot, snapshot) {
+        write_snapshot(path, &snapshot)?;
+    }
+    print_summary(args, &summary)?;
+    Ok(())
+}
+
+fn play(args: &Args, source: &mut LogSource, settings: &Settings, interface: &str) -> Result<(), ReplayError> {
+    let mut player = Player::open(interface)?;
+    let bar = Bar::new(&args.logs);
+    let result = replay::play(source, settings, &mut |_, frame| player.send(frame), &mut |p| bar.show(p));
+    bar.clear();
+    let sent = result?;
+    report::played(sent, interface, source.counts(), args.json)?;
+    Ok(())
+}
+
+fn log_options(args: &Args, config: &Config) -> LogOptions {
+    let sample = &config.monitor.sample;
+    let encoder = InputEncoder::new(&config.monitor.input);
+    LogOptions {
+        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+        strict: args.strict,
+        csv: CsvOptions {
+            columns: args.columns.clone(),
+            charge_positive: args.csv_sign == args::CsvSign::Charge,
+            start_times: args.start_times.clone(),
+            cells: sample.cells,
+            pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+        },
+        encode_row: Box::new(move |values, frames| {
+            encoder.encode(values, frames);
+        }),
+    }
+}
+
+fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
+    // Onto an interface the frames' own time is what is wanted; through the core, the result.
+    let speed = args.speed.or(args.to.is_some().then_some(1.0));
+    Ok(Settings {
+        speed: speed.filter(|speed| speed.is_finite()),
+        from: args.from,
+        until: args.until,
+        sleep_gap_s: args.sleep_gap,
+        snapshot: args.snapshot.is_some(),
+        snapshot_at: args.snapshot_at,
+        restore: args.restore.as_deref().map(read_snapshot).transpose()?,
+        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+    })
+}
+
+fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
+    path.map(ResultFile::create).transpose()
+}
+
+fn write_snapshot(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
+    let mut file = ResultFile::create(path)?;
+    serde_json::to_writer(&mut file, snapshot)?;
+    io::Write::write_all(&mut file, b"\n")?;
+    file.finish()
+}
+
+fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
+    let bytes = std::fs::read(path).map_err(|e| Failure::new(format!("{}: cannot be read: {e}", path.display())))?;
+    serde_json::from_slice(&bytes)
+        .map_err(|e| Failure::new(format!("{}:{}: not a snapshot: {e}", path.display(), e.line())))
+}
+
+fn print_summary(args: &Args, summary: &Summary) -> io::Result<()> {
+    if args.json { report::json(summary) } else { report::table(summary, args.results_on_stdout()) }
 }

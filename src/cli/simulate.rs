@@ -1,12 +1,203 @@
-//! `packwatch simulate`.
+//! `packwatch simulate`: a pack whose truth is known, as frames of the configured DBC.
+//!
+//! Out: a candump log (`-o`, compressed when the name ends in `.gz`) or frames onto an interface (`--to`), and the
+//! truth as CSV (`--truth`). One seed gives the same bytes on every machine. Frames of one moment follow each other
+//! at the pace of a 1 Mbit/s bus, and closer where many have to fit between two samples.
+
+mod output;
+mod player;
+mod settings;
+
+use std::path::PathBuf;
 
 use super::Failure;
+use crate::can::encode::InputEncoder;
+use crate::can::{CanId, Frame};
+use crate::config::{self, Config};
+use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
+use crate::sample::{SampleConfig, VoltageSource};
+use crate::sim::{Moment, Settings, Simulation, Wiring};
+use output::{LogWriter, TruthWriter};
+use player::Player;
+
+/// Time between frames sent together, ns: a classic frame of 8 bytes at 1 Mbit/s.
+const FRAME_SPACING_NS: i64 = 130_000;
 
 /// Arguments of `simulate`.
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+pub(crate) struct Args {
+    /// What happens to the pack
+    scenario: settings::Name,
+    /// Configuration whose DBC, cell model and number of cells are used
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Candump log to write; compressed when the name ends in .gz; - for standard output
+    #[arg(short, long, value_name = "LOG", required_unless_present = "to", conflicts_with = "to")]
+    out: Option<PathBuf>,
+    /// Play the frames onto this CAN interface instead
+    #[arg(long, value_name = "INTERFACE")]
+    to: Option<String>,
+    /// How many times faster than real time frames are played; 0 = as fast as the bus takes them
+    #[arg(long, default_value_t = 1.0, value_parser = settings::non_negative, requires = "to")]
+    speed: f64,
+    /// CSV to write the true state to; compressed when the name ends in .gz
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// Seconds between rows of the truth
+    #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = settings::positive)]
+    truth_period: f64,
+    /// Unix time of the first frame, s
+    #[arg(long, value_name = "S", default_value_t = 1_700_000_000)]
+    start: u32,
+    #[command(flatten)]
+    changes: settings::Changes,
+}
+
+/// What came of a run.
+#[derive(Debug, Default)]
+struct Tally {
+    frames: u64,
+    moments: u64,
+    end_s: f64,
+}
 
 /// Runs the command.
-pub(crate) fn run(_args: &Args) -> Result<(), Failure> {
-    Err(Failure::new("simulate: not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let config = config::load(&args.config)?;
+    let settings = settings_for(args, &config)?;
+    let monitor = &config.monitor;
+    let mut sim = Simulation::new(monitor.model.clone(), settings, wiring(&monitor.sample));
+    let mut sink = Sink::open(args, &config)?;
+    let mut truth = match &args.truth {
+        Some(path) => Some(TruthWriter::create(path, monitor.model.branches.len(), args.truth_period)?),
+        None => None,
+    };
+    let start = Timestamp::from_nanos(i64::from(args.start) * 1_000_000_000);
+    let mut frames = Frames::new(InputEncoder::new(&monitor.input), &settings, start);
+    let mut tally = Tally::default();
+    while let Some(moment) = sim.advance() {
+        for (time, bus, frame) in frames.of(&sim, &moment) {
+            sink.write(time, bus, frame)?;
+            tally.frames += 1;
+        }
+        if let Some(truth) = &mut truth {
+            truth.write(start, &moment, &sim)?;
+        }
+        tally.moments += 1;
+        tally.end_s = moment.time.secs();
+    }
+    sink.finish()?;
+    truth.map_or(Ok(()), TruthWriter::finish)?;
+    eprintln!("{}", summary(&sim, &tally));
+    Ok(())
+}
+
+/// Where the frames go.
+enum Sink {
+    Log(LogWriter),
+    Bus(Player),
+}
+
+impl Sink {
+    fn open(args: &Args, config: &Config) -> Result<Self, Failure> {
+        match (&args.to, &args.out) {
+            (Some(interface), _) => {
+                let fd = config.interfaces.iter().any(|interface| interface.fd);
+                Ok(Self::Bus(Player::open(interface, fd, args.speed)?))
+            }
+            (None, Some(path)) => {
+                let names = config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+                Ok(Self::Log(LogWriter::create(path, names)?))
+            }
+            (None, None) => Err(Failure::new("neither --out nor --to, one must be given")),
+        }
+    }
+
+    fn write(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) -> Result<(), Failure> {
+        match self {
+            Self::Log(log) => log.write(time, bus, frame),
+            Self::Bus(player) => player.play(time, frame),
+        }
+    }
+
+    fn finish(self) -> Result<(), Failure> {
+        match self {
+            Self::Log(log) => log.finish(),
+            Self::Bus(_) => Ok(()),
+        }
+    }
+}
+
+/// The scenario's defaults for the configured cell, with what the command line changes.
+fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
+    let capacity_ah = args.changes.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
+    let mut settings = Settings::of(args.scenario.into(), capacity_ah);
+    let series = cells_in_series(&config.monitor.sample);
+    settings.pack.cells = series;
+    settings.pack.ambient_c = config.monitor.sample.ambient_c;
+    args.changes.apply(&mut settings)?;
+    if settings.pack.cells > series {
+        let (found, file) = (settings.pack.cells, args.config.display());
+        return Err(Failure::new(format!("--cells {found}, {file} has signals for {series}")));
+    }
+    Ok(settings)
+}
+
+fn cells_in_series(sample: &SampleConfig) -> u16 {
+    match sample.voltage_source {
+        VoltageSource::Cells => sample.cells,
+        VoltageSource::PackTotal { series } => series,
+    }
+}
+
+/// A temperature sensor sits on the first cell it serves.
+fn wiring(sample: &SampleConfig) -> Wiring {
+    let sensors = sample.sensor_of_cell.iter().flatten().map(|s| s.0 + 1).max().unwrap_or(0);
+    let cell_of = |sensor| {
+        let cell = sample.sensor_of_cell.iter().position(|s| s.is_some_and(|s| s.0 == sensor))?;
+        Some(CellIndex(u16::try_from(cell).ok()?))
+    };
+    Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
+}
+
+/// Makes the frames of a moment, those with the current first: the voltages have its drop in them.
+struct Frames {
+    encoder: InputEncoder,
+    with_current: Vec<(BusIndex, CanId)>,
+    made: Vec<(BusIndex, Frame)>,
+    start: Timestamp,
+    period_ns: i64,
+}
+
+impl Frames {
+    fn new(encoder: InputEncoder, settings: &Settings, start: Timestamp) -> Self {
+        let mut made = Vec::new();
+        encoder.encode(&[(Channel::Current, Some(0.0))], &mut made);
+        let with_current = made.iter().map(|(bus, frame)| (*bus, frame.id())).collect();
+        Self { encoder, with_current, made, start, period_ns: settings.current_period_ns }
+    }
+
+    fn of(&mut self, sim: &Simulation, moment: &Moment) -> impl Iterator<Item = (Timestamp, BusIndex, &Frame)> {
+        self.made.clear();
+        self.encoder.encode(sim.readings(), &mut self.made);
+        self.made.sort_by_key(|(bus, frame)| !self.with_current.contains(&(*bus, frame.id())));
+        let count = i64::try_from(self.made.len()).unwrap_or(i64::MAX - 1);
+        let spacing_ns = FRAME_SPACING_NS.min(self.period_ns / (count + 1));
+        let first = self.start.plus_nanos(moment.time.nanos());
+        (0..).zip(&self.made).map(move |(i, (bus, frame))| (first.plus_nanos(i * spacing_ns), *bus, frame))
+    }
+}
+
+fn summary(sim: &Simulation, tally: &Tally) -> String {
+    let pack = sim.pack();
+    format!(
+        "{:.0} s simulated, {} samples, {} frames, {} cycles completed; weakest cell {:.3} Ah, SOC {:.1} to {:.1} %",
+        tally.end_s,
+        tally.moments,
+        tally.frames,
+        pack.cycles(),
+        pack.lowest_capacity_ah(),
+        100.0 * pack.lowest_soc(),
+        100.0 * pack.highest_soc(),
+    )
 }

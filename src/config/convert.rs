@@ -7,9 +7,10 @@ use super::keys::{
 };
 use super::schema::{Section as _, Walk};
 use crate::alarm::{Rule, RuleConfig};
+use crate::can::decode::InputMap;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
-use crate::monitor::MonitorConfig;
+use crate::monitor::{MonitorConfig, OutputConfig};
 use crate::quantity::SensorIndex;
 use crate::sample::{Limits, SampleConfig, VoltageSource};
 
@@ -81,14 +82,20 @@ impl Raw {
 }
 
 /// Everything the core must know; `None` when a table is missing or faulty (and noted).
-pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges) -> Option<MonitorConfig> {
+pub(crate) fn monitor(
+    raw: &Raw,
+    mut model: CellModel,
+    found: &Ranges,
+    input: InputMap,
+    output: Option<OutputConfig>,
+) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
     let rules: Option<Vec<_>> = raw.alarms.iter().map(|alarm| rule(alarm, rated_ah)).collect();
     Some(MonitorConfig {
-        input: crate::can::decode::InputMap::default(),
-        output: None,
+        input,
+        output,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
         health: HealthConfig {

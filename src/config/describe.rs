@@ -79,6 +79,8 @@ pub struct SignalUse {
     pub unit: String,
     /// From the DBC's unit and sign to ours (positive = discharge); negative when the bus counts charge positive.
     pub scale: f64,
+    /// Added after the scale, in our unit and sign.
+    pub added: f64,
     /// Smallest and largest value the DBC gives, in our unit and sign.
     pub range: Option<[f64; 2]>,
     /// Raw codes that mean "not available", hex.
@@ -88,7 +90,7 @@ pub struct SignalUse {
 }
 
 /// A frame that is sent.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct OutputUse {
     /// `status`, `health`, `alarm`.
     pub frame: &'static str,
@@ -97,7 +99,7 @@ pub struct OutputUse {
     /// Interfaces.
     pub interfaces: Vec<String>,
     /// Period, ms.
-    pub period_ms: u32,
+    pub period_ms: f64,
 }
 
 /// Describes a checked configuration and the signals found for it.
@@ -143,9 +145,13 @@ fn pack(config: &Config) -> Vec<String> {
     let bare = (1..).zip(&sample.sensor_of_cell).filter(|(_, sensor)| sensor.is_none()).map(|(cell, _)| cell);
     let bare: Vec<u16> = bare.collect();
     if !bare.is_empty() {
-        let (ambient_c, cells) = (sample.ambient_c, cell_list(&bare));
+        let ambient_c = sample.ambient_c;
+        let cells = match bare.len() == usize::from(sample.cells) {
+            true => String::new(),
+            false => format!(" for cells {}", cell_list(&bare)),
+        };
         let from = if config.monitor.model.thermal.is_some() { "from the thermal model round" } else { "taken as" };
-        words.push(format!("no temperature sensor for cells {cells}: {from} {ambient_c} degrees C"));
+        words.push(format!("no temperature sensor{cells}: {from} {ambient_c} degrees C"));
     }
     words.push("a positive current is a discharge in everything reported".to_owned());
     words
@@ -187,6 +193,7 @@ fn signal(raw: &Raw, config: &Config, resolved: &Resolved<'_>) -> SignalUse {
         offset: layout.offset,
         unit: resolved.signal.unit.clone(),
         scale: resolved.scale,
+        added: resolved.offset,
         range: range.0.is_finite().then_some([range.0, range.1]),
         not_available: resolved.not_available.iter().map(|code| format!("{code:X}")).collect(),
         serves: match resolved.channel {

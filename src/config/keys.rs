@@ -98,6 +98,8 @@ macro_rules! signal_section {
                 interface: Option<String>, "", NotEmpty, Optional;
                 /// Factor from the DBC's unit to this program's, after the DBC's own factor (0.001 for a DBC in milli-units).
                 scale: f64, $unit, Above(0.0, 1e9), Default("1.0");
+                /// Added after `scale`, in this program's unit (-273.15 for a DBC in kelvin).
+                offset: f64, "", Between(-1e9, 1e9), Default("0.0");
                 /// Raw codes that mean "not available", besides those the DBC's value table calls so.
                 not_available: Vec<u64>, "", Any, Default("[]");
                 $($keys)*
@@ -112,6 +114,7 @@ macro_rules! signal_section {
                     signal: &self.signal,
                     interface: self.interface.as_deref(),
                     scale: self.scale,
+                    offset: self.offset,
                     not_available: &self.not_available,
                 }
             }
@@ -130,6 +133,8 @@ pub(crate) struct SignalSource<'a> {
     pub(crate) interface: Option<&'a str>,
     /// DBC unit to ours.
     pub(crate) scale: f64,
+    /// Added after it.
+    pub(crate) offset: f64,
     /// Raw codes that mean "not available".
     pub(crate) not_available: &'a [u64],
 }
@@ -167,9 +172,9 @@ signal_section! {
 section! {
     /// What a plausible pack current is. A reading outside moves no estimate and is counted.
     CurrentLimits at "limits.current" {
-        /// Largest plausible discharge current of the pack. Without it: what the DBC gives.
+        /// Largest plausible discharge current of the pack. Without it: what the DBC gives (never more).
         max_discharge_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
-        /// Largest plausible charge current of the pack, written positive. Without it: what the DBC gives.
+        /// Largest plausible charge current of the pack, written positive. Without it: what the DBC gives (never more).
         max_charge_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
         /// Fastest plausible change. Without it: not checked.
         max_rate_a_per_s: Option<f64>, "A/s", Above(0.0, 1e9), Optional;
@@ -344,28 +349,28 @@ section! {
 }
 
 section! {
-    /// What the daemon sends. It transmits only the frames whose identifiers are given here.
+    /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent.
     Output at "output" {
-        /// Whether anything is sent at all.
+        /// Whether anything is sent.
         enabled: bool, "", Any, Default("true");
         /// Interfaces to send on. Without it: all.
         interfaces: Option<Vec<String>>, "", NotEmpty, Optional;
         /// DBC that lays the frames out, relative to this file. Without it: the built-in `packwatch.dbc`.
         dbc: Option<String>, "", NotEmpty, Optional;
-        /// Identifier of the status frame. Without it: not sent.
+        /// Identifier of the status frame. Without it: the DBC's.
         status_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Identifier of the health frame. Without it: not sent.
+        /// Identifier of the health frame. Without it: the DBC's.
         health_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Identifier of the alarm frame. Without it: not sent.
+        /// Identifier of the alarm frame. Without it: the DBC's.
         alarm_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Whether these identifiers have 29 bits.
+        /// Whether the identifiers given here have 29 bits.
         extended: bool, "", Any, Default("false");
-        /// Period of the status frame.
-        status_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("100");
-        /// Period of the health frame.
-        health_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("1000");
-        /// Period at which an active alarm is repeated; a change is sent at once.
-        alarm_period_ms: u32, "ms", Between(10.0, 3_600_000.0), Default("1000");
+        /// Period of the status frame. Without it: the DBC's cycle time, or else 1000 ms.
+        status_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
+        /// Period of the health frame, all its pages. Without it: the DBC's cycle time, or else 1000 ms.
+        health_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
+        /// Period at which active alarms are repeated; a change is sent at once. Without it: the DBC's cycle time, or else 1000 ms.
+        alarm_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
     }
 }
 

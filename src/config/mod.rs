@@ -95,12 +95,13 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
     let databases = Databases::load(path, names, read, faults);
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
-    output::check(&raw, &found, faults);
+    let output = output::output(&raw, path, &found, read, faults);
+    let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let monitor = convert::monitor(&raw, model?, &ranges)?;
+    let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, output)?;
     let config = Config { path: path.to_owned(), interfaces, monitor };
-    let description = describe::describe(&raw, &config, &found, output::uses(&raw));
+    let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
 }
 

@@ -13,6 +13,8 @@ use super::pattern::Pattern;
 use super::schema::did_you_mean;
 use super::{ReadFile, beside};
 use crate::can::dbc::{Database, Message, Signal};
+use crate::can::decode::{Binding, InputMap};
+use crate::can::signal::LayoutFault;
 use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 /// Most cell numbers named in one fault.
@@ -39,6 +41,8 @@ pub(crate) struct Resolved<'d> {
     pub(crate) signal: &'d Signal,
     /// Factor from the DBC's unit and sign to ours; negative when the bus counts charge positive.
     pub(crate) scale: f64,
+    /// Added after it, in our unit and sign.
+    pub(crate) offset: f64,
     /// Raw codes that mean "not available", the configuration's and the DBC's.
     pub(crate) not_available: Vec<u64>,
 }
@@ -171,7 +175,7 @@ impl<'d> Search<'_, 'd> {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = format!("{}.{}", message.name, signal.name);
-        if let Err(error) = signal.layout.plan() {
+        if let Err(error) = Binding::new(bus, message, signal, channel) {
             source.place.fault(self.faults, "signal", &format!("{full_name} in {file} cannot be read: {error}"));
         }
         let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
@@ -195,8 +199,8 @@ impl<'d> Search<'_, 'd> {
         not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
         not_available.sort_unstable();
         not_available.dedup();
-        let scale = sign * source.scale;
-        self.found.push(Resolved { channel, bus, file, message, signal, scale, not_available });
+        let (scale, offset) = (sign * source.scale, sign * source.offset);
+        self.found.push(Resolved { channel, bus, file, message, signal, scale, offset, not_available });
     }
 
     fn bus(&self, source: &SignalSource<'_>) -> Option<BusIndex> {
@@ -232,15 +236,30 @@ fn list(numbers: &[u32]) -> String {
 }
 
 impl Resolved<'_> {
+    /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
+    fn binding(&self) -> Result<Binding, LayoutFault> {
+        let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
+        binding.scale = self.scale;
+        binding.offset = self.offset;
+        binding.not_available.clone_from(&self.not_available);
+        Ok(binding)
+    }
+
     /// The DBC's range in our unit and sign; infinite when it gives none.
     pub(crate) fn range(&self) -> (f64, f64) {
         let layout = &self.signal.layout;
         if !layout.has_range() {
             return UNLIMITED;
         }
-        let (a, b) = (layout.minimum * self.scale, layout.maximum * self.scale);
+        let (a, b) = (layout.minimum * self.scale + self.offset, layout.maximum * self.scale + self.offset);
         (a.min(b), a.max(b))
     }
+}
+
+/// The decoder's map; `None` when a layout cannot be read (noted when it was found).
+pub(crate) fn input_map(found: &[Resolved<'_>]) -> Option<InputMap> {
+    let bindings: Result<Vec<_>, _> = found.iter().map(Resolved::binding).collect();
+    bindings.ok().map(InputMap::new)
 }
 
 /// The widest range the DBC gives each kind of value; a total voltage counts per cell.

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 
 use super::*;
+use crate::can::{CanId, Frame};
 use crate::health::CapacityMethod;
-use crate::quantity::SensorIndex;
+use crate::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex};
 use crate::sample::VoltageSource;
 
 const DBC: &str = r#"VERSION ""
@@ -134,6 +135,55 @@ fn a_relative_threshold_is_of_the_rated_capacity() {
     assert_eq!((config.monitor.rules[0].threshold, config.monitor.model.rated_capacity_ah), (3.0, 4.0));
 }
 
+fn decoded(config: &Config, id: u16, payload: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> {
+    let frame = Frame::classic(CanId::Standard(id), payload).unwrap();
+    let mut readings = Vec::new();
+    config.monitor.input.decode(BusIndex(0), &frame, |reading| readings.push((reading.channel, reading.value)));
+    readings
+}
+
+#[test]
+fn readings_have_our_sign_scale_and_cells() {
+    let pack = pack_with("\"charge\"", "\"charge\"\nscale = 0.5\nnot_available = [0x7FFF]")
+        .replace("Status.Temperature\"", "Status.Temperature\"\noffset = -1");
+    let config = good(&pack);
+    let temperature = Channel::Temperature(SensorIndex(0));
+    let status = decoded(&config, 0x100, &[100, 0, 0, 0, 65, 0, 0, 0]);
+    assert_eq!(status, [(Channel::Current, Ok(-5.0)), (temperature, Ok(24.0))]);
+    for code in [[0xFF, 0x7F], [0x00, 0x80]] {
+        let status = decoded(&config, 0x100, &[code[0], code[1], 0, 0, 65, 0, 0, 0]);
+        assert_eq!(status[0], (Channel::Current, Err(Fault::NotAvailable)), "configured, or in the DBC's value table");
+    }
+    let second_page = decoded(&config, 0x110, &[1, 0xE8, 0x03, 0xD0, 0x07, 0, 0, 0]);
+    let (cell_3, cell_4) = (Channel::CellVoltage(CellIndex(2)), Channel::CellVoltage(CellIndex(3)));
+    assert_eq!(second_page, [(cell_3, Ok(1.0)), (cell_4, Ok(2.0))]);
+    assert!(decoded(&config, 0x120, &[0; 8]).is_empty(), "a message nobody configured");
+}
+
+#[test]
+fn nothing_is_sent_unless_configured() {
+    assert!(good(PACK).monitor.output.is_none());
+    assert!(good(&format!("{PACK}[output]\nenabled = false\nstatus_id = 5\n")).monitor.output.is_none());
+}
+
+#[test]
+fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
+    let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 1.0));
+    let text = "[output]\nextended = true\nstatus_id = 0x18FF_0001\nstatus_period_ms = 100\n";
+    let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
+    assert_eq!((output.status_period_s, output.alarm_period_s), (0.1, 1.0));
+}
+
+#[test]
+fn an_output_dbc_must_have_the_daemons_messages() {
+    let all = faults(&format!("{PACK}[output]\ndbc = \"twin.dbc\"\n"));
+    assert_eq!(all[0], "pack.toml:16: output.dbc = \"twin.dbc\", message PACKWATCH_Status is missing");
+    assert_eq!(all.len(), 3);
+}
+
 #[test]
 fn numbers_may_be_hex_or_have_underscores() {
     let output =
@@ -143,7 +193,13 @@ fn numbers_may_be_hex_or_have_underscores() {
     assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
 }
 
-/// Each edit of the good file and the whole of what is said about it.
+/// Each edit of the good file (from, to) and the whole of what is said about it.
+fn each_edit_gives(table: &[(&str, &str, &str)]) {
+    for (from, to, fault) in table {
+        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
+    }
+}
+
 #[test]
 fn single_faults_name_file_line_key_found_and_allowed() {
     let table: &[(&str, &str, &str)] = &[
@@ -181,6 +237,13 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "dbc = [\"pack.dbc\", 7]",
             "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
         ),
+    ];
+    each_edit_gives(table);
+}
+
+#[test]
+fn single_faults_of_signals_name_what_the_dbc_has() {
+    let table: &[(&str, &str, &str)] = &[
         ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
         ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
         (
@@ -244,9 +307,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, like \"1-12, 15\"",
         ),
     ];
-    for (from, to, fault) in table {
-        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
-    }
+    each_edit_gives(table);
 }
 
 #[test]
@@ -284,16 +345,12 @@ fn single_faults_of_appended_tables() {
             "pack.toml:19: alarm[2].rule = \"input_missing\", must differ in severity from the same rule in line 15",
         ),
         (
-            "[output]\n",
-            "pack.toml:15: output has no identifier, must have status_id, health_id or alarm_id, or enabled = false",
-        ),
-        (
             "[output]\nstatus_id = 0x800\n",
             "pack.toml:16: output.status_id = 0x800, must be 0 to 0x7FF, or output.extended = true",
         ),
         (
             "[output]\nstatus_id = 1\nalarm_id = 1\n",
-            "pack.toml:17: output.alarm_id = 1, must differ from output.status_id",
+            "pack.toml:17: output.alarm_id = 1, alarm and status frame would both be 001, must differ",
         ),
         (
             "[output]\nstatus_id = 1\ninterfaces = [\"can7\"]\n",
@@ -301,7 +358,7 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[output]\nhealth_id = 0x110\n",
-            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has it",
+            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has 110",
         ),
         (
             "[[interface]]\nname = \"can0\"\n",

@@ -145,15 +145,15 @@ impl Monitor {
     fn status_frame(&self) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
         let pack = self.pack.as_ref();
-        output.plan.status(&StatusFields {
+        Some(output.plan.status(&StatusFields {
             soc: pack.map(|pack| pack.soc),
             soc_std: pack.map(|pack| pack.soc_std),
-            mode: self.detector.mode(),
+            mode: Some(self.detector.mode()),
             validity: self.validity() as u8,
-            highest_severity: self.alarms.highest_severity().map_or(0, |severity| severity as u8),
-            active_alarms: self.alarms.count(),
+            highest_severity: Some(self.alarms.highest_severity().map_or(0, |severity| severity as u8)),
+            active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-        })
+        }))
     }
 
     /// Health of the pack: its weakest cell's capacity, as an estimate only once a half-cycle has taught something.
@@ -186,7 +186,7 @@ impl Monitor {
         let Some(output) = &self.config.output else { return };
         let fields = self.health_fields();
         for page in 0..output.plan.health_pages() {
-            self.send(output.plan.health(page, &fields), out);
+            self.send(Some(output.plan.health(page, &fields)), out);
         }
     }
 
@@ -204,14 +204,15 @@ impl Monitor {
 
     fn alarm_frame(&self, alarm: &AlarmChange) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
-        output.plan.alarm(&AlarmFields {
+        Some(output.plan.alarm(&AlarmFields {
             rule: alarm.rule as u8,
-            state: if alarm.active { 1 } else { 2 },
-            severity: alarm.severity as u8,
+            state: Some(if alarm.active { 1 } else { 2 }),
+            severity: Some(alarm.severity as u8),
+            test: false,
             cell: alarm.cell,
             value: alarm.value,
             threshold: Some(alarm.threshold),
-        })
+        }))
     }
 }
 

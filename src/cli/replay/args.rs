@@ -1,0 +1,130 @@
+//! What `replay` can be told.
+
+use std::path::{Path, PathBuf};
+
+use crate::cli::Failure;
+use crate::daemon::replay::When;
+use crate::io::stamp;
+
+/// Which way a CSV's positive current flows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum CsvSign {
+    /// Positive is discharge
+    Discharge,
+    /// Positive is charge
+    Charge,
+}
+
+/// Arguments of `replay`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Configuration
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) config: PathBuf,
+    /// Journals, candump logs or CSV files, also .gz or .zst, read one after another; - is standard input
+    #[arg(required = true, value_name = "LOG")]
+    pub(crate) logs: Vec<PathBuf>,
+    /// End at the first malformed line
+    #[arg(long)]
+    pub(crate) strict: bool,
+    /// Times real time (1 = real time); as fast as possible when not given, real time with --to
+    #[arg(long, value_name = "X", value_parser = positive)]
+    pub(crate) speed: Option<f64>,
+    /// Play the frames onto this CAN interface instead of through the core
+    #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore"])]
+    pub(crate) to: Option<String>,
+    /// Write every estimate, as CSV
+    #[arg(long, value_name = "FILE.csv")]
+    pub(crate) estimates: Option<PathBuf>,
+    /// Write every event, one JSON document per line
+    #[arg(long, value_name = "FILE.jsonl")]
+    pub(crate) events: Option<PathBuf>,
+    /// Write the frames that would be sent, as candump lines
+    #[arg(long, value_name = "FILE.log")]
+    pub(crate) frames: Option<PathBuf>,
+    /// Print the summary as JSON
+    #[arg(long)]
+    pub(crate) json: bool,
+    /// Write the core's state, to start from with --restore
+    #[arg(long, value_name = "FILE")]
+    pub(crate) snapshot: Option<PathBuf>,
+    /// When the state is written: a stamp of the log in seconds, +SECONDS after its start, or like
+    /// 2008-04-02T13:08:17 (UTC); the end when not given
+    #[arg(long, value_name = "WHEN", requires = "snapshot", value_parser = when, allow_hyphen_values = true)]
+    pub(crate) snapshot_at: Option<When>,
+    /// Start from a written state
+    #[arg(long, value_name = "FILE")]
+    pub(crate) restore: Option<PathBuf>,
+    /// Leave out what is before; as --snapshot-at
+    #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
+    pub(crate) from: Option<When>,
+    /// Leave out what is after; as --snapshot-at
+    #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
+    pub(crate) until: Option<When>,
+    /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
+    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
+    pub(crate) sleep_gap: f64,
+    /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
+    /// with {n}, one per cell or sensor from 1, as voltage{n}=U{n}
+    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
+    pub(crate) columns: Vec<(String, String)>,
+    /// Sign of a CSV's current
+    #[arg(long, value_enum, default_value = "discharge")]
+    pub(crate) csv_sign: CsvSign,
+    /// CSV table with the section's column and `start`, which makes stamps absolute
+    #[arg(long, value_name = "TABLE.csv")]
+    pub(crate) start_times: Option<PathBuf>,
+}
+
+impl Args {
+    fn results(&self) -> impl Iterator<Item = &Path> {
+        [&self.estimates, &self.events, &self.frames, &self.snapshot].into_iter().filter_map(|path| path.as_deref())
+    }
+
+    /// Whether a result file goes to standard output, so that the summary must not.
+    pub(crate) fn results_on_stdout(&self) -> bool {
+        self.results().any(|path| path == Path::new("-"))
+    }
+
+    /// What one argument alone cannot tell.
+    pub(crate) fn check(&self) -> Result<(), Failure> {
+        let on_stdout = self.results().filter(|&path| path == Path::new("-")).count() + usize::from(self.json);
+        if on_stdout > 1 {
+            return Err(Failure::new("only one of the results and --json can go to standard output"));
+        }
+        let files: Vec<_> = self.results().filter(|&path| path != Path::new("-")).collect();
+        for (index, file) in files.iter().enumerate() {
+            if files[..index].contains(file) {
+                return Err(Failure::new(format!("{}: named for two results", file.display())));
+            }
+            if self.logs.iter().any(|log| log == file) {
+                return Err(Failure::new(format!("{}: is a log to read, cannot be a result", file.display())));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|e| format!("{e}"))?;
+    if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) }
+}
+
+fn when(text: &str) -> Result<When, String> {
+    let after = text.strip_prefix('+').map(|s| stamp::parse_seconds(s.as_bytes()).map(|t| When::After(t.nanos())));
+    after
+        .unwrap_or_else(|| stamp::parse_stamp(text).map(When::At))
+        .ok_or_else(|| "must be seconds, +seconds or like 2008-04-02T13:08:17.921".to_owned())
+}
+
+fn column(text: &str) -> Result<(String, String), String> {
+    const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
+    let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
+    if !ROLES.contains(&role) {
+        return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));
+    }
+    if role.ends_with("{n}") != name.contains("{n}") {
+        return Err("{n} must be in role and column, or in neither".to_owned());
+    }
+    Ok((role.to_owned(), name.to_owned()))
+}

@@ -1,0 +1,159 @@
+//! What `replay` tells on the terminal: a progress bar, a summary.
+
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use crate::daemon::replay::{Progress, Summary};
+use crate::io::log::LogCounts;
+use crate::monitor::{Event, EventKind};
+
+/// Alarms listed for people; JSON has more.
+const MAX_SHOWN_ALARMS: usize = 20;
+/// Cells listed for people; JSON has all.
+const MAX_SHOWN_CELLS: usize = 16;
+
+/// Progress on standard error, when that is a terminal.
+#[derive(Debug)]
+pub(super) struct Bar(ProgressBar);
+
+impl Bar {
+    /// For logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
+    pub(super) fn new(logs: &[PathBuf]) -> Self {
+        let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
+        let total: Option<u64> = logs.iter().map(size).sum();
+        let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(5));
+        let template = match total {
+            Some(_) => "{bar:32} {bytes}/{total_bytes} {msg} eta {eta}",
+            None => "{spinner} {bytes} {msg}",
+        };
+        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Self(bar)
+    }
+
+    /// The present state.
+    pub(super) fn show(&self, progress: Progress) {
+        let seconds = self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64();
+        if self.0.is_hidden() {
+            return;
+        }
+        let rate = progress.frames as f64 / seconds;
+        self.0.set_message(format!("{rate:.0} frames/s, {:.0} x real time", progress.times_real_time));
+        self.0.set_position(progress.bytes);
+    }
+
+    /// Takes the bar away.
+    pub(super) fn clear(&self) {
+        self.0.finish_and_clear();
+    }
+}
+
+/// The summary as one JSON document on standard output.
+pub(super) fn json(summary: &Summary) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    serde_json::to_writer_pretty(&mut out, summary)?;
+    writeln!(out)
+}
+
+/// The summary for people.
+pub(super) fn table(summary: &Summary, to_stderr: bool) -> io::Result<()> {
+    let mut text = Vec::new();
+    write_table(&mut text, summary)?;
+    if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
+}
+
+/// What was played onto an interface.
+pub(super) fn played(sent: u64, interface: &str, counts: &LogCounts, as_json: bool) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    if as_json {
+        let document = serde_json::json!({ "sent": sent, "to": interface, "log": counts });
+        return writeln!(out, "{document}");
+    }
+    let mut rows = log_rows(counts);
+    rows.insert(0, ("frames sent", format!("{sent} to {interface}")));
+    write_rows(&mut out, &rows)
+}
+
+fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
+    let mut rows = vec![("lines", log.lines.to_string()), ("frames", log.frames.to_string())];
+    rows.push(("bad lines", log.bad_lines.to_string()));
+    rows.extend(log.first_bad_line.clone().map(|line| ("first bad line", line)));
+    let counted = [
+        ("ignored lines", log.ignored_lines),
+        ("CAN XL frames", log.xl_frames),
+        ("error frames", log.error_frames),
+        ("frames the recorder lost", log.dropped_frames),
+        ("stamps backwards", log.time_backwards),
+        ("unknown gaps", log.unknown_gaps),
+    ];
+    rows.extend(counted.into_iter().filter(|&(_, count)| count > 0).map(|(name, count)| (name, count.to_string())));
+    if !log.foreign.is_empty() {
+        let each: Vec<_> = log.foreign.iter().map(|(name, count)| format!("{name} {count}")).collect();
+        rows.push(("other interfaces", each.join(", ")));
+    }
+    rows
+}
+
+fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
+    let s = summary;
+    let mut rows = log_rows(&s.log);
+    rows.push(("record", format!("{:.1} s awake", s.awake_s)));
+    rows.push(("wall time", format!("{:.2} s ({:.0} x real time)", s.wall_s, s.times_real_time)));
+    rows.extend(s.peak_memory_kib.map(|kib| ("peak memory", format!("{:.1} MiB", kib as f64 / 1024.0))));
+    rows.push(("ticks", s.ticks.to_string()));
+    rows.push(("frames to send", s.frames_out.to_string()));
+    let events: Vec<_> = s.events.iter().map(|(name, count)| format!("{name} {count}")).collect();
+    rows.push(("events", if events.is_empty() { "none".to_owned() } else { events.join(", ") }));
+    rows.extend(s.notes.iter().map(|note| ("note", note.clone())));
+    write_rows(out, &rows)?;
+    write_cells(out, summary)?;
+    for event in s.alarms_raised.iter().take(MAX_SHOWN_ALARMS) {
+        write_alarm(out, event)?;
+    }
+    let more = s.events.get("alarm_raised").copied().unwrap_or(0).saturating_sub(MAX_SHOWN_ALARMS as u64);
+    if more > 0 {
+        writeln!(out, "... and {more} more alarms")?;
+    }
+    Ok(())
+}
+
+fn write_rows(out: &mut impl Write, rows: &[(&str, String)]) -> io::Result<()> {
+    let width = rows.iter().map(|(name, _)| name.len()).max().unwrap_or(0);
+    rows.iter().try_for_each(|(name, value)| writeln!(out, "{name:width$}  {value}"))
+}
+
+fn write_cells(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
+    if summary.cells.is_empty() {
+        return writeln!(out, "no estimate was made");
+    }
+    let with_std = |value: f64, std: f64, digits: usize| format!("{value:.digits$} +/- {std:.digits$}");
+    writeln!(
+        out,
+        "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}",
+        "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x"
+    )?;
+    for cell in summary.cells.iter().take(MAX_SHOWN_CELLS) {
+        let usable = cell.usable_capacity_ah.zip(cell.usable_capacity_std_ah);
+        writeln!(
+            out,
+            "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}",
+            cell.cell + 1,
+            with_std(100.0 * cell.soc, 100.0 * cell.soc_std, 2),
+            with_std(cell.capacity_ah, cell.capacity_std_ah, 3),
+            usable.map_or_else(|| "unknown".to_owned(), |(value, std)| with_std(value, std, 3)),
+            with_std(cell.resistance_ratio, cell.resistance_ratio_std, 2),
+        )?;
+    }
+    let more = summary.cells.len().saturating_sub(MAX_SHOWN_CELLS);
+    if more > 0 { writeln!(out, "  ... and {more} more cells (--json has all)") } else { Ok(()) }
+}
+
+fn write_alarm(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    let EventKind::Alarm { rule, cell, severity, value, threshold, .. } = event.kind else { return Ok(()) };
+    let place = cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell.0 + 1));
+    let value = value.map_or_else(|| "unknown".to_owned(), |value| format!("{value:.4}"));
+    let seconds = event.time.secs();
+    writeln!(out, "alarm {rule:?} ({severity:?}) at {seconds:.3} s, {place}: {value}, threshold {threshold}")
+}

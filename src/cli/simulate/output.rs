@@ -1,0 +1,126 @@
+//! The simulator's files: a candump log and the truth as CSV, plain or .gz.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+
+use crate::can::Frame;
+use crate::cli::Failure;
+use crate::io::candump::{self, StampDigits};
+use crate::quantity::{BusIndex, Timestamp};
+use crate::sim::{Moment, Simulation};
+
+/// A file being written, and its name for messages.
+struct Target {
+    path: PathBuf,
+    to: Destination,
+}
+
+enum Destination {
+    Stdout(BufWriter<io::Stdout>),
+    Plain(BufWriter<File>),
+    Gz(GzEncoder<BufWriter<File>>),
+}
+
+impl Target {
+    fn create(path: &Path) -> Result<Self, Failure> {
+        let file = || File::create(path).map(BufWriter::new).map_err(|e| failure(path, &e));
+        let to = match path.extension().and_then(|e| e.to_str()) {
+            _ if path == Path::new("-") => Destination::Stdout(BufWriter::new(io::stdout())),
+            Some("gz") => Destination::Gz(GzEncoder::new(file()?, Compression::fast())),
+            _ => Destination::Plain(file()?),
+        };
+        Ok(Self { path: path.to_owned(), to })
+    }
+
+    fn write(&mut self, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Failure> {
+        let result = match &mut self.to {
+            Destination::Stdout(out) => write(out),
+            Destination::Plain(out) => write(out),
+            Destination::Gz(out) => write(out),
+        };
+        result.map_err(|e| failure(&self.path, &e))
+    }
+
+    fn finish(self) -> Result<(), Failure> {
+        let result = match self.to {
+            Destination::Stdout(mut out) => out.flush(),
+            Destination::Plain(mut out) => out.flush(),
+            Destination::Gz(out) => out.finish().and_then(|mut file| file.flush()),
+        };
+        result.map_err(|e| failure(&self.path, &e))
+    }
+}
+
+fn failure(path: &Path, error: &io::Error) -> Failure {
+    Failure::new(format!("{}: cannot be written: {error}", path.display()))
+}
+
+/// Frames as candump lines with nanosecond stamps.
+pub(super) struct LogWriter {
+    target: Target,
+    interfaces: Vec<String>,
+}
+
+impl LogWriter {
+    pub(super) fn create(path: &Path, interfaces: Vec<String>) -> Result<Self, Failure> {
+        Ok(Self { target: Target::create(path)?, interfaces })
+    }
+
+    pub(super) fn write(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) -> Result<(), Failure> {
+        let interface = self.interfaces.get(bus.index()).map_or("can0", String::as_str);
+        self.target.write(|mut out| candump::write_line(&mut out, time, StampDigits::Nanos, interface, frame))
+    }
+
+    pub(super) fn finish(self) -> Result<(), Failure> {
+        self.target.finish()
+    }
+}
+
+/// The true state as CSV.
+pub(super) struct TruthWriter {
+    target: Target,
+    branches: usize,
+    period_ns: i64,
+    next: Option<Timestamp>,
+}
+
+impl TruthWriter {
+    pub(super) fn create(path: &Path, branches: usize, period_s: f64) -> Result<Self, Failure> {
+        let mut target = Target::create(path)?;
+        let columns: String = (1..=branches).map(|i| format!("u{i}_v,")).collect();
+        target.write(|out| {
+            writeln!(out, "time_s,cell,soc,{columns}capacity_ah,resistance_ratio,current_a,voltage_v,temperature_c")
+        })?;
+        Ok(Self { target, branches, period_ns: Timestamp::from_secs(period_s).nanos(), next: None })
+    }
+
+    /// One row per cell when a row is due and the cells were sampled.
+    pub(super) fn write(&mut self, start: Timestamp, moment: &Moment, sim: &Simulation) -> Result<(), Failure> {
+        if !moment.cells_sampled || self.next.is_some_and(|next| moment.time < next) {
+            return Ok(());
+        }
+        self.next = Some(moment.time.plus_nanos(self.period_ns));
+        let time_ns = start.plus_nanos(moment.time.nanos()).nanos();
+        let (seconds, micros) = (time_ns / 1_000_000_000, time_ns % 1_000_000_000 / 1000);
+        let (branches, current_a) = (self.branches, moment.current_a);
+        self.target.write(|out| {
+            for (cell, (truth, voltage_v)) in sim.pack().cells().iter().zip(sim.voltages_v()).enumerate() {
+                write!(out, "{seconds}.{micros:06},{cell},{:.9}", truth.soc)?;
+                for u in &truth.branch_v[..branches] {
+                    write!(out, ",{u:.6}")?;
+                }
+                let (capacity, ratio, celsius) = (truth.capacity_ah, truth.resistance_ratio, truth.temperature_c);
+                writeln!(out, ",{capacity:.6},{ratio:.6},{current_a:.6},{voltage_v:.6},{celsius:.3}")?;
+            }
+            Ok(())
+        })
+    }
+
+    pub(super) fn finish(self) -> Result<(), Failure> {
+        self.target.finish()
+    }
+}

@@ -1,0 +1,36 @@
+//! Plays simulated frames onto a CAN interface, at their own pace or a multiple of it.
+
+use std::time::{Duration, Instant};
+
+use crate::can::Frame;
+use crate::cli::Failure;
+use crate::io::socket::CanSender;
+use crate::quantity::Timestamp;
+
+/// Sends frames when their time has come.
+pub(super) struct Player {
+    sender: CanSender,
+    speed: f64,
+    /// Wall clock and stamp of the first frame.
+    begun: Option<(Instant, Timestamp)>,
+}
+
+impl Player {
+    /// Opens `interface`; speed 0 waits for nothing.
+    pub(super) fn open(interface: &str, fd: bool, speed: f64) -> Result<Self, Failure> {
+        let sender = CanSender::open(interface, fd).map_err(|error| Failure::new(error.to_string()))?;
+        Ok(Self { sender, speed, begun: None })
+    }
+
+    /// Waits until the frame is due, then sends it; every interface of the configuration goes onto this one.
+    pub(super) fn play(&mut self, time: Timestamp, frame: &Frame) -> Result<(), Failure> {
+        let (start, first) = *self.begun.get_or_insert_with(|| (Instant::now(), time));
+        if self.speed > 0.0 {
+            let due = Duration::try_from_secs_f64(time.since(first) / self.speed).unwrap_or_default();
+            if let Some(wait) = due.checked_sub(start.elapsed()) {
+                std::thread::sleep(wait);
+            }
+        }
+        self.sender.send(frame).map_err(|error| Failure::new(error.to_string()))
+    }
+}

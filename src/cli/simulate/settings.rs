@@ -1,0 +1,205 @@
+//! What the command line changes in a scenario's settings.
+
+use crate::cli::Failure;
+use crate::sim::{Hysteresis, Scenario, Settings};
+
+/// Scenarios by name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Name {
+    /// 2.6 Ah, 0.05 Ah lost per cycle between SOC 30 and 90 %, until 0.25 Ah
+    Paper,
+    /// The 30 Ah example: random discharge pulses, 1 Ah lost per cycle
+    Reference,
+    /// Random 5-minute loads with reference cycles in between
+    RandomWalk,
+    /// A day of an electric car: drive, park asleep, fast charge
+    EvDay,
+}
+
+impl From<Name> for Scenario {
+    fn from(name: Name) -> Self {
+        match name {
+            Name::Paper => Self::Paper,
+            Name::Reference => Self::Reference,
+            Name::RandomWalk => Self::RandomWalk,
+            Name::EvDay => Self::EvDay,
+        }
+    }
+}
+
+/// Every change; what is not given stays as the scenario has it. Amounts of a scenario (currents, losses) are stated
+/// for its source's cell and scale with the capacity.
+#[derive(Debug, clap::Args)]
+pub(super) struct Changes {
+    /// Seed of all randomness
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// End after this many cycles (reference: 10; random-walk: blocks, 1; ev-day: days)
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
+    cycles: Option<u32>,
+    /// End after this time, s (ev-day: 86400)
+    #[arg(long, value_name = "S", value_parser = positive)]
+    duration: Option<f64>,
+    /// Cells in series [default: as configured]
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..=1024))]
+    cells: Option<u16>,
+    /// Capacity of a new cell, Ah [default: the cell model's]
+    #[arg(long, value_name = "AH", value_parser = positive)]
+    pub(super) capacity_ah: Option<f64>,
+    /// SOC at the start, fraction (paper: 0.9; reference: 1; random-walk: 0.9; ev-day: 0.85)
+    #[arg(long, value_name = "SOC", value_parser = fraction)]
+    initial_soc: Option<f64>,
+    /// Temperature of the surroundings, degrees C [default: as configured]
+    #[arg(long, value_name = "C", allow_negative_numbers = true, value_parser = temperature)]
+    ambient: Option<f64>,
+    /// Capacity lost per cycle, Ah
+    #[arg(long, value_name = "AH", value_parser = non_negative)]
+    loss_per_cycle: Option<f64>,
+    /// Resistance gained per cycle, fraction of new
+    #[arg(long, value_name = "X", value_parser = non_negative)]
+    resistance_per_cycle: Option<f64>,
+    /// Spread of capacity over the cells, relative standard deviation (ev-day: 0.01, others 0)
+    #[arg(long, value_name = "X", value_parser = spread)]
+    spread_capacity: Option<f64>,
+    /// Spread of resistance over the cells, relative standard deviation (ev-day: 0.03, others 0)
+    #[arg(long, value_name = "X", value_parser = spread)]
+    spread_resistance: Option<f64>,
+    /// Spread of the first SOC over the cells, standard deviation (ev-day: 0.005, others 0)
+    #[arg(long, value_name = "X", value_parser = spread)]
+    spread_soc: Option<f64>,
+    /// Open-circuit hysteresis that the estimator does not model, V each way
+    #[arg(long, value_name = "V", value_parser = non_negative)]
+    hysteresis: Option<f64>,
+    /// Self-discharge, A
+    #[arg(long, value_name = "A", value_parser = non_negative)]
+    leakage: Option<f64>,
+    /// White noise of cell voltages, V (paper: 0.005)
+    #[arg(long, value_name = "V", value_parser = non_negative)]
+    noise_voltage: Option<f64>,
+    /// White noise of the current, A (paper: 0.02)
+    #[arg(long, value_name = "A", value_parser = non_negative)]
+    noise_current: Option<f64>,
+    /// White noise of temperatures, K (0.1)
+    #[arg(long, value_name = "K", value_parser = non_negative)]
+    noise_temperature: Option<f64>,
+    /// Constant error of cell voltages, V
+    #[arg(long, value_name = "V", allow_negative_numbers = true, value_parser = finite)]
+    offset_voltage: Option<f64>,
+    /// Constant error of the current, A (paper: 0.01)
+    #[arg(long, value_name = "A", allow_negative_numbers = true, value_parser = finite)]
+    offset_current: Option<f64>,
+    /// Relative error of the current (paper: 0.005)
+    #[arg(long, value_name = "X", allow_negative_numbers = true, value_parser = finite)]
+    gain_current: Option<f64>,
+    /// Step of the voltage converter, V (the DBC's own resolution comes on top)
+    #[arg(long, value_name = "V", value_parser = non_negative)]
+    resolution_voltage: Option<f64>,
+    /// Probability that a reading is missing
+    #[arg(long, value_name = "P", value_parser = fraction)]
+    dropout: Option<f64>,
+    /// Time between current samples, ms (ev-day: 10, others: 1000)
+    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    period: Option<u32>,
+    /// Time between samples of the cells, ms, a multiple of --period (ev-day: 100) [default: --period]
+    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    cell_period: Option<u32>,
+    /// Random walk: loads before each pair of reference cycles (1500)
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
+    walk_steps: Option<u32>,
+}
+
+impl Changes {
+    /// Changes `settings` as told.
+    pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
+        settings.seed = self.seed;
+        settings.cycles = self.cycles.or(settings.cycles);
+        settings.duration_s = self.duration.or(settings.duration_s);
+        settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);
+        self.apply_to_pack(settings);
+        self.apply_to_sensors(settings);
+        self.apply_periods(settings)
+    }
+
+    fn apply_to_pack(&self, settings: &mut Settings) {
+        let pack = &mut settings.pack;
+        pack.cells = self.cells.unwrap_or(pack.cells);
+        set(&mut pack.initial_soc, self.initial_soc);
+        set(&mut pack.ambient_c, self.ambient);
+        set(&mut pack.leakage_a, self.leakage);
+        set(&mut pack.ageing.capacity_loss_ah_per_cycle, self.loss_per_cycle);
+        set(&mut pack.ageing.resistance_growth_per_cycle, self.resistance_per_cycle);
+        set(&mut pack.spread.capacity, self.spread_capacity);
+        set(&mut pack.spread.resistance, self.spread_resistance);
+        set(&mut pack.spread.soc, self.spread_soc);
+        if let Some(magnitude_v) = self.hysteresis {
+            pack.hysteresis = Hysteresis { magnitude_v, ..Hysteresis::default() };
+        }
+    }
+
+    fn apply_to_sensors(&self, settings: &mut Settings) {
+        let sensors = &mut settings.sensors;
+        set(&mut sensors.voltage.noise_std, self.noise_voltage);
+        set(&mut sensors.voltage.offset, self.offset_voltage);
+        set(&mut sensors.voltage.resolution, self.resolution_voltage);
+        set(&mut sensors.current.noise_std, self.noise_current);
+        set(&mut sensors.current.offset, self.offset_current);
+        set(&mut sensors.current.gain, self.gain_current);
+        set(&mut sensors.temperature.noise_std, self.noise_temperature);
+        for sensor in [&mut sensors.current, &mut sensors.voltage, &mut sensors.temperature] {
+            set(&mut sensor.dropout, self.dropout);
+        }
+    }
+
+    fn apply_periods(&self, settings: &mut Settings) -> Result<(), Failure> {
+        let ns = |ms: u32| i64::from(ms) * 1_000_000;
+        if let Some(period) = self.period {
+            settings.current_period_ns = ns(period);
+            settings.cell_period_ns = ns(period);
+        }
+        settings.cell_period_ns = self.cell_period.map_or(settings.cell_period_ns, ns);
+        if settings.cell_period_ns % settings.current_period_ns != 0 {
+            let (cell, current) = (settings.cell_period_ns / 1_000_000, settings.current_period_ns / 1_000_000);
+            return Err(Failure::new(format!(
+                "--cell-period {cell}, must be a multiple of the current's {current} ms"
+            )));
+        }
+        Ok(())
+    }
+}
+
+fn set(value: &mut f64, change: Option<f64>) {
+    *value = change.unwrap_or(*value);
+}
+
+/// Parses a number above 0.
+pub(super) fn positive(text: &str) -> Result<f64, String> {
+    checked(text, "above 0", |x| x > 0.0)
+}
+
+/// Parses a number of 0 or more.
+pub(super) fn non_negative(text: &str) -> Result<f64, String> {
+    checked(text, "0 or more", |x| x >= 0.0)
+}
+
+fn fraction(text: &str) -> Result<f64, String> {
+    checked(text, "0 to 1", |x| (0.0..=1.0).contains(&x))
+}
+
+fn spread(text: &str) -> Result<f64, String> {
+    checked(text, "0 to 0.3", |x| (0.0..=0.3).contains(&x))
+}
+
+fn temperature(text: &str) -> Result<f64, String> {
+    checked(text, "-60 to 100", |x| (-60.0..=100.0).contains(&x))
+}
+
+fn finite(text: &str) -> Result<f64, String> {
+    checked(text, "a finite number", |_| true)
+}
+
+fn checked(text: &str, allowed: &str, good: fn(f64) -> bool) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(x) if x.is_finite() && good(x) => Ok(x),
+        _ => Err(format!("must be {allowed}")),
+    }
+}

@@ -1,0 +1,102 @@
+//! Cycling between two SOC limits: the paper's scenario and the published example.
+
+use super::super::noise::Noise;
+use super::super::scenario::Settings;
+use super::super::truth::Pack;
+use super::Demand;
+
+/// Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
+const PAPER_CURRENT_A: f64 = 1.325;
+/// Charging current of the example, A for 30 Ah (it says constant, not how much; half the capacity per hour).
+const REFERENCE_CHARGE_A: f64 = 15.0;
+/// Discharge pulses of the example, A for 30 Ah: uniform in this range, 15 A mean.
+const PULSE_A: (f64, f64) = (0.0, 30.0);
+/// Length of a pulse, s.
+const PULSE_S: f64 = 60.0;
+
+/// How the cell is discharged.
+#[derive(Debug, Clone)]
+enum Load {
+    Constant { current_a: f64 },
+    Pulses(Box<Pulses>),
+}
+
+/// Constant for [`PULSE_S`], then another strength.
+#[derive(Debug, Clone)]
+struct Pulses {
+    noise: Noise,
+    scale: f64,
+    current_a: f64,
+    left_s: f64,
+}
+
+impl Load {
+    fn next_a(&mut self, dt_s: f64) -> f64 {
+        match self {
+            Self::Constant { current_a } => *current_a,
+            Self::Pulses(pulses) => {
+                if pulses.left_s <= 0.0 {
+                    pulses.current_a = pulses.scale * pulses.noise.between(PULSE_A.0, PULSE_A.1);
+                    pulses.left_s = PULSE_S;
+                }
+                pulses.left_s -= dt_s;
+                pulses.current_a
+            }
+        }
+    }
+}
+
+/// Discharge to the low SOC, charge to the high one, age, again.
+#[derive(Debug, Clone)]
+pub(crate) struct CycleCourse {
+    load: Load,
+    charge_a: f64,
+    charging: bool,
+    soc_window: (f64, f64),
+    cycles: Option<u32>,
+    loss_ah: f64,
+    end_capacity_ah: f64,
+}
+
+impl CycleCourse {
+    pub(super) fn paper(settings: &Settings, scale: f64) -> Self {
+        let current_a = PAPER_CURRENT_A * scale;
+        Self::new(settings, Load::Constant { current_a }, current_a)
+    }
+
+    pub(super) fn reference(settings: &Settings, scale: f64, noise: Noise) -> Self {
+        let load = Pulses { noise, scale, current_a: 0.0, left_s: 0.0 };
+        Self::new(settings, Load::Pulses(Box::new(load)), REFERENCE_CHARGE_A * scale)
+    }
+
+    fn new(settings: &Settings, load: Load, charge_a: f64) -> Self {
+        Self {
+            load,
+            charge_a,
+            charging: false,
+            soc_window: settings.soc_window,
+            cycles: settings.cycles,
+            loss_ah: settings.pack.ageing.capacity_loss_ah_per_cycle,
+            end_capacity_ah: settings.end_capacity_ah,
+        }
+    }
+
+    pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
+        if self.charging && pack.highest_soc() >= self.soc_window.1 {
+            if self.is_last_cycle(pack) {
+                return Demand::Finished;
+            }
+            pack.complete_cycle();
+            self.charging = false;
+        } else if !self.charging && pack.lowest_soc() <= self.soc_window.0 {
+            self.charging = true;
+        }
+        Demand::Current(if self.charging { -self.charge_a } else { self.load.next_a(dt_s) })
+    }
+
+    /// Half a loss of tolerance: 47 losses of 0.05 Ah do not add up to 2.35 Ah in binary.
+    fn is_last_cycle(&self, pack: &Pack) -> bool {
+        self.cycles.is_some_and(|cycles| pack.cycles() + 1 >= cycles)
+            || pack.lowest_capacity_ah() - 0.5 * self.loss_ah < self.end_capacity_ah
+    }
+}

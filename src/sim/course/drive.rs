@@ -1,0 +1,158 @@
+//! A day of an electric car: drive, park asleep, fast charge.
+//!
+//! The car is a point mass that follows random target speeds with bounded acceleration; its electric power is scaled
+//! from a 60 kWh car to the pack at hand, so that every cell sees the same share of its capacity per hour.
+
+use super::super::noise::Noise;
+use super::super::truth::Pack;
+use super::Demand;
+
+/// Mass with two people, kg.
+const MASS_KG: f64 = 1900.0;
+/// Rolling resistance, fraction of weight.
+const ROLLING: f64 = 0.010;
+/// Half the air's density times drag coefficient times frontal area, kg/m.
+const DRAG_KG_PER_M: f64 = 0.5 * 1.2 * 0.25 * 2.3;
+/// Battery to wheel.
+const DRIVE_EFFICIENCY: f64 = 0.90;
+/// Wheel to battery.
+const REGEN_EFFICIENCY: f64 = 0.70;
+/// Everything that is not propulsion, W.
+const AUXILIARY_W: f64 = 600.0;
+/// Energy of the pack these numbers are for, Wh.
+const PACK_WH: f64 = 60_000.0;
+/// Voltage at which that energy is stated, V per cell.
+const NOMINAL_V: f64 = 3.65;
+/// Target speeds, km/h: town, country road, motorway.
+const SPEEDS_KMH: [f64; 8] = [0.0, 30.0, 50.0, 50.0, 70.0, 90.0, 110.0, 120.0];
+/// Strongest acceleration and braking, m/s^2.
+const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
+/// Limits of the power electronics, capacities per hour: regeneration and traction.
+const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
+/// A drive ends at this SOC with a charge, whatever the plan says.
+const RESERVE_SOC: f64 = 0.10;
+/// Fast charging ends here.
+const CHARGE_TO_SOC: f64 = 0.80;
+/// Fast charging current, capacities per hour: up to SOC 0.4, then falling in a line to the second at 0.8.
+const CHARGE_C: (f64, f64) = (1.5, 0.6);
+
+/// One stretch of the day.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    Drive {
+        left_s: f64,
+    },
+    /// Asleep until this second of the day.
+    Park {
+        until_s: f64,
+    },
+    FastCharge,
+}
+
+/// Shortest sleep, s, when drives and charges have eaten up the time.
+const MIN_SLEEP_S: f64 = 60.0;
+/// Length of a day, s.
+const DAY_S: f64 = 86_400.0;
+
+/// The plan of a day that begins at 7:30: to work, back at 17:00 with a stop at the charger, night.
+const DAY: [Phase; 6] = [
+    Phase::Drive { left_s: 3300.0 },
+    Phase::Park { until_s: 9.5 * 3600.0 },
+    Phase::Drive { left_s: 3300.0 },
+    Phase::FastCharge,
+    Phase::Drive { left_s: 900.0 },
+    Phase::Park { until_s: DAY_S },
+];
+
+/// Days, one after the other; each completed one counts as a cycle.
+#[derive(Debug, Clone)]
+pub(crate) struct DayCourse {
+    plan: usize,
+    phase: Phase,
+    day_s: f64,
+    noise: Noise,
+    capacity_ah: f64,
+    speed_m_s: f64,
+    target_m_s: f64,
+    hold_s: f64,
+}
+
+impl DayCourse {
+    pub(super) fn new(capacity_ah: f64, noise: Noise) -> Self {
+        Self { plan: 0, phase: DAY[0], day_s: 0.0, noise, capacity_ah, speed_m_s: 0.0, target_m_s: 0.0, hold_s: 0.0 }
+    }
+
+    pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
+        if matches!(self.phase, Phase::Drive { .. }) && pack.lowest_soc() < RESERVE_SOC {
+            self.phase = Phase::FastCharge;
+        }
+        match self.phase {
+            Phase::Drive { left_s } if left_s <= 0.0 => {
+                self.speed_m_s = 0.0;
+                self.next_phase(pack, dt_s)
+            }
+            Phase::Drive { left_s } => {
+                self.phase = Phase::Drive { left_s: left_s - dt_s };
+                self.day_s += dt_s;
+                Demand::Current(self.drive_a(pack, dt_s))
+            }
+            Phase::FastCharge if pack.highest_soc() >= CHARGE_TO_SOC => self.next_phase(pack, dt_s),
+            Phase::FastCharge => {
+                self.day_s += dt_s;
+                Demand::Current(self.charge_a(pack))
+            }
+            Phase::Park { until_s } => {
+                let duration_s = (until_s - self.day_s).max(MIN_SLEEP_S);
+                self.day_s += duration_s;
+                self.advance_plan(pack);
+                Demand::Asleep { duration_s }
+            }
+        }
+    }
+
+    fn next_phase(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
+        self.advance_plan(pack);
+        self.next(pack, dt_s)
+    }
+
+    fn advance_plan(&mut self, pack: &mut Pack) {
+        self.plan = (self.plan + 1) % DAY.len();
+        self.phase = DAY[self.plan];
+        if self.plan == 0 {
+            self.day_s -= DAY_S;
+            pack.complete_cycle();
+        }
+    }
+
+    fn drive_a(&mut self, pack: &Pack, dt_s: f64) -> f64 {
+        if self.hold_s <= 0.0 {
+            self.target_m_s = self.noise.choose(&SPEEDS_KMH) / 3.6;
+            self.hold_s = self.noise.between(15.0, 120.0);
+        }
+        self.hold_s -= dt_s;
+        let wanted = (self.target_m_s - self.speed_m_s) / dt_s.max(1.0); // 1 s to close the last difference
+        let acceleration = wanted.clamp(-ACCELERATION_M_S2.1, ACCELERATION_M_S2.0);
+        self.speed_m_s = (self.speed_m_s + acceleration * dt_s).max(0.0);
+        let capacities_per_hour = power_w(self.speed_m_s, acceleration) / PACK_WH;
+        let cell_v = 0.5 * (pack.lowest_v(0.0) + pack.highest_v(0.0));
+        let current_c = capacities_per_hour * NOMINAL_V / cell_v;
+        let floor_a = pack.current_at_highest_a(pack.model().voltage_max_v); // regeneration never overcharges
+        (self.capacity_ah * current_c.clamp(-CURRENT_LIMIT_C.0, CURRENT_LIMIT_C.1)).max(floor_a.min(0.0))
+    }
+
+    fn charge_a(&self, pack: &Pack) -> f64 {
+        let along = ((pack.highest_soc() - 0.4) / (CHARGE_TO_SOC - 0.4)).clamp(0.0, 1.0);
+        let current_c = CHARGE_C.0 + along * (CHARGE_C.1 - CHARGE_C.0);
+        (-self.capacity_ah * current_c).max(pack.current_at_highest_a(pack.model().voltage_max_v))
+    }
+}
+
+/// Electric power, W, negative when braking feeds the battery.
+fn power_w(speed_m_s: f64, acceleration_m_s2: f64) -> f64 {
+    if speed_m_s == 0.0 {
+        return AUXILIARY_W;
+    }
+    let force_n = MASS_KG * (acceleration_m_s2 + 9.81 * ROLLING) + DRAG_KG_PER_M * speed_m_s * speed_m_s;
+    let wheel_w = force_n * speed_m_s;
+    AUXILIARY_W + if wheel_w > 0.0 { wheel_w / DRIVE_EFFICIENCY } else { wheel_w * REGEN_EFFICIENCY }
+}

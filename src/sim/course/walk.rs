@@ -1,0 +1,126 @@
+//! The random walk: 5-minute loads of random strength within voltage limits, and reference cycles in between.
+
+use super::super::noise::Noise;
+use super::super::scenario::Settings;
+use super::super::truth::Pack;
+use super::Demand;
+
+/// The loads, A for 2.1 Ah.
+const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
+/// Length of a load that no voltage limit cuts short, s.
+const LOAD_S: f64 = 300.0;
+/// Voltage range of the walk, V (narrowed to the cell's own limits).
+const RANGE_V: (f64, f64) = (3.2, 4.2);
+/// Draws for a load within the voltage range before a rest takes its place: 12 loads, half of them of either sign.
+const MAX_DRAWS: u32 = 32;
+/// Reference current in both directions, A for 2.1 Ah.
+const REFERENCE_A: f64 = 2.0;
+/// Charging at constant voltage ends at this current, A for 2.1 Ah.
+const TAPER_END_A: f64 = 0.05;
+/// Rest after each half of a reference cycle, s.
+const REST_S: f64 = 1800.0;
+/// Reference cycles after each block of loads.
+const REFERENCE_CYCLES: u32 = 2;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Phase {
+    Walk { steps_left: u32, current_a: f64, left_s: f64 },
+    Charge { cycles_left: u32 },
+    RestFull { cycles_left: u32, left_s: f64 },
+    Discharge { cycles_left: u32 },
+    RestEmpty { cycles_left: u32, left_s: f64 },
+}
+
+/// Blocks of random loads, each followed by reference cycles; a block with its reference is the cycle that counts.
+#[derive(Debug, Clone)]
+pub(crate) struct WalkCourse {
+    phase: Phase,
+    noise: Noise,
+    scale: f64,
+    steps: u32,
+    cycles: Option<u32>,
+    end_capacity_ah: f64,
+}
+
+impl WalkCourse {
+    pub(super) fn new(settings: &Settings, scale: f64, noise: Noise) -> Self {
+        Self {
+            phase: Phase::Walk { steps_left: settings.walk_steps, current_a: 0.0, left_s: 0.0 },
+            noise,
+            scale,
+            steps: settings.walk_steps,
+            cycles: settings.cycles,
+            end_capacity_ah: settings.end_capacity_ah,
+        }
+    }
+
+    pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
+        let low_v = RANGE_V.0.max(pack.model().voltage_min_v);
+        let high_v = RANGE_V.1.min(pack.model().voltage_max_v);
+        match self.phase {
+            Phase::Walk { steps_left, current_a, left_s } => {
+                let inside = pack.lowest_v(current_a) > low_v && pack.highest_v(current_a) < high_v;
+                if inside && left_s > 0.0 {
+                    self.phase = Phase::Walk { steps_left, current_a, left_s: left_s - dt_s };
+                    return Demand::Current(current_a);
+                }
+                if steps_left == 0 {
+                    return self.enter(Phase::Charge { cycles_left: REFERENCE_CYCLES }, pack, dt_s);
+                }
+                let current_a = self.draw_load(pack, low_v, high_v);
+                self.phase = Phase::Walk { steps_left: steps_left - 1, current_a, left_s: LOAD_S - dt_s };
+                Demand::Current(current_a)
+            }
+            Phase::Charge { cycles_left } => {
+                let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
+                if current_a > -TAPER_END_A * self.scale {
+                    return self.enter(Phase::RestFull { cycles_left, left_s: REST_S }, pack, dt_s);
+                }
+                Demand::Current(current_a)
+            }
+            Phase::RestFull { cycles_left, left_s } if left_s > 0.0 => {
+                self.rest(Phase::RestFull { cycles_left, left_s: left_s - dt_s })
+            }
+            Phase::RestFull { cycles_left, .. } => self.enter(Phase::Discharge { cycles_left }, pack, dt_s),
+            Phase::Discharge { cycles_left } => {
+                let current_a = REFERENCE_A * self.scale;
+                if pack.lowest_v(current_a) <= low_v {
+                    let cycles_left = cycles_left - 1;
+                    return self.enter(Phase::RestEmpty { cycles_left, left_s: REST_S }, pack, dt_s);
+                }
+                Demand::Current(current_a)
+            }
+            Phase::RestEmpty { cycles_left, left_s } if left_s > 0.0 => {
+                self.rest(Phase::RestEmpty { cycles_left, left_s: left_s - dt_s })
+            }
+            Phase::RestEmpty { cycles_left: 0, .. } => self.next_block(pack, dt_s),
+            Phase::RestEmpty { cycles_left, .. } => self.enter(Phase::Charge { cycles_left }, pack, dt_s),
+        }
+    }
+
+    fn enter(&mut self, phase: Phase, pack: &mut Pack, dt_s: f64) -> Demand {
+        self.phase = phase;
+        self.next(pack, dt_s)
+    }
+
+    fn rest(&mut self, phase: Phase) -> Demand {
+        self.phase = phase;
+        Demand::Current(0.0)
+    }
+
+    fn next_block(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
+        pack.complete_cycle();
+        if self.cycles.is_some_and(|cycles| pack.cycles() >= cycles) || pack.lowest_capacity_ah() < self.end_capacity_ah
+        {
+            return Demand::Finished;
+        }
+        self.enter(Phase::Walk { steps_left: self.steps, current_a: 0.0, left_s: 0.0 }, pack, dt_s)
+    }
+
+    fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {
+        (0..MAX_DRAWS)
+            .map(|_| self.scale * self.noise.choose(&LOADS_A))
+            .find(|&a| pack.lowest_v(a) > low_v && pack.highest_v(a) < high_v)
+            .unwrap_or(0.0)
+    }
+}

@@ -1,0 +1,161 @@
+//! Whole scenarios, run without any file.
+
+use super::super::scenario::Scenario;
+use super::super::truth::tests::plain_model;
+use super::*;
+
+fn simulation(settings: Settings) -> Simulation {
+    Simulation::new(plain_model(settings.pack.capacity_ah), settings, Wiring::single())
+}
+
+struct Course {
+    moments: u64,
+    end_s: f64,
+    soc: (f64, f64),
+    voltage_v: (f64, f64),
+    current_a: (f64, f64),
+    longest_gap_s: f64,
+    mean_discharge_a: f64,
+}
+
+fn run(sim: &mut Simulation) -> Course {
+    let outside = (f64::INFINITY, f64::NEG_INFINITY);
+    let widen = |range: (f64, f64), x: f64| (range.0.min(x), range.1.max(x));
+    let mut c = Course {
+        moments: 0,
+        end_s: 0.0,
+        soc: outside,
+        voltage_v: outside,
+        current_a: outside,
+        longest_gap_s: 0.0,
+        mean_discharge_a: 0.0,
+    };
+    let mut discharges = 0.0;
+    while let Some(moment) = sim.advance() {
+        c.moments += 1;
+        c.longest_gap_s = f64::max(c.longest_gap_s, moment.time.secs() - c.end_s);
+        c.end_s = moment.time.secs();
+        for (cell, voltage_v) in sim.pack().cells().iter().zip(sim.voltages_v()) {
+            c.soc = widen(c.soc, cell.soc);
+            c.voltage_v = widen(c.voltage_v, voltage_v);
+        }
+        c.current_a = widen(c.current_a, moment.current_a);
+        if moment.current_a > 0.0 {
+            discharges += 1.0;
+            c.mean_discharge_a += (moment.current_a - c.mean_discharge_a) / discharges;
+        }
+    }
+    c
+}
+
+#[test]
+fn paper_scenario_takes_the_papers_time_and_ends_at_its_capacity() {
+    let mut sim = simulation(Settings::of(Scenario::Paper, 2.6));
+    let course = run(&mut sim);
+    assert_eq!(sim.pack().cycles(), 47); // the 48th, at 0.25 Ah, is the last and loses nothing
+    assert!((sim.pack().lowest_capacity_ah() - 0.25).abs() < 1e-9);
+    assert!((course.end_s / 2.23e5 - 1.0).abs() < 0.01, "{} s", course.end_s);
+    let one_sample = 1.325 / (3600.0 * 0.25);
+    assert!(course.soc.0 > 0.3 - 2.0 * one_sample && course.soc.1 < 0.9 + 2.0 * one_sample, "{:?}", course.soc);
+    assert_eq!(course.moments, course.end_s as u64 + 1);
+}
+
+#[test]
+fn reference_scenario_loses_1_ah_per_cycle_under_pulses_of_15_a_mean() {
+    let mut sim = simulation(Settings::of(Scenario::Reference, 30.0));
+    let course = run(&mut sim);
+    assert!((sim.pack().lowest_capacity_ah() - 21.0).abs() < 1e-9);
+    assert!(course.soc.0 > 0.299 && course.soc.1 == 1.0, "{:?}", course.soc);
+    assert!((course.mean_discharge_a - 15.0).abs() < 1.0, "{} A", course.mean_discharge_a);
+    assert!(course.current_a.0 == -15.0 && course.current_a.1 <= 30.0, "{:?}", course.current_a);
+}
+
+#[test]
+fn random_walk_stays_within_its_voltages_and_measures_by_two_reference_cycles() {
+    let mut settings = Settings::of(Scenario::RandomWalk, 2.1);
+    settings.walk_steps = 60;
+    settings.cycles = Some(2);
+    let mut sim = simulation(settings);
+    let course = run(&mut sim);
+    assert_eq!(sim.pack().cycles(), 2);
+    assert!(course.voltage_v.0 > 3.19 && course.voltage_v.1 < 4.2 + 1e-9, "{:?}", course.voltage_v);
+    assert_eq!(course.current_a, (-4.5, 4.5));
+    let walk_s = 2.0 * 60.0 * 300.0;
+    assert!(course.end_s > 0.3 * walk_s + 4.0 * 3600.0 && course.end_s < walk_s + 16.0 * 3600.0, "{}", course.end_s);
+    assert!(sim.pack().lowest_capacity_ah() < 2.1 && sim.pack().cells()[0].resistance_ratio > 1.0);
+}
+
+#[test]
+fn ev_day_drives_regenerates_sleeps_and_charges() {
+    let mut settings = Settings::of(Scenario::EvDay, 50.0);
+    settings.pack.cells = 3;
+    let mut sim = simulation(settings);
+    let course = run(&mut sim);
+    assert_eq!(course.longest_gap_s.round(), 9.5 * 3600.0 - 3300.0); // the night ends with the run
+    assert_eq!(sim.pack().cycles(), 1);
+    assert!(course.soc.0 > 0.3 && course.soc.1 < 0.88, "{:?}", course.soc);
+    assert!(course.current_a.1 > 50.0 && course.current_a.0 < -20.0, "{:?}", course.current_a);
+    assert!(course.voltage_v.1 <= 4.2 + 1e-3);
+    let awake_s = course.moments as f64 * 0.01;
+    assert!((7500.0..12_000.0).contains(&awake_s), "{awake_s}");
+}
+
+#[test]
+fn cells_are_sampled_at_their_own_period_and_see_the_mean_current() {
+    let mut settings = Settings::of(Scenario::EvDay, 50.0);
+    settings.pack.cells = 1;
+    settings.pack.spread = Default::default();
+    settings.duration_s = Some(60.0);
+    let mut sim = simulation(settings);
+    let (mut charge_as, mut cell_samples, mut samples) = (0.0, 0, 0);
+    while let Some(moment) = sim.advance() {
+        if moment.cells_sampled {
+            let moved = (0.85 - sim.pack().cells()[0].soc) * 3600.0 * sim.pack().cells()[0].capacity_ah;
+            assert!((moved - charge_as).abs() < 0.01 + 1e-4 * charge_as.abs());
+            cell_samples += 1;
+        }
+        assert_eq!(sim.readings().len(), if moment.cells_sampled { 4 } else { 1 });
+        charge_as += moment.current_a * 0.01;
+        samples += 1;
+    }
+    assert_eq!((samples, cell_samples), (6000, 600));
+}
+
+#[test]
+fn a_seed_gives_the_same_readings_again_and_another_seed_others() {
+    let readings = |seed| {
+        let mut settings = Settings::of(Scenario::Reference, 30.0);
+        (settings.seed, settings.duration_s) = (seed, Some(500.0));
+        let mut sim = simulation(settings);
+        let mut all = Vec::new();
+        while sim.advance().is_some() {
+            all.extend(sim.readings().iter().map(|(channel, value)| (*channel, value.map(f64::to_bits))));
+        }
+        all
+    };
+    assert_eq!(readings(4), readings(4));
+    assert_ne!(readings(4), readings(5));
+}
+
+#[test]
+fn scenarios_scale_with_the_cell() {
+    let settings = Settings::of(Scenario::Paper, 5.2);
+    assert_eq!(settings.pack.ageing.capacity_loss_ah_per_cycle, 0.1);
+    let mut sim = simulation(settings);
+    assert_eq!(sim.advance().map(|m| m.current_a), Some(2.65));
+}
+
+#[test]
+fn pack_current_is_strings_times_cell_current_and_pack_voltage_the_sum() {
+    let mut settings = Settings::of(Scenario::Paper, 2.6);
+    settings.pack.cells = 4;
+    settings.sensors = Default::default();
+    let wiring = Wiring { strings: 3, temperature_at: vec![None] };
+    let mut sim = Simulation::new(plain_model(2.6), settings, wiring);
+    sim.advance();
+    let of = |channel| sim.readings().iter().find(|(c, _)| *c == channel).and_then(|(_, v)| *v);
+    assert_eq!(of(Channel::Current), Some(3.0 * 1.325));
+    assert_eq!(of(Channel::Temperature(SensorIndex(0))), Some(25.0));
+    let total: f64 = (0..4).filter_map(|i| of(Channel::CellVoltage(CellIndex(i)))).sum();
+    assert!((of(Channel::PackVoltage).unwrap_or(0.0) - total).abs() < 1e-12);
+}

@@ -1,0 +1,96 @@
+//! What a sensor makes of a true value.
+//!
+//! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`, n normal and independent from sample to
+//! sample; or no reading at all with probability `dropout`. Resolution 0 leaves quantisation to the signal's own
+//! encoding in the DBC.
+
+use super::noise::{Noise, Stream};
+
+/// Errors of one kind of sensor, in its own unit.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct SensorError {
+    /// Standard deviation of the white noise per sample.
+    pub noise_std: f64,
+    /// Constant error.
+    pub offset: f64,
+    /// Relative error of the slope.
+    pub gain: f64,
+    /// Step of the converter; 0 = none.
+    pub resolution: f64,
+    /// Probability that a sample is missing.
+    pub dropout: f64,
+}
+
+/// Errors of all sensors of a pack.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Sensors {
+    /// Pack current, A.
+    pub current: SensorError,
+    /// Cell voltages, V (the pack voltage has the same relative to its cells: noise times the root of their number).
+    pub voltage: SensorError,
+    /// Temperatures, degrees C.
+    pub temperature: SensorError,
+}
+
+/// One sensor with its own stream of noise.
+#[derive(Debug, Clone)]
+pub(crate) struct Sensor {
+    error: SensorError,
+    noise: Noise,
+}
+
+impl Sensor {
+    pub(crate) fn new(error: SensorError, seed: u64, stream: Stream) -> Self {
+        Self { error, noise: Noise::new(seed, stream) }
+    }
+
+    /// The reading of `truth`; `None` = dropped out. Draws the same random numbers either way.
+    pub(crate) fn read(&mut self, truth: f64) -> Option<f64> {
+        let e = self.error;
+        let value = truth * (1.0 + e.gain) + e.offset + e.noise_std * self.noise.normal();
+        let dropped = e.dropout > 0.0 && self.noise.uniform() < e.dropout;
+        if dropped {
+            return None;
+        }
+        Some(if e.resolution > 0.0 { (value / e.resolution).round() * e.resolution } else { value })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn readings(error: SensorError, truth: f64, n: usize) -> Vec<Option<f64>> {
+        let mut sensor = Sensor::new(error, 11, Stream::Current);
+        (0..n).map(|_| sensor.read(truth)).collect()
+    }
+
+    #[test]
+    fn without_errors_the_truth_is_read() {
+        assert_eq!(readings(SensorError::default(), 3.7, 3), vec![Some(3.7); 3]);
+    }
+
+    #[test]
+    fn noise_offset_and_gain_have_the_stated_size() {
+        let error = SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, ..SensorError::default() };
+        let values: Vec<f64> = readings(error, 2.0, 100_000).into_iter().flatten().collect();
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let std = (values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / n).sqrt();
+        assert!((mean - 2.02).abs() < 3e-4, "mean {mean}");
+        assert!((std - 0.02).abs() < 2e-4, "std {std}");
+    }
+
+    #[test]
+    fn resolution_leaves_only_whole_steps() {
+        let error = SensorError { noise_std: 0.1, resolution: 0.25, ..SensorError::default() };
+        assert!(readings(error, 1.1, 100).into_iter().flatten().all(|v| (v * 4.0).fract() == 0.0));
+    }
+
+    #[test]
+    fn dropouts_come_as_often_as_stated() {
+        let error = SensorError { dropout: 0.1, ..SensorError::default() };
+        let missing = readings(error, 1.0, 50_000).iter().filter(|v| v.is_none()).count();
+        assert!((4_700..5_300).contains(&missing), "{missing}");
+    }
+}

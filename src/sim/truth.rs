@@ -1,0 +1,392 @@
+//! The pack as it really is: what the estimator has to find out and never sees.
+//!
+//! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with things the
+//! estimator does not model. Current positive = discharge. Over one step of `dt` seconds the current and the tables'
+//! values are constant, and within that every equation is solved exactly:
+//! * `SOC -= (I + I_leak) dt / (3600 C)`; it is not clamped, 0 and 1 are open-circuit voltages and not walls;
+//! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance, time constants stay;
+//! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
+//! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
+//!
+//! Terminal voltage `V = OCV(SOC, T) + M h - sum U_i - I R0`.
+//! Ageing changes capacity and resistance; the SOC fraction stays (the reference example's plant does so too).
+
+use super::noise::{Noise, Stream};
+use crate::cell::{CellModel, MAX_BRANCHES};
+
+/// Open-circuit hysteresis the estimator does not model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Hysteresis {
+    /// Distance of the settled discharge and charge curves from the OCV, V; 0 = none.
+    pub magnitude_v: f64,
+    /// How fast a change of direction takes hold: e-foldings per full charge moved.
+    pub rate: f64,
+}
+
+impl Default for Hysteresis {
+    fn default() -> Self {
+        Self { magnitude_v: 0.0, rate: 50.0 }
+    }
+}
+
+/// How a cell grows old.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Ageing {
+    /// Capacity lost at the end of each cycle, Ah.
+    pub capacity_loss_ah_per_cycle: f64,
+    /// Capacity lost per Ah moved in either direction, Ah.
+    pub capacity_loss_ah_per_ah: f64,
+    /// Resistance gained at the end of each cycle, relative to new.
+    pub resistance_growth_per_cycle: f64,
+    /// Resistance gained per Ah moved in either direction, relative to new.
+    pub resistance_growth_per_ah: f64,
+}
+
+/// Standard deviations of what differs from cell to cell.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Spread {
+    /// Capacity, relative.
+    pub capacity: f64,
+    /// Resistance, relative.
+    pub resistance: f64,
+    /// SOC at the start, fraction.
+    pub soc: f64,
+}
+
+/// A pack of equal cells in series, but for their spread.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PackSettings {
+    /// Cells in series, at least 1.
+    pub cells: u16,
+    /// Capacity of a new cell, Ah.
+    pub capacity_ah: f64,
+    /// SOC at the start, fraction.
+    pub initial_soc: f64,
+    /// What differs from cell to cell.
+    pub spread: Spread,
+    /// Ageing.
+    pub ageing: Ageing,
+    /// Hysteresis.
+    pub hysteresis: Hysteresis,
+    /// Self-discharge, A.
+    pub leakage_a: f64,
+    /// Temperature of the surroundings and of the cells at the start, degrees C.
+    pub ambient_c: f64,
+}
+
+/// A capacity never falls below this fraction of the new one: SOC divides by it.
+const CAPACITY_FLOOR: f64 = 0.01;
+/// Spread beyond this many standard deviations is cut off, so that no cell gets a negative capacity.
+const SPREAD_LIMIT: f64 = 3.0;
+
+/// One cell as it really is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TruthCell {
+    /// State of charge, fraction.
+    pub soc: f64,
+    /// Branch voltages, V; 0 beyond the model's branches.
+    pub branch_v: [f64; MAX_BRANCHES],
+    /// Hysteresis state, -1 (discharged into) to 1 (charged into).
+    pub hysteresis: f64,
+    /// Temperature, degrees C.
+    pub temperature_c: f64,
+    /// Capacity, Ah.
+    pub capacity_ah: f64,
+    /// Resistance relative to the model.
+    pub resistance_ratio: f64,
+    /// Charge moved so far in either direction, Ah.
+    pub throughput_ah: f64,
+    floor_ah: f64,
+}
+
+impl TruthCell {
+    fn new(settings: &PackSettings, noise: &mut Noise) -> Self {
+        let mut spread = |std: f64| std * noise.normal().clamp(-SPREAD_LIMIT, SPREAD_LIMIT);
+        let floor_ah = settings.capacity_ah * CAPACITY_FLOOR;
+        Self {
+            capacity_ah: (settings.capacity_ah * (1.0 + spread(settings.spread.capacity))).max(floor_ah),
+            resistance_ratio: (1.0 + spread(settings.spread.resistance)).max(0.1),
+            soc: settings.initial_soc + spread(settings.spread.soc),
+            branch_v: [0.0; MAX_BRANCHES],
+            hysteresis: 0.0,
+            temperature_c: settings.ambient_c,
+            throughput_ah: 0.0,
+            floor_ah,
+        }
+    }
+
+    /// Terminal voltage, V, while `current_a` flows.
+    pub fn voltage_v(&self, model: &CellModel, hysteresis: &Hysteresis, current_a: f64) -> f64 {
+        let place = model.place(self.soc, self.temperature_c);
+        self.unloaded_v(model, hysteresis) - current_a * model.r0_ohm(&place) * self.resistance_ratio
+    }
+
+    /// The current, A, at which the terminal voltage would be `voltage_v`.
+    pub fn current_at_a(&self, model: &CellModel, hysteresis: &Hysteresis, voltage_v: f64) -> f64 {
+        let place = model.place(self.soc, self.temperature_c);
+        (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
+    }
+
+    fn unloaded_v(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
+        let place = model.place(self.soc, self.temperature_c);
+        model.ocv_v(&place) + hysteresis.magnitude_v * self.hysteresis - self.branch_v.iter().sum::<f64>()
+    }
+
+    fn step(&mut self, model: &CellModel, settings: &PackSettings, current_a: f64, dt_s: f64) {
+        let place = model.place(self.soc, self.temperature_c);
+        let mut heat_w = current_a * current_a * model.r0_ohm(&place) * self.resistance_ratio;
+        for i in 0..model.branches.len() {
+            let r = model.branch_r_ohm(i, &place) * self.resistance_ratio;
+            heat_w += self.branch_v[i] * self.branch_v[i] / r;
+            let a = libm::exp(-dt_s / model.branch_tau_s(i, &place));
+            self.branch_v[i] = self.branch_v[i] * a + r * current_a * (1.0 - a);
+        }
+        let charge_ah = current_a * dt_s / 3600.0;
+        if settings.hysteresis.magnitude_v != 0.0 && current_a != 0.0 {
+            let e = libm::exp(-charge_ah.abs() * settings.hysteresis.rate / self.capacity_ah);
+            self.hysteresis = self.hysteresis * e - (1.0 - e) * current_a.signum();
+        }
+        self.soc -= (charge_ah + settings.leakage_a * dt_s / 3600.0) / self.capacity_ah;
+        if let Some(thermal) = &model.thermal {
+            let end_c = settings.ambient_c + thermal.resistance_k_per_w * heat_w;
+            let tau_s = thermal.resistance_k_per_w * thermal.heat_capacity_j_per_k;
+            self.temperature_c = end_c + (self.temperature_c - end_c) * libm::exp(-dt_s / tau_s);
+        }
+        self.throughput_ah += charge_ah.abs();
+        self.age(
+            settings.ageing.capacity_loss_ah_per_ah * charge_ah.abs(),
+            settings.ageing.resistance_growth_per_ah * charge_ah.abs(),
+        );
+    }
+
+    fn age(&mut self, capacity_loss_ah: f64, resistance_growth: f64) {
+        self.capacity_ah = (self.capacity_ah - capacity_loss_ah).max(self.floor_ah);
+        self.resistance_ratio += resistance_growth;
+    }
+}
+
+/// Cells in series.
+#[derive(Debug, Clone)]
+pub struct Pack {
+    model: CellModel,
+    settings: PackSettings,
+    cells: Vec<TruthCell>,
+    cycles: u32,
+}
+
+impl Pack {
+    /// A pack at rest; the spread of its cells follows from `seed`.
+    pub fn new(model: CellModel, settings: PackSettings, seed: u64) -> Self {
+        assert!(settings.cells > 0, "a pack has at least one cell");
+        let mut noise = Noise::new(seed, Stream::Spread);
+        let cells = (0..settings.cells).map(|_| TruthCell::new(&settings, &mut noise)).collect();
+        Self { model, settings, cells, cycles: 0 }
+    }
+
+    /// `current_a` flows through every cell for `dt_s` seconds.
+    pub fn step(&mut self, current_a: f64, dt_s: f64) {
+        for cell in &mut self.cells {
+            cell.step(&self.model, &self.settings, current_a, dt_s);
+        }
+    }
+
+    /// A cycle is over: the ageing that comes per cycle happens now.
+    pub fn complete_cycle(&mut self) {
+        self.cycles += 1;
+        let ageing = self.settings.ageing;
+        for cell in &mut self.cells {
+            cell.age(ageing.capacity_loss_ah_per_cycle, ageing.resistance_growth_per_cycle);
+        }
+    }
+
+    /// Cycles completed.
+    pub fn cycles(&self) -> u32 {
+        self.cycles
+    }
+
+    /// The cells.
+    pub fn cells(&self) -> &[TruthCell] {
+        &self.cells
+    }
+
+    /// The cells' model.
+    pub fn model(&self) -> &CellModel {
+        &self.model
+    }
+
+    /// Terminal voltage of each cell while `current_a` flows, V.
+    pub fn voltages_v(&self, current_a: f64) -> impl Iterator<Item = f64> + '_ {
+        self.cells.iter().map(move |cell| cell.voltage_v(&self.model, &self.settings.hysteresis, current_a))
+    }
+
+    /// Lowest cell voltage while `current_a` flows, V.
+    pub fn lowest_v(&self, current_a: f64) -> f64 {
+        self.voltages_v(current_a).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Highest cell voltage while `current_a` flows, V.
+    pub fn highest_v(&self, current_a: f64) -> f64 {
+        self.voltages_v(current_a).fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// The current, A, at which no cell is above `voltage_v` and the highest is just there.
+    pub fn current_at_highest_a(&self, voltage_v: f64) -> f64 {
+        let at = |cell: &TruthCell| cell.current_at_a(&self.model, &self.settings.hysteresis, voltage_v);
+        self.cells.iter().map(at).fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// SOC of the emptiest cell.
+    pub fn lowest_soc(&self) -> f64 {
+        self.cells.iter().map(|cell| cell.soc).fold(f64::INFINITY, f64::min)
+    }
+
+    /// SOC of the fullest cell.
+    pub fn highest_soc(&self) -> f64 {
+        self.cells.iter().map(|cell| cell.soc).fold(f64::NEG_INFINITY, f64::max)
+    }
+
+    /// Capacity of the weakest cell, Ah.
+    pub fn lowest_capacity_ah(&self) -> f64 {
+        self.cells.iter().map(|cell| cell.capacity_ah).fold(f64::INFINITY, f64::min)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::cell::{Branch, Table, Thermal};
+
+    /// A flat-resistance cell: closed forms hold over any swing.
+    pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
+        let k = capacity_ah / 2.6;
+        let flat = |value: f64| Table { values: vec![vec![value; 5]] };
+        CellModel {
+            name: "plain".into(),
+            rated_capacity_ah: capacity_ah,
+            capacity_ah,
+            voltage_min_v: 2.5,
+            voltage_max_v: 4.2,
+            soc: vec![0.0, 0.1, 0.5, 0.9, 1.0],
+            temperature_c: vec![25.0],
+            ocv_v: Table { values: vec![vec![3.0, 3.45, 3.7, 4.08, 4.19]] },
+            r0_ohm: flat(0.03 / k),
+            branches: vec![Branch { r_ohm: flat(0.02 / k), c_farad: flat(2000.0 * k) }],
+            thermal: Some(Thermal { heat_capacity_j_per_k: 45.0 * k, resistance_k_per_w: 8.0 / k }),
+        }
+    }
+
+    pub(crate) fn plain_settings() -> PackSettings {
+        PackSettings {
+            cells: 1,
+            capacity_ah: 2.6,
+            initial_soc: 0.9,
+            spread: Spread::default(),
+            ageing: Ageing::default(),
+            hysteresis: Hysteresis::default(),
+            leakage_a: 0.0,
+            ambient_c: 25.0,
+        }
+    }
+
+    fn plain_pack() -> Pack {
+        Pack::new(plain_model(2.6), plain_settings(), 1)
+    }
+
+    #[test]
+    fn constant_current_moves_soc_linearly_and_u1_exponentially_whatever_the_step() {
+        for dt in [0.1, 1.0, 10.0] {
+            let mut pack = plain_pack();
+            for _ in 0..(600.0 / dt) as u32 {
+                pack.step(1.3, dt);
+            }
+            let cell = pack.cells()[0];
+            assert!((cell.soc - (0.9 - 1.3 * 600.0 / (3600.0 * 2.6))).abs() < 1e-12, "dt {dt}");
+            let u1 = 1.3 * 0.02 * (1.0 - libm::exp(-600.0 / 40.0));
+            assert!((cell.branch_v[0] - u1).abs() < 1e-12, "dt {dt}");
+        }
+    }
+
+    #[test]
+    fn temperature_settles_where_losses_equal_cooling() {
+        let mut pack = plain_pack();
+        for i in 0..20_000 {
+            pack.step(if i % 2 == 0 { 3.0 } else { -3.0 }, 1.0);
+        }
+        let losses_w = 9.0 * 0.03; // the branch voltage stays near 0 with alternating current
+        assert!((pack.cells()[0].temperature_c - (25.0 + 8.0 * losses_w)).abs() < 0.01);
+    }
+
+    #[test]
+    fn cut_off_current_gives_the_voltage_asked_for() {
+        let mut pack = plain_pack();
+        pack.step(-2.0, 300.0);
+        let current = pack.current_at_highest_a(4.2);
+        assert!((pack.highest_v(current) - 4.2).abs() < 1e-12);
+    }
+
+    #[test]
+    fn hysteresis_parts_the_curves_by_its_magnitude_and_is_off_by_default() {
+        let mut settings = plain_settings();
+        settings.hysteresis = Hysteresis { magnitude_v: 0.02, rate: 50.0 };
+        let mut pack = Pack::new(plain_model(2.6), settings, 1);
+        let mut without = plain_pack();
+        for (current, shift) in [(1.3, -0.02), (-1.3, 0.02)] {
+            for _ in 0..1800 {
+                pack.step(current, 1.0);
+                without.step(current, 1.0);
+            }
+            assert!((pack.lowest_v(0.0) - without.lowest_v(0.0) - shift).abs() < 1e-5);
+        }
+        assert_eq!(without.cells()[0].hysteresis, 0.0);
+    }
+
+    #[test]
+    fn ageing_per_cycle_and_per_charge_add_up_and_keep_the_soc() {
+        let mut settings = plain_settings();
+        settings.ageing = Ageing {
+            capacity_loss_ah_per_cycle: 0.05,
+            capacity_loss_ah_per_ah: 0.01,
+            resistance_growth_per_cycle: 0.1,
+            resistance_growth_per_ah: 0.02,
+        };
+        let mut pack = Pack::new(plain_model(2.6), settings, 1);
+        pack.step(1.0, 3600.0);
+        let soc = pack.cells()[0].soc;
+        pack.complete_cycle();
+        let cell = pack.cells()[0];
+        assert!((cell.capacity_ah - 2.54).abs() < 1e-12);
+        assert!((cell.resistance_ratio - 1.12).abs() < 1e-12);
+        assert_eq!((cell.soc, pack.cycles()), (soc, 1));
+        for _ in 0..100 {
+            pack.complete_cycle();
+        }
+        assert!(pack.lowest_capacity_ah() > 0.0);
+    }
+
+    #[test]
+    fn leakage_discharges_a_resting_cell() {
+        let mut settings = plain_settings();
+        settings.leakage_a = 0.001;
+        let mut pack = Pack::new(plain_model(2.6), settings, 1);
+        pack.step(0.0, 3600.0 * 100.0);
+        assert!((pack.cells()[0].soc - (0.9 - 0.1 / 2.6)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn spread_has_the_stated_size_and_follows_from_the_seed() {
+        let mut settings = plain_settings();
+        settings.cells = 1000;
+        settings.spread = Spread { capacity: 0.02, resistance: 0.1, soc: 0.01 };
+        let pack = |seed| Pack::new(plain_model(2.6), settings, seed);
+        assert_eq!(pack(5).cells(), pack(5).cells());
+        assert_ne!(pack(5).cells(), pack(6).cells());
+        let std = |value: fn(&TruthCell) -> f64| {
+            let values: Vec<f64> = pack(5).cells().iter().map(value).collect();
+            let mean = values.iter().sum::<f64>() / 1000.0;
+            (values.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / 1000.0).sqrt()
+        };
+        assert!((std(|c| c.capacity_ah / 2.6) / 0.02 - 1.0).abs() < 0.1);
+        assert!((std(|c| c.resistance_ratio) / 0.1 - 1.0).abs() < 0.1);
+        assert!((std(|c| c.soc) / 0.01 - 1.0).abs() < 0.1);
+    }
+}

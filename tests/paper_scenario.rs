@@ -1,0 +1,120 @@
+//! The paper's scenario through the whole core: truth -> sensors -> frames of the DBC -> Monitor, judged per cycle.
+//!
+//! 2.6 Ah, 0.05 Ah lost per cycle between SOC 0.3 and 0.9 until 0.25 Ah, 1 s samples; sensor errors: voltage 5 mV,
+//! current 20 mA noise + 10 mA offset + 0.5 % gain. The paper's figures show |SOC error| of 1 to 5 % through life and
+//! about 20 % at the end, and a capacity that is late by one event, with a dip to 2.2 Ah at the first.
+//! `cargo test --release --test paper_scenario -- --nocapture` prints the table.
+#![expect(clippy::print_stdout, reason = "the table is the report")]
+
+use std::path::Path;
+
+use packwatch::can::encode::InputEncoder;
+use packwatch::config;
+use packwatch::io::ticks::Ticks;
+use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::quantity::CellIndex;
+use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+
+/// Cycles in which the filters may still settle from what they start with.
+const SETTLING_CYCLES: usize = 3;
+/// Largest |SOC error| allowed while the true capacity is above [`LATE_LIFE_AH`]; the paper's figures: 0.05.
+const MAX_SOC_ERROR: f64 = 0.01;
+/// The same from there to the end; the paper's figures: 0.20.
+const MAX_SOC_ERROR_LATE: f64 = 0.02;
+/// Below this the 10 mA offset and the loss of up to a fifth of the capacity in one cycle weigh heavily, Ah.
+const LATE_LIFE_AH: f64 = 1.0;
+/// Largest |capacity error| at a cycle's end, Ah: about one cycle's loss.
+const MAX_CAPACITY_ERROR_AH: f64 = 0.06;
+/// Smallest share of cycles whose true capacity lies within two stated standard deviations.
+const MIN_COVERAGE: f64 = 0.90;
+
+/// What one cycle came to.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cycle {
+    true_ah: f64,
+    estimated_ah: f64,
+    std_ah: f64,
+    max_soc_error: f64,
+    soc_square: f64,
+    soc_inside: f64,
+    samples: f64,
+}
+
+impl Cycle {
+    fn add(&mut self, soc_error: f64, soc_std: f64) {
+        self.max_soc_error = self.max_soc_error.max(soc_error.abs());
+        self.soc_square += soc_error * soc_error;
+        self.soc_inside += f64::from(u8::from(soc_error.abs() <= 2.0 * soc_std));
+        self.samples += 1.0;
+    }
+}
+
+fn live(config: MonitorConfig, settings: Settings) -> Vec<Cycle> {
+    let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
+    let encoder = InputEncoder::new(&config.input);
+    let mut monitor = Monitor::new(config);
+    let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, 30.0), Outputs::default(), Vec::new());
+    let (mut cycles, mut cycle, mut completed) = (Vec::new(), Cycle::default(), 0);
+    while let Some(moment) = sim.advance() {
+        if sim.pack().cycles() != completed {
+            completed = sim.pack().cycles();
+            cycles.push(std::mem::take(&mut cycle));
+        }
+        frames.clear();
+        encoder.encode(sim.readings(), &mut frames);
+        ticks.advance(moment.time);
+        while let Some(time) = ticks.pop(monitor.next_due()) {
+            monitor.handle(Input::Tick { time }, &mut out);
+        }
+        for (bus, frame) in &frames {
+            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+        }
+        out.clear();
+        let truth = sim.pack().cells()[0];
+        let capacity = monitor.capacity(CellIndex(0));
+        (cycle.true_ah, cycle.estimated_ah, cycle.std_ah) = (truth.capacity_ah, capacity.mean, capacity.std());
+        if let Some(estimate) = monitor.latest().next().flatten() {
+            cycle.add(estimate.soc - truth.soc, estimate.soc_std);
+        }
+    }
+    cycles.push(cycle);
+    cycles
+}
+
+fn print(cycles: &[Cycle]) {
+    println!("cycle  true Ah  estimated +-   std  error Ah | max |SOC error| %  RMS %  within 2 std %");
+    for (i, c) in cycles.iter().enumerate() {
+        println!(
+            "{:5}  {:7.3}  {:9.3} +- {:5.3}  {:+8.3} | {:17.2}  {:5.2}  {:14.0}",
+            i + 1,
+            c.true_ah,
+            c.estimated_ah,
+            c.std_ah,
+            c.estimated_ah - c.true_ah,
+            100.0 * c.max_soc_error,
+            100.0 * (c.soc_square / c.samples).sqrt(),
+            100.0 * c.soc_inside / c.samples,
+        );
+    }
+}
+
+#[test]
+fn paper_scenario_is_estimated_within_the_papers_own_errors() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
+    let config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")));
+    let settings = Settings::of(Scenario::Paper, 2.6);
+    let cycles = live(config.monitor, settings);
+    print(&cycles);
+    assert_eq!(cycles.len(), 48);
+    let settled = &cycles[SETTLING_CYCLES..];
+    for (i, c) in settled.iter().enumerate() {
+        let cycle = SETTLING_CYCLES + i + 1;
+        let allowed = if c.true_ah > LATE_LIFE_AH { MAX_SOC_ERROR } else { MAX_SOC_ERROR_LATE };
+        assert!(c.max_soc_error <= allowed, "cycle {cycle}: SOC error {}, allowed {allowed}", c.max_soc_error);
+        let error_ah = c.estimated_ah - c.true_ah;
+        assert!(error_ah.abs() <= MAX_CAPACITY_ERROR_AH, "cycle {cycle}: capacity error {error_ah} Ah");
+    }
+    let covered = settled.iter().filter(|c| (c.estimated_ah - c.true_ah).abs() <= 2.0 * c.std_ah).count();
+    let share = covered as f64 / settled.len() as f64;
+    assert!(share >= MIN_COVERAGE, "{share:.2} of the cycles cover the true capacity");
+}
