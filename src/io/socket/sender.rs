@@ -1,0 +1,65 @@
+//! A blocking sender: plays frames onto an interface for `replay --to` and `simulate --to`.
+
+use std::io;
+use std::os::fd::AsFd;
+use std::time::Duration;
+
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+
+use super::raw::{RawConfig, RawSocket};
+use crate::can::Frame;
+
+/// Pause before a full transmit queue is tried again: about four frames of a 500 kbit/s bus.
+const RETRY_PAUSE: Duration = Duration::from_millis(1);
+
+/// Tries before a queue that does not empty is an error: 2 s, in which any live bus sends hundreds of frames.
+const MAX_TRIES: u32 = 2_000;
+
+/// Sends frames one after the other on one interface; receives nothing.
+#[derive(Debug)]
+pub struct CanSender {
+    socket: RawSocket,
+    interface: String,
+}
+
+impl CanSender {
+    /// Opens the interface; `fd` allows FD frames.
+    ///
+    /// # Errors
+    /// When the interface does not exist, is down, or this kernel has no SocketCAN.
+    pub fn open(interface: &str, fd: bool) -> io::Result<Self> {
+        let named = |error: io::Error| io::Error::new(error.kind(), format!("{interface}: {error}"));
+        let config = RawConfig { interface, fd, ids: &[], receive_buffer_bytes: 0 };
+        let socket = RawSocket::open(&config).map_err(named)?;
+        match socket.take_error().map_err(named)? {
+            Some(error) => Err(named(error)),
+            None => Ok(Self { socket, interface: interface.to_owned() }),
+        }
+    }
+
+    /// Sends one frame; waits while the transmit queue is full, at most about 2 s.
+    ///
+    /// # Errors
+    /// When the queue does not empty, the interface goes down or away, or it cannot carry this frame (FD on classic).
+    pub fn send(&self, frame: &Frame) -> io::Result<()> {
+        for _ in 0..MAX_TRIES {
+            match self.socket.send(frame) {
+                Ok(()) => return Ok(()),
+                Err(Errno::ENOBUFS) => std::thread::sleep(RETRY_PAUSE),
+                Err(Errno::EAGAIN) => self.wait_for_room()?,
+                Err(Errno::EINTR) => {}
+                Err(error) => return Err(io::Error::other(format!("{}: {frame:?} not sent: {error}", self.interface))),
+            }
+        }
+        Err(io::Error::new(io::ErrorKind::TimedOut, format!("{}: transmit queue stays full", self.interface)))
+    }
+
+    fn wait_for_room(&self) -> io::Result<()> {
+        let mut fds = [PollFd::new(self.socket.as_fd(), PollFlags::POLLOUT)];
+        poll(&mut fds, PollTimeout::from(RETRY_PAUSE.as_millis() as u8)).map(drop).or_else(|error| match error {
+            Errno::EINTR => Ok(()),
+            other => Err(other.into()),
+        })
+    }
+}
