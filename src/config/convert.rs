@@ -228,7 +228,7 @@ fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
 
 fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     let (method, usual_noise_ah) = match keys.method {
-        Method::Swing => (CapacityMethod::Swing, 0.002 * rated_ah),
+        Method::Swing => (CapacityMethod::Swing, 0.004 * rated_ah),
         Method::Nominal => {
             let (swing, variance_ah2) = (keys.nominal_swing, keys.nominal_variance_ah2);
             (CapacityMethod::Nominal { swing, variance_ah2 }, 1.0)
@@ -237,7 +237,7 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     CapacityConfig {
         method,
         noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(usual_noise_ah),
-        noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.01 * rated_ah),
+        noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah),
         current_gain_std: keys.current_gain_std,
     }
 }

@@ -294,9 +294,9 @@ section! {
         nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6");
         /// Measurement variance of method "nominal".
         nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1");
-        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.2 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
+        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.4 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional;
-        /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 1 % of the rated capacity.
+        /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 2 % of the rated capacity.
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;
         /// Standard deviation of the current sensor's gain: no capacity is known better than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");

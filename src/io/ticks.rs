@@ -2,9 +2,9 @@
 //!
 //! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
 //! says only when frames came, so the same ticks are made here, at multiples of the period: a tick at T comes after
-//! every record of T and before the first later one. The first record, and the first after a hole longer than the
-//! sleep gap, wake the recorder: one tick at that record's own time, and none inside the hole. Nothing follows the
-//! last record.
+//! every record of T and before the first later one. After a record the recorder stays awake for the sleep gap, as a
+//! daemon on a silent bus does (so a lost input is noticed), and then is taken to be asleep. The first record, and the
+//! first after sleep, wake it: one tick at that record's own time. Nothing follows the last record.
 //!
 //! The caller says when the core next cares ([`Ticks::pop`]'s `due`); ticks before that are skipped, which costs
 //! nothing and changes nothing.
@@ -27,7 +27,7 @@ pub struct Ticks {
 }
 
 impl Ticks {
-    /// Ticks every `period_ms` (at least 1), none in holes longer than `sleep_gap_s`.
+    /// Ticks every `period_ms` (at least 1), and for `sleep_gap_s` into a hole that is longer than that.
     pub fn new(period_ms: u32, sleep_gap_s: f64) -> Self {
         Self {
             period_ns: i64::from(period_ms.max(1)) * 1_000_000,
@@ -51,7 +51,7 @@ impl Ticks {
         };
         let asleep = time_ns.saturating_sub(latest_ns) > self.sleep_gap_ns;
         if asleep {
-            self.limit_ns = latest_ns.saturating_add(1);
+            self.limit_ns = latest_ns.saturating_add(self.sleep_gap_ns).saturating_add(1);
             self.wake_ns = Some(time_ns);
         } else {
             self.limit_ns = self.limit_ns.max(time_ns);
@@ -102,7 +102,7 @@ mod tests {
 
     /// Ticks in ms made by records at `records` ms, `due` as given, ended properly.
     fn ticks_ms(records: &[i64], due: Option<Timestamp>) -> Vec<i64> {
-        let mut ticks = Ticks::new(10, 30.0);
+        let mut ticks = Ticks::new(10, 0.05);
         let mut made = Vec::new();
         let mut drain = |ticks: &mut Ticks| {
             while let Some(tick) = ticks.pop(due) {
@@ -130,13 +130,15 @@ mod tests {
     }
 
     #[test]
-    fn a_hole_costs_one_tick_at_its_end() {
-        assert_eq!(ticks_ms(&[0, 15, 40_000_003, 40_000_020], EVERY), [0, 10, 40_000_003, 40_000_010, 40_000_020]);
+    fn into_a_hole_ticks_go_on_for_the_sleep_gap_and_start_again_at_its_end() {
+        let ticks = ticks_ms(&[0, 15, 40_000_003, 40_000_020], EVERY);
+        assert_eq!(ticks, [0, 10, 20, 30, 40, 50, 60, 40_000_003, 40_000_010, 40_000_020]);
     }
 
     #[test]
-    fn records_further_apart_than_the_sleep_gap_get_one_tick_each() {
-        assert_eq!(ticks_ms(&[5, 60_005, 120_005], EVERY), [5, 60_005, 120_005]);
+    fn a_hole_as_long_as_the_sleep_gap_is_no_sleep() {
+        assert_eq!(ticks_ms(&[5, 55], EVERY), [5, 10, 20, 30, 40, 50]);
+        assert_eq!(ticks_ms(&[5, 66], EVERY), [5, 10, 20, 30, 40, 50, 66]);
     }
 
     #[test]
