@@ -1,12 +1,83 @@
-//! `packwatch run`.
+//! `packwatch run`: the service on live CAN interfaces.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use super::Failure;
+use crate::config;
+use crate::daemon::{logging, service::Service};
+use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
+use crate::monitor::Snapshot;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+pub(crate) struct Args {
+    /// Configuration
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Journal everything that comes in, for `packwatch replay`
+    #[arg(long, value_name = "FILE")]
+    record: Option<PathBuf>,
+    /// Log the frames that go out, in candump's form, with the time of the input that caused each
+    #[arg(long, value_name = "FILE")]
+    frames: Option<PathBuf>,
+    /// Start from a stored state
+    #[arg(long, value_name = "FILE")]
+    restore: Option<PathBuf>,
+    /// Age of the stored state, where its stamp does not tell (it came from a log)
+    #[arg(long, value_name = "SECONDS", requires = "restore", value_parser = seconds)]
+    away: Option<f64>,
+    /// Store the state here on stopping
+    #[arg(long, value_name = "FILE")]
+    snapshot: Option<PathBuf>,
+    /// Stop after this time
+    #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
+    duration: Option<f64>,
+    /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
+    #[arg(long, value_name = "LEVEL")]
+    log: Option<String>,
+    /// Receive buffer to ask the kernel for, per interface
+    #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = buffer_bytes)]
+    receive_buffer: usize,
+}
+
+/// Longest time an option takes, s: ten years.
+const MAX_SECONDS: f64 = 315_576_000.0;
+/// Largest receive buffer, bytes: the kernel's own limit on the option, halved as it doubles it.
+const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=MAX_SECONDS).contains(&value) => Ok(value),
+        _ => Err(format!("must be seconds, 0 to {MAX_SECONDS}")),
+    }
+}
+
+fn buffer_bytes(text: &str) -> Result<usize, String> {
+    match text.parse::<usize>() {
+        Ok(value) if value <= MAX_BUFFER_BYTES => Ok(value),
+        _ => Err(format!("must be bytes, 0 to {MAX_BUFFER_BYTES}")),
+    }
+}
 
 /// Runs the command.
-pub(crate) fn run(_args: &Args) -> Result<(), Failure> {
-    Err(Failure::new("run: not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    logging::start(args.log.as_deref()).map_err(Failure::new)?;
+    let service = Service {
+        config: config::load(&args.config)?,
+        record: args.record.clone(),
+        frames: args.frames.clone(),
+        restore: args.restore.as_deref().map(read_snapshot).transpose()?,
+        away_s: args.away,
+        snapshot: args.snapshot.clone(),
+        duration: args.duration.map(Duration::from_secs_f64),
+        receive_buffer_bytes: args.receive_buffer,
+    };
+    service.run().map_err(|error| Failure::new(error.to_string()))
+}
+
+fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
+    let text = std::fs::read(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
+    serde_json::from_slice(&text)
+        .map_err(|error| Failure::new(format!("{}:{}: not a snapshot: {error}", path.display(), error.line())))
 }

@@ -1,0 +1,32 @@
+//! Where the log goes: journald with its fields when systemd connected standard error to it, else standard error.
+
+use std::os::linux::fs::MetadataExt;
+
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
+
+/// Environment variable with the filter, where `--log` is not given.
+pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
+
+/// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
+///
+/// # Errors
+/// When the filter cannot be read.
+pub fn start(filter: Option<&str>) -> Result<(), String> {
+    let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
+    let filter = EnvFilter::try_new(&text).map_err(|error| format!("log filter '{text}': {error}"))?;
+    let registry = tracing_subscriber::registry().with(filter);
+    // A second start (tests) keeps the first logger: nothing is lost by that.
+    let _ = match stderr_is_journal().then(tracing_journald::layer) {
+        Some(Ok(journal)) => registry.with(journal).try_init(),
+        _ => registry.with(tracing_subscriber::fmt::layer().with_writer(std::io::stderr)).try_init(),
+    };
+    Ok(())
+}
+
+/// systemd names the journal's stream by device and inode; a redirected standard error is another file.
+fn stderr_is_journal() -> bool {
+    let Ok(stream) = std::env::var("JOURNAL_STREAM") else { return false };
+    std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.st_dev(), file.st_ino()))
+}

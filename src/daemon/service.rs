@@ -1,0 +1,347 @@
+//! The live loop: interfaces in, the core stepped, frames out, a tick every [`TICK_PERIOD_MS`].
+//!
+//! One task owns the [`Monitor`]; every input is journalled before it is handed over, in that very order, so that
+//! the journal replayed gives the same frames. Nothing a bus, a disk or a service manager does ends the loop;
+//! SIGTERM and SIGINT do, cleanly.
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use sd_notify::NotifyState;
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
+
+use super::background_file::BackgroundFile;
+use super::event_log::EventLog;
+use crate::config::Config;
+use crate::io::candump::{self, StampDigits};
+use crate::io::clock::{MappedClock, Reading};
+use crate::io::journal::JournalWriter;
+use crate::io::socket::{Link, LinkConfig, LinkOutput, Received, What};
+use crate::monitor::{Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::quantity::BusIndex;
+
+/// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
+const INBOX: usize = 4096;
+/// Of these, handed over between two looks at the timer: under one tick's time of a full bus.
+const BATCH: usize = 256;
+/// Time the interfaces have to send what is queued when the daemon stops.
+const DRAIN_LIMIT: Duration = Duration::from_millis(500);
+/// How often files are handed to the operating system: what a crash of the daemon can lose.
+const FLUSH_PERIOD: Duration = Duration::from_secs(1);
+
+/// What to run.
+#[derive(Debug)]
+pub struct Service {
+    /// Checked configuration.
+    pub config: Config,
+    /// Journal of every input.
+    pub record: Option<PathBuf>,
+    /// Log of the frames sent, with the time of the input that caused each.
+    pub frames: Option<PathBuf>,
+    /// State to start from.
+    pub restore: Option<Snapshot>,
+    /// Age of that state, s; `None` = as its stamp says.
+    pub away_s: Option<f64>,
+    /// Where the state goes when the daemon stops.
+    pub snapshot: Option<PathBuf>,
+    /// Stop after this long; `None` = when told to.
+    pub duration: Option<Duration>,
+    /// Receive buffer asked for per interface, bytes.
+    pub receive_buffer_bytes: usize,
+}
+
+/// Why the service could not start, or not end as it should.
+#[derive(Debug, thiserror::Error)]
+pub enum ServiceError {
+    /// A file could not be written.
+    #[error("{}: {error}", path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        error: io::Error,
+    },
+    /// The snapshot does not fit.
+    #[error("{0}")]
+    Restore(#[from] RestoreError),
+    /// The runtime or a signal handler could not be set up.
+    #[error("cannot start: {0}")]
+    Start(#[from] io::Error),
+}
+
+impl Service {
+    /// Runs until told to stop.
+    ///
+    /// # Errors
+    /// When it cannot start, or its final snapshot cannot be written.
+    pub fn run(self) -> Result<(), ServiceError> {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        runtime.block_on(self.serve())
+    }
+
+    async fn serve(mut self) -> Result<(), ServiceError> {
+        let stop = Stop::new(self.duration)?;
+        let clock = MappedClock::new(Reading::now());
+        let (sender, inbox) = mpsc::channel(INBOX);
+        let snapshot = self.snapshot.take();
+        let engine = self.engine(clock)?;
+        let (links, outputs) = self.start_links(clock, &sender);
+        drop(sender);
+        let mut service = Loop { engine, inbox, clock, outputs, batch: Vec::with_capacity(BATCH) };
+        notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        tracing::info!(interfaces = self.config.interfaces.len(), "started");
+        service.run(stop).await;
+        notify(&[NotifyState::Stopping]);
+        service.finish(links, snapshot.as_deref()).await
+    }
+
+    /// The core and the files round it; its first input is the time of the start.
+    fn engine(&mut self, clock: MappedClock) -> Result<Engine, ServiceError> {
+        let names: Vec<String> = self.config.interfaces.iter().map(|i| i.name.clone()).collect();
+        let mut monitor = Monitor::new(self.config.monitor.clone());
+        let mut record = open_journal(self.record.as_deref(), &names)?;
+        let now = clock.now();
+        if let Some(snapshot) = self.restore.take() {
+            tracing::info!(away_s = self.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0)), "state taken up");
+            monitor.restore(snapshot, self.away_s)?;
+            if let Some(Err(error)) = record.as_mut().map(|journal| journal.restored(now, self.away_s)) {
+                tracing::error!(%error, "recording stopped");
+                record = None;
+            }
+        }
+        let frames = self.frames.as_deref().map(create).transpose()?;
+        let log = EventLog::new(names.clone());
+        let mut engine = Engine { monitor, outputs: Outputs::default(), record, frames, names, log };
+        engine.handle(&Input::Tick { time: now }, &[]);
+        Ok(engine)
+    }
+
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
+        let mut links = JoinSet::new();
+        let mut outputs = Vec::new();
+        for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {
+            let config = LinkConfig {
+                bus,
+                interface: interface.name.clone(),
+                fd: interface.fd,
+                ids: self.config.monitor.input.ids(bus),
+                receive_buffer_bytes: self.receive_buffer_bytes,
+            };
+            let (link, output) = Link::new(config, clock, inbox.clone());
+            links.spawn(link.run());
+            outputs.push(output);
+        }
+        (links, outputs)
+    }
+}
+
+/// The core, its journal and its log.
+#[derive(Debug)]
+struct Engine {
+    monitor: Monitor,
+    outputs: Outputs,
+    record: Option<JournalWriter<BackgroundFile>>,
+    frames: Option<BackgroundFile>,
+    names: Vec<String>,
+    log: EventLog,
+}
+
+impl Engine {
+    /// Journals one input, hands it to the core, and hands on what comes of it.
+    fn handle(&mut self, input: &Input<'_>, links: &[LinkOutput]) {
+        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.append(input)) {
+            self.stop_recording(&error);
+        }
+        self.outputs.clear();
+        self.monitor.handle(*input, &mut self.outputs);
+        for transmit in &self.outputs.frames {
+            if let Some(link) = links.get(transmit.bus.index()) {
+                link.send(transmit.frame);
+            }
+            let Some(name) = self.names.get(transmit.bus.index()) else { continue };
+            let Some(file) = &mut self.frames else { continue };
+            if let Err(error) = candump::write_line(file, transmit.time, StampDigits::Nanos, name, &transmit.frame) {
+                tracing::error!(%error, "log of sent frames stopped");
+                self.frames = None;
+            }
+        }
+        for event in &self.outputs.events {
+            self.log.log(event);
+        }
+    }
+
+    fn stop_recording(&mut self, error: &io::Error) {
+        tracing::error!(%error, "recording stopped");
+        self.record = None;
+    }
+
+    fn flush(&mut self) {
+        if let Some(Err(error)) = self.record.as_mut().map(JournalWriter::flush) {
+            self.stop_recording(&error);
+        }
+        if let Some(Err(error)) = self.frames.as_mut().map(Write::flush) {
+            tracing::error!(%error, "log of sent frames stopped");
+            self.frames = None;
+        }
+    }
+
+    fn close_files(&mut self) {
+        let record = self.record.take().map(|journal| ("record", journal.into_inner()));
+        let frames = self.frames.take().map(|file| ("frames", file));
+        for (what, file) in record.into_iter().chain(frames) {
+            if let Err(error) = file.finish() {
+                tracing::error!(what, %error, "file is not complete");
+            }
+        }
+    }
+}
+
+/// The running loop.
+#[derive(Debug)]
+struct Loop {
+    engine: Engine,
+    inbox: mpsc::Receiver<Received>,
+    clock: MappedClock,
+    outputs: Vec<LinkOutput>,
+    batch: Vec<Received>,
+}
+
+impl Loop {
+    async fn run(&mut self, mut stop: Stop) {
+        let mut ticks = interval(Duration::from_millis(u64::from(TICK_PERIOD_MS)));
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
+        let (mut fed, mut flushed) = (Instant::now(), Instant::now());
+        loop {
+            // In this order: a bus that never falls silent must hold up neither the stop nor the ticks.
+            tokio::select! {
+                biased;
+                () = stop.wait() => return,
+                now = ticks.tick() => {
+                    self.tick().await;
+                    if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
+                        notify(&[NotifyState::Watchdog]);
+                        fed = now;
+                    }
+                    if now.duration_since(flushed) >= FLUSH_PERIOD {
+                        self.engine.flush();
+                        flushed = now;
+                    }
+                }
+                received = self.inbox.recv_many(&mut self.batch, BATCH) => {
+                    if received > 0 { self.handle_batch() }
+                }
+            }
+        }
+    }
+
+    /// What came before the tick is handed over before it.
+    async fn tick(&mut self) {
+        // Lets the interfaces' tasks take what is in their sockets.
+        tokio::task::yield_now().await;
+        while self.batch.len() < INBOX && let Ok(received) = self.inbox.try_recv() {
+            self.batch.push(received);
+        }
+        self.handle_batch();
+        self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
+    }
+
+    /// Interfaces merge by time; what one interface delivered keeps its order.
+    fn handle_batch(&mut self) {
+        self.batch.sort_by_key(|received| received.time);
+        for received in &self.batch {
+            let Received { time, bus, what } = *received;
+            let input = match &what {
+                What::Frame(frame) => Input::Frame { time, bus, frame },
+                What::Event(event) => Input::Bus { time, bus, event: *event },
+            };
+            self.engine.handle(&input, &self.outputs);
+        }
+        self.batch.clear();
+    }
+
+    /// Sends what is queued, closes the files, stores the state.
+    async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
+        self.outputs.clear();
+        self.inbox.close();
+        let drained = async { while links.join_next().await.is_some() {} };
+        if timeout(DRAIN_LIMIT, drained).await.is_err() {
+            tracing::warn!("not every queued frame was sent before the stop");
+        }
+        self.engine.close_files();
+        if let Some(path) = snapshot {
+            write_snapshot(path, &self.engine.monitor.snapshot())
+                .map_err(|error| ServiceError::File { path: path.to_owned(), error })?;
+        }
+        tracing::info!("stopped");
+        Ok(())
+    }
+}
+
+/// What ends the loop.
+#[derive(Debug)]
+struct Stop {
+    terminate: Signal,
+    interrupt: Signal,
+    at: Option<Instant>,
+}
+
+impl Stop {
+    fn new(duration: Option<Duration>) -> io::Result<Self> {
+        Ok(Self {
+            terminate: signal(SignalKind::terminate())?,
+            interrupt: signal(SignalKind::interrupt())?,
+            at: duration.map(|duration| Instant::now() + duration),
+        })
+    }
+
+    async fn wait(&mut self) {
+        let at = self.at;
+        let timer = async move {
+            match at {
+                Some(at) => sleep_until(at).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            _ = self.terminate.recv() => {}
+            _ = self.interrupt.recv() => {}
+            () = timer => {}
+        }
+    }
+}
+
+/// Tells the service manager; without one nothing happens.
+fn notify(states: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(states) {
+        tracing::warn!(%error, "service manager not told");
+    }
+}
+
+fn create(path: &Path) -> Result<BackgroundFile, ServiceError> {
+    BackgroundFile::create(path).map_err(|error| ServiceError::File { path: path.to_owned(), error })
+}
+
+fn open_journal(path: Option<&Path>, names: &[String]) -> Result<Option<JournalWriter<BackgroundFile>>, ServiceError> {
+    let Some(path) = path else { return Ok(None) };
+    let journal = JournalWriter::new(create(path)?, names.to_vec());
+    journal.map(Some).map_err(|error| ServiceError::File { path: path.to_owned(), error })
+}
+
+/// Stores a state so that after a power cut there is the old one or the new one, whole.
+fn write_snapshot(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    let mut file = fs::File::create(&part)?;
+    serde_json::to_writer(&mut file, snapshot)?;
+    file.write_all(b"\n")?;
+    file.sync_all()?;
+    fs::rename(&part, path)?;
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    fs::File::open(folder)?.sync_all()
+}
