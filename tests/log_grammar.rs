@@ -182,7 +182,7 @@ fn read(
     adapt(&mut options);
     let mut source = LogSource::new(paths.to_vec(), options);
     let mut records = Vec::new();
-    while let Some(record) = source.next()? {
+    while let Some(record) = source.next_record()? {
         records.push(record);
     }
     Ok((records, source.counts().clone()))

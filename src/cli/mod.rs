@@ -27,7 +27,7 @@ enum Command {
     /// Run the service on live CAN interfaces
     Run(run::Args),
     /// Replay journals, candump logs or CSV files through the same core
-    Replay(replay::Args),
+    Replay(Box<replay::Args>),
     /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
     Simulate(simulate::Args),
     /// A short ageing life on an in-process bus, ending in alarms; needs nothing

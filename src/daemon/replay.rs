@@ -182,7 +182,7 @@ pub fn run(
 ) -> Result<(Summary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
     let mut records: u64 = 0;
-    while let Some(record) = source.next()? {
+    while let Some(record) = source.next_record()? {
         if !replay.take(&record, source.carries_ticks())? {
             break;
         }
@@ -208,7 +208,7 @@ pub fn play(
     let (mut span, mut pace, mut window) =
         (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
     let mut sent = 0;
-    while let Some(record) = source.next()? {
+    while let Some(record) = source.next_record()? {
         match window.judge(record.time()) {
             Place::Before => continue,
             Place::After => break,
@@ -291,9 +291,8 @@ impl Replay {
             self.ticks.advance(time);
         }
         self.make_ticks()?;
-        match record.input() {
-            Some(input) => self.feed(input)?,
-            None => {}
+        if let Some(input) = record.input() {
+            self.feed(input)?;
         }
         Ok(true)
     }

@@ -483,8 +483,8 @@ impl FrameText {
             FrameKind::Classic => {}
             FrameKind::Remote => {
                 self.push(b'R');
-                if frame.len() > 0 {
-                    self.push(b'0' + frame.len() as u8);
+                if let len @ 1..=8 = frame.len() {
+                    self.push(b'0' + len as u8);
                 }
             }
             FrameKind::Fd { brs, esi } => {

@@ -88,7 +88,7 @@ impl Lines {
     ///
     /// # Errors
     /// Those of the source: a damaged compressed file, say.
-    pub fn next(&mut self) -> io::Result<Option<RawLine<'_>>> {
+    pub fn next_line(&mut self) -> io::Result<Option<RawLine<'_>>> {
         let mut searched = self.start;
         let mut too_long = false;
         loop {
@@ -175,7 +175,7 @@ mod tests {
     fn all(text: &[u8]) -> Vec<(usize, bool)> {
         let mut lines = Lines::new(Box::new(Cursor::new(text.to_vec())));
         let mut seen = Vec::new();
-        while let Some(line) = lines.next().expect("memory reads") {
+        while let Some(line) = lines.next_line().expect("memory reads") {
             seen.push(match line {
                 RawLine::Whole(bytes) => (bytes.len(), true),
                 RawLine::Last(bytes) => (bytes.len(), false),

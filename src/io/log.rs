@@ -238,7 +238,7 @@ impl LogSource {
     ///
     /// # Errors
     /// When a log cannot be opened, a CSV's header does not fit, or, if strict, at the first bad line.
-    pub fn next(&mut self) -> Result<Option<Record>, LogError> {
+    pub fn next_record(&mut self) -> Result<Option<Record>, LogError> {
         loop {
             if let Some(record) = self.queue.pop_front() {
                 return Ok(Some(record));
@@ -316,7 +316,7 @@ impl State {
     fn next_text(&mut self, lines: &mut Lines, journal: bool, name: &str) -> Result<Option<Record>, LogError> {
         loop {
             let number = lines.number() + 1;
-            let bytes = match lines.next() {
+            let bytes = match lines.next_line() {
                 Ok(Some(RawLine::Whole(bytes))) => bytes,
                 Ok(Some(RawLine::Last(bytes))) if !journal => bytes,
                 Ok(Some(RawLine::Last(_))) => {
