@@ -146,6 +146,7 @@ fn ev_day(mut s: Settings, capacity_ah: f64) -> Settings {
         ..SensorError::default()
     };
     s.sensors.voltage.noise_std = 0.001;
+    s.sensors.temperature.noise_std = 0.02; // at ten samples a second more would look like a jump of 5 K/s
     s.current_period_ns = SECOND_NS / 100;
     s.cell_period_ns = SECOND_NS / 10;
     s.end_capacity_ah = 0.0;

@@ -79,7 +79,7 @@ pub(super) struct Changes {
     /// White noise of the current, A (paper: 0.02)
     #[arg(long, value_name = "A", value_parser = non_negative)]
     noise_current: Option<f64>,
-    /// White noise of temperatures, K (0.1)
+    /// White noise of temperatures, K (paper: 0.1; ev-day: 0.02)
     #[arg(long, value_name = "K", value_parser = non_negative)]
     noise_temperature: Option<f64>,
     /// Constant error of cell voltages, V
