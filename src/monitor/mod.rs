@@ -221,6 +221,7 @@ impl Monitor {
             self.observe_current(None, out);
             self.alarms.handle_gap();
             self.recharge.interrupt();
+            self.sampler.wake(time);
             self.schedule.restart(time);
         }
         self.now = time;

@@ -173,6 +173,13 @@ impl Sampler {
         self.next_stale = None;
     }
 
+    /// The computer was asleep until `time`: values are as old as they are, but nothing is called silent or stale
+    /// for the time in which nobody listened.
+    pub fn wake(&mut self, time: Timestamp) {
+        self.state.began = Some(time);
+        self.next_stale = None;
+    }
+
     /// Pack current, A, positive = discharge, when its last good reading is fresh.
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
         self.state.signals[0].fresh(now, &self.config.current)
@@ -200,7 +207,7 @@ impl Sampler {
         self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
     }
 
-    /// Age of the last good value, s; from the start when there is none yet. `None` = the channel feeds nothing.
+    /// Age of the last good value, s; from the start or the last waking when there is none since. `None` = the channel feeds nothing.
     pub fn age_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         self.slot(channel).map(|slot| self.since(self.state.signals[slot].good_at(), now))
     }
@@ -295,7 +302,8 @@ impl Sampler {
     }
 
     fn since(&self, stamp: Option<Timestamp>, now: Timestamp) -> f64 {
-        stamp.or(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
+        // `None` < `Some`: what came before the start or the last sleep counts from there.
+        stamp.max(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
     }
 
     fn strings(&self) -> f64 {

@@ -85,9 +85,9 @@ impl Signal {
         if stale { self.turn(Some(Fault::Stale), 0) } else { None }
     }
 
-    /// From when on the signal is stale if nothing good comes.
+    /// From when on the signal is called stale if nothing good comes: its age counts from when somebody began to listen.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
-        self.good.map_or(began, |good| good.time).plus_secs(limits.max_age_s)
+        self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
 
     /// Whether the signal is known to be bad.
