@@ -57,7 +57,9 @@ impl BackgroundFile {
                 self.pieces = None;
                 Err(io::Error::new(io::ErrorKind::TimedOut, "disk more than 4 MB behind"))
             }
-            Err(TrySendError::Disconnected(_)) => Err(self.join().err().unwrap_or_else(|| io::Error::other("writer gone"))),
+            Err(TrySendError::Disconnected(_)) => {
+                Err(self.join().err().unwrap_or_else(|| io::Error::other("writer gone")))
+            }
         }
     }
 

@@ -40,7 +40,9 @@ impl EventLog {
             EventKind::SignalBad { .. }
             | EventKind::FilterReset { .. }
             | EventKind::TimeBackwards { .. }
-            | EventKind::Trust { trusted: false, .. } => tracing::warn!(kind = ?event.kind, "input or estimate not usable"),
+            | EventKind::Trust { trusted: false, .. } => {
+                tracing::warn!(kind = ?event.kind, "input or estimate not usable")
+            }
             EventKind::Mode { .. }
             | EventKind::HalfCycle { .. }
             | EventKind::Capacity { .. }

@@ -244,7 +244,9 @@ impl Loop {
     async fn tick(&mut self) {
         // Lets the interfaces' tasks take what is in their sockets.
         tokio::task::yield_now().await;
-        while self.batch.len() < INBOX && let Ok(received) = self.inbox.try_recv() {
+        while self.batch.len() < INBOX
+            && let Ok(received) = self.inbox.try_recv()
+        {
             self.batch.push(received);
         }
         self.handle_batch();

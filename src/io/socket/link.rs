@@ -136,7 +136,10 @@ struct Open {
 }
 
 /// Registers a socket with the runtime. Errors too: a removed interface makes the socket neither readable nor writable.
-#[expect(deprecated, reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives")]
+#[expect(
+    deprecated,
+    reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"
+)]
 fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
     AsyncFd::with_interest(socket, Interest::READABLE | Interest::WRITABLE | Interest::ERROR)
 }
