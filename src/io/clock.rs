@@ -4,8 +4,8 @@
 //! clock, whose origin is anything. [`MappedClock`] and [`HardwareClock`] move both onto ours:
 //!
 //! * a software stamp becomes `stamp - (realtime - boottime)` with that difference measured when the frame is read.
-//!   Where the clock stepped between stamp and reading, the difference of the previous reading is tried; a stamp
-//!   that fits neither becomes the time of reading;
+//!   Around a step of the clock the difference of the previous reading is tried too and the later time taken; a
+//!   stamp that fits neither becomes the time of reading;
 //! * what "fits" means is known exactly: a frame that is read now came after the socket was last found empty. So
 //!   the error of any one stamp is bounded by the time since then, and a step bends no time difference by more;
 //! * a hardware stamp becomes `stamp + offset`, the offset being the least seen lately of (arrival - stamp): queueing
@@ -133,8 +133,10 @@ impl StampMapper {
 
     /// A realtime stamp on the boot clock.
     fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
-        let fits = |offset: i64| stamp.map(|s| s.saturating_sub(offset)).filter(|&t| self.possible(t, reading));
-        fits(reading.offset_ns()).or_else(|| fits(self.emptied_offset_ns)).unwrap_or(reading.boottime_ns)
+        let candidates =
+            [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
+        // Both fit only around a step. Frames are read soon after they arrive: the later one.
+        candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
     }
 
     /// Whether a frame read at `reading` can have arrived at `arrived_ns`.
