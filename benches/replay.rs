@@ -1,4 +1,5 @@
 //! The whole replay of a log: read, parse, decode, estimate, encode, as the command does it.
+#![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
 
 use std::process::Command;
 
