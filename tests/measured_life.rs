@@ -10,6 +10,7 @@ use std::process::Command;
 use serde_json::Value;
 
 /// The measured data, or `None` where it is not.
+#[expect(clippy::print_stdout, reason = "a skipped test says so")]
 fn data() -> Option<PathBuf> {
     let root = std::env::var_os("PACKWATCH_DATA")
         .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
