@@ -117,9 +117,5 @@ fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
 }
 
 fn print_summary(args: &Args, summary: &Summary) -> io::Result<()> {
-    if args.json {
-        report::json(summary)
-    } else {
-        report::table(summary, args.results_on_stdout())
-    }
+    if args.json { report::json(summary) } else { report::table(summary, args.results_on_stdout()) }
 }

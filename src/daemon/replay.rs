@@ -205,7 +205,8 @@ pub fn play(
     send: &mut dyn FnMut(BusIndex, &Frame) -> io::Result<()>,
     report: &mut dyn FnMut(Progress),
 ) -> Result<u64, ReplayError> {
-    let (mut span, mut pace, mut window) = (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
+    let (mut span, mut pace, mut window) =
+        (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
     let mut sent = 0;
     while let Some(record) = source.next()? {
         match window.judge(record.time()) {
@@ -307,9 +308,10 @@ impl Replay {
         };
         match (self.settings.restore.take(), recorded) {
             (Some(snapshot), recorded) => self.monitor.restore(snapshot, recorded.flatten())?,
-            (None, Some(_)) => self.summary.notes.push(
-                "the recorded run began from a stored state: without --restore its results differ".to_owned(),
-            ),
+            (None, Some(_)) => self
+                .summary
+                .notes
+                .push("the recorded run began from a stored state: without --restore its results differ".to_owned()),
             (None, None) => {}
         }
         Ok(())
@@ -399,10 +401,7 @@ impl Sinks {
     }
 }
 
-fn cell_summaries(
-    monitor: &Monitor,
-    usable: &BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
-) -> Vec<CellSummary> {
+fn cell_summaries(monitor: &Monitor, usable: &BTreeMap<CellIndex, (Option<f64>, Option<f64>)>) -> Vec<CellSummary> {
     let of = |estimate: &Estimate| {
         let (usable_capacity_ah, usable_capacity_std_ah) = usable.get(&estimate.cell).copied().unwrap_or_default();
         CellSummary {

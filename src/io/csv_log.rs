@@ -72,10 +72,8 @@ impl CsvLog {
     pub(crate) fn open(source: Box<dyn Read>, name: &str, options: &CsvOptions) -> Result<Self, LogError> {
         let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
         let header = reader.byte_headers().map_err(|e| LogError(format!("{name}:1: {e}")))?;
-        let headers: Vec<String> = header
-            .iter()
-            .map(|h| String::from_utf8_lossy(h).trim_start_matches('\u{feff}').to_owned())
-            .collect();
+        let headers: Vec<String> =
+            header.iter().map(|h| String::from_utf8_lossy(h).trim_start_matches('\u{feff}').to_owned()).collect();
         let columns = Columns { headers: &headers, options, name };
         let time_column = columns.required("time", "time_s")?;
         let section_column = columns.section()?;
@@ -117,7 +115,10 @@ impl CsvLog {
             Err((column, expected)) => {
                 let found = self.record.get(column).map(String::from_utf8_lossy);
                 let found = found.map_or("no such field".to_owned(), |f| format!("{f:?}"));
-                RowResult::Bad { line, what: format!("column {}: found {found}, expected {expected}", self.headers[column]) }
+                RowResult::Bad {
+                    line,
+                    what: format!("column {}: found {found}, expected {expected}", self.headers[column]),
+                }
             }
         })
     }
@@ -179,7 +180,9 @@ impl Columns<'_> {
 
     fn missing<T>(&self, role: &str, column: &str) -> Result<T, LogError> {
         let (name, found) = (self.name, self.headers.join(","));
-        Err(LogError(format!("{name}:1: no column {column} for {role}, found {found} (map it with --column {role}=NAME)")))
+        Err(LogError(format!(
+            "{name}:1: no column {column} for {role}, found {found} (map it with --column {role}=NAME)"
+        )))
     }
 
     fn required(&self, role: &str, default: &str) -> Result<usize, LogError> {
@@ -251,7 +254,9 @@ fn read_starts(path: &std::path::Path, section: &str) -> Result<HashMap<Vec<u8>,
     let headers = reader.byte_headers().map_err(|e| error(1, e.to_string()))?.clone();
     let column = |wanted: &str| {
         let found = headers.iter().position(|h| h == wanted.as_bytes());
-        found.ok_or_else(|| error(1, format!("no column {wanted}, found {}", String::from_utf8_lossy(headers.as_slice()))))
+        found.ok_or_else(|| {
+            error(1, format!("no column {wanted}, found {}", String::from_utf8_lossy(headers.as_slice())))
+        })
     };
     let (section_column, start_column) = (column(section)?, column("start")?);
     let mut starts = HashMap::new();

@@ -118,8 +118,7 @@ fn when(text: &str) -> Result<When, String> {
 }
 
 fn column(text: &str) -> Result<(String, String), String> {
-    const ROLES: [&str; 7] =
-        ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
+    const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
     let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
     if !ROLES.contains(&role) {
         return Err(format!("role {role:?}, must be one of {}", ROLES.join(", ")));

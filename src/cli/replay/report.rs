@@ -129,7 +129,11 @@ fn write_cells(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
         return writeln!(out, "no estimate was made");
     }
     let with_std = |value: f64, std: f64, digits: usize| format!("{value:.digits$} +/- {std:.digits$}");
-    writeln!(out, "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}", "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x")?;
+    writeln!(
+        out,
+        "{:>5}  {:>18}  {:>18}  {:>18}  {:>16}",
+        "cell", "SOC %", "capacity Ah", "usable Ah", "resistance x"
+    )?;
     for cell in summary.cells.iter().take(MAX_SHOWN_CELLS) {
         let usable = cell.usable_capacity_ah.zip(cell.usable_capacity_std_ah);
         writeln!(
