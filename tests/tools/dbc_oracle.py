@@ -38,36 +38,42 @@ def reaches_past(path):
                     yield message, size, found[1], needed
 
 
-def decode(path, strict):
+def load(path, strict):
+    """The DBC as cantools reads it, with the file's own names.
+
+    Where a file gives long names (over 32 characters), cantools renames a multiplexor but not in the signals that
+    depend on it, and then decodes none of them: those attributes are left out.
+    """
     import cantools
 
-    db = cantools.database.load_file(path, strict=strict)
-    # cantools puts long names (over 32 characters) in the place of those the file defines.
-    messages = {m.name[:32]: m for m in db.messages}
+    with open(path, encoding="latin-1") as text:
+        lines = [line for line in text if not re.match(r'BA_ +"System\w+LongSymbol"', line)]
+    return cantools.database.load_string("".join(lines), "dbc", strict=strict)
+
+
+def decode(path, strict):
+    messages = {m.name: m for m in load(path, strict).messages}
     past = list(reaches_past(path))
     for name, _, _, needed in past:
         # cantools cannot decode such a message at all: let it have the bytes, zeros, and leave the signals out.
-        message = messages[name[:32]]
+        message = messages[name]
         message.length = max(message.length, needed)
         message.refresh(strict=False)
-    left_out = {(name[:32], signal[:32]) for name, _, signal, _ in past}
+    left_out = {(name, signal) for name, _, signal, _ in past}
     for line in sys.stdin:
         name, payload = line.split()
         try:
-            message = messages[name[:32]]
+            message = messages[name]
             data = bytes.fromhex(payload).ljust(message.length, b"\0")
             values = message.decode(data, decode_choices=False, scaling=True)
-            pairs = (f"{k[:32]}={v!r}" for k, v in values.items() if (name[:32], k[:32]) not in left_out)
-            print("\t".join(pairs))
-        except Exception as error:  # an unknown page: nothing is said about this payload
+            print("\t".join(f"{k}={v!r}" for k, v in values.items() if (name, k) not in left_out))
+        except Exception as error:  # an unknown page, say
             print(f"!{type(error).__name__}: {error}".replace("\n", " "))
 
 
 def count(path):
-    import cantools
-
-    db = cantools.database.load_file(path, strict=False)
-    print(len(db.messages), sum(len(m.signals) for m in db.messages))
+    messages = load(path, False).messages
+    print(len(messages), sum(len(m.signals) for m in messages))
 
 
 if sys.argv[2] == "short":
