@@ -1,5 +1,6 @@
 //! Where the log goes: journald with its fields when systemd connected standard error to it, else standard error.
 
+use std::io::IsTerminal;
 use std::os::linux::fs::MetadataExt;
 
 use tracing_subscriber::EnvFilter;
@@ -20,7 +21,10 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     // A second start (tests) keeps the first logger: nothing is lost by that.
     let _ = match stderr_is_journal().then(tracing_journald::layer) {
         Some(Ok(journal)) => registry.with(journal).try_init(),
-        _ => registry.with(tracing_subscriber::fmt::layer().with_writer(std::io::stderr)).try_init(),
+        _ => {
+            let colour = std::io::stderr().is_terminal();
+            registry.with(tracing_subscriber::fmt::layer().with_ansi(colour).with_writer(std::io::stderr)).try_init()
+        }
     };
     Ok(())
 }
