@@ -21,6 +21,9 @@ pub(crate) struct Args {
     /// Log the frames that go out, in candump's form, with the time of the input that caused each
     #[arg(long, value_name = "FILE")]
     frames: Option<PathBuf>,
+    /// Write events as JSON, a line each, as `packwatch replay --events` does
+    #[arg(long, value_name = "FILE")]
+    events: Option<PathBuf>,
     /// Start from a stored state
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
@@ -67,6 +70,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         config: config::load(&args.config)?,
         record: args.record.clone(),
         frames: args.frames.clone(),
+        events: args.events.clone(),
         restore: args.restore.as_deref().map(read_snapshot).transpose()?,
         away_s: args.away,
         snapshot: args.snapshot.clone(),

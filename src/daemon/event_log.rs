@@ -1,5 +1,7 @@
 //! Core events as log lines: on change, with fields, by severity. Error frames are told once, then as a count: a
-//! bus without a partner makes thousands a second.
+//! bus without a partner makes thousands a second. And as JSON lines, all of them.
+
+use std::io::{self, Write};
 
 use crate::alarm::Severity;
 use crate::monitor::{BusEvent, Event, EventKind};
@@ -7,6 +9,12 @@ use crate::quantity::{CellIndex, Timestamp};
 
 /// Error frames of one interface are summed up this often, s.
 const ERROR_SUMMARY_S: f64 = 10.0;
+
+/// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
+pub(crate) fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    serde_json::to_writer(&mut *out, event)?;
+    out.write_all(b"\n")
+}
 
 /// Error frames of one interface.
 #[derive(Debug, Clone, Copy, Default)]

@@ -21,9 +21,11 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     // A second start (tests) keeps the first logger: nothing is lost by that.
     let _ = match stderr_is_journal().then(tracing_journald::layer) {
         Some(Ok(journal)) => registry.with(journal).try_init(),
+        // Colours for a person at a terminal; in a file they are rubbish. An empty NO_COLOR counts as none.
         _ => {
-            let colour = std::io::stderr().is_terminal();
-            registry.with(tracing_subscriber::fmt::layer().with_ansi(colour).with_writer(std::io::stderr)).try_init()
+            let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+            let ansi = wanted && std::io::stderr().is_terminal();
+            registry.with(tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(ansi)).try_init()
         }
     };
     Ok(())

@@ -16,7 +16,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 
 use super::background_file::BackgroundFile;
-use super::event_log::EventLog;
+use super::event_log::{self, EventLog};
 use crate::config::Config;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::{MappedClock, Reading};
@@ -43,6 +43,8 @@ pub struct Service {
     pub record: Option<PathBuf>,
     /// Log of the frames sent, with the time of the input that caused each.
     pub frames: Option<PathBuf>,
+    /// Events as JSON, a line each.
+    pub events: Option<PathBuf>,
     /// State to start from.
     pub restore: Option<Snapshot>,
     /// Age of that state, s; `None` = as its stamp says.
@@ -115,8 +117,9 @@ impl Service {
             }
         }
         let frames = self.frames.as_deref().map(create).transpose()?;
+        let events = self.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        let mut engine = Engine { monitor, outputs: Outputs::default(), record, frames, names, log };
+        let mut engine = Engine { monitor, outputs: Outputs::default(), record, frames, events, names, log };
         engine.handle(&Input::Tick { time: now }, &[]);
         Ok(engine)
     }
@@ -147,6 +150,7 @@ struct Engine {
     outputs: Outputs,
     record: Option<JournalWriter<BackgroundFile>>,
     frames: Option<BackgroundFile>,
+    events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
 }
@@ -164,14 +168,13 @@ impl Engine {
                 link.send(transmit.frame);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
-            let Some(file) = &mut self.frames else { continue };
-            if let Err(error) = candump::write_line(file, transmit.time, StampDigits::Nanos, name, &transmit.frame) {
-                tracing::error!(%error, "log of sent frames stopped");
-                self.frames = None;
-            }
+            let write =
+                |file: &mut _| candump::write_line(file, transmit.time, StampDigits::Nanos, name, &transmit.frame);
+            write_or_stop(&mut self.frames, "frames", write);
         }
         for event in &self.outputs.events {
             self.log.log(event);
+            write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }
 
@@ -184,16 +187,15 @@ impl Engine {
         if let Some(Err(error)) = self.record.as_mut().map(JournalWriter::flush) {
             self.stop_recording(&error);
         }
-        if let Some(Err(error)) = self.frames.as_mut().map(Write::flush) {
-            tracing::error!(%error, "log of sent frames stopped");
-            self.frames = None;
-        }
+        write_or_stop(&mut self.frames, "frames", Write::flush);
+        write_or_stop(&mut self.events, "events", Write::flush);
     }
 
     fn close_files(&mut self) {
         let record = self.record.take().map(|journal| ("record", journal.into_inner()));
         let frames = self.frames.take().map(|file| ("frames", file));
-        for (what, file) in record.into_iter().chain(frames) {
+        let events = self.events.take().map(|file| ("events", file));
+        for (what, file) in record.into_iter().chain(frames).chain(events) {
             if let Err(error) = file.finish() {
                 tracing::error!(what, %error, "file is not complete");
             }
@@ -315,6 +317,18 @@ impl Stop {
             _ = self.interrupt.recv() => {}
             () = timer => {}
         }
+    }
+}
+
+/// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on.
+fn write_or_stop(
+    file: &mut Option<BackgroundFile>,
+    what: &str,
+    write: impl FnOnce(&mut BackgroundFile) -> io::Result<()>,
+) {
+    if let Some(Err(error)) = file.as_mut().map(write) {
+        tracing::error!(what, %error, "file given up");
+        *file = None;
     }
 }
 
