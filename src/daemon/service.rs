@@ -91,9 +91,11 @@ impl Service {
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
-        let engine = self.engine(clock)?;
+        let mut engine = self.engine(clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
         drop(sender);
+        // The first input is the time of the start; what it sends waits for the interfaces.
+        engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         let mut service = Loop { engine, inbox, clock, outputs, batch: Vec::with_capacity(BATCH) };
         notify(&[NotifyState::Ready, NotifyState::Status("running")]);
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
@@ -102,13 +104,13 @@ impl Service {
         service.finish(links, snapshot.as_deref()).await
     }
 
-    /// The core and the files round it; its first input is the time of the start.
+    /// The core and the files round it.
     fn engine(&mut self, clock: MappedClock) -> Result<Engine, ServiceError> {
         let names: Vec<String> = self.config.interfaces.iter().map(|i| i.name.clone()).collect();
         let mut monitor = Monitor::new(self.config.monitor.clone());
         let mut record = open_journal(self.record.as_deref(), &names)?;
-        let now = clock.now();
         if let Some(snapshot) = self.restore.take() {
+            let now = clock.now();
             tracing::info!(away_s = self.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0)), "state taken up");
             monitor.restore(snapshot, self.away_s)?;
             if let Some(Err(error)) = record.as_mut().map(|journal| journal.restored(now, self.away_s)) {
@@ -119,9 +121,7 @@ impl Service {
         let frames = self.frames.as_deref().map(create).transpose()?;
         let events = self.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        let mut engine = Engine { monitor, outputs: Outputs::default(), record, frames, events, names, log };
-        engine.handle(&Input::Tick { time: now }, &[]);
-        Ok(engine)
+        Ok(Engine { monitor, outputs: Outputs::default(), record, frames, events, names, log })
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
@@ -244,14 +244,19 @@ impl Loop {
 
     /// What came before the tick is handed over before it.
     async fn tick(&mut self) {
-        // Lets the interfaces' tasks take what is in their sockets.
-        tokio::task::yield_now().await;
-        while self.batch.len() < INBOX
-            && let Ok(received) = self.inbox.try_recv()
-        {
-            self.batch.push(received);
+        for _ in 0..INBOX / BATCH {
+            // Lets the interfaces' tasks take what is in their sockets, and send.
+            tokio::task::yield_now().await;
+            while self.batch.len() < BATCH
+                && let Ok(received) = self.inbox.try_recv()
+            {
+                self.batch.push(received);
+            }
+            if self.batch.is_empty() {
+                break;
+            }
+            self.handle_batch();
         }
-        self.handle_batch();
         self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
     }
 

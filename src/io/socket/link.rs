@@ -119,6 +119,8 @@ pub(crate) struct Link {
     outgoing: mpsc::Receiver<Outgoing>,
     unsent: Arc<AtomicU64>,
     state: Option<State>,
+    /// When that was noted.
+    state_since: Timestamp,
     /// Frames lost since the last report: by the kernel, and by our full inbox.
     lost: u64,
     report: Interval,
@@ -159,6 +161,7 @@ impl Link {
             outgoing,
             unsent,
             state: None,
+            state_since: clock.now(),
             lost: 0,
             report,
             pause: FIRST_PAUSE,
@@ -252,11 +255,11 @@ impl Link {
 
     /// Reads until the socket is empty, with pauses for the other tasks.
     async fn receive_all(&mut self, open: &mut Open) -> Option<End> {
+        let mut before = Reading::now();
         loop {
             for _ in 0..READ_BATCH {
-                let before = Reading::now();
                 match open.socket.get_mut().receive() {
-                    Ok(received) => self.take(open, received).await,
+                    Ok(received) => before = self.take(open, received).await,
                     Err(Errno::EAGAIN) => {
                         open.mapper.socket_empty(before);
                         return None;
@@ -273,29 +276,31 @@ impl Link {
         }
     }
 
-    /// Hands on one thing read.
-    async fn take(&mut self, open: &mut Open, received: RawReceived) {
+    /// Hands on one thing read; the clocks at its reading.
+    async fn take(&mut self, open: &mut Open, received: RawReceived) -> Reading {
         let reading = Reading::now();
-        if self.state != Some(State::Up) {
-            self.enter(State::Up).await;
+        let time = open.mapper.arrival(received.stamps, reading);
+        // Frames that were still in the socket when the interface went down do not say that it is up again.
+        if self.state != Some(State::Up) && time > self.state_since {
+            self.enter_at(State::Up, time).await;
         }
         if let Some(total) = received.dropped_total {
             self.lost += u64::from(total.wrapping_sub(open.dropped_total));
             open.dropped_total = total;
         }
-        let time = open.mapper.arrival(received.stamps, reading);
         let what = match received.what {
-            Wire::Frame(frame) if self.config.ids.binary_search(&frame.id()).is_err() => return,
+            Wire::Frame(frame) if self.config.ids.binary_search(&frame.id()).is_err() => return reading,
             Wire::Frame(frame) => What::Frame(frame),
             Wire::Error(class) => What::Event(BusEvent::ErrorFrame { class }),
             Wire::Malformed => {
                 self.lost += 1;
-                return;
+                return reading;
             }
         };
         if self.inbox.try_send(Received { time, bus: self.config.bus, what }).is_err() {
             self.lost += 1;
         }
+        reading
     }
 
     /// Sends what waits, if there is room.
@@ -375,10 +380,16 @@ impl Link {
 
     /// Notes the interface's state; tells it when it is new.
     async fn enter(&mut self, state: State) {
+        self.enter_at(state, self.clock.now()).await;
+    }
+
+    /// The same, found out from something of that time.
+    async fn enter_at(&mut self, state: State, time: Timestamp) {
         if self.state == Some(state) {
             return;
         }
         self.state = Some(state);
+        self.state_since = time;
         if state == State::Up {
             self.pause = FIRST_PAUSE;
         }
@@ -387,7 +398,7 @@ impl Link {
             State::Down => BusEvent::Down,
             State::Missing => BusEvent::Missing,
         };
-        self.tell(self.clock.now(), event).await;
+        self.tell(time, event).await;
     }
 
     /// Tells what was lost since the last report.
