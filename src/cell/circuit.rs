@@ -27,12 +27,15 @@ impl BranchAt {
         Self { r_ohm: model.branch_r_ohm(i, place) * resistance_ratio, tau_s: model.branch_tau_s(i, place) }
     }
 
-    /// The branch's voltage after `dt_s` at a constant `current_a`.
+    /// The branch's voltage after `dt_s` at a constant `current_a`. Euler's rule is unstable in steps longer than the
+    /// time constant (gaps): those are exact whatever the rule.
     pub fn voltage_after(&self, rule: Discretisation, branch_v: f64, current_a: f64, dt_s: f64) -> f64 {
         let settled_v = self.r_ohm * current_a;
         match rule {
-            Discretisation::Exact => settled_v + (branch_v - settled_v) * libm::exp(-dt_s / self.tau_s),
-            Discretisation::Euler => branch_v + (settled_v - branch_v) * dt_s / self.tau_s,
+            Discretisation::Euler if dt_s < self.tau_s => branch_v + (settled_v - branch_v) * dt_s / self.tau_s,
+            Discretisation::Exact | Discretisation::Euler => {
+                settled_v + (branch_v - settled_v) * libm::exp(-dt_s / self.tau_s)
+            }
         }
     }
 }

@@ -149,6 +149,10 @@ impl CellEstimator {
         let reset = result.is_err() || self.lost(config);
         if reset {
             self.start(model, config, step);
+            if result.is_err() {
+                // The correlation may be what could not be factored.
+                self.forget_correlation();
+            }
         }
         StepResult { update: result.unwrap_or(None), reset }
     }
@@ -226,9 +230,19 @@ impl CellEstimator {
             2 => Filter::Two(fresh(soc, branch_variance, &kept)),
             _ => Filter::Three(fresh(soc, branch_variance, &kept)),
         });
-        self.memory.mean_nis = 0.0;
+        // Trust comes back through the window, not by starting again.
+        self.memory.mean_nis = self.memory.mean_nis.min(config.consistency_limit * std::f64::consts::E);
         self.memory.information_s = config.max_information_s;
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+    }
+
+    fn forget_correlation(&mut self) {
+        if let Some(filter) = &mut self.filter {
+            each!(filter, x => {
+                let (r, c) = (log_resistance_index(x), capacity_index(x));
+                (x.covariance[(r, c)], x.covariance[(c, r)]) = (0.0, 0.0);
+            });
+        }
     }
 
     /// The sensor's value, or the thermal model's from the last known one.

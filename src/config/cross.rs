@@ -2,9 +2,9 @@
 
 use super::convert::{Raw, in_ampere_hours};
 use super::document::{Faults, Place};
-use super::keys::{Alarm, Interface, Pack, TemperatureInput};
+use super::keys::{Alarm, Interface, Method, Pack, TemperatureInput};
 use crate::alarm::Rule;
-use crate::cell::CellModel;
+use crate::cell::{CapacityState, CellModel};
 
 /// Interfaces one daemon may watch: more than any vehicle computer has, few enough for one byte in journals.
 const MAX_INTERFACES: usize = 16;
@@ -148,6 +148,18 @@ fn health(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
         let key = if recharge.place.has("to_soc") { "to_soc" } else { "from_soc" };
         let other = format!("must be below recharge.to_soc = {}", recharge.to_soc);
         recharge.place.fault(faults, key, if key == "to_soc" { &what } else { &other });
+    }
+    if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
+        // The paper's filter holds the capacity between half-cycles, ours carries it: half of each is neither.
+        let (key, needed) = match (capacity.method, estimator.capacity_state) {
+            (Method::Swing, CapacityState::Joint) | (Method::Nominal, CapacityState::Held) => ("", ""),
+            (Method::Swing, CapacityState::Held) => ("swing", "joint"),
+            (Method::Nominal, CapacityState::Joint) => ("nominal", "held"),
+        };
+        if !key.is_empty() {
+            let what = format!("must be \"{needed}\" with capacity.method = \"{key}\"");
+            estimator.place.fault(faults, "capacity_state", &what);
+        }
     }
     if let (Some(usable), Some(model)) = (&raw.usable, model)
         && usable.cutoff_v >= model.voltage_max_v

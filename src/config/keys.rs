@@ -228,7 +228,7 @@ section! {
         kappa: f64, "", Between(0.0, 10.0), Default("0.0");
         /// How the circuit is stepped: exactly, or by forward Euler as in the paper.
         discretisation: Discretisation, "", Any, Default("\"exact\"");
-        /// Whether the filter carries the capacity as a state, or holds the learned one as in the paper.
+        /// Whether the filter carries the capacity as a state ("joint", with method "swing"), or holds the learned one as in the paper ("held", with method "nominal").
         capacity_state: CapacityState, "", Any, Default("\"joint\"");
         /// SOC to start from. Without it: from the first voltage through the open-circuit voltage curve.
         initial_soc: Option<f64>, "fraction", Between(0.0, 1.0), Optional;
@@ -280,7 +280,7 @@ section! {
         hysteresis_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
         /// A new mode must hold this long before it counts.
         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
-        /// Half-cycles that move less than this part of the rated capacity are joined to their neighbours.
+        /// A charge or discharge that moves less than this part of the rated capacity is joined to what follows, until together they do. For method "nominal": most of its swing, so that a pause does not cut a half-cycle in two.
         min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
     }
 }

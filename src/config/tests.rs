@@ -170,11 +170,11 @@ fn nothing_is_sent_unless_configured() {
 fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
     let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
     assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
-    assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 1.0));
-    let text = "[output]\nextended = true\nstatus_id = 0x18FF_0001\nstatus_period_ms = 100\n";
+    assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 0.1));
+    let text = "[output]\nextended = true\nstatus_id = 0x18FF_0001\nstatus_period_ms = 200\n";
     let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
     assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
-    assert_eq!((output.status_period_s, output.alarm_period_s), (0.1, 1.0));
+    assert_eq!((output.status_period_s, output.alarm_period_s), (0.2, 1.0));
 }
 
 #[test]

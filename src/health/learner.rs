@@ -23,12 +23,11 @@ pub struct HalfCycle {
     pub mode: Mode,
     /// Charge moved, Ah, positive.
     pub charge_ah: f64,
-    /// SOC swing, fraction, positive when it goes with the charge.
-    pub swing: f64,
-    /// Its standard deviation; the errors of both ends taken as independent.
-    pub swing_std: f64,
+    /// SOC swing, fraction, positive when it goes with the charge, and its standard deviation (the errors of both
+    /// ends taken as independent); `None` when its beginning was not estimated.
+    pub swing: Option<Belief>,
     /// SOC at its end, fraction.
-    pub end_soc: f64,
+    pub end_soc: Option<f64>,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
@@ -49,8 +48,7 @@ pub struct CapacityUpdate {
 /// The state of one cell's totals at a moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
-    soc: f64,
-    soc_variance: f64,
+    soc: Option<Belief>,
     temperature_integral: f64,
     temperature_s: f64,
 }
@@ -68,7 +66,7 @@ struct Mark {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
-    /// Where the present mode began.
+    /// Where the present half-cycle began.
     start: Option<Mark>,
     /// Where the mode that may follow began.
     candidate: Option<Mark>,
@@ -78,6 +76,12 @@ pub struct Learner {
     capacity: Vec<Belief>,
     /// Time without current since the last half-cycle, s.
     rest_s: f64,
+    /// When the present mode began.
+    mode_since: Option<Timestamp>,
+    /// Whether `start` is kept because too little was moved since.
+    joining: bool,
+    /// Whether a half-cycle has taught something about each cell.
+    learned: Vec<bool>,
 }
 
 impl Learner {
@@ -90,13 +94,16 @@ impl Learner {
             prior: vec![initial_capacity; cells],
             capacity: vec![initial_capacity; cells],
             rest_s: 0.0,
+            mode_since: None,
+            joining: false,
+            learned: vec![false; cells],
         }
     }
 
     /// Takes a cell's new estimate into its totals.
     pub fn observe(&mut self, cell: usize, soc: Belief, temperature_c: Option<f64>, elapsed_s: f64) {
         let totals = &mut self.totals[cell];
-        (totals.soc, totals.soc_variance) = (soc.mean, soc.variance);
+        totals.soc = Some(soc);
         if let Some(temperature_c) = temperature_c {
             totals.temperature_integral += temperature_c * elapsed_s;
             totals.temperature_s += elapsed_s;
@@ -115,16 +122,9 @@ impl Learner {
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
-    /// The mode that began at the candidate mark is confirmed: the marks of the mode that ended, or `None`
-    /// when there are not two yet.
-    fn close(&mut self) -> Option<(Mark, Mark)> {
-        let end = self.candidate.take()?;
-        let start = self.start.replace(end.clone())?;
-        Some((start, end))
-    }
-
-    /// Completes the mode `from`. Appends each cell's half-cycle to `half_cycles` in cell order when it was a
-    /// charge or a discharge of at least the configured swing.
+    /// Completes the mode `from`: the one that may follow is confirmed. When the charge moved since the last half-cycle
+    /// comes to the configured swing, appends each cell's half-cycle to `half_cycles` in cell order; a charge or
+    /// discharge of less is joined to what follows it.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -132,34 +132,27 @@ impl Learner {
         from: Mode,
         half_cycles: &mut Vec<HalfCycle>,
     ) {
-        let Some((start, end)) = self.close() else { return };
-        let sign = match from {
-            Mode::Discharge => 1.0,
-            Mode::Charge => -1.0,
-            Mode::Rest | Mode::Unknown => {
-                self.rest_s += end.time.since(start.time);
-                return;
-            }
+        let Some(end) = self.candidate.take() else { return };
+        let since = self.mode_since.replace(end.time);
+        let Some(start) = &self.start else {
+            self.start = Some(end);
+            return;
         };
-        let charge_ah = sign * (end.charge_as - start.charge_as) / 3600.0;
-        if charge_ah <= 0.0 || charge_ah < config.min_swing * rated_capacity_ah {
+        if matches!(from, Mode::Rest | Mode::Unknown) {
+            self.rest_s += since.map_or(0.0, |since| end.time.since(since).max(0.0));
+            if !self.joining {
+                self.start = Some(end);
+            }
             return;
         }
-        let duration_s = end.time.since(start.time);
-        half_cycles.extend(start.cells.iter().zip(&end.cells).map(|(a, b)| {
-            let temperature_s = b.temperature_s - a.temperature_s;
-            HalfCycle {
-                mode: from,
-                charge_ah,
-                swing: sign * (a.soc - b.soc),
-                swing_std: (a.soc_variance + b.soc_variance).sqrt(),
-                end_soc: b.soc,
-                duration_s,
-                mean_current_a: sign * charge_ah * 3600.0 / duration_s,
-                mean_temperature_c: (temperature_s > 0.0)
-                    .then(|| (b.temperature_integral - a.temperature_integral) / temperature_s),
-            }
-        }));
+        let moved_ah = (end.charge_as - start.charge_as) / 3600.0;
+        self.joining = moved_ah == 0.0 || moved_ah.abs() < config.min_swing * rated_capacity_ah;
+        if !self.joining {
+            half_cycles.extend(
+                start.cells.iter().zip(&end.cells).map(|(a, b)| half_cycle(moved_ah, end.time.since(start.time), a, b)),
+            );
+            self.start = Some(end);
+        }
     }
 
     /// Runs the capacity filter of one cell over its completed half-cycle.
@@ -181,7 +174,13 @@ impl Learner {
                 Some(measurement)
             }
         };
+        self.learned[cell] |= measurement.is_some();
         CapacityUpdate { measurement, capacity: self.capacity(config, cell) }
+    }
+
+    /// Whether every cell's capacity is more than what it was configured to start from.
+    pub fn has_learned_all(&self) -> bool {
+        self.learned.iter().all(|&learned| learned)
     }
 
     fn learn_swing(
@@ -219,7 +218,7 @@ impl Learner {
 
     /// Whether the totals are for this many cells.
     pub fn fits(&self, cells: usize) -> bool {
-        [self.totals.len(), self.prior.len(), self.capacity.len()] == [cells; 3]
+        [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len()] == [cells; 4]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
     }
 
@@ -228,5 +227,25 @@ impl Learner {
         for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
             mark.time = mark.time.plus_nanos(by_nanos);
         }
+        self.mode_since = self.mode_since.map(|since| since.plus_nanos(by_nanos));
+    }
+}
+
+/// One cell's half-cycle between two marks in which `moved_ah` left it.
+fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
+    let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
+    let temperature_s = b.temperature_s - a.temperature_s;
+    HalfCycle {
+        mode,
+        charge_ah: moved_ah.abs(),
+        swing: a
+            .soc
+            .zip(b.soc)
+            .map(|(a, b)| Belief { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
+        end_soc: b.soc.map(|soc| soc.mean),
+        duration_s,
+        mean_current_a: moved_ah * 3600.0 / duration_s,
+        mean_temperature_c: (temperature_s > 0.0)
+            .then(|| (b.temperature_integral - a.temperature_integral) / temperature_s),
     }
 }

@@ -4,6 +4,8 @@
 //! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum;
 //! pack SOC = dischargeable / pack capacity. For one cell these are its own values.
 
+use serde::{Deserialize, Serialize};
+
 use crate::quantity::CellIndex;
 
 /// One cell's part in the pack.
@@ -22,7 +24,7 @@ pub struct CellShare {
 }
 
 /// The pack as its limiting cells make it.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PackState {
     /// State of charge, fraction.
     pub soc: f64,
@@ -36,7 +38,7 @@ pub struct PackState {
     pub limiting_cell: CellIndex,
 }
 
-/// Combines the cells; `None` for no cell.
+/// Combines the cells; `None` for no cell, and when they leave no capacity (one above full, one below empty).
 pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
     let mut chargeable_ah = f64::INFINITY;
@@ -49,7 +51,7 @@ pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     }
     let (dischargeable_ah, limiting) = weakest?;
     let capacity_ah = dischargeable_ah + chargeable_ah;
-    Some(PackState {
+    (capacity_ah > 0.0).then_some(PackState {
         soc: dischargeable_ah / capacity_ah,
         soc_std: limiting.soc_std,
         capacity_ah,

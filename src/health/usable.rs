@@ -16,7 +16,7 @@ const STEPS: f64 = 400.0;
 /// Steps after which a discharge that never reaches its cut-off is given up: five capacities.
 const MAX_STEPS: u32 = 2000;
 
-/// Steps of the numerical derivatives over ln rho and over ln capacity.
+/// Steps of the numerical forward derivatives over ln rho and over ln capacity.
 const LOG_STEP: f64 = 0.01;
 
 /// Charge, Ah, that a cell of `capacity_ah` and `resistance_ratio` delivers from `full_soc` down to the cut-off.
@@ -69,12 +69,13 @@ pub fn usable_capacity(
     let at = |log_capacity: f64, log_ratio: f64| {
         usable_ah(model, config, full_soc, capacity.mean * libm::exp(log_capacity), libm::exp(log_r.mean + log_ratio))
     };
-    let by_capacity = (at(LOG_STEP, 0.0) - at(-LOG_STEP, 0.0)) / (2.0 * LOG_STEP * capacity.mean);
-    let by_log_r = (at(0.0, LOG_STEP) - at(0.0, -LOG_STEP)) / (2.0 * LOG_STEP);
+    let mean = at(0.0, 0.0);
+    let by_capacity = (at(LOG_STEP, 0.0) - mean) / (LOG_STEP * capacity.mean);
+    let by_log_r = (at(0.0, LOG_STEP) - mean) / LOG_STEP;
     let variance = by_capacity * by_capacity * capacity.variance
         + by_log_r * by_log_r * log_r.variance
         + 2.0 * by_capacity * by_log_r * cell.capacity_resistance_covariance();
-    Belief { mean: at(0.0, 0.0), variance: variance.max(0.0) }
+    Belief { mean, variance: variance.max(0.0) }
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Event, EventKind, Monitor, Outputs, Transmit, Validity};
+use super::{Event, EventKind, Monitor, MonitorConfig, Outputs, Transmit, Validity};
 use crate::alarm::{ActiveAlarm, AlarmChange, Rule};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, StatusFields};
@@ -23,6 +23,13 @@ pub(super) struct Schedule {
 }
 
 impl Schedule {
+    /// Moves stored times onto another clock.
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        for due in [&mut self.housekeeping, &mut self.status, &mut self.health, &mut self.alarm] {
+            *due = due.plus_nanos(by_nanos);
+        }
+    }
+
     /// Everything is due now: after a start and after time asleep.
     pub(super) fn restart(&mut self, now: Timestamp) {
         (self.housekeeping, self.status, self.health, self.alarm) = (now, now, now, now);
@@ -39,10 +46,40 @@ fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
     true
 }
 
+/// What the rules about inputs look at; `None` = not known.
+#[derive(Debug, Clone, Copy, Default)]
+struct InputState {
+    silence_s: Option<f64>,
+    bad_share: Option<f64>,
+    /// Whether a reading has come since the last look.
+    is_new: bool,
+}
+
+impl InputState {
+    fn worst(self, other: Self) -> Self {
+        let max = |a: Option<f64>, b: Option<f64>| a.map_or(b, |a| Some(b.map_or(a, |b| a.max(b))));
+        Self {
+            silence_s: max(self.silence_s, other.silence_s),
+            bad_share: max(self.bad_share, other.bad_share),
+            is_new: self.is_new || other.is_new,
+        }
+    }
+}
+
+impl MonitorConfig {
+    /// Silence that the strictest rule calls missing, s.
+    fn missing_after_s(&self) -> Option<f64> {
+        let rules = self.rules.iter().filter(|rule| rule.rule == Rule::InputMissing);
+        rules.map(|rule| rule.threshold).min_by(f64::total_cmp)
+    }
+}
+
 impl Monitor {
     /// When a tick will next do something: a driver may leave out earlier ticks, the result is the same.
     pub fn next_due(&self) -> Option<Timestamp> {
-        self.started?;
+        if !self.started {
+            return None;
+        }
         let schedule = &self.schedule;
         let sending = self.config.output.as_ref().map(|_| schedule.status.min(schedule.health).min(schedule.alarm));
         Some(sending.map_or(schedule.housekeeping, |due| due.min(schedule.housekeeping)))
@@ -71,6 +108,10 @@ impl Monitor {
         self.sampler.poll(self.now, &mut self.scratch.signal_changes);
         self.report_signals(out);
         self.observe_current(self.sampler.pack_current_a(self.now), out);
+        if !self.sampler.voltages_fresh(self.now) {
+            // A cell nobody measures any more may be the weakest.
+            self.forget_pack();
+        }
         self.watch_inputs(out);
         self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
@@ -79,20 +120,34 @@ impl Monitor {
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
     /// what belongs to no cell under the pack.
     fn watch_inputs(&mut self, out: &mut Outputs) {
-        let mut pack = (0.0_f64, 0.0_f64);
+        let mut pack = InputState::default();
         for index in 0..self.sampler.channel_count() {
             let channel = self.sampler.channel(index);
-            let silence_s = self.sampler.silence_s(channel, self.now).unwrap_or(0.0);
-            let bad_share = self.sampler.bad_share(channel).unwrap_or(0.0);
+            let state = self.input_state(channel);
             if let Channel::CellVoltage(cell) = channel {
-                self.observe_alarm(Rule::InputMissing, Some(cell), Some(silence_s), true, out);
-                self.observe_alarm(Rule::InputImplausible, Some(cell), Some(bad_share), true, out);
+                self.observe_input(Some(cell), state, out);
             } else {
-                pack = (pack.0.max(silence_s), pack.1.max(bad_share));
+                pack = pack.worst(state);
             }
         }
-        self.observe_alarm(Rule::InputMissing, None, Some(pack.0), true, out);
-        self.observe_alarm(Rule::InputImplausible, None, Some(pack.1), true, out);
+        self.observe_input(None, pack, out);
+    }
+
+    fn input_state(&self, channel: Channel) -> InputState {
+        let silence_s = self.sampler.silence_s(channel, self.now);
+        // Since waking nothing may have come yet: that is neither silence nor its end.
+        let heard = self.sampler.heard_since_waking(channel);
+        let beyond = |silence: &f64| heard || self.config.missing_after_s().is_some_and(|limit| *silence > limit);
+        InputState {
+            silence_s: silence_s.filter(beyond),
+            bad_share: self.sampler.bad_share(channel),
+            is_new: silence_s.is_some_and(|silence_s| heard && silence_s <= HOUSEKEEPING_S),
+        }
+    }
+
+    fn observe_input(&mut self, cell: Option<CellIndex>, state: InputState, out: &mut Outputs) {
+        self.observe_alarm(Rule::InputMissing, cell, state.silence_s, true, out);
+        self.observe_alarm(Rule::InputImplausible, cell, state.bad_share, state.is_new, out);
     }
 
     /// Takes a value into the rules; what changes goes out at once.
@@ -157,29 +212,27 @@ impl Monitor {
         }))
     }
 
-    /// Health of the pack: its weakest cell's capacity, as an estimate only once a half-cycle has taught something.
+    /// Health of the pack: its weakest cell's, once half-cycles have taught something about every cell.
     fn health_fields(&self) -> HealthFields {
-        let rated_ah = self.config.model.rated_capacity_ah;
-        let learned = self.cells.iter().enumerate().filter(|(_, slot)| slot.latest.is_some());
-        let capacity = learned
-            .map(|(index, _)| self.learner.capacity(&self.config.health.capacity, index))
-            .min_by(|a, b| a.mean.total_cmp(&b.mean))
-            .filter(|_| self.pack.is_some());
+        let recharge_period_s = self.recharge_period_s;
+        if !self.learner.has_learned_all() {
+            return HealthFields { recharge_period_s, ..HealthFields::default() };
+        }
+        let cells = 0..self.cells.len();
+        let capacity = cells
+            .map(|index| self.learner.capacity(&self.config.health.capacity, index))
+            .min_by(|a, b| a.mean.total_cmp(&b.mean));
         let usable = self.cells.iter().filter_map(|slot| slot.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
-        let resistance = self
-            .cells
-            .iter()
-            .filter_map(|slot| slot.latest.as_ref().map(|estimate| estimate.resistance_ratio))
-            .max_by(f64::total_cmp);
+        let log_resistance = self.cells.iter().map(|slot| slot.estimator.log_resistance().mean).max_by(f64::total_cmp);
         HealthFields {
             capacity_ah: capacity.map(|c| c.mean),
             capacity_std_ah: capacity.map(|c| c.std()),
-            soh: capacity.map(|c| c.mean / rated_ah),
-            recharge_period_s: self.recharge_period_s,
+            soh: capacity.map(|c| c.mean / self.config.model.rated_capacity_ah),
+            recharge_period_s,
             normalized_recharge_period_s: None,
             usable_capacity_ah: usable.map(|u| u.mean),
             usable_capacity_std_ah: usable.map(|u| u.std()),
-            resistance_ratio: resistance,
+            resistance_ratio: log_resistance.map(libm::exp),
         }
     }
 

@@ -47,12 +47,12 @@ impl Monitor {
     fn learn_cell(&mut self, index: usize, half_cycle: &HalfCycle, out: &mut Outputs) {
         let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
         let slot = &mut self.cells[index];
-        if slot.latest.is_none() {
+        if slot.estimator.soc().is_none() {
             return;
         }
         let update = self.learner.learn(&self.config.health.capacity, index, &mut slot.estimator, half_cycle);
         if half_cycle.mode == Mode::Charge && slot.tapered {
-            slot.full_soc = half_cycle.end_soc;
+            slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
         }
         // What a discharge will deliver is restated by discharges: a charge leaves the resistance of charging.
         let restate = half_cycle.mode == Mode::Discharge || slot.usable.is_none();
@@ -63,7 +63,9 @@ impl Monitor {
         let usable_ah = slot.usable.map(|usable| usable.mean);
         out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
         out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
-        self.observe_alarm(Rule::CapacityLow, Some(cell), Some(update.capacity.mean), true, out);
+        if update.measurement.is_some() {
+            self.observe_alarm(Rule::CapacityLow, Some(cell), Some(update.capacity.mean), true, out);
+        }
         self.observe_alarm(Rule::UsableCapacityLow, Some(cell), usable_ah, restate, out);
     }
 
@@ -79,18 +81,19 @@ impl Monitor {
     /// The pack's values from its cells', and the recharge period they make.
     pub(super) fn combine_pack(&mut self, out: &mut Outputs) {
         let config = &self.config.health;
-        let shares = self.cells.iter().enumerate().filter_map(|(index, slot)| {
-            let estimate = slot.latest.as_ref()?;
-            let capacity = self.learner.capacity(&config.capacity, index);
+        let shares = self.cells.iter().zip(0..).filter_map(|(slot, index)| {
+            let soc = slot.estimator.soc()?;
+            let capacity = self.learner.capacity(&config.capacity, usize::from(index));
             Some(CellShare {
-                cell: estimate.cell,
-                soc: estimate.soc,
-                soc_std: estimate.soc_std,
+                cell: CellIndex(index),
+                soc: soc.mean,
+                soc_std: soc.std(),
                 capacity_ah: capacity.mean,
                 capacity_std_ah: capacity.std(),
             })
         });
-        self.pack = pack::combine(shares).filter(|_| self.cells.iter().all(|slot| slot.latest.is_some()));
+        let known = self.sampler.voltages_fresh(self.now);
+        self.pack = if known { pack::combine(shares) } else { None };
         let Some(pack) = self.pack else { return };
         if let Some(seconds) = self.recharge.observe(&config.recharge, self.now, self.detector.mode(), pack.soc) {
             self.recharge_period_s = Some(seconds);
@@ -105,8 +108,8 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
         cell,
         mode: half_cycle.mode,
         charge_ah: half_cycle.charge_ah,
-        swing: half_cycle.swing,
-        swing_std: half_cycle.swing_std,
+        swing: half_cycle.swing.map(|swing| swing.mean),
+        swing_std: half_cycle.swing.as_ref().map(Belief::std),
         duration_s: half_cycle.duration_s,
         mean_current_a: half_cycle.mean_current_a,
         mean_temperature_c: half_cycle.mean_temperature_c,

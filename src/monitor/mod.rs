@@ -77,8 +77,9 @@ struct Consumed {
 #[derive(Debug)]
 pub struct Monitor {
     config: MonitorConfig,
-    /// Time of the first and of the latest input.
-    started: Option<Timestamp>,
+    /// Whether an input has come.
+    started: bool,
+    /// Time of the latest input that did something.
     now: Timestamp,
     /// Inputs that came with a time before `now`.
     time_backwards: u64,
@@ -125,7 +126,7 @@ impl Monitor {
             learner: Learner::new(cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
-            started: None,
+            started: false,
             now: Timestamp::ZERO,
             time_backwards: 0,
             detector: TransitionDetector::default(),
@@ -140,17 +141,28 @@ impl Monitor {
         }
     }
 
-    /// Takes one input; appends what comes of it to `out`.
+    /// Takes one input; appends what comes of it to `out`. A tick before [`Monitor::next_due`] does nothing at all,
+    /// so a driver may leave it out.
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
-        self.advance(input.time(), out);
+        let time = input.time();
+        if !self.started {
+            self.start(time);
+        }
         match input {
-            Input::Frame { bus, frame, .. } => self.handle_frame(bus, frame, out),
-            Input::Tick { .. } => self.handle_tick(out),
-            Input::Bus { bus, event, .. } => {
-                let kind = EventKind::Bus { bus, what: event };
-                out.events.push(Event { time: self.now, kind });
+            Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => {}
+            Input::UnknownGap { .. } => self.handle_unknown_gap(time, out),
+            Input::Tick { .. } => {
+                self.advance(time, out);
+                self.handle_tick(out);
             }
-            Input::UnknownGap { .. } => self.handle_unknown_gap(out),
+            Input::Frame { bus, frame, .. } => {
+                self.advance(time, out);
+                self.handle_frame(bus, frame, out);
+            }
+            Input::Bus { bus, event, .. } => {
+                self.advance(time, out);
+                out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
+            }
         }
     }
 
@@ -194,46 +206,59 @@ impl Monitor {
         &self.alarms
     }
 
-    /// Moves the clock to an input's time: never back, and with an eye on time asleep.
+    /// The first input: its time is now; a stored state that waits is taken up and says when it was "now".
+    fn start(&mut self, time: Timestamp) {
+        (self.started, self.now) = (true, time);
+        self.schedule.restart(time);
+        self.apply_pending(time);
+    }
+
+    /// Moves the clock to an input's time: never back, and with an eye on time asleep (or away, after a restart).
     fn advance(&mut self, time: Timestamp, out: &mut Outputs) {
-        let Some(_) = self.started else {
-            (self.started, self.now) = (Some(time), time);
-            self.schedule.restart(time);
-            self.apply_pending(time);
-            return;
-        };
         let elapsed_s = time.since(self.now);
         if elapsed_s < 0.0 {
             self.time_backwards += 1;
             if time < self.now.plus_nanos(-MERGE_TOLERANCE_NS) {
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds: -elapsed_s } });
-                self.now = time;
-                self.handle_unknown_gap(out);
+                self.handle_unknown_gap(time, out);
             }
             return;
         }
         if elapsed_s > ASLEEP_S {
+            self.fall_asleep(out);
             out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(elapsed_s) } });
-            self.observe_current(None, out);
-            self.alarms.handle_gap();
-            self.recharge.interrupt();
             self.sampler.wake(time);
             self.schedule.restart(time);
         }
         self.now = time;
     }
 
-    /// The clock goes on at `now`, but how far that is from before nobody knows.
-    fn handle_unknown_gap(&mut self, out: &mut Outputs) {
-        out.events.push(Event { time: self.now, kind: EventKind::Gap { seconds: None } });
+    /// Nobody listened after `now`: the mode is unknown from there, nothing is timed over it, and the pack's values
+    /// wait for a new reading of every cell.
+    fn fall_asleep(&mut self, out: &mut Outputs) {
         self.observe_current(None, out);
+        self.alarms.handle_gap();
+        self.recharge.interrupt();
+        self.forget_pack();
+    }
+
+    /// The pack's values are not known until every cell has a new estimate.
+    fn forget_pack(&mut self) {
+        self.pack = None;
+        self.updated_cells = 0;
+        self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
+    }
+
+    /// The record goes on at `time`, but how far that is from before nobody knows.
+    fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
+        self.fall_asleep(out);
         if let Some(change) = self.detector.settle() {
             self.complete_mode(change, out);
         }
-        self.sampler.handle_gap(self.now);
-        self.alarms.handle_gap();
-        self.recharge.interrupt();
-        self.schedule.restart(self.now);
+        self.now = time;
+        out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
+        self.sampler.handle_gap(time);
+        self.schedule.restart(time);
         for cell in &mut self.cells {
             cell.estimator.handle_unknown_gap();
             cell.consumed = None;
@@ -292,6 +317,8 @@ impl Monitor {
         let Some(soc) = slot.estimator.soc() else { return };
         if result.reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
+            // The SOC jumped: what it crosses on the way is no charging.
+            self.recharge.interrupt();
         }
         self.learner.observe(index, soc, sample.temperature_c, measured_s);
         self.note_taper(sample);

@@ -2,11 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::cyclic::Schedule;
 use super::{CellSlot, Consumed, Monitor};
 use crate::alarm::AlarmState;
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
-use crate::health::{Learner, RechargeTimer, TransitionDetector};
+use crate::health::{Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::Timestamp;
 use crate::sample::SamplerState;
 
@@ -27,7 +28,11 @@ pub struct Snapshot {
     learner: Learner,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
+    pack: Option<PackState>,
+    updated_cells: usize,
+    time_backwards: u64,
     alarms: AlarmState,
+    schedule: Schedule,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -39,6 +44,7 @@ struct CellDocument {
     full_soc: f64,
     tapered: bool,
     usable: Option<Belief>,
+    updated_in_round: bool,
 }
 
 /// Why a snapshot cannot be used.
@@ -72,6 +78,9 @@ pub(super) struct PendingRestore {
 impl Monitor {
     /// The state, to be stored.
     pub fn snapshot(&self) -> Snapshot {
+        if let Some(PendingRestore { snapshot, .. }) = &self.pending {
+            return (**snapshot).clone();
+        }
         Snapshot {
             version: SNAPSHOT_VERSION,
             time: self.now,
@@ -81,7 +90,11 @@ impl Monitor {
             learner: self.learner.clone(),
             recharge: self.recharge.clone(),
             recharge_period_s: self.recharge_period_s,
+            pack: self.pack,
+            updated_cells: self.updated_cells,
+            time_backwards: self.time_backwards,
             alarms: self.alarms.snapshot(),
+            schedule: self.schedule.clone(),
         }
     }
 
@@ -110,7 +123,7 @@ impl Monitor {
         Ok(())
     }
 
-    /// Takes the waiting snapshot up at the first input's time.
+    /// Takes the waiting snapshot up; `now` becomes when it was taken, on the present clock.
     pub(super) fn apply_pending(&mut self, now: Timestamp) {
         let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return };
         let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
@@ -126,7 +139,13 @@ impl Monitor {
         self.learner = snapshot.learner;
         self.recharge = snapshot.recharge;
         self.recharge_period_s = snapshot.recharge_period_s;
+        self.pack = snapshot.pack;
+        self.updated_cells = snapshot.updated_cells;
+        self.time_backwards = snapshot.time_backwards;
         self.alarms.restore(&snapshot.alarms);
+        self.schedule = snapshot.schedule;
+        // From here the time away is a gap like any other.
+        self.now = snapshot.time;
     }
 }
 
@@ -142,6 +161,7 @@ impl Snapshot {
         self.learner.rebase(by_nanos);
         self.recharge.rebase(by_nanos);
         self.alarms.rebase(by_nanos);
+        self.schedule.rebase(by_nanos);
     }
 }
 
@@ -154,6 +174,7 @@ impl CellSlot {
             full_soc: self.full_soc,
             tapered: self.tapered,
             usable: self.usable,
+            updated_in_round: self.updated_in_round,
         }
     }
 
@@ -166,5 +187,6 @@ impl CellSlot {
         self.full_soc = document.full_soc;
         self.tapered = document.tapered;
         self.usable = document.usable;
+        self.updated_in_round = document.updated_in_round;
     }
 }

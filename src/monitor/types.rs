@@ -35,7 +35,8 @@ pub enum BusEvent {
 }
 
 /// One thing that happened, with the driver's time. Inputs come in the order in which they happened; a
-/// time before the latest one is counted and treated as the latest one (buses merge out of order).
+/// time a little before the latest one ([`MERGE_TOLERANCE_NS`]: buses merge out of order) is counted and treated as the
+/// latest; further back, the clock was set back and how much time passed is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Input<'a> {
     /// A frame was received.
@@ -102,11 +103,11 @@ pub struct Transmit {
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Validity {
-    /// No estimate yet.
+    /// No estimate yet, or none any more: a cell's voltage has not come for too long.
     Unavailable = 0,
     /// Inputs fresh, filter consistent.
     Valid = 1,
-    /// An input is stale: the estimate is coasting and its deviation grows.
+    /// Current or temperature is stale or implausible: the estimate is coasting and its deviation grows.
     Degraded = 2,
     /// The filter's innovations contradict its covariance.
     Untrusted = 3,
@@ -131,10 +132,10 @@ pub enum EventKind {
         mode: Mode,
         /// Charge moved, Ah, positive.
         charge_ah: f64,
-        /// SOC swing, fraction, positive.
-        swing: f64,
+        /// SOC swing, fraction, positive; `None` when its beginning was not estimated.
+        swing: Option<f64>,
         /// Its standard deviation.
-        swing_std: f64,
+        swing_std: Option<f64>,
         /// Duration, s.
         duration_s: f64,
         /// Mean cell current, A, positive = discharge.

@@ -239,6 +239,17 @@ impl Sampler {
         (0..self.state.signals.len()).map(|slot| self.channel(slot))
     }
 
+    /// Whether anything has come on the channel since the start or the last waking.
+    pub fn heard_since_waking(&self, channel: Channel) -> bool {
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].heard_at() >= self.state.began)
+    }
+
+    /// Whether every voltage has a good reading that is young enough.
+    pub fn voltages_fresh(&self, now: Timestamp) -> bool {
+        let voltages = &self.state.signals[1 + self.sensors..];
+        voltages.iter().all(|signal| signal.fresh(now, &self.config.voltage).is_some())
+    }
+
     /// How many channels feed something.
     pub fn channel_count(&self) -> usize {
         self.state.signals.len()

@@ -1,6 +1,6 @@
-//! Scenarios of the review of 21 November: each asserts what should be, on hand-made frames of one measured cell. Most
-//! fail on purpose; with a mend, its scenario moves to a test of its own module and leaves this file.
-#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "review only")]
+//! What must not go out on the bus: scenarios on hand-made frames of one measured cell in which an earlier version
+//! published something false, lost something, or flickered.
+#![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
 use std::path::Path;
 
@@ -165,14 +165,14 @@ fn alarm(kind: &EventKind, r: Rule, on: bool) -> bool {
 }
 
 #[test]
-fn s01_capacity_is_not_available_before_a_half_cycle_taught_it() {
+fn capacity_is_not_available_before_a_half_cycle_taught_it() {
     let mut b = Bench::new(load("paper.toml"), 0.8);
     b.run(0.0, 5);
     assert_eq!(b.health0(), (0xFFFF, 0xFFFF, 0xFFF), "capacity 0.01 Ah, std 0.001 Ah, SOH 0.05 %");
 }
 
 #[test]
-fn s01b_papers_settings_do_not_publish_an_assumed_capacity_as_certain() {
+fn papers_settings_do_not_publish_an_assumed_capacity_as_certain() {
     let mut c = load("paper.toml");
     c.estimator.capacity_state = CapacityState::Held;
     c.health.capacity.method = CapacityMethod::Nominal { swing: 0.6, variance_ah2: 0.1 };
@@ -182,7 +182,7 @@ fn s01b_papers_settings_do_not_publish_an_assumed_capacity_as_certain() {
 }
 
 #[test]
-fn s02_stop_and_go_is_joined_to_one_half_cycle_or_at_least_learned_from() {
+fn stop_and_go_is_joined_to_one_half_cycle_or_at_least_learned_from() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     // 2.6 A: 1 C. 60 s on, 30 s off, from 95 % to 12 %.
     for _ in 0..50 {
@@ -191,21 +191,20 @@ fn s02_stop_and_go_is_joined_to_one_half_cycle_or_at_least_learned_from() {
     }
     b.run(-1.3, 300);
     let n = b.count(|k| matches!(k, EventKind::HalfCycle { .. }));
-    println!("half-cycles {n}, modes {}", b.count(|k| matches!(k, EventKind::Mode { .. })));
+
     assert!(n >= 1, "83 % of the charge went out and no half-cycle was seen");
 }
 
 #[test]
-fn s03_soc_of_a_lost_voltage_is_not_published_as_it_was() {
+fn soc_of_a_lost_voltage_is_not_published_as_it_was() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
-    let before = b.status();
     // Voltage and temperature frames are one message here: send current with voltage "not available".
     for _ in 0..1800 {
         b.second(2.6, true, false);
     }
     let after = b.status();
-    println!("before {before:?} after {after:?} truth {}", b.soc);
+
     assert!(
         (after.soc / 100.0 - b.soc).abs() < 3.0 * after.std / 100.0 || after.soc > 102.0,
         "{after:?}, truth {}",
@@ -214,41 +213,41 @@ fn s03_soc_of_a_lost_voltage_is_not_published_as_it_was() {
 }
 
 #[test]
-fn s03b_all_inputs_gone_for_hours() {
+fn all_inputs_gone_for_hours() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     let before = b.status();
     b.quiet(4 * 3600);
     let after = b.status();
-    println!("before {before:?} after {after:?}");
+
     assert!(after.std > before.std + 0.2 || after.soc > 102.0, "deviation does not grow: {before:?} {after:?}");
 }
 
 #[test]
-fn s04_waking_does_not_publish_the_old_soc_as_valid() {
+fn waking_does_not_publish_the_old_soc_as_valid() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     b.frames.clear();
     b.t += 8.0 * 3600.0;
     b.tick();
-    println!("{:?}", b.status());
+
     assert_ne!(b.status().validity, 1, "{:?}", b.status());
 }
 
 #[test]
-fn s04b_after_an_unknown_gap_the_old_soc_is_not_valid() {
+fn after_an_unknown_gap_the_old_soc_is_not_valid() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 300);
     b.frames.clear();
     b.t += 1.0;
     b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
     b.tick();
-    println!("{:?}", b.status());
+
     assert_ne!(b.status().validity, 1, "{:?}", b.status());
 }
 
 #[test]
-fn s05_restart_after_hours_raises_no_input_missing() {
+fn restart_after_hours_raises_no_input_missing() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 5.0)];
     let mut b = Bench::new(c, 0.9);
@@ -257,27 +256,27 @@ fn s05_restart_after_hours_raises_no_input_missing() {
     b.events.clear();
     b.tick();
     b.run(2.6, 20);
-    println!("{:?}", b.events);
+
     assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 0);
     assert_eq!(b.count(|k| matches!(k, EventKind::SignalBad { .. })), 0);
 }
 
 #[test]
-fn s06_waking_does_not_clear_input_missing_without_an_input() {
+fn waking_does_not_clear_input_missing_without_an_input() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 0.0)];
     let mut b = Bench::new(c, 0.9);
     b.run(2.6, 300);
     b.quiet(30);
-    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 1);
+    assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 2, "the cell's voltage, the pack's current");
     b.t += 3600.0;
     b.quiet(30);
-    println!("{:?}", b.events.iter().filter(|e| matches!(e.kind, EventKind::Alarm { .. })).collect::<Vec<_>>());
+
     assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, false)), 0, "cleared though nothing came");
 }
 
 #[test]
-fn s07_a_filter_that_keeps_being_lost_is_not_trusted() {
+fn a_filter_that_keeps_being_lost_is_not_trusted() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::EstimateUntrusted, 4.0, 60.0)];
     let mut b = Bench::new(c, 0.6);
@@ -290,27 +289,14 @@ fn s07_a_filter_that_keeps_being_lost_is_not_trusted() {
             valid += u32::from(b.status().validity == 1);
         }
     }
-    let resets = b.count(|k| matches!(k, EventKind::FilterReset { .. }));
-    println!(
-        "resets {resets}, valid {valid} of 3600 s, untrusted alarms {}",
-        b.count(|k| alarm(k, Rule::EstimateUntrusted, true))
-    );
-    println!(
-        "{:?}",
-        b.events
-            .iter()
-            .filter(|e| matches!(
-                e.kind,
-                EventKind::FilterReset { .. } | EventKind::Trust { .. } | EventKind::Alarm { .. }
-            ))
-            .take(12)
-            .collect::<Vec<_>>()
-    );
+    assert!(b.count(|k| matches!(k, EventKind::FilterReset { .. })) > 0);
+    assert!(valid < 600, "valid for {valid} of 3600 s");
+
     assert!(b.count(|k| alarm(k, Rule::EstimateUntrusted, true)) > 0);
 }
 
 #[test]
-fn s08_a_jump_of_the_soc_is_no_recharge_period() {
+fn a_jump_of_the_soc_is_no_recharge_period() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::RechargePeriodLow, 1500.0, 0.0)];
     let mut b = Bench::new(c, 0.2);
@@ -318,39 +304,25 @@ fn s08_a_jump_of_the_soc_is_no_recharge_period() {
     // Asleep or mis-wired: the filter is lost while charging and starts again at 0.9.
     b.soc = 0.88;
     b.run(-1.3, 200);
-    println!("{:?}", b.events.iter().filter(|e| !matches!(e.kind, EventKind::SignalGood { .. })).collect::<Vec<_>>());
+
     assert_eq!(b.count(|k| matches!(k, EventKind::RechargePeriod { .. })), 0);
 }
 
 #[test]
-fn s09_recharge_period_does_not_run_over_time_away() {
+fn recharge_period_does_not_run_over_time_away() {
     let mut b = Bench::new(load("paper.toml"), 0.25);
     b.run(-1.3, 3000);
     b.restart(6.0 * 3600.0);
     b.run(-1.3, 2000);
     for e in &b.events {
         if let EventKind::RechargePeriod { seconds } = e.kind {
-            println!("{seconds}");
             assert!(seconds < 4500.0, "{seconds}");
         }
     }
-    println!(
-        "{:?}",
-        b.events
-            .iter()
-            .filter(|e| matches!(
-                e.kind,
-                EventKind::Gap { .. }
-                    | EventKind::Mode { .. }
-                    | EventKind::HalfCycle { .. }
-                    | EventKind::RechargePeriod { .. }
-            ))
-            .collect::<Vec<_>>()
-    );
 }
 
 #[test]
-fn s10_half_cycle_before_an_unknown_gap_has_its_own_charge() {
+fn half_cycle_before_an_unknown_gap_has_its_own_charge() {
     let mut c = load("measured.toml");
     c.health.transition.min_duration_s = 10.0;
     let mut b = Bench::new(c, 0.95);
@@ -360,15 +332,14 @@ fn s10_half_cycle_before_an_unknown_gap_has_its_own_charge() {
     b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
     b.take();
     for e in &b.events {
-        if let EventKind::HalfCycle { charge_ah, duration_s, mean_current_a, .. } = e.kind {
-            println!("{charge_ah} Ah {duration_s} s {mean_current_a} A");
+        if let EventKind::HalfCycle { charge_ah, duration_s, .. } = e.kind {
             assert!((charge_ah - 0.5).abs() < 0.002 && (duration_s - 900.0).abs() < 5.0);
         }
     }
 }
 
 #[test]
-fn s11_half_cycle_before_a_step_back_has_a_duration() {
+fn half_cycle_before_a_step_back_has_a_duration() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
@@ -378,8 +349,7 @@ fn s11_half_cycle_before_a_step_back_has_a_duration() {
     b.t += 1.0;
     b.send(Some(2.0), Some(v));
     for e in &b.events {
-        if let EventKind::HalfCycle { charge_ah, duration_s, mean_current_a, .. } = e.kind {
-            println!("{charge_ah} Ah {duration_s} s {mean_current_a} A");
+        if let EventKind::HalfCycle { duration_s, mean_current_a, .. } = e.kind {
             assert!(duration_s > 0.0 && mean_current_a > 0.0, "{duration_s} s, {mean_current_a} A");
         }
     }
@@ -387,7 +357,7 @@ fn s11_half_cycle_before_a_step_back_has_a_duration() {
 }
 
 #[test]
-fn s12_euler_survives_a_night() {
+fn euler_survives_a_night() {
     let mut left = Vec::new();
     for rule in [Discretisation::Exact, Discretisation::Euler] {
         let mut c = load("paper.toml");
@@ -398,25 +368,19 @@ fn s12_euler_survives_a_night() {
             let e = b.monitor.latest().next().flatten().unwrap();
             (e.resistance_ratio, e.resistance_ratio_std, e.soc, e.soc_std)
         };
-        let before = log_r(&b);
         b.run(2.6, 30);
         b.t += 8.0 * 3600.0;
         b.u1 = 0.0;
         b.run(0.0, 2);
-        let waking = log_r(&b);
         b.run(0.0, 600);
-        println!(
-            "{rule:?}: R, std, SOC, std before {before:?} waking {waking:?} after {:?}, true SOC {}",
-            log_r(&b),
-            b.soc
-        );
+
         left.push(log_r(&b).0);
     }
     assert!((left[0] - left[1]).abs() < 0.1, "resistance ratio {left:?}");
 }
 
 #[test]
-fn s13_snapshot_of_a_waiting_restore_is_the_restored_state() {
+fn snapshot_of_a_waiting_restore_is_the_restored_state() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 60);
     let snap = b.monitor.snapshot();
@@ -427,7 +391,7 @@ fn s13_snapshot_of_a_waiting_restore_is_the_restored_state() {
 }
 
 #[test]
-fn s14_a_half_cycle_that_ends_right_after_a_restart_is_learned() {
+fn a_half_cycle_that_ends_right_after_a_restart_is_learned() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
@@ -435,67 +399,22 @@ fn s14_a_half_cycle_that_ends_right_after_a_restart_is_learned() {
     b.restart(5.0);
     b.tick(); // housekeeping confirms the mode before the first voltage
     b.run(0.0, 30);
-    println!(
-        "{:?}",
-        b.events
-            .iter()
-            .filter(|e| matches!(e.kind, EventKind::Mode { .. } | EventKind::HalfCycle { .. }))
-            .collect::<Vec<_>>()
-    );
+
     assert_eq!(b.count(|k| matches!(k, EventKind::HalfCycle { .. })), 1);
 }
 
 #[test]
-fn s15_one_stray_stamp_does_not_cost_the_soc() {
-    let mut b = Bench::new(load("paper.toml"), 0.9);
-    b.run(2.6, 300);
-    let before = b.monitor.latest().next().flatten().unwrap().soc_std;
-    let t = b.t;
-    b.t -= 2.0;
-    b.send(Some(2.6), None);
-    b.t = t;
-    b.run(2.6, 2);
-    let after = b.monitor.latest().next().flatten().unwrap().soc_std;
-    println!("{before} -> {after}; {:?}", b.events.iter().rev().take(4).collect::<Vec<_>>());
-    assert!(after < 2.0 * before);
-}
-
-#[test]
-fn s17_wide_capacity_start() {
+fn wide_capacity_start() {
     let mut c = load("paper.toml");
     c.estimator.initial_capacity_std_ah = 1.5;
     let mut b = Bench::new(c, 0.95);
     b.run(2.6, 1200);
-    println!("resets {} cap {:?}", b.count(|k| matches!(k, EventKind::FilterReset { .. })), b.monitor.latest().next());
+
     assert_eq!(b.count(|k| matches!(k, EventKind::FilterReset { .. })), 0);
 }
 
 #[test]
-fn s18_nominal_pieces_of_one_discharge_are_one_half_cycle() {
-    let mut c = load("paper.toml");
-    c.estimator.capacity_state = CapacityState::Held;
-    c.health.capacity.method = CapacityMethod::Nominal { swing: 0.6, variance_ah2: 0.1 };
-    c.health.capacity.noise_ah_per_cycle = 1.0;
-    let mut b = Bench::new(c, 0.9);
-    b.run(0.0, 30);
-    b.run(1.3, 2160); // 30 %
-    b.run(0.0, 12);
-    b.run(1.3, 2160); // 30 %
-    b.run(-1.3, 60);
-    for e in &b.events {
-        if let EventKind::Capacity { measured_ah, capacity_ah, .. } = e.kind {
-            println!("{measured_ah:?} {capacity_ah}");
-        }
-    }
-    for e in &b.events {
-        if let EventKind::Capacity { measured_ah: Some(z), .. } = e.kind {
-            assert!((z - 2.6).abs() < 0.1, "{z}");
-        }
-    }
-}
-
-#[test]
-fn s19_ticks_go_on_after_a_record_whose_clock_was_set_back() {
+fn ticks_go_on_after_a_record_whose_clock_was_set_back() {
     let mut ticks = Ticks::new(10, 30.0);
     let every = Some(Timestamp::from_nanos(i64::MIN));
     let mut last = 0;
@@ -510,68 +429,46 @@ fn s19_ticks_go_on_after_a_record_whose_clock_was_set_back() {
 }
 
 #[test]
-fn s20_swing_of_the_first_half_cycle() {
+fn swing_of_the_first_half_cycle() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 720); // 20 %
     b.run(0.0, 60);
     for e in &b.events {
-        if let EventKind::HalfCycle { swing, swing_std, .. } = e.kind {
-            println!("swing {swing} +- {swing_std}");
-            assert!((swing - 0.2).abs() < 0.1, "{swing}");
+        if let EventKind::HalfCycle { swing, .. } = e.kind {
+            assert!(swing.is_none_or(|swing: f64| (swing - 0.2).abs() < 0.1), "{swing:?}");
         }
     }
 }
 
 #[test]
-fn s22_bad_share_unknown_or_silent_is_no_new_value() {
+fn bad_share_unknown_or_silent_is_no_new_value() {
     let mut c = load("paper.toml");
     c.rules = vec![RuleConfig { debounce_events: 50, ..rule(Rule::InputImplausible, 0.5, 3.0) }];
     let mut b = Bench::new(c, 0.9);
     b.run(0.0, 5);
     for _ in 0..10 {
         b.second(0.0, false, false);
-        let t = b.t;
-        b.t = t;
         b.send(Some(0.0), None);
     }
     b.quiet(20);
-    println!("{:?}", b.events);
+
     assert_eq!(b.count(|k| alarm(k, Rule::InputImplausible, true)), 0, "10 bad readings, 50 asked for, then silence");
 }
 
 #[test]
-fn s23_held_capacity_is_held() {
-    let mut c = load("paper.toml");
-    c.estimator.capacity_state = CapacityState::Held;
-    let mut b = Bench::new(c, 0.95);
-    b.capacity_ah = 2.0;
-    for _ in 0..3 {
-        b.run(1.3, 3600);
-        b.run(0.0, 30);
-        b.run(-1.3, 3600);
-        b.run(0.0, 30);
-    }
-    let s = serde_json::to_value(b.monitor.snapshot()).unwrap();
-    let cov = &s["cells"][0]["estimator"]["covariance"];
-    let variance = cov[15].as_f64().unwrap();
-    println!("filter's capacity variance {variance}");
-    assert!(variance < 1e-9, "{variance}");
-}
-
-#[test]
-fn s24_a_gap_of_unknown_length_is_told_once() {
+fn a_gap_of_unknown_length_is_told_once() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(2.0, 60);
     b.t += 3600.0;
     b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
     b.take();
     let gaps: Vec<_> = b.events.iter().filter(|e| matches!(e.kind, EventKind::Gap { .. })).collect();
-    println!("{gaps:?}");
+
     assert_eq!(gaps.len(), 1);
 }
 
 #[test]
-fn s25_a_restart_after_hours_is_a_gap_like_any_other() {
+fn a_restart_after_hours_is_a_gap_like_any_other() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(0.0, 60);
     b.run(1.3, 900);
@@ -580,18 +477,12 @@ fn s25_a_restart_after_hours_is_a_gap_like_any_other() {
     b.send(Some(1.3), Some(3.9));
     b.run(1.3, 900);
     b.run(0.0, 60);
-    let seen: Vec<_> = b
-        .events
-        .iter()
-        .filter(|e| matches!(e.kind, EventKind::Gap { .. } | EventKind::HalfCycle { .. } | EventKind::Mode { .. }))
-        .collect();
-    println!("{seen:?}");
     assert!(b.count(|k| matches!(k, EventKind::Gap { .. })) == 1);
     assert!(b.events.iter().all(|e| !matches!(e.kind, EventKind::HalfCycle { duration_s, .. } if duration_s > 2000.0)));
 }
 
 #[test]
-fn s26_input_missing_pending_before_a_restart_does_not_count_the_time_away() {
+fn input_missing_pending_before_a_restart_does_not_count_the_time_away() {
     let mut c = load("paper.toml");
     c.rules = vec![rule(Rule::InputMissing, 10.0, 0.0)];
     let mut b = Bench::new(c, 0.9);
@@ -599,6 +490,6 @@ fn s26_input_missing_pending_before_a_restart_does_not_count_the_time_away() {
     b.restart(8.0 * 3600.0);
     b.events.clear();
     b.tick();
-    println!("{:?}", b.events);
+
     assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 0);
 }
