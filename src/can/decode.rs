@@ -1,4 +1,9 @@
 //! The plan that turns input frames into readings.
+//!
+//! Built once from the configured signals; per frame it is a look-up by interface and identifier, a look at the
+//! multiplexors, and a shift and a multiply-add per signal. A signal whose multiplexor says that it is not in this
+//! payload gives nothing; one that is there but unusable gives a reading with its fault. The same identifier on
+//! another interface is another message, and so is the extended identifier of the same number.
 
 use std::ops::Range;
 
@@ -70,7 +75,7 @@ impl Binding {
     }
 
     /// Whether the payload carries the signal.
-    fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
+    pub(crate) fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
         for test in &self.mux {
             let code = test.plan.raw(payload)?;
             if !test.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code)) {
@@ -95,7 +100,9 @@ impl Binding {
 pub struct InputMap {
     /// Sorted by message, then channel.
     bindings: Vec<Binding>,
-    /// Per interface, sorted by identifier: where in `bindings` the message's signals are.
+    /// Neighbours in `bindings` of one message and with equal multiplexors: there or not there together.
+    runs: Vec<Range<usize>>,
+    /// Per interface, sorted by identifier: where in `runs` the message's are.
     messages: Vec<Vec<(CanId, Range<usize>)>>,
 }
 
@@ -103,18 +110,24 @@ impl InputMap {
     /// Sorts the bindings by message and channel.
     pub fn new(mut bindings: Vec<Binding>) -> Self {
         bindings.sort_by_key(|binding| (binding.bus, binding.id, binding.channel));
+        let mut runs: Vec<Range<usize>> = Vec::new();
+        let together = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id) && a.mux == b.mux;
+        for run in bindings.chunk_by(together) {
+            let start = runs.last().map_or(0, |last| last.end);
+            runs.push(start..start + run.len());
+        }
         let mut messages: Vec<Vec<(CanId, Range<usize>)>> = Vec::new();
-        for (index, binding) in bindings.iter().enumerate() {
-            if messages.len() <= binding.bus.index() {
-                messages.resize(binding.bus.index() + 1, Vec::new());
+        for (index, run) in runs.iter().enumerate() {
+            let Binding { bus, id, .. } = bindings[run.start];
+            if messages.len() <= bus.index() {
+                messages.resize(bus.index() + 1, Vec::new());
             }
-            let Some(ids) = messages.get_mut(binding.bus.index()) else { continue };
-            match ids.last_mut() {
-                Some((id, range)) if *id == binding.id => range.end = index + 1,
-                _ => ids.push((binding.id, index..index + 1)),
+            match messages[bus.index()].last_mut() {
+                Some((last, range)) if *last == id => range.end = index + 1,
+                _ => messages[bus.index()].push((id, index..index + 1)),
             }
         }
-        Self { bindings, messages }
+        Self { bindings, runs, messages }
     }
 
     /// Hands the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those
@@ -127,13 +140,17 @@ impl InputMap {
         if frame.kind() == FrameKind::Remote {
             return;
         }
-        for binding in &self.bindings[ids[found].1.clone()] {
-            let value = match binding.holds(frame.data()) {
-                Ok(false) => continue,
-                Ok(true) => binding.value(frame.data()),
-                Err(fault) => Err(fault),
-            };
-            each(Reading { channel: binding.channel, value });
+        let payload = frame.data();
+        for run in &self.runs[ids[found].1.clone()] {
+            let bindings = &self.bindings[run.clone()];
+            let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
+            if present == Ok(false) {
+                continue;
+            }
+            for binding in bindings {
+                let value = present.and_then(|_| binding.value(payload));
+                each(Reading { channel: binding.channel, value });
+            }
         }
     }
 
@@ -155,3 +172,6 @@ impl InputMap {
         &self.bindings
     }
 }
+
+#[cfg(test)]
+pub(super) mod tests;

@@ -76,6 +76,13 @@ pub struct StepResult {
 #[derive(Debug, Clone)]
 pub struct CellEstimator {
     filter: Option<Filter>,
+    memory: Memory,
+}
+
+/// What the estimator remembers beside its filter.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Memory {
     /// Capacity before the first voltage, and what a reset keeps.
     capacity: Belief,
     log_resistance: Belief,
@@ -121,21 +128,23 @@ impl CellEstimator {
         let log_std = config.initial_log_resistance_std;
         Self {
             filter: None,
-            capacity: Belief { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
-            log_resistance: Belief { mean: 0.0, variance: (log_std * log_std).max(KNOWN_VARIANCE) },
-            temperature_c: None,
-            last_current_a: 0.0,
-            mean_nis: 0.0,
-            information_s: config.max_information_s,
-            rejected: 0,
-            rejected_s: 0.0,
-            rejected_after_gap: false,
+            memory: Memory {
+                capacity: Belief { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
+                log_resistance: Belief { mean: 0.0, variance: (log_std * log_std).max(KNOWN_VARIANCE) },
+                temperature_c: None,
+                last_current_a: 0.0,
+                mean_nis: 0.0,
+                information_s: config.max_information_s,
+                rejected: 0,
+                rejected_s: 0.0,
+                rejected_after_gap: false,
+            },
         }
     }
 
     /// Takes one voltage reading and what happened since the last one.
     pub fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
-        self.temperature_c = Some(self.temperature(model, step));
+        self.memory.temperature_c = Some(self.temperature(model, step));
         let result = self.try_step(model, config, step);
         let reset = result.is_err() || self.lost(config);
         if reset {
@@ -150,17 +159,17 @@ impl CellEstimator {
         config: &EstimatorConfig,
         step: &CellStep,
     ) -> Result<Option<Update>, FilterError> {
-        let temperature_c = self.temperature_c.unwrap_or(step.ambient_c);
+        let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
         if self.filter.is_none() {
             self.start(model, config, step);
         } else if let Some(filter) = &mut self.filter {
-            let gap_load_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
         }
-        self.information_s += step.measured_s + step.unmeasured_s;
-        self.last_current_a = step.current_a.unwrap_or(self.last_current_a);
+        self.memory.information_s += step.measured_s + step.unmeasured_s;
+        self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
-        let information_s = self.information_s.clamp(1e-3, config.max_information_s);
+        let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
         let reading = Reading { voltage_v: step.voltage_v, current_a, temperature_c, information_s };
         let update = each!(filter, x => update(x, model, config, &reading))?;
         self.watch(config, step, &update);
@@ -171,44 +180,45 @@ impl CellEstimator {
     fn watch(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
         let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency_window_s);
-        self.mean_nis += forget * (update.test_ratio - self.mean_nis);
+        self.memory.mean_nis += forget * (update.test_ratio - self.memory.mean_nis);
         if update.accepted {
-            (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
+            (self.memory.information_s, self.memory.rejected, self.memory.rejected_s) = (0.0, 0, 0.0);
         } else {
             // The time before the first of them is not part of the run.
-            if self.rejected == 0 {
-                (self.rejected_s, self.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
+            if self.memory.rejected == 0 {
+                (self.memory.rejected_s, self.memory.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
             } else {
-                self.rejected_s += elapsed_s;
+                self.memory.rejected_s += elapsed_s;
             }
-            self.rejected += 1;
+            self.memory.rejected += 1;
         }
     }
 
     fn lost(&self, config: &EstimatorConfig) -> bool {
-        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
-        long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
+        let long_enough = self.memory.rejected >= MIN_REJECTED && self.memory.rejected_s >= config.lost_after_s;
+        long_enough || (self.memory.rejected_after_gap && self.memory.rejected >= MIN_REJECTED_AFTER_GAP)
     }
 
     /// Starts SOC and branches from the voltage at hand; keeps what was learned of resistance and capacity.
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
         if let Some(filter) = &self.filter {
-            self.capacity = each!(filter, x => marginal(x, capacity_index(x)));
-            self.log_resistance = each!(filter, x => marginal(x, log_resistance_index(x)));
+            self.memory.capacity = each!(filter, x => marginal(x, capacity_index(x)));
+            self.memory.log_resistance = each!(filter, x => marginal(x, log_resistance_index(x)));
         }
-        let temperature_c = self.temperature_c.unwrap_or(step.ambient_c);
+        let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
         let told = config.initial_soc.filter(|_| first);
         let soc = told.unwrap_or_else(|| {
             let guess = model.place(0.5, temperature_c);
-            let load_v = model.r0_ohm(&guess) * libm::exp(self.log_resistance.mean) * step.current_a.unwrap_or(0.0);
+            let load_v =
+                model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             model.soc_of_ocv(step.voltage_v + load_v, temperature_c)
         });
         let soc = Belief { mean: soc, variance: square(config.initial_soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = square(config.initial_branch_std_v).max(KNOWN_VARIANCE);
         let kept = Kept {
-            log_resistance: self.log_resistance,
-            capacity: self.capacity,
+            log_resistance: self.memory.log_resistance,
+            capacity: self.memory.capacity,
             covariance: self.capacity_resistance_covariance(),
         };
         self.filter = Some(match model.branches.len() {
@@ -216,9 +226,9 @@ impl CellEstimator {
             2 => Filter::Two(fresh(soc, branch_variance, &kept)),
             _ => Filter::Three(fresh(soc, branch_variance, &kept)),
         });
-        self.mean_nis = 0.0;
-        self.information_s = config.max_information_s;
-        (self.rejected, self.rejected_s) = (0, 0.0);
+        self.memory.mean_nis = 0.0;
+        self.memory.information_s = config.max_information_s;
+        (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
     }
 
     /// The sensor's value, or the thermal model's from the last known one.
@@ -226,8 +236,8 @@ impl CellEstimator {
         if let Some(measured) = step.temperature_c {
             return measured;
         }
-        let (Some(last_c), Some(thermal)) = (self.temperature_c, &model.thermal) else {
-            return self.temperature_c.unwrap_or(step.ambient_c);
+        let (Some(last_c), Some(thermal)) = (self.memory.temperature_c, &model.thermal) else {
+            return self.memory.temperature_c.unwrap_or(step.ambient_c);
         };
         let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
         let place = model.place(self.soc().map_or(0.5, |soc| soc.mean), last_c);
@@ -268,12 +278,12 @@ impl CellEstimator {
     pub fn log_resistance(&self) -> Belief {
         self.filter
             .as_ref()
-            .map_or(self.log_resistance, |filter| each!(filter, x => marginal(x, log_resistance_index(x))))
+            .map_or(self.memory.log_resistance, |filter| each!(filter, x => marginal(x, log_resistance_index(x))))
     }
 
     /// Capacity as the filter works with it now, Ah.
     pub fn capacity(&self) -> Belief {
-        self.filter.as_ref().map_or(self.capacity, |filter| each!(filter, x => marginal(x, capacity_index(x))))
+        self.filter.as_ref().map_or(self.memory.capacity, |filter| each!(filter, x => marginal(x, capacity_index(x))))
     }
 
     /// Covariance of capacity (Ah) and ln(resistance).
@@ -285,7 +295,7 @@ impl CellEstimator {
 
     /// The capacity walks: its variance grows by `process_variance_ah2` (at transitions only).
     pub fn widen_capacity(&mut self, process_variance_ah2: f64) {
-        self.capacity.variance += process_variance_ah2;
+        self.memory.capacity.variance += process_variance_ah2;
         if let Some(filter) = &mut self.filter {
             each!(filter, x => { let c = capacity_index(x); x.covariance[(c, c)] += process_variance_ah2; });
         }
@@ -293,7 +303,7 @@ impl CellEstimator {
 
     /// Tells the filter the capacity to work with ([`CapacityState::Held`]), Ah.
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
-        self.capacity.mean = capacity_ah;
+        self.memory.capacity.mean = capacity_ah;
         if let Some(filter) = &mut self.filter {
             each!(filter, x => { let c = capacity_index(x); x.mean[c] = capacity_ah; });
         }
@@ -302,12 +312,12 @@ impl CellEstimator {
     /// Mean normalised innovation squared over the consistency window: about 1 or less when the filter's
     /// covariance is honest.
     pub fn mean_nis(&self) -> f64 {
-        self.mean_nis
+        self.memory.mean_nis
     }
 
     /// Temperature the filter works with, degrees C.
     pub fn temperature_c(&self) -> Option<f64> {
-        self.temperature_c
+        self.memory.temperature_c
     }
 }
 
@@ -461,15 +471,7 @@ pub struct CellState {
     mean: Vec<f64>,
     /// Its covariance, row by row.
     covariance: Vec<f64>,
-    capacity: Belief,
-    log_resistance: Belief,
-    temperature_c: Option<f64>,
-    last_current_a: f64,
-    mean_nis: f64,
-    information_s: f64,
-    rejected: u32,
-    rejected_s: f64,
-    rejected_after_gap: bool,
+    memory: Memory,
 }
 
 impl CellEstimator {
@@ -479,19 +481,7 @@ impl CellEstimator {
             Default::default,
             |filter| each!(filter, x => (x.mean.as_slice().to_vec(), x.covariance.as_slice().to_vec())),
         );
-        CellState {
-            mean,
-            covariance,
-            capacity: self.capacity,
-            log_resistance: self.log_resistance,
-            temperature_c: self.temperature_c,
-            last_current_a: self.last_current_a,
-            mean_nis: self.mean_nis,
-            information_s: self.information_s,
-            rejected: self.rejected,
-            rejected_s: self.rejected_s,
-            rejected_after_gap: self.rejected_after_gap,
-        }
+        CellState { mean, covariance, memory: self.memory }
     }
 
     /// A stored state taken up again; `None` when it is for another number of branches.
@@ -503,18 +493,7 @@ impl CellEstimator {
             (6, 3) => Some(Filter::Three(gaussian(state)?)),
             _ => return None,
         };
-        Some(Self {
-            filter,
-            capacity: state.capacity,
-            log_resistance: state.log_resistance,
-            temperature_c: state.temperature_c,
-            last_current_a: state.last_current_a,
-            mean_nis: state.mean_nis,
-            information_s: state.information_s,
-            rejected: state.rejected,
-            rejected_s: state.rejected_s,
-            rejected_after_gap: state.rejected_after_gap,
-        })
+        Some(Self { filter, memory: state.memory })
     }
 }
 

@@ -29,7 +29,7 @@ enum Command {
     /// Replay journals, candump logs or CSV files through the same core
     Replay(Box<replay::Args>),
     /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
-    Simulate(simulate::Args),
+    Simulate(Box<simulate::Args>),
     /// A short ageing life on an in-process bus, ending in alarms; needs nothing
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to

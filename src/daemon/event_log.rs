@@ -5,7 +5,7 @@ use std::io::{self, Write};
 
 use crate::alarm::Severity;
 use crate::monitor::{BusEvent, Event, EventKind};
-use crate::quantity::Timestamp;
+use crate::quantity::{CellIndex, Timestamp};
 
 /// Error frames of one interface are summed up this often, s.
 const ERROR_SUMMARY_S: f64 = 10.0;
@@ -41,23 +41,22 @@ impl EventLog {
     pub(crate) fn log(&mut self, event: &Event) {
         match event.kind {
             EventKind::Bus { bus, what } => self.log_bus(event.time, bus.index(), what),
-            EventKind::Alarm { severity, active: true, .. } if severity != Severity::Info => {
-                tracing::warn!(kind = ?event.kind, "alarm");
+            EventKind::Alarm { severity, active, .. } => log_alarm(&event.kind, active && severity != Severity::Info),
+            EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::RechargePeriod { .. } => {
+                log_learned(&event.kind);
             }
-            EventKind::Alarm { .. } => tracing::info!(kind = ?event.kind, "alarm"),
-            EventKind::SignalBad { .. }
-            | EventKind::FilterReset { .. }
-            | EventKind::TimeBackwards { .. }
-            | EventKind::Trust { trusted: false, .. } => {
-                tracing::warn!(kind = ?event.kind, "input or estimate not usable")
+            EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
+            EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
+            EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
+            EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
+            EventKind::Trust { cell, trusted: false, mean_nis } => {
+                tracing::warn!(cell = number(cell), mean_nis, "estimate not to be trusted");
             }
-            EventKind::Mode { .. }
-            | EventKind::HalfCycle { .. }
-            | EventKind::Capacity { .. }
-            | EventKind::RechargePeriod { .. }
-            | EventKind::SignalGood { .. }
-            | EventKind::Gap { .. }
-            | EventKind::Trust { trusted: true, .. } => tracing::info!(kind = ?event.kind, "event"),
+            EventKind::Trust { cell, trusted: true, mean_nis } => {
+                tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
+            }
+            EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
+            EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
         }
     }
 
@@ -79,5 +78,50 @@ impl EventLog {
                 }
             }
         }
+    }
+}
+
+/// A cell's number as people count, from 1.
+fn number(cell: CellIndex) -> u32 {
+    u32::from(cell.0) + 1
+}
+
+fn log_alarm(kind: &EventKind, loud: bool) {
+    let EventKind::Alarm { rule, cell, active, severity, value, threshold } = *kind else { return };
+    let cell = cell.map(number);
+    if loud {
+        tracing::warn!(?rule, cell, ?severity, value, threshold, "alarm raised");
+    } else {
+        let what = if active { "alarm raised" } else { "alarm cleared" };
+        tracing::info!(?rule, cell, ?severity, value, threshold, "{what}");
+    }
+}
+
+fn log_learned(kind: &EventKind) {
+    match *kind {
+        EventKind::HalfCycle { cell, mode, charge_ah, swing, swing_std, duration_s, .. } => {
+            tracing::info!(cell = number(cell), ?mode, charge_ah, swing, swing_std, duration_s, "half-cycle");
+        }
+        EventKind::Capacity {
+            cell,
+            measured_ah,
+            capacity_ah,
+            capacity_std_ah,
+            usable_capacity_ah,
+            resistance_ratio,
+            ..
+        } => {
+            tracing::info!(
+                cell = number(cell),
+                measured_ah,
+                capacity_ah,
+                capacity_std_ah,
+                usable_capacity_ah,
+                resistance_ratio,
+                "capacity"
+            );
+        }
+        EventKind::RechargePeriod { seconds } => tracing::info!(seconds, "recharge period"),
+        _ => {}
     }
 }

@@ -9,6 +9,7 @@
 //! The caller says when the core next cares ([`Ticks::pop`]'s `due`); ticks before that are skipped, which costs
 //! nothing and changes nothing.
 
+use crate::monitor::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
 
 /// Makes ticks between records.
@@ -40,7 +41,8 @@ impl Ticks {
     }
 
     /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then hand the record on. Whether the
-    /// recorder was asleep before it (the first record, or one after a hole). A time before the latest makes no tick.
+    /// recorder was asleep before it (the first record, or one after a hole). A time a little before the latest (interfaces
+    /// merged out of order) makes no tick.
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();
         let Some(latest_ns) = self.latest_ns else {
@@ -49,6 +51,11 @@ impl Ticks {
             self.wake_ns = Some(time_ns);
             return true;
         };
+        if time_ns < latest_ns.saturating_sub(MERGE_TOLERANCE_NS) {
+            // The record's clock was set back: the grid goes on from there.
+            (self.limit_ns, self.latest_ns, self.wake_ns) = (i64::MIN, Some(time_ns), Some(time_ns));
+            return true;
+        }
         let asleep = time_ns.saturating_sub(latest_ns) > self.sleep_gap_ns;
         if asleep {
             self.limit_ns = latest_ns.saturating_add(self.sleep_gap_ns).saturating_add(1);
@@ -144,6 +151,11 @@ mod tests {
     #[test]
     fn a_record_back_in_time_makes_no_tick() {
         assert_eq!(ticks_ms(&[20, 5, 20, 25], EVERY), [20]);
+    }
+
+    #[test]
+    fn a_clock_that_was_set_back_takes_the_grid_along() {
+        assert_eq!(ticks_ms(&[9_000_000, 9_000_015, 5_003, 5_025], EVERY), [9_000_000, 9_000_010, 5_003, 5_010, 5_020]);
     }
 
     #[test]

@@ -150,7 +150,8 @@ impl Monitor {
             soc_std: pack.map(|pack| pack.soc_std),
             mode: Some(self.detector.mode()),
             validity: self.validity() as u8,
-            highest_severity: Some(self.alarms.highest_severity().map_or(0, |severity| severity as u8)),
+            // Before there is an estimate, "no alarm" would be a claim nobody can make.
+            highest_severity: self.alarms.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
         }))

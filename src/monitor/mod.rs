@@ -30,10 +30,6 @@ use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 /// Without any input, not even a tick, for this long, the computer was asleep, s: 500 ticks.
 const ASLEEP_S: f64 = 5.0;
 
-/// Steps back in time up to this are frames of several interfaces merged out of order, s; beyond, the record's
-/// clock was set back.
-const MERGE_TOLERANCE_S: f64 = 1.0;
-
 /// Everything the core must know, already checked.
 #[derive(Debug, Clone)]
 pub struct MonitorConfig {
@@ -209,7 +205,7 @@ impl Monitor {
         let elapsed_s = time.since(self.now);
         if elapsed_s < 0.0 {
             self.time_backwards += 1;
-            if elapsed_s < -MERGE_TOLERANCE_S {
+            if time < self.now.plus_nanos(-MERGE_TOLERANCE_NS) {
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds: -elapsed_s } });
                 self.now = time;
                 self.handle_unknown_gap(out);

@@ -82,6 +82,10 @@ impl Input<'_> {
 /// Period of the driver's ticks, ms: ten times faster than the fastest sensible cyclic frame needs.
 pub const TICK_PERIOD_MS: u32 = 10;
 
+/// Steps back in time up to this are frames of several interfaces merged out of order, ns; beyond, the record's
+/// clock was set back.
+pub const MERGE_TOLERANCE_NS: i64 = 1_000_000_000;
+
 /// A frame to send.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Transmit {

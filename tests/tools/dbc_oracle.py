@@ -1,19 +1,85 @@
-"""Decodes payloads with cantools: reads `name hex` lines, answers one line each of `signal=repr(value)` pairs.
+"""What cantools, and a DBC's own bit positions, say.
 
-usage: dbc_oracle.py FILE.dbc [strict]
+usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answers one line each of
+                                                `signal=repr(value)` pairs, or `!what` when cantools refuses;
+                                                signals that reach past their message are left out
+       dbc_oracle.py FILE.dbc short             answers `message.signal` for each signal that reaches past its
+                                                message, walked bit by bit from the file's text, without cantools
+       dbc_oracle.py FILE.dbc count             answers `messages signals`, as cantools counts them
 """
+import re
 import sys
-import cantools
 
-db = cantools.database.load_file(sys.argv[1], strict=len(sys.argv) > 2)
-# cantools puts long names (over 32 characters) in the place of those the file defines.
-messages = {m.name[:32]: m for m in db.messages}
-for line in sys.stdin:
-    name, payload = line.split()
-    try:
-        message = messages[name[:32]]
-        values = message.decode(
-            bytes.fromhex(payload), decode_choices=False, scaling=True, allow_truncated=True)
-        print("\t".join(f"{k[:32]}={v!r}" for k, v in values.items()))
-    except Exception as error:  # an unknown page: nothing is said about this payload
-        print(f"!{type(error).__name__}")
+
+def last_byte(start, length, big_endian):
+    """The highest byte that one of the signal's bits lies in, walking from its start bit."""
+    bit, highest = start, start // 8
+    for _ in range(length - 1):
+        if not big_endian:
+            bit += 1
+        elif bit % 8:
+            bit -= 1
+        else:
+            bit += 15  # from a byte's lowest bit to the next byte's highest
+        highest = max(highest, bit // 8)
+    return highest
+
+
+def reaches_past(path):
+    """(message, its bytes, signal, bytes needed) for each signal that needs more bytes than its message has."""
+    message = None
+    with open(path, encoding="latin-1") as text:
+        for line in text:
+            if found := re.match(r"BO_ +\d+ +(\w+) *: *(\d+) ", line):
+                message, size = found[1], int(found[2])
+            elif found := re.match(r"\s+SG_ +(\w+) .*?: *(\d+)\|(\d+)@([01])[+-]", line):
+                needed = last_byte(int(found[2]), int(found[3]), found[4] == "0") + 1
+                if needed > size:
+                    yield message, size, found[1], needed
+
+
+def load(path, strict):
+    """The DBC as cantools reads it, with the file's own names.
+
+    Where a file gives long names (over 32 characters), cantools renames a multiplexor but not in the signals that
+    depend on it, and then decodes none of them: those attributes are left out.
+    """
+    import cantools
+
+    with open(path, encoding="latin-1") as text:
+        lines = [line for line in text if not re.match(r'BA_ +"System\w+LongSymbol"', line)]
+    return cantools.database.load_string("".join(lines), "dbc", strict=strict)
+
+
+def decode(path, strict):
+    messages = {m.name: m for m in load(path, strict).messages}
+    past = list(reaches_past(path))
+    for name, _, _, needed in past:
+        # cantools cannot decode such a message at all: let it have the bytes, zeros, and leave the signals out.
+        message = messages[name]
+        message.length = max(message.length, needed)
+        message.refresh(strict=False)
+    left_out = {(name, signal) for name, _, signal, _ in past}
+    for line in sys.stdin:
+        name, payload = line.split()
+        try:
+            message = messages[name]
+            data = bytes.fromhex(payload).ljust(message.length, b"\0")
+            values = message.decode(data, decode_choices=False, scaling=True)
+            print("\t".join(f"{k}={v!r}" for k, v in values.items() if (name, k) not in left_out))
+        except Exception as error:  # an unknown page, say
+            print(f"!{type(error).__name__}: {error}".replace("\n", " "))
+
+
+def count(path):
+    messages = load(path, False).messages
+    print(len(messages), sum(len(m.signals) for m in messages))
+
+
+if sys.argv[2] == "short":
+    for name, _, signal, _ in reaches_past(sys.argv[1]):
+        print(f"{name}.{signal}")
+elif sys.argv[2] == "count":
+    count(sys.argv[1])
+else:
+    decode(sys.argv[1], strict=len(sys.argv) > 3)

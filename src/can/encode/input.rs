@@ -75,30 +75,19 @@ impl Field {
 }
 
 impl InputEncoder {
-    /// Groups the map's signals by message and multiplexer page.
+    /// One page per message and selector codes that some signal asks for.
     pub fn new(map: &InputMap) -> Self {
-        let mut pages: Vec<Page> = Vec::new();
-        // Signals that are always there ride on every page of their message: they come last.
-        let (paged, always): (Vec<_>, Vec<_>) = map.bindings().iter().partition(|binding| !binding.mux.is_empty());
-        for binding in paged {
-            let template = template(binding);
-            let same = |page: &&mut Page| page.same_message(binding) && page.template == template;
-            match pages.iter_mut().find(same) {
-                Some(page) => page.fields.push(Field::new(binding)),
-                None => pages.push(Page::new(binding, template)),
-            }
-        }
-        for binding in always {
-            let mut found = false;
-            for page in pages.iter_mut().filter(|page| page.same_message(binding)) {
-                page.fields.push(Field::new(binding));
-                found = true;
-            }
-            if !found {
-                pages.push(Page::new(binding, [0; MAX_DATA]));
-            }
-        }
-        Self { pages }
+        let same_message = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id);
+        let pages = map.bindings().chunk_by(same_message).flat_map(|message| {
+            // Signals that are always there ride on the pages of the others, when there are any.
+            let paged = message.iter().any(|binding| !binding.mux.is_empty());
+            let of_a_page = message.iter().filter(|binding| !paged || !binding.mux.is_empty());
+            let mut templates: Vec<_> = of_a_page.map(template).collect();
+            templates.sort_unstable();
+            templates.dedup();
+            templates.into_iter().map(|template| Page::new(message, template))
+        });
+        Self { pages: pages.collect() }
     }
 
     /// Appends the frames that carry `values` to `out`; `None` and NaN mean "no value now". Returns how many
@@ -119,13 +108,16 @@ impl InputEncoder {
 }
 
 impl Page {
-    fn new(binding: &Binding, template: [u8; MAX_DATA]) -> Self {
-        let len = usize::from(binding.len_bytes).max(binding.plan.bytes_needed()).min(MAX_DATA);
-        Self { bus: binding.bus, id: binding.id, len, template, fields: vec![Field::new(binding)] }
-    }
-
-    fn same_message(&self, binding: &Binding) -> bool {
-        self.bus == binding.bus && self.id == binding.id
+    /// The page of `template` with every signal whose multiplexors are so.
+    fn new(message: &[Binding], template: [u8; MAX_DATA]) -> Self {
+        let (bus, id) = (message[0].bus, message[0].id);
+        let there: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
+        let needed = |binding: &&Binding| {
+            let plans = binding.mux.iter().map(|test| &test.plan).chain([&binding.plan]);
+            plans.map(SignalPlan::bytes_needed).fold(usize::from(binding.len_bytes), usize::max)
+        };
+        let len = there.iter().map(needed).max().unwrap_or(0).min(MAX_DATA);
+        Self { bus, id, len, template, fields: there.into_iter().map(Field::new).collect() }
     }
 
     fn frame(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Frame> {
@@ -156,3 +148,6 @@ fn template(binding: &Binding) -> [u8; MAX_DATA] {
     }
     payload
 }
+
+#[cfg(test)]
+mod tests;

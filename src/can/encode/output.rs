@@ -3,6 +3,9 @@
 //! The shipped `config/packwatch.dbc` is the default; another DBC serves when it has the same message and signal
 //! names. An unknown value is sent as the code the DBC's value table calls "not available", else as all ones
 //! (unsigned), the lowest code (signed) or NaN (float). A known value never takes that code: it saturates before it.
+//!
+//! A DBC that lacks something, or in which a value could be read as another rule's or page's, is refused with all its
+//! faults at once.
 
 use crate::can::dbc::{Database, DbcError, Message, Signal};
 use crate::can::encode::frame_of;
@@ -22,6 +25,29 @@ pub fn default_database() -> Result<Database, DbcError> {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", .0.join("\n"))]
 pub struct PlanFaults(pub Vec<String>);
+
+/// Signals of the status frame.
+const STATUS: [&str; 7] = ["Soc", "SocStd", "Mode", "Validity", "HighestSeverity", "ActiveAlarms", "LimitingCell"];
+
+/// Signals of the health frame, whatever its pages.
+const HEALTH: [&str; 8] = [
+    "Capacity",
+    "CapacityStd",
+    "Soh",
+    "RechargePeriod",
+    "NormalizedRechargePeriod",
+    "UsableCapacity",
+    "UsableCapacityStd",
+    "ResistanceRatio",
+];
+
+/// Signals on every page of the alarm frame.
+const ALARM: [&str; 5] = ["Rule", "State", "Severity", "Test", "Cell"];
+
+/// The alarm rules in the order of their numbers, which start at 1: each has its `Value_...` and `Threshold_...`, for
+/// their units differ.
+const RULES: [&str; 6] =
+    ["CapacityLow", "UsableCapacityLow", "RechargePeriodLow", "InputMissing", "InputImplausible", "EstimateUntrusted"];
 
 /// Identifiers to send with instead of the DBC's.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -130,12 +156,12 @@ impl OutputPlan {
     /// All that is missing or cannot be written, by name.
     pub fn new(database: &Database, ids: &IdOverrides) -> Result<Self, PlanFaults> {
         let mut faults = Vec::new();
-        let status = ["Soc", "SocStd", "Mode", "Validity", "HighestSeverity", "ActiveAlarms", "LimitingCell"];
-        let health = ["Capacity", "CapacityStd", "Soh", "RechargePeriod"];
-        let alarm = ["Rule", "State", "Severity", "Test", "Cell"];
-        let status = MessagePlan::new(database, "PACKWATCH_Status", ids.status, &status, &mut faults);
-        let health = MessagePlan::new(database, "PACKWATCH_Health", ids.health, &health, &mut faults);
-        let alarm = MessagePlan::new(database, "PACKWATCH_Alarm", ids.alarm, &alarm, &mut faults);
+        let status = MessagePlan::new(database, "PACKWATCH_Status", ids.status, &STATUS, &mut faults);
+        let health = MessagePlan::new(database, "PACKWATCH_Health", ids.health, &HEALTH, &mut faults);
+        let alarm = MessagePlan::new(database, "PACKWATCH_Alarm", ids.alarm, &ALARM, &mut faults);
+        if let Some(alarm) = &alarm {
+            alarm.check_rules(&mut faults);
+        }
         match (status, health, alarm) {
             (Some(status), Some(health), Some(alarm)) if faults.is_empty() => {
                 let pages = health.page_codes();
@@ -203,8 +229,8 @@ impl OutputPlan {
             "Severity" => fields.severity.map(f64::from),
             "Test" => Some(if fields.test { 1.0 } else { 0.0 }),
             "Cell" => fields.cell.map(|cell| f64::from(cell.0)),
-            name if name.starts_with("Value") => fields.value,
-            name if name.starts_with("Threshold") => fields.threshold,
+            name if name.starts_with("Value_") => fields.value,
+            name if name.starts_with("Threshold_") => fields.threshold,
             _ => None,
         })
     }
@@ -233,13 +259,35 @@ impl MessagePlan {
                 .map_err(|fault| faults.push(format!("signal {name}.{}: {fault}", signal.name)))
                 .ok()
         });
-        let fields = fields.collect();
+        let fields: Vec<_> = fields.collect();
+        check_pages(name, &fields, faults);
         Some(Self {
             id: id.unwrap_or(message.id),
             len: usize::from(message.len_bytes),
             cycle_time_ms: message.cycle_time_ms,
             fields,
         })
+    }
+
+    /// Every rule must have its value and its threshold, on its own page and on no other rule's.
+    fn check_rules(&self, faults: &mut Vec<String>) {
+        if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
+            faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
+        }
+        for (number, rule) in (1..).zip(RULES) {
+            for name in [format!("Value_{rule}"), format!("Threshold_{rule}")] {
+                let Some(field) = self.fields.iter().find(|field| field.name == name) else {
+                    faults.push(format!("signal PACKWATCH_Alarm.{name} is missing"));
+                    continue;
+                };
+                let found: Vec<_> = (1..).take(RULES.len()).filter(|page| field.is_on(*page)).collect();
+                if found != [number] {
+                    faults.push(format!(
+                        "signal PACKWATCH_Alarm.{name} is there for the rules {found:?}, must be for {number} alone"
+                    ));
+                }
+            }
+        }
     }
 
     /// First selector code of every page; a message without pages has the one page 0.
@@ -259,6 +307,18 @@ impl MessagePlan {
             let _ = field.plan.encode_raw(&mut payload, code);
         }
         frame_of(self.id, self.len, &payload).unwrap_or_else(|| empty_frame(self.id))
+    }
+}
+
+/// The multiplexor must be able to say every page, or a page would go out under another one's number.
+fn check_pages(message: &str, fields: &[Field], faults: &mut Vec<String>) {
+    for selector in fields.iter().filter(|field| field.is_multiplexor) {
+        let highest = selector.plan.all_ones();
+        for field in fields.iter().filter(|field| field.pages.iter().any(|(first, _)| *first > highest)) {
+            let (name, selector) = (&field.name, &selector.name);
+            faults
+                .push(format!("signal {message}.{name} is on a page above {highest}, the highest {selector} can say"));
+        }
     }
 }
 
@@ -303,11 +363,20 @@ impl Field {
         match code {
             None => self.not_available,
             // One bit cannot spare a code.
-            Some(code) if code == self.not_available && self.plan.length_bits() > 1 => match code {
-                0 => 1,
-                taken => taken - 1,
-            },
+            Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.beside(code),
             Some(code) => code,
         }
     }
+
+    /// The code next to one that is taken: one below, or above where there is none below.
+    fn beside(&self, taken: u64) -> u64 {
+        let lowest = match self.plan.value_type() {
+            ValueType::Signed => 1 << (self.plan.length_bits() - 1),
+            ValueType::Unsigned | ValueType::Float32 | ValueType::Float64 => 0,
+        };
+        if taken == lowest { taken + 1 } else { taken.wrapping_sub(1) & self.plan.all_ones() }
+    }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,65 @@
+//! One estimator step, and one round of a 96-cell pack through the whole core (frames in, frames out).
+
+use packwatch::can::encode::InputEncoder;
+use packwatch::cell::{CellEstimator, CellModel, CellStep};
+use packwatch::config;
+use packwatch::monitor::{Input, Monitor, Outputs};
+use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
+
+fn main() {
+    divan::main();
+}
+
+fn example() -> config::Config {
+    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
+    config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
+}
+
+/// The example's cell with 1 to 3 RC branches.
+fn model(branches: usize) -> CellModel {
+    let mut model = example().monitor.model;
+    model.branches = vec![model.branches[0].clone(); branches];
+    model
+}
+
+#[divan::bench(args = [1, 2, 3])]
+fn ukf_step(bencher: divan::Bencher, branches: usize) {
+    let (model, config) = (model(branches), example().monitor.estimator);
+    let mut estimator = CellEstimator::new(&config);
+    let mut k = 0_u32;
+    bencher.bench_local(|| {
+        k = k.wrapping_add(1);
+        let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
+        let step = CellStep {
+            measured_s: 1.0,
+            charge_as: current_a,
+            unmeasured_s: 0.0,
+            current_a: Some(current_a),
+            temperature_c: Some(25.0),
+            ambient_c: 25.0,
+            voltage_v: 3.7 - 0.05 * current_a,
+        };
+        divan::black_box(estimator.step(&model, &config, &step))
+    });
+}
+
+#[divan::bench]
+fn round_of_96_cells(bencher: divan::Bencher) {
+    let config = example();
+    let mut values = vec![(Channel::Current, Some(10.0))];
+    values.extend((0..12).map(|sensor| (Channel::Temperature(SensorIndex(sensor)), Some(25.0))));
+    values.extend((0..96).map(|cell| (Channel::CellVoltage(CellIndex(cell)), Some(3.7 + 0.0001 * f64::from(cell)))));
+    let mut frames = Vec::new();
+    InputEncoder::new(&config.monitor.input).encode(&values, &mut frames);
+    let (mut monitor, mut out) = (Monitor::new(config.monitor), Outputs::default());
+    let mut time = Timestamp::from_secs(1.7e9);
+    bencher.counter(divan::counter::ItemsCount::new(96_u32)).bench_local(|| {
+        time = time.plus_secs(0.1);
+        for (bus, frame) in &frames {
+            monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut out);
+        }
+        monitor.handle(Input::Tick { time }, &mut out);
+        divan::black_box(&out);
+        out.clear();
+    });
+}

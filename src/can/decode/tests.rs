@@ -1,0 +1,207 @@
+use super::*;
+use crate::can::dbc::Database;
+use crate::quantity::CellIndex;
+
+/// A plain message whose voltage comes first and current last, a paged one with a signal on every page, and one whose
+/// pages hang below pages.
+pub(crate) const DBC: &str = r#"VERSION ""
+BU_: BMS
+BO_ 256 Pack: 6 BMS
+ SG_ Voltage : 0|16@1+ (0.1,0) [0|500] "V" BMS
+ SG_ Temperature : 16|8@1+ (1,-40) [-40|210] "degC" BMS
+ SG_ Current : 31|16@0- (0.1,0) [-3000|3000] "A" BMS
+BO_ 257 Cells: 7 BMS
+ SG_ Page M : 0|8@1+ (1,0) [0|255] "" BMS
+ SG_ Cell1 m0 : 8|16@1+ (0.001,0) [0|5] "V" BMS
+ SG_ Cell2 m0 : 24|16@1+ (0.001,0) [0|5] "V" BMS
+ SG_ Cell3 m1 : 8|16@1+ (0.001,0) [0|0] "V" BMS
+ SG_ Air : 40|16@1- (0.01,0) [-300|300] "degC" BMS
+BO_ 2147483905 Nested: 16 BMS
+ SG_ Outer M : 0|8@1+ (1,0) [0|0] "" BMS
+ SG_ Inner m3M : 8|8@1+ (1,0) [0|0] "" BMS
+ SG_ Always : 16|8@1+ (1,0) [0|254] "degC" BMS
+ SG_ Middle m3 : 24|8@1+ (1,0) [0|254] "degC" BMS
+ SG_ Deep m7 : 64|16@1+ (0.001,0) [0|5] "V" BMS
+ SG_ Wide m0 : 96|32@1- (1,0) [0|0] "V" BMS
+SG_MUL_VAL_ 2147483905 Inner Outer 3-3;
+SG_MUL_VAL_ 2147483905 Middle Outer 3-5, 9-9;
+SG_MUL_VAL_ 2147483905 Deep Inner 7-8;
+SG_MUL_VAL_ 2147483905 Wide Outer 4-6;
+SIG_VALTYPE_ 2147483905 Wide : 1;
+VAL_ 256 Temperature 255 "not available" ;
+"#;
+
+/// Binds `name` on interface 0.
+pub(crate) fn bind(name: &str, channel: Channel) -> Binding {
+    let dbc = Database::parse(DBC).unwrap();
+    let (message, signal) = dbc.signal(name).unwrap();
+    Binding::new(BusIndex(0), message, signal, channel).unwrap()
+}
+
+pub(crate) const fn cell(n: u16) -> Channel {
+    Channel::CellVoltage(CellIndex(n))
+}
+
+pub(crate) const fn sensor(n: u16) -> Channel {
+    Channel::Temperature(SensorIndex(n))
+}
+
+/// The first two messages, bound in no particular order; the bus counts charging positive.
+pub(crate) fn map() -> InputMap {
+    InputMap::new(vec![
+        bind("Cells.Cell3", cell(2)),
+        bind("Cells.Cell2", cell(1)),
+        bind("Cells.Air", sensor(1)),
+        bind("Pack.Temperature", sensor(0)),
+        bind("Pack.Voltage", Channel::PackVoltage),
+        bind("Cells.Cell1", cell(0)),
+        Binding { scale: -1.0, ..bind("Pack.Current", Channel::Current) },
+    ])
+}
+
+/// The third message.
+pub(crate) fn nested() -> InputMap {
+    InputMap::new(vec![
+        bind("Nested.Deep", cell(0)),
+        bind("Nested.Middle", sensor(1)),
+        bind("Nested.Always", sensor(0)),
+        bind("Nested.Wide", cell(1)),
+    ])
+}
+
+/// All readings of one frame.
+pub(crate) fn readings(map: &InputMap, bus: u8, frame: &Frame) -> Vec<(Channel, Result<f64, Fault>)> {
+    let mut found = Vec::new();
+    map.decode(BusIndex(bus), frame, |reading| found.push((reading.channel, reading.value)));
+    found
+}
+
+fn read(id: CanId, data: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> {
+    readings(&map(), 0, &Frame::classic(id, data).unwrap())
+}
+
+const PACK: CanId = CanId::Standard(256);
+const CELLS: CanId = CanId::Standard(257);
+
+#[test]
+fn current_comes_before_temperature_before_voltages_wherever_they_lie() {
+    let found = read(PACK, &[0xDF, 0x0D, 65, 0x00, 0x64, 0]);
+    assert_eq!(found, [(Channel::Current, Ok(-10.0)), (sensor(0), Ok(25.0)), (Channel::PackVoltage, Ok(355.1))]);
+    let found = read(CELLS, &[0, 0x10, 0x0E, 0x11, 0x0E, 0xC4, 0x09]);
+    assert_eq!(found, [(sensor(1), Ok(25.0)), (cell(0), Ok(3.6)), (cell(1), Ok(3.601))]);
+}
+
+#[test]
+fn signals_between_two_pages_of_a_message_keep_the_channel_order() {
+    // Channels alternate between the pages, so that no page's signals are neighbours.
+    let found = InputMap::new(vec![
+        bind("Cells.Cell1", cell(0)),
+        bind("Cells.Cell3", cell(1)),
+        bind("Cells.Cell2", cell(2)),
+        bind("Cells.Air", sensor(0)),
+    ]);
+    let frame = |page| Frame::classic(CELLS, &[page, 0x10, 0x0E, 0x11, 0x0E, 0, 0]).unwrap();
+    assert_eq!(readings(&found, 0, &frame(0)), [(sensor(0), Ok(0.0)), (cell(0), Ok(3.6)), (cell(2), Ok(3.601))]);
+    assert_eq!(readings(&found, 0, &frame(1)), [(sensor(0), Ok(0.0)), (cell(1), Ok(3.6))]);
+}
+
+#[test]
+fn only_the_page_that_is_there_is_read() {
+    let found = read(CELLS, &[1, 0x10, 0x0E, 0xFF, 0xFF, 0, 0]);
+    assert_eq!(found, [(sensor(1), Ok(0.0)), (cell(2), Ok(3.6))]);
+    assert_eq!(read(CELLS, &[7, 0, 0, 0, 0, 0, 0]), [(sensor(1), Ok(0.0))]);
+}
+
+#[test]
+fn a_signal_below_two_selectors_needs_both_and_ranges_count_with_their_ends() {
+    let channels = |outer: u8, inner: u8| -> Vec<Channel> {
+        let mut data = [0; 16];
+        (data[0], data[1]) = (outer, inner);
+        let frame = Frame::fd(CanId::Extended(257), true, false, &data).unwrap();
+        readings(&nested(), 0, &frame).into_iter().map(|(channel, _)| channel).collect()
+    };
+    assert_eq!(channels(3, 7), [sensor(0), sensor(1), cell(0)]);
+    assert_eq!(channels(3, 8), [sensor(0), sensor(1), cell(0)]);
+    assert_eq!(channels(3, 6), [sensor(0), sensor(1)]);
+    assert_eq!(channels(3, 9), [sensor(0), sensor(1)]);
+    assert_eq!(channels(4, 7), [sensor(0), sensor(1), cell(1)], "the inner selector is not there on page 4");
+    assert_eq!(channels(5, 0), [sensor(0), sensor(1), cell(1)]);
+    assert_eq!(channels(6, 0), [sensor(0), cell(1)]);
+    assert_eq!(channels(9, 0), [sensor(0), sensor(1)]);
+    assert_eq!(channels(2, 7), [sensor(0)]);
+    assert_eq!(channels(10, 7), [sensor(0)]);
+}
+
+#[test]
+fn a_short_frame_spoils_only_the_signals_it_does_not_reach() {
+    let values = |data: &[u8]| -> Vec<_> { read(CELLS, data).into_iter().map(|(_, value)| value).collect() };
+    let short = Err(Fault::ShortFrame);
+    assert_eq!(values(&[0, 0x10, 0x0E]), [short, Ok(3.6), short]);
+    assert_eq!(values(&[1, 0x10]), [short, short]);
+    // Without the selector nobody knows which page it is: all of them are short.
+    assert_eq!(values(&[]), [short; 4]);
+    assert_eq!(values(&[0, 0x10, 0x0E, 0x11, 0x0E, 0, 0, 0xFF]), [Ok(0.0), Ok(3.6), Ok(3.601)], "too long is no harm");
+}
+
+#[test]
+fn bad_readings_say_why() {
+    let values = |data: &[u8]| -> Vec<_> { read(PACK, data).into_iter().map(|(_, value)| value).collect() };
+    let out = Err(Fault::OutOfRange);
+    assert_eq!(values(&[0x88, 0x13, 255, 0x7F, 0xFF, 0]), [out, Err(Fault::NotAvailable), Ok(500.0)]);
+    assert_eq!(values(&[0x89, 0x13, 250, 0x75, 0x30, 0]), [Ok(-3000.0), Ok(210.0), out]);
+    assert_eq!(values(&[0, 0, 251, 0x75, 0x31, 0]), [out, out, Ok(0.0)]);
+    let mut nan = [4; 16];
+    nan[12..].copy_from_slice(&f32::NAN.to_le_bytes());
+    let nan = Frame::fd(CanId::Extended(257), false, false, &nan).unwrap();
+    assert!(readings(&nested(), 0, &nan).contains(&(cell(1), Err(Fault::NotFinite))));
+}
+
+#[test]
+fn the_configured_range_holds_after_scale_and_offset_with_both_ends() {
+    let binding = Binding { scale: 0.5, offset: 1.0, range: (2.0, 3.0), ..bind("Cells.Cell3", cell(2)) };
+    let value = |millivolts: u16| {
+        let [low, high] = millivolts.to_le_bytes();
+        readings(&InputMap::new(vec![binding.clone()]), 0, &Frame::classic(CELLS, &[1, low, high]).unwrap())[0].1
+    };
+    assert_eq!((value(2000), value(3000), value(4000)), (Ok(2.0), Ok(2.5), Ok(3.0)));
+    assert_eq!((value(1998), value(4002)), (Err(Fault::OutOfRange), Err(Fault::OutOfRange)));
+}
+
+#[test]
+fn a_configured_code_for_not_available_counts_beside_the_range() {
+    let binding = Binding { not_available: vec![0, 0xFFFE], ..bind("Cells.Cell3", cell(2)) };
+    let map = InputMap::new(vec![binding]);
+    let value = |low, high| readings(&map, 0, &Frame::classic(CELLS, &[1, low, high]).unwrap())[0].1;
+    assert_eq!((value(0, 0), value(0xFE, 0xFF)), (Err(Fault::NotAvailable), Err(Fault::NotAvailable)));
+    assert_eq!(value(1, 0), Ok(0.001));
+}
+
+#[test]
+fn another_interface_another_kind_of_identifier_and_remote_requests_are_other_things() {
+    let frame = Frame::classic(PACK, &[0; 6]).unwrap();
+    assert_eq!(readings(&map(), 0, &frame).len(), 3);
+    assert_eq!(readings(&map(), 1, &frame), []);
+    assert_eq!(read(CanId::Extended(256), &[0; 6]), []);
+    assert_eq!(read(CanId::Standard(258), &[0; 6]), []);
+    assert_eq!(readings(&map(), 0, &Frame::remote(PACK, 6).unwrap()), []);
+    assert_eq!(readings(&InputMap::default(), 0, &frame), []);
+}
+
+#[test]
+fn one_identifier_on_two_interfaces_is_two_messages() {
+    let other = Binding { bus: BusIndex(2), ..bind("Pack.Temperature", sensor(5)) };
+    let map = InputMap::new(vec![other, bind("Pack.Voltage", Channel::PackVoltage)]);
+    let frame = Frame::classic(PACK, &[0; 6]).unwrap();
+    assert_eq!(readings(&map, 0, &frame), [(Channel::PackVoltage, Ok(0.0))]);
+    assert_eq!(readings(&map, 1, &frame), []);
+    assert_eq!(readings(&map, 2, &frame), [(sensor(5), Ok(-40.0))]);
+    assert_eq!((map.ids(BusIndex(0)), map.ids(BusIndex(1)), map.ids(BusIndex(2))), (vec![PACK], vec![], vec![PACK]));
+}
+
+#[test]
+fn identifiers_and_channels_are_listed_once_and_in_order() {
+    assert_eq!(map().ids(BusIndex(0)), [PACK, CELLS]);
+    assert_eq!(map().ids(BusIndex(9)), []);
+    let all = [Channel::Current, sensor(0), sensor(1), Channel::PackVoltage, cell(0), cell(1), cell(2)];
+    assert_eq!(map().channels(), all);
+}

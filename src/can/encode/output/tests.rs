@@ -1,0 +1,313 @@
+//! What goes out reads back with the same DBC, and unknown never reads as a number.
+
+use super::*;
+use crate::quantity::Fault;
+
+const TEXT: &str = include_str!("../../../../config/packwatch.dbc");
+
+fn plan() -> OutputPlan {
+    OutputPlan::new(&default_database().unwrap(), &IdOverrides::default()).unwrap()
+}
+
+/// Raw code and physical value of `Message.Signal` in a frame.
+fn read(name: &str, frame: &Frame) -> (u64, Result<f64, Fault>) {
+    let dbc = default_database().unwrap();
+    let (_, signal) = dbc.signal(&format!("PACKWATCH_{name}")).unwrap();
+    let plan = signal.layout.plan().unwrap();
+    (plan.raw(frame.data()).unwrap(), plan.decode(frame.data()))
+}
+
+/// Asserts a value within half a bit, in the DBC's unit.
+fn says(name: &str, frame: &Frame, wanted: f64) {
+    let dbc = default_database().unwrap();
+    let half = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout.factor / 2.0 + 1e-9;
+    let (_, found) = read(name, frame);
+    assert!(found.is_ok_and(|found| (found - wanted).abs() <= half), "{name}: {found:?} for {wanted}");
+}
+
+/// Asserts the code for not available, which must lie outside the range.
+fn says_nothing(name: &str, frame: &Frame) {
+    let dbc = default_database().unwrap();
+    let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();
+    let (code, value) = read(name, frame);
+    assert_eq!(vec![code], codes, "{name}");
+    // Severity 0 is the one code for "not available" inside a range.
+    assert!(value == Err(Fault::OutOfRange) || name == "Alarm.Severity", "{name} reads {value:?}");
+}
+
+/// The DBC with one text replaced.
+fn faults(from: &str, to: &str) -> Vec<String> {
+    assert!(TEXT.contains(from), "{from}");
+    let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();
+    OutputPlan::new(&dbc, &IdOverrides::default()).unwrap_err().0
+}
+
+#[test]
+fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
+    let plan = plan();
+    assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!(plan.cycle_times_ms(), [Some(100), Some(1000), Some(1000)]);
+    assert_eq!(plan.health_pages(), 3);
+}
+
+#[test]
+fn identifiers_can_be_others_than_the_dbc_s() {
+    let ids = IdOverrides { status: None, health: Some(CanId::Extended(5)), alarm: Some(CanId::Standard(7)) };
+    let plan = OutputPlan::new(&default_database().unwrap(), &ids).unwrap();
+    assert_eq!(plan.ids(), [CanId::Standard(0x6B0), CanId::Extended(5), CanId::Standard(7)]);
+    assert_eq!(plan.health(0, &HealthFields::default()).id(), CanId::Extended(5));
+}
+
+#[test]
+fn status_reads_back_within_half_a_bit() {
+    let fields = StatusFields {
+        soc: Some(0.7312),
+        soc_std: Some(0.0123),
+        mode: Some(Mode::Discharge),
+        validity: 2,
+        highest_severity: Some(3),
+        active_alarms: Some(17),
+        limiting_cell: Some(CellIndex(1023)),
+    };
+    let frame = plan().status(&fields);
+    for (name, wanted) in [
+        ("Soc", 73.12),
+        ("SocStd", 1.23),
+        ("Mode", 3.0),
+        ("Validity", 2.0),
+        ("HighestSeverity", 3.0),
+        ("ActiveAlarms", 17.0),
+        ("LimitingCell", 1023.0),
+    ] {
+        says(&format!("Status.{name}"), &frame, wanted);
+    }
+    assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]), "kept free for end-to-end protection");
+    for (mode, code) in [(Mode::Unknown, 0.0), (Mode::Charge, 1.0), (Mode::Rest, 2.0)] {
+        says("Status.Mode", &plan().status(&StatusFields { mode: Some(mode), ..fields }), code);
+    }
+}
+
+/// Fields of the health frame with the page each is on, a value inside, and what it reads.
+const HEALTH_VALUES: [(usize, &str, f64, f64); 8] = [
+    (0, "Capacity", 2.6, 2.6),
+    (0, "CapacityStd", 0.0213, 0.0213),
+    (0, "Soh", 0.871, 87.1),
+    (1, "RechargePeriod", 3611.0, 3611.0),
+    (1, "NormalizedRechargePeriod", 3500.4, 3500.4),
+    (2, "UsableCapacity", 2.41, 2.41),
+    (2, "UsableCapacityStd", 0.031, 0.031),
+    (2, "ResistanceRatio", 1.37, 137.0),
+];
+
+fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
+    HealthFields {
+        capacity_ah: of(0),
+        capacity_std_ah: of(1),
+        soh: of(2),
+        recharge_period_s: of(3),
+        normalized_recharge_period_s: of(4),
+        usable_capacity_ah: of(5),
+        usable_capacity_std_ah: of(6),
+        resistance_ratio: of(7),
+    }
+}
+
+#[test]
+fn every_page_of_the_health_frame_reads_back_within_half_a_bit() {
+    let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
+    for (page, name, _, wanted) in HEALTH_VALUES {
+        let frame = plan().health(page, &fields);
+        says(&format!("Health.{name}"), &frame, wanted);
+        assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
+        assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
+        assert_eq!(plan().health(page + 3, &fields), frame, "after the last page comes the first");
+    }
+}
+
+#[test]
+fn each_health_value_alone_leaves_the_others_not_available() {
+    for known in 0..HEALTH_VALUES.len() {
+        let fields = health_fields(|n| (n == known).then_some(HEALTH_VALUES[n].2));
+        for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
+            let frame = plan().health(page, &fields);
+            if n == known {
+                says(&format!("Health.{name}"), &frame, wanted);
+            } else {
+                says_nothing(&format!("Health.{name}"), &frame);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_not_known_is_not_available_on_every_frame() {
+    let status = plan().status(&StatusFields::default());
+    for name in STATUS.into_iter().filter(|name| *name != "Validity") {
+        says_nothing(&format!("Status.{name}"), &status);
+    }
+    says("Status.Validity", &status, 0.0);
+    for (page, name, _, _) in HEALTH_VALUES {
+        says_nothing(&format!("Health.{name}"), &plan().health(page, &HealthFields::default()));
+    }
+    for (number, rule) in (1..).zip(RULES) {
+        let frame = plan().alarm(&AlarmFields { rule: number, ..Default::default() });
+        for name in ["State", "Severity", "Cell"] {
+            says_nothing(&format!("Alarm.{name}"), &frame);
+        }
+        says_nothing(&format!("Alarm.Value_{rule}"), &frame);
+        says_nothing(&format!("Alarm.Threshold_{rule}"), &frame);
+    }
+    let nan = StatusFields { soc: Some(f64::NAN), soc_std: Some(f64::NAN), ..Default::default() };
+    assert_eq!(plan().status(&nan), status, "NaN is not known");
+}
+
+#[test]
+fn extremes_saturate_at_the_range_and_never_say_not_available() {
+    let dbc = default_database().unwrap();
+    for extreme in [f64::MAX, f64::INFINITY, f64::MIN, f64::NEG_INFINITY] {
+        let end = |name: &str| {
+            let layout = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout;
+            if extreme > 0.0 { layout.maximum } else { layout.minimum }
+        };
+        let status = plan().status(&StatusFields { soc: Some(extreme), soc_std: Some(extreme), ..Default::default() });
+        for name in ["Status.Soc", "Status.SocStd"] {
+            says(name, &status, end(name));
+        }
+        let fields = health_fields(|_| Some(extreme));
+        for (page, name, _, _) in HEALTH_VALUES {
+            let name = format!("Health.{name}");
+            says(&name, &plan().health(page, &fields), end(&name));
+        }
+        for (number, rule) in (1..).zip(RULES) {
+            let value = Some(extreme);
+            let frame = plan().alarm(&AlarmFields { rule: number, value, threshold: value, ..Default::default() });
+            for name in [format!("Alarm.Value_{rule}"), format!("Alarm.Threshold_{rule}")] {
+                says(&name, &frame, end(&name));
+            }
+        }
+    }
+    let many = StatusFields {
+        active_alarms: Some(u16::MAX),
+        limiting_cell: Some(CellIndex(u16::MAX)),
+        validity: u8::MAX,
+        highest_severity: Some(u8::MAX),
+        ..Default::default()
+    };
+    let frame = plan().status(&many);
+    for (name, end) in [("ActiveAlarms", 62.0), ("LimitingCell", 1023.0), ("Validity", 3.0), ("HighestSeverity", 3.0)] {
+        says(&format!("Status.{name}"), &frame, end);
+    }
+}
+
+#[test]
+fn every_rule_has_its_own_value_and_threshold() {
+    // In the rule's inside unit and as read: the share of bad readings is a fraction inside and % on the wire.
+    let values = [(1.4, 1.4), (1.38, 1.38), (3600.0, 3600.0), (2.5, 2.5), (0.25, 25.0), (9.51, 9.51)];
+    for ((number, rule), (inside, wire)) in (1..).zip(RULES).zip(values) {
+        let fields = AlarmFields {
+            rule: number,
+            state: Some(1),
+            severity: Some(3),
+            test: false,
+            cell: Some(CellIndex(96)),
+            value: Some(inside),
+            threshold: Some(inside * 1.1),
+        };
+        let frame = plan().alarm(&fields);
+        says("Alarm.Rule", &frame, f64::from(number));
+        says("Alarm.State", &frame, 1.0);
+        says("Alarm.Severity", &frame, 3.0);
+        says("Alarm.Test", &frame, 0.0);
+        says("Alarm.Cell", &frame, 96.0);
+        says(&format!("Alarm.Value_{rule}"), &frame, wire);
+        says(&format!("Alarm.Threshold_{rule}"), &frame, wire * 1.1);
+        assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
+        let other = plan().alarm(&AlarmFields { value: None, cell: None, test: true, ..fields });
+        says_nothing(&format!("Alarm.Value_{rule}"), &other);
+        says(&format!("Alarm.Threshold_{rule}"), &other, wire * 1.1);
+        says_nothing("Alarm.Cell", &other);
+        says("Alarm.Test", &other, 1.0);
+    }
+}
+
+#[test]
+fn the_rules_numbers_and_names_are_those_of_the_value_table() {
+    let dbc = default_database().unwrap();
+    let table = &dbc.signal("PACKWATCH_Alarm.Rule").unwrap().1.values;
+    let named = (1..).zip(RULES).map(|(number, name)| (number, name.to_owned()));
+    assert!(named.eq(table.iter().take(RULES.len()).cloned()), "{table:?}");
+}
+
+#[test]
+fn everything_missing_is_told_at_once() {
+    let text = "VERSION \"\"\nBU_: X\nBO_ 1 PACKWATCH_Status: 8 X\n SG_ Soc : 0|8@1+ (1,0) [0|100] \"%\" X\n";
+    let found = OutputPlan::new(&Database::parse(text).unwrap(), &IdOverrides::default()).unwrap_err();
+    let mut wanted: Vec<_> =
+        STATUS.iter().skip(1).map(|name| format!("signal PACKWATCH_Status.{name} is missing")).collect();
+    wanted.extend(["Health", "Alarm"].map(|name| format!("message PACKWATCH_{name} is missing")));
+    assert_eq!(found.0, wanted);
+    assert_eq!(found.to_string().lines().count(), 8);
+}
+
+#[test]
+fn every_signal_the_daemon_fills_is_required() {
+    let rules = RULES.iter().flat_map(|rule| [format!("Value_{rule}"), format!("Threshold_{rule}")]);
+    let all = STATUS.map(|name| format!("Status.{name}")).into_iter();
+    let all = all.chain(HEALTH.map(|name| format!("Health.{name}")));
+    let all = all.chain(ALARM.map(str::to_owned).into_iter().chain(rules).map(|name| format!("Alarm.{name}")));
+    let mut count = 0;
+    for name in all.filter(|name| name != "Alarm.Rule") {
+        let mut dbc = default_database().unwrap();
+        let (message, signal) = name.split_once('.').unwrap();
+        let message = dbc.messages.iter_mut().find(|m| m.name.ends_with(message)).unwrap();
+        let position = message.signals.iter().position(|s| s.name == signal).unwrap();
+        // Renamed and not removed: the others' conditions count positions.
+        message.signals[position].name = "Other".to_owned();
+        let found = OutputPlan::new(&dbc, &IdOverrides::default()).unwrap_err();
+        assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);
+        count += 1;
+    }
+    assert_eq!(count, 31);
+}
+
+#[test]
+fn a_value_that_could_be_read_as_another_s_is_refused() {
+    assert_eq!(
+        faults("Value_InputMissing m4", "Value_InputMissing m5"),
+        ["signal PACKWATCH_Alarm.Value_InputMissing is there for the rules [5], must be for 4 alone"]
+    );
+    assert_eq!(
+        faults("Threshold_CapacityLow m1", "Threshold_CapacityLow "),
+        ["signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6], must be for 1 alone"]
+    );
+    assert_eq!(faults("Page M : 16|4@1+", "Page M : 16|1@1+").len(), 3, "three signals are on page 2");
+}
+
+#[test]
+fn a_signal_past_its_message_or_without_layout_is_refused() {
+    assert_eq!(
+        faults("LimitingCell : 51|11@1+", "LimitingCell : 54|11@1+"),
+        ["signal PACKWATCH_Status.LimitingCell: reaches past the message's 8 bytes"]
+    );
+    assert_eq!(faults("Soc : 16|12@1+ (0.025,0)", "Soc : 16|12@1+ (0,0)").len(), 1);
+    assert_eq!(
+        faults("PACKWATCH_Health: 8", "PACKWATCH_Health: 100"),
+        ["message PACKWATCH_Health: 100 bytes, must be at most 64"]
+    );
+}
+
+#[test]
+fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() {
+    let text = TEXT
+        .replace("Soc : 16|12@1+ (0.025,0) [0|102.35]", "Soc : 16|12@1- (1,0) [0|0]")
+        .replace("SocStd : 28|8@1+ (0.1,0) [0|25.4]", "SocStd : 28|8@1+ (1,0) [0|0]")
+        .replace("VAL_ 1712 Soc 4095 \"not available\" ;\n", "");
+    let plan = OutputPlan::new(&Database::parse(&text).unwrap(), &IdOverrides::default()).unwrap();
+    let codes = |value: Option<f64>| {
+        let frame = plan.status(&StatusFields { soc: value, soc_std: value, ..Default::default() });
+        (read("Status.Soc", &frame).0, read("Status.SocStd", &frame).0)
+    };
+    assert_eq!(codes(None), (0x800, 255));
+    assert_eq!(codes(Some(1e9)), (0x7FF, 254));
+    assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is taken: the next one up");
+}
