@@ -13,11 +13,12 @@ use super::Failure;
 use crate::can::encode::InputEncoder;
 use crate::config::{self, Config};
 use crate::daemon::replay::{self, ReplayError, Settings, Sinks, Summary};
+use crate::daemon::snapshot_file;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
-use crate::io::player::Player;
 use crate::io::result_file::ResultFile;
-use crate::monitor::{Monitor, Snapshot};
+use crate::io::socket::CanSender;
+use crate::monitor::Monitor;
 use crate::sample::VoltageSource;
 
 /// Runs the command.
@@ -49,16 +50,16 @@ fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: Set
     bar.clear();
     let (summary, snapshot) = result?;
     if let (Some(path), Some(snapshot)) = (&args.snapshot, snapshot) {
-        write_snapshot(path, &snapshot)?;
+        snapshot_file::write(path, &snapshot)?;
     }
     print_summary(args, &summary)?;
     Ok(())
 }
 
 fn play(args: &Args, source: &mut LogSource, settings: &Settings, interface: &str) -> Result<(), ReplayError> {
-    let mut player = Player::open(interface)?;
+    let sender = CanSender::open(interface, true)?;
     let bar = Bar::new(&args.logs);
-    let result = replay::play(source, settings, &mut |_, frame| player.send(frame), &mut |p| bar.show(p));
+    let result = replay::play(source, settings, &mut |_, frame| sender.send(frame), &mut |p| bar.show(p));
     bar.clear();
     let sent = result?;
     report::played(sent, interface, source.counts(), args.json)?;
@@ -92,26 +93,13 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
         sleep_gap_s: args.sleep_gap,
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
-        restore: args.restore.as_deref().map(read_snapshot).transpose()?,
+        restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
         interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
     })
 }
 
 fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
     path.map(ResultFile::create).transpose()
-}
-
-fn write_snapshot(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
-    let mut file = ResultFile::create(path)?;
-    serde_json::to_writer(&mut file, snapshot)?;
-    io::Write::write_all(&mut file, b"\n")?;
-    file.finish()
-}
-
-fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
-    let bytes = std::fs::read(path).map_err(|e| Failure::new(format!("{}: cannot be read: {e}", path.display())))?;
-    serde_json::from_slice(&bytes)
-        .map_err(|e| Failure::new(format!("{}:{}: not a snapshot: {e}", path.display(), e.line())))
 }
 
 fn print_summary(args: &Args, summary: &Summary) -> io::Result<()> {

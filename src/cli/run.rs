@@ -1,13 +1,13 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
 use crate::config;
+use crate::daemon::snapshot_file;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
-use crate::monitor::Snapshot;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -71,17 +71,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         record: args.record.clone(),
         frames: args.frames.clone(),
         events: args.events.clone(),
-        restore: args.restore.as_deref().map(read_snapshot).transpose()?,
+        restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
         away_s: args.away,
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
         receive_buffer_bytes: args.receive_buffer,
     };
     service.run().map_err(|error| Failure::new(error.to_string()))
-}
-
-fn read_snapshot(path: &Path) -> Result<Snapshot, Failure> {
-    let text = std::fs::read(path).map_err(|error| Failure::new(format!("{}: {error}", path.display())))?;
-    serde_json::from_slice(&text)
-        .map_err(|error| Failure::new(format!("{}:{}: not a snapshot: {error}", path.display(), error.line())))
 }

@@ -5,3 +5,4 @@ mod event_log;
 pub mod logging;
 pub mod replay;
 pub mod service;
+pub mod snapshot_file;

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+use super::event_log;
 use crate::can::Frame;
 use crate::cell::MAX_BRANCHES;
 use crate::io::candump::{self, StampDigits};
@@ -344,8 +345,7 @@ impl Replay {
         for event in &out.events {
             note_event(&mut self.summary, &mut self.usable, event);
             if let Some(file) = &mut self.sinks.events {
-                serde_json::to_writer(&mut *file, event)?;
-                file.write_all(b"\n")?;
+                event_log::write_line(file, event)?;
             }
         }
         self.summary.frames_out += out.frames.len() as u64;

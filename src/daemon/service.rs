@@ -4,7 +4,6 @@
 //! the journal replayed gives the same frames. Nothing a bus, a disk or a service manager does ends the loop;
 //! SIGTERM and SIGINT do, cleanly.
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -17,6 +16,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 
 use super::background_file::BackgroundFile;
 use super::event_log::{self, EventLog};
+use super::snapshot_file;
 use crate::config::Config;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::{MappedClock, Reading};
@@ -284,7 +284,7 @@ impl Loop {
         }
         self.engine.close_files();
         if let Some(path) = snapshot {
-            write_snapshot(path, &self.engine.monitor.snapshot())
+            snapshot_file::write(path, &self.engine.monitor.snapshot())
                 .map_err(|error| ServiceError::File { path: path.to_owned(), error })?;
         }
         tracing::info!("stopped");
@@ -352,17 +352,4 @@ fn open_journal(path: Option<&Path>, names: &[String]) -> Result<Option<JournalW
     let Some(path) = path else { return Ok(None) };
     let journal = JournalWriter::new(create(path)?, names.to_vec());
     journal.map(Some).map_err(|error| ServiceError::File { path: path.to_owned(), error })
-}
-
-/// Stores a state so that after a power cut there is the old one or the new one, whole.
-fn write_snapshot(path: &Path, snapshot: &Snapshot) -> io::Result<()> {
-    let mut part = path.as_os_str().to_owned();
-    part.push(".part");
-    let mut file = fs::File::create(&part)?;
-    serde_json::to_writer(&mut file, snapshot)?;
-    file.write_all(b"\n")?;
-    file.sync_all()?;
-    fs::rename(&part, path)?;
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    fs::File::open(folder)?.sync_all()
 }

@@ -6,7 +6,6 @@ pub mod csv_log;
 pub mod journal;
 pub mod lines;
 pub mod log;
-pub mod player;
 pub mod result_file;
 pub mod socket;
 pub mod stamp;

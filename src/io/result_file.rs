@@ -71,7 +71,9 @@ impl ResultFile {
         }
         fs::rename(part, &self.path).map_err(|e| named(&self.path, e))?;
         self.part = None;
-        Ok(())
+        // The new name itself must survive a power cut too.
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(|e| named(&self.path, e))
     }
 }
 

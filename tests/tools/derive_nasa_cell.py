@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Cell model of a NASA PCoE 18650 from its first cycles: derive_model.py CELL.csv.gz OUT.toml [--name NAME]
+"""Cell model of a NASA PCoE 18650 from its first cycles: derive_nasa_cell.py CELL.csv.gz OUT.toml [--name NAME]
 
 Reads cycles 0..LAST only (five discharges, five charges; the rest of the life stays unseen by the model).
 One RC branch at a fixed time constant makes the voltage linear in the table values:
@@ -148,7 +148,7 @@ def main():
     def row(x, d):
         return "[" + ", ".join(f"{v:.{d}f}" for v in x) + "]"
     with open(args.toml, "w") as f:
-        f.write(f'''# Written by derive_model.py; do not edit by hand.
+        f.write(f'''# Written by tests/tools/derive_nasa_cell.py; do not edit by hand.
 format = 1
 name = "{args.name}"
 chemistry = "Li-ion 18650 (cathode not published)"
