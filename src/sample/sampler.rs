@@ -190,11 +190,6 @@ impl Sampler {
         self.pack_current_a(now).map(|current| current / self.strings())
     }
 
-    /// When the last good current came.
-    pub fn current_at(&self) -> Option<Timestamp> {
-        self.state.signals[0].good_at()
-    }
-
     /// Charge (As, per cell) and unmeasured time (s) up to `now`, as in [`CellSample`].
     pub fn counted(&self, now: Timestamp) -> (f64, f64) {
         let totals = self.state.charge.totals_at(now, self.config.current.max_age_s);
@@ -217,21 +212,10 @@ impl Sampler {
         self.slot(channel).map(|slot| self.since(self.state.signals[slot].heard_at(), now))
     }
 
-    /// The channel nothing has come on for longest, and for how long, s.
-    pub fn worst_age(&self, now: Timestamp) -> (Channel, f64) {
-        let silences = self.channels().map(|channel| (channel, self.silence_s(channel, now).unwrap_or(0.0)));
-        worst(silences).unwrap_or((Channel::Current, 0.0))
-    }
-
     /// Share of bad readings on a channel, fraction, forgotten over about
     /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = nothing came yet.
     pub fn bad_share(&self, channel: Channel) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
-    }
-
-    /// The channel with the largest share of bad readings; `None` = nothing came yet.
-    pub fn worst_bad_share(&self) -> Option<(Channel, f64)> {
-        worst(self.channels().filter_map(|channel| self.bad_share(channel).map(|share| (channel, share))))
     }
 
     /// The channels that feed something: current, sensors, voltages.
@@ -371,10 +355,6 @@ fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
     }
-}
-
-fn worst(values: impl Iterator<Item = (Channel, f64)>) -> Option<(Channel, f64)> {
-    values.reduce(|worst, next| if next.1 > worst.1 { next } else { worst })
 }
 
 #[cfg(test)]

@@ -90,7 +90,7 @@ fn measured_glitches_make_no_sample_and_are_told_once() {
     assert!(bench.ok(4.0, CELL, 3.9).is_some());
     assert_eq!(bench.states(), [Err(Fault::OutOfRange), Ok(3)]);
     assert_eq!(bench.sampler.bad_share(CELL), Some(0.6));
-    assert_eq!(bench.sampler.worst_bad_share(), Some((CELL, 0.6)));
+    assert_eq!(bench.sampler.bad_share(CELL), Some(0.6));
 }
 
 #[test]
@@ -209,7 +209,7 @@ fn ages_tell_good_values_from_anything_heard() {
     let now = at(10.0);
     assert_eq!(bench.sampler.age_s(CELL, now), Some(10.0));
     assert_eq!(bench.sampler.silence_s(CELL, now), Some(6.0));
-    assert_eq!(bench.sampler.worst_age(now), (Channel::CellVoltage(CellIndex(1)), 10.0));
+    assert_eq!(bench.sampler.silence_s(Channel::CellVoltage(CellIndex(1)), now), Some(10.0));
     assert_eq!(bench.sampler.age_s(Channel::PackVoltage, now), None);
 }
 
