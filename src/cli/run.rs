@@ -15,10 +15,10 @@ pub(crate) struct Args {
     /// Configuration
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Journal everything that comes in, for `packwatch replay`
+    /// Journal everything that comes in, for `packwatch replay`; a file of that name becomes FILE.1
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Log the frames that go out, in candump's form, with the time of the input that caused each
+    /// Log the frames handed to the interfaces, in candump's form, with the time of the input that caused each
     #[arg(long, value_name = "FILE")]
     frames: Option<PathBuf>,
     /// Write events as JSON, a line each, as `packwatch replay --events` does

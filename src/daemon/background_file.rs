@@ -8,11 +8,17 @@ use std::io::{self, Write};
 use std::path::Path;
 use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 /// Bytes collected before they are handed over, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
 /// Pieces waiting at most: 4 MB, ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
+
+/// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
+const MAX_FINISH: Duration = Duration::from_secs(5);
+/// How often the end is looked for.
+const FINISH_POLL: Duration = Duration::from_millis(5);
 
 /// See the module.
 #[derive(Debug)]
@@ -29,6 +35,7 @@ impl BackgroundFile {
     /// # Errors
     /// When the file cannot be created.
     pub(crate) fn create(path: &Path) -> io::Result<Self> {
+        keep_earlier(path)?;
         let file = File::create(path)?;
         let (pieces, queue) = sync_channel(MAX_PIECES);
         let writer = std::thread::Builder::new().name("record".to_owned()).spawn(move || write_all(file, &queue))?;
@@ -66,8 +73,29 @@ impl BackgroundFile {
     fn join(&mut self) -> io::Result<()> {
         self.pieces = None;
         let Some(writer) = self.writer.take() else { return Ok(()) };
+        let asked = Instant::now();
+        while !writer.is_finished() {
+            if asked.elapsed() > MAX_FINISH {
+                return Err(io::Error::new(
+                    io::ErrorKind::TimedOut,
+                    "the disk does not answer, the file is not complete",
+                ));
+            }
+            std::thread::sleep(FINISH_POLL);
+        }
         writer.join().unwrap_or_else(|_| Err(io::Error::other("writer panicked")))
     }
+}
+
+/// A record of an earlier run becomes `NAME.1`: what led to a crash is what somebody will want to read.
+fn keep_earlier(path: &Path) -> io::Result<()> {
+    let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
+    if !earlier.is_file() || earlier.len() == 0 {
+        return Ok(());
+    }
+    let mut kept = path.as_os_str().to_owned();
+    kept.push(".1");
+    std::fs::rename(path, kept)
 }
 
 impl Write for BackgroundFile {

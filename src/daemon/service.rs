@@ -108,15 +108,20 @@ impl Service {
     fn engine(&mut self, clock: MappedClock) -> Result<Engine, ServiceError> {
         let names: Vec<String> = self.config.interfaces.iter().map(|i| i.name.clone()).collect();
         let mut monitor = Monitor::new(self.config.monitor.clone());
-        let mut record = open_journal(self.record.as_deref(), &names)?;
-        if let Some(snapshot) = self.restore.take() {
-            let now = clock.now();
-            tracing::info!(away_s = self.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0)), "state taken up");
+        let restored = self.restore.take();
+        let now = clock.now();
+        let is_restored = restored.is_some();
+        if let Some(snapshot) = restored {
+            let away_s = self.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0));
+            // Before any file is opened: a start that fails leaves what an earlier run has recorded.
             monitor.restore(snapshot, self.away_s)?;
-            if let Some(Err(error)) = record.as_mut().map(|journal| journal.restored(now, self.away_s)) {
-                tracing::error!(%error, "recording stopped");
-                record = None;
-            }
+            tracing::info!(away_s, "state taken up");
+        }
+        let mut record = open_journal(self.record.as_deref(), &names)?;
+        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, self.away_s));
+        if let Some(Err(error)) = marked {
+            tracing::error!(%error, "recording stopped");
+            record = None;
         }
         let frames = self.frames.as_deref().map(create).transpose()?;
         let events = self.events.as_deref().map(create).transpose()?;
@@ -282,13 +287,14 @@ impl Loop {
         if timeout(DRAIN_LIMIT, drained).await.is_err() {
             tracing::warn!("not every queued frame was sent before the stop");
         }
-        self.engine.close_files();
-        if let Some(path) = snapshot {
+        // The state first: the files may hang on a disk that does not answer.
+        let stored = snapshot.map_or(Ok(()), |path| {
             snapshot_file::write(path, &self.engine.monitor.snapshot())
-                .map_err(|error| ServiceError::File { path: path.to_owned(), error })?;
-        }
+                .map_err(|error| ServiceError::File { path: path.to_owned(), error })
+        });
+        self.engine.close_files();
         tracing::info!("stopped");
-        Ok(())
+        stored
     }
 }
 

@@ -70,10 +70,14 @@ pub(crate) struct CsvLog {
 impl CsvLog {
     /// Reads the header line and finds the columns; `name` is the file's, for messages.
     pub(crate) fn open(source: Box<dyn Read>, name: &str, options: &CsvOptions) -> Result<Self, LogError> {
-        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
+        // No quoting: one stray quote would swallow every row after it. A field that is quoted whole is still read.
+        let mut builder = csv::ReaderBuilder::new();
+        let mut reader = builder.quoting(false).flexible(true).trim(csv::Trim::All).from_reader(source);
         let header = reader.byte_headers().map_err(|e| LogError(format!("{name}:1: {e}")))?;
-        let headers: Vec<String> =
-            header.iter().map(|h| String::from_utf8_lossy(h).trim_start_matches('\u{feff}').to_owned()).collect();
+        let headers: Vec<String> = header
+            .iter()
+            .map(|h| String::from_utf8_lossy(h).trim_start_matches('\u{feff}').trim_matches('"').to_owned())
+            .collect();
         let columns = Columns { headers: &headers, options, name };
         let time_column = columns.required("time", "time_s")?;
         let section_column = columns.section()?;
@@ -155,6 +159,7 @@ impl CsvLog {
 
 /// An empty field is `Some(None)`, no finite number is `None`.
 fn parse_field(field: &[u8]) -> Option<Option<f64>> {
+    let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
     if field.is_empty() {
         return Some(None);
     }
