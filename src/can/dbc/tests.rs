@@ -1,3 +1,5 @@
+//! DBC texts read whole, and refused with their line.
+
 use super::*;
 
 const HEAD: &str = "VERSION \"\"\nNS_ :\nBS_:\nBU_: X\n";

@@ -1,3 +1,5 @@
+//! What an input map hands on, and what it passes over.
+
 use super::*;
 use crate::can::dbc::Database;
 use crate::quantity::CellIndex;

@@ -1,3 +1,5 @@
+//! Signal plans against the bits one by one, and against published vectors.
+
 use proptest::prelude::*;
 
 use super::*;

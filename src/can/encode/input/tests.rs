@@ -1,3 +1,5 @@
+//! Frames made from values decode to those values.
+
 use super::*;
 use crate::can::FrameKind;
 use crate::can::decode::tests::{bind, cell, map, nested, readings, sensor};
