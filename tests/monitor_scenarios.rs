@@ -493,3 +493,18 @@ fn input_missing_pending_before_a_restart_does_not_count_the_time_away() {
 
     assert_eq!(b.count(|k| alarm(k, Rule::InputMissing, true)), 0);
 }
+
+#[test]
+fn a_state_taken_up_on_an_earlier_clock_goes_on_sending() {
+    let mut b = Bench::new(load("paper.toml"), 0.9);
+    b.run(2.6, 60);
+    let mut monitor = Monitor::new(b.config.clone());
+    monitor.restore(b.monitor.snapshot(), Some(0.0)).unwrap();
+    let mut out = Outputs::default();
+    for tick in 0..300 {
+        let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);
+        monitor.handle(Input::Tick { time }, &mut out);
+    }
+    // Three seconds: a status frame and three pages of health each, from wherever in the period the state was taken.
+    assert!((8..=16).contains(&out.frames.len()), "{} frames", out.frames.len());
+}

@@ -519,4 +519,4 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

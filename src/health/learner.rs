@@ -249,3 +249,49 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .then(|| (b.temperature_integral - a.temperature_integral) / temperature_s),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::CellStep;
+    use crate::cell::estimator::tests::config as estimator_config;
+    use crate::cell::model::tests::small_model;
+
+    /// An hour's discharge at 1 A whose voltages fall from 4.1 V to 3.5 V.
+    fn discharge(estimator: &mut CellEstimator) {
+        for k in 0..360 {
+            let step = CellStep {
+                measured_s: 10.0,
+                charge_as: 10.0,
+                unmeasured_s: 0.0,
+                current_a: Some(1.0),
+                temperature_c: Some(20.0),
+                ambient_c: 20.0,
+                voltage_v: 4.1 - 0.6 * f64::from(k) / 360.0,
+            };
+            estimator.step(&small_model(), &estimator_config(), &step);
+        }
+    }
+
+    #[test]
+    fn a_half_cycle_is_measured_by_what_it_alone_has_told() {
+        let config = CapacityConfig {
+            method: CapacityMethod::Swing,
+            noise_ah_per_cycle: 0.01,
+            noise_ah_per_rest_day: 0.0,
+            current_gain_std: 0.0,
+        };
+        let mut estimator = CellEstimator::new(&estimator_config());
+        let mut learner = Learner::new(1, estimator.capacity());
+        let at = |soc| CellMark { soc: Some(Belief::from_std(soc, 0.01)), ..CellMark::default() };
+        let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
+        discharge(&mut estimator);
+        assert!(!learner.has_learned_all());
+        let first = learner.learn(&config, 0, &mut estimator, &moved);
+        assert!(first.measurement.is_some() && learner.has_learned_all());
+        // Nothing was measured since: the same voltages must not be counted a second time.
+        let second = learner.learn(&config, 0, &mut estimator, &moved);
+        assert_eq!(second.measurement, None);
+        assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
+    }
+}

@@ -4,7 +4,7 @@ use super::*;
 use crate::cell::Discretisation;
 use crate::cell::model::tests::small_model;
 
-fn config() -> EstimatorConfig {
+pub(crate) fn config() -> EstimatorConfig {
     EstimatorConfig {
         alpha: 1.0,
         beta: 2.0,
