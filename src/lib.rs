@@ -14,8 +14,10 @@
 //! | 2 | [`alarm`] | rules over named values |
 //! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |
 //! | 3 | [`sim`] | truth model, sensor errors, scenarios |
+//! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
 //! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service |
+//! | 5 | `lab` | measured files against truth, plots (feature `lab`) |
 //! | 6 | [`cli`] | one file per command |
 //!
 //! # Invariants
@@ -31,7 +33,11 @@ pub mod config;
 pub mod daemon;
 pub mod filter;
 pub mod health;
+#[cfg(feature = "lab")]
+pub mod ident;
 pub mod io;
+#[cfg(feature = "lab")]
+pub mod lab;
 pub mod monitor;
 pub mod quantity;
 pub mod sample;

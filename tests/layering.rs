@@ -19,19 +19,24 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("alarm", &["quantity"], Core::Pure),
     ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
+    ("ident", &["quantity", "filter", "cell"], Core::Pure),
     ("config", BELOW_CONFIG, Core::Shell),
     ("io", BELOW_IO, Core::Shell),
     ("daemon", BELOW_DAEMON, Core::Shell),
+    ("lab", BELOW_LAB, Core::Shell),
     ("cli", BELOW_CLI, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// Every module below `cli`, lowest first.
-const LAYERS: [&str; 12] =
-    ["quantity", "filter", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "config", "io", "daemon"];
-const BELOW_CONFIG: &[&str] = LAYERS.split_at(9).0;
-const BELOW_IO: &[&str] = LAYERS.split_at(10).0;
-const BELOW_DAEMON: &[&str] = LAYERS.split_at(11).0;
+const LAYERS: [&str; 14] = [
+    "quantity", "filter", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "ident", "config", "io",
+    "daemon", "lab",
+];
+const BELOW_CONFIG: &[&str] = LAYERS.split_at(10).0;
+const BELOW_IO: &[&str] = LAYERS.split_at(11).0;
+const BELOW_DAEMON: &[&str] = LAYERS.split_at(12).0;
+const BELOW_LAB: &[&str] = LAYERS.split_at(13).0;
 const BELOW_CLI: &[&str] = &LAYERS;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -3,8 +3,12 @@
 
 mod check;
 mod demo;
+#[cfg(feature = "lab")]
+mod fit;
 mod replay;
 mod run;
+#[cfg(feature = "lab")]
+mod score;
 mod simulate;
 
 use std::process::ExitCode;
@@ -34,6 +38,12 @@ enum Command {
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
+    /// Fit a cell model to measured data
+    #[cfg(feature = "lab")]
+    Fit(Box<fit::Args>),
+    /// Replay measured files and compare the estimates with the truth
+    #[cfg(feature = "lab")]
+    Score(Box<score::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -66,6 +76,10 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Fit(args) => fit::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Score(args) => score::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

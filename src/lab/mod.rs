@@ -1,0 +1,5 @@
+//! Offline work on measured files: reading them, fitting, scoring against truth, plots.
+
+pub mod measured;
+pub(crate) mod plot;
+pub mod score;

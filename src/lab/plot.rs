@@ -1,0 +1,1 @@
+//! Plots of estimates and residuals, as SVG.
