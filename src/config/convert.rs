@@ -101,7 +101,7 @@ pub(crate) fn monitor(
         health: HealthConfig {
             transition: transition(raw.transition.as_ref()?, rated_ah * f64::from(pack.strings)),
             capacity: capacity(raw.capacity.as_ref()?, rated_ah),
-            recharge: recharge(raw.recharge.as_ref()?),
+            recharge: recharge(raw.recharge.as_ref()?, rated_ah),
             usable: raw.usable.as_ref().map(|keys| usable(keys, rated_ah)),
         },
         rules: rules?,
@@ -242,8 +242,14 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     }
 }
 
-fn recharge(keys: &Recharge) -> RechargeConfig {
-    RechargeConfig { from_soc: keys.from_soc, to_soc: keys.to_soc }
+fn recharge(keys: &Recharge, rated_ah: f64) -> RechargeConfig {
+    RechargeConfig {
+        from_soc: keys.from_soc,
+        to_soc: keys.to_soc,
+        reference_current_a: keys.reference_current_a.unwrap_or(rated_ah / 2.0),
+        min_coverage: keys.min_coverage,
+        alarm_on: keys.alarm_on,
+    }
 }
 
 fn usable(keys: &Usable, rated_ah: f64) -> UsableConfig {

@@ -9,6 +9,7 @@ use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
 use crate::alarm::{Rule, Severity};
 use crate::cell::{CapacityState, Discretisation};
+use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
 
 /// Coldest and hottest temperature anybody may configure, degrees C.
@@ -38,6 +39,7 @@ choice!(Positive { "charge" => Self::Charge, "discharge" => Self::Discharge });
 choice!(Method { "swing" => Self::Swing, "nominal" => Self::Nominal });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
+choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
 choice!(Severity { "info" => Self::Info, "warning" => Self::Warning, "severe" => Self::Severe });
 choice!(Rule {
     "capacity_low" => Self::CapacityLow,
@@ -304,12 +306,18 @@ section! {
 }
 
 section! {
-    /// The SOC window whose charging time is the recharge period.
+    /// The SOC window whose charging time is the recharge period: raw, as the charge at hand took, and normalised, as a reference charger would take.
     Recharge at "recharge" {
         /// Lower SOC.
         from_soc: f64, "fraction", Between(0.0, 1.0), Default("0.3");
         /// Upper SOC.
         to_soc: f64, "fraction", Between(0.0, 1.0), Default("0.9");
+        /// Current of the reference charger, per cell, which it holds over the whole window: the normalised period is the window's share of the learned capacity over it. Without it: the rated capacity over 2 h (C/2).
+        reference_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
+        /// Part of the window that a charge must cover to be told with a normalised period (a raw one needs all of it).
+        min_coverage: f64, "fraction", Above(0.0, 1.0), Default("0.5");
+        /// What the alarm `recharge_period_low` compares. "raw": each period as soon as the charge leaves the window; a stronger charger looks like a worn pack, a weaker one hides it. "normalised": what the reference charger would need, at the end of each charge that covered enough.
+        alarm_on: RechargeAlarm, "", Any, Default("\"raw\"");
     }
 }
 

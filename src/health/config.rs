@@ -41,6 +41,15 @@ pub struct CapacityConfig {
     pub current_gain_std: f64,
 }
 
+/// Which recharge period the rule about it compares.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RechargeAlarm {
+    /// As it was, with the charger at hand.
+    Raw,
+    /// What the reference charger would need.
+    Normalised,
+}
+
 /// SOC window whose charging time is the recharge period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RechargeConfig {
@@ -48,6 +57,12 @@ pub struct RechargeConfig {
     pub from_soc: f64,
     /// Upper SOC, fraction (0.9).
     pub to_soc: f64,
+    /// Current of the reference charger per cell, A, positive.
+    pub reference_current_a: f64,
+    /// Part of the window a charge must cover to be told as a normalised period, fraction.
+    pub min_coverage: f64,
+    /// What the rule about the recharge period compares.
+    pub alarm_on: RechargeAlarm,
 }
 
 /// The load at which the usable capacity is stated.

@@ -89,6 +89,7 @@ pub struct Monitor {
     learner: Learner,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
+    normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
     /// Cells with a new estimate since the pack's values were last combined.
     updated_cells: usize,
@@ -132,6 +133,7 @@ impl Monitor {
             detector: TransitionDetector::default(),
             recharge: RechargeTimer::default(),
             recharge_period_s: None,
+            normalised_recharge: None,
             pack: None,
             updated_cells: 0,
             schedule: Schedule::default(),
@@ -184,6 +186,11 @@ impl Monitor {
     /// The last recorded recharge period, s.
     pub fn recharge_period_s(&self) -> Option<f64> {
         self.recharge_period_s
+    }
+
+    /// What the reference charger would need for the window, s, after the last charge that covered enough of it.
+    pub fn normalised_recharge_period(&self) -> Option<Belief> {
+        self.normalised_recharge
     }
 
     /// Usable capacity of a cell after its last half-cycle.
@@ -318,7 +325,7 @@ impl Monitor {
         if result.reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
-            self.recharge.interrupt();
+            self.recharge.discard();
         }
         self.learner.observe(index, soc, sample.temperature_c, measured_s);
         self.note_taper(sample);
