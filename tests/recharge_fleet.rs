@@ -5,7 +5,6 @@
 //! gain of either sign; 5 mV): the normalised period must rank the cells by their true capacity, and its stated
 //! interval must hold the truth. One life whose charger gets weaker half way. What the alarm makes of it.
 //! `cargo test --release --test recharge_fleet -- --nocapture` prints the tables.
-#![expect(clippy::print_stdout, reason = "the tables are the report")]
 
 use std::path::Path;
 
