@@ -239,6 +239,9 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
         noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(usual_noise_ah),
         noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah),
         current_gain_std: keys.current_gain_std,
+        current_offset_std_a: keys.current_offset_std_a.unwrap_or(0.005 * rated_ah),
+        fade_std_ah_per_cycle: keys.fade_std_ah_per_cycle,
+        fade_noise_ah_per_cycle: keys.fade_noise_ah_per_cycle,
     }
 }
 

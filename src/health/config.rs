@@ -39,6 +39,12 @@ pub struct CapacityConfig {
     pub noise_ah_per_rest_day: f64,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
     pub current_gain_std: f64,
+    /// Standard deviation of the current sensor's offset at the start, per cell, A; 0 = not learned. Not used by `Nominal`.
+    pub current_offset_std_a: f64,
+    /// Standard deviation of the fade at the start, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
+    pub fade_std_ah_per_cycle: f64,
+    /// How fast the fade may change: standard deviation gained per equivalent full cycle, Ah per full cycle.
+    pub fade_noise_ah_per_cycle: f64,
 }
 
 /// Which recharge period the rule about it compares.

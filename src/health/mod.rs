@@ -1,6 +1,7 @@
 //! What a battery loses over its life: half-cycles, capacity, recharge period, usable capacity.
 
 pub mod config;
+pub mod drift;
 pub mod learner;
 pub mod pack;
 pub mod recharge;

@@ -124,7 +124,7 @@ impl Monitor {
         };
         Self {
             sampler: Sampler::new(config.sample.clone()),
-            learner: Learner::new(cells, slot.estimator.capacity()),
+            learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
             started: false,
@@ -311,11 +311,13 @@ impl Monitor {
         }
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         slot.consumed = Some(Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured });
+        // What charges and discharges have shown to be the sensor's, not the cell's.
+        let offset_a = self.learner.current_offset_a(index);
         let step = CellStep {
             measured_s,
-            charge_as,
+            charge_as: charge_as - offset_a * measured_s,
             unmeasured_s,
-            current_a: sample.current_a,
+            current_a: sample.current_a.map(|current_a| current_a - offset_a),
             temperature_c: sample.temperature_c,
             ambient_c: self.config.sample.ambient_c,
             voltage_v: sample.voltage_v,
