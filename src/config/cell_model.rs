@@ -46,6 +46,8 @@ section! {
         ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
         /// Series resistance of a new cell.
         r0_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` finds it. Without it the estimator's `model_error_v_sqrt_s` holds.
+        voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
     }
 }
 
@@ -126,6 +128,7 @@ fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Optio
         ocv_v: Table { values: tables.ocv_v },
         r0_ohm: Table { values: tables.r0_ohm },
         branches: branches.into_iter().map(branch).collect(),
+        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
         thermal: thermal.map(|t| Thermal {
             heat_capacity_j_per_k: t.heat_capacity_j_per_k,
             resistance_k_per_w: t.resistance_k_per_w,
@@ -155,6 +158,9 @@ fn check_tables(tables: &Tables, faults: &mut Faults) {
     }
     check_shape(place, "ocv_v", &tables.ocv_v, tables, faults);
     check_shape(place, "r0_ohm", &tables.r0_ohm, tables, faults);
+    if let Some(voltage_error_v) = &tables.voltage_error_v {
+        check_shape(place, "voltage_error_v", voltage_error_v, tables, faults);
+    }
     for (row, t) in tables.ocv_v.iter().zip(&tables.temperature_c) {
         if let Some((a, b)) = first_not_rising(row) {
             place.note(faults, "ocv_v", &format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));
