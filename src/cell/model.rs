@@ -78,6 +78,8 @@ pub struct CellModel {
     pub temperature_c: Vec<f64>,
     /// Open-circuit voltage, V.
     pub ocv_v: Table,
+    /// How far the open-circuit curve shifts as capacity is lost, see [`CellModel::ocv_soc`]; 0 = the curve only shrinks.
+    pub ocv_ageing_shift: f64,
     /// Series resistance, ohm.
     pub r0_ohm: Table,
     /// RC branches, 1 to [`MAX_BRANCHES`].
@@ -170,6 +172,18 @@ impl CellModel {
         self.ocv_v.at(place, place.beyond_s, place.row.along_t)
     }
 
+    /// SOC of a new cell whose open-circuit voltage a cell of `capacity_ah` at `soc` has.
+    ///
+    /// An ageing cell does not lose its charge evenly over the curve: lithium bound elsewhere lets the anode slip against
+    /// the cathode, so the top keeps its ampere-hours and the bottom loses them. s' = s + a s (1 - s) with
+    /// a = shift * (1 - C / C_new); a shift of 1 would keep the slope over ampere-hours at SOC 1 exactly, 0 shrinks evenly.
+    pub fn ocv_soc(&self, soc: f64, capacity_ah: f64) -> f64 {
+        let lost = self.ocv_ageing_shift * (1.0 - capacity_ah / self.capacity_ah);
+        // Beyond +-1 the curve would fold; beyond the ends of the curve it keeps its course.
+        let inside = soc.clamp(0.0, 1.0);
+        soc + lost.clamp(-0.9, 0.9) * inside * (1.0 - inside)
+    }
+
     /// Slope of the open-circuit voltage over SOC, V per unit of SOC.
     pub fn ocv_slope_v(&self, place: &Place) -> f64 {
         let rise = |t: usize| self.ocv_v.values[t][place.s + 1] - self.ocv_v.values[t][place.s];
@@ -241,6 +255,7 @@ pub(crate) mod tests {
             voltage_max_v: 4.2,
             soc: vec![0.0, 0.5, 1.0],
             temperature_c: vec![0.0, 40.0],
+            ocv_ageing_shift: 0.0,
             ocv_v: table([[3.0, 3.6, 4.2], [3.0, 3.7, 4.2]]),
             r0_ohm: table([[0.08, 0.06, 0.06], [0.04, 0.03, 0.03]]),
             branches: vec![Branch {

@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use super::document::{Document, Faults, Place};
-use super::schema::Presence::{Optional, Required};
+use super::schema::Presence::{Default, Optional, Required};
 use super::schema::{Section as _, SectionInfo, Walk, section};
 use super::setting::Allowed::{Above, Between, NotEmpty};
 use super::{ConfigFaults, ReadFile, read_text};
@@ -28,6 +28,8 @@ section! {
         rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
         /// Charge of a new cell from full to empty open-circuit voltage.
         capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        /// How far the open-circuit curve shifts as the cell loses capacity: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
+        ocv_ageing_shift: f64, "", Between(0.0, 1.0), Default("0.0");
         /// Lowest voltage under load.
         voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
         /// Highest voltage under charge.
@@ -125,6 +127,7 @@ fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Optio
         voltage_max_v: head.voltage_max_v,
         soc: tables.soc,
         temperature_c: tables.temperature_c,
+        ocv_ageing_shift: head.ocv_ageing_shift,
         ocv_v: Table { values: tables.ocv_v },
         r0_ohm: Table { values: tables.r0_ohm },
         branches: branches.into_iter().map(branch).collect(),

@@ -206,6 +206,8 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
         gap_rest_current_a: keys.gap_rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
         voltage_noise_v: keys.voltage_noise_v,
         model_error_v_sqrt_s: keys.model_error_v_sqrt_s,
+        load_error_sqrt_s: keys.load_error_sqrt_s,
+        load_memory_s: keys.load_memory_s,
         max_information_s: keys.max_information_s,
         gate_sigma: keys.gate_sigma,
         gate_model_error_v: keys.gate_model_error_v,

@@ -256,6 +256,10 @@ section! {
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Slow error of the cell model under load, as part of the voltage the load drops in the cell: standard deviation of its average over one second.
+        load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
+        /// How long that error outlives the load (slow diffusion).
+        load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
         /// Longest time one voltage reading may speak for: readings further apart are no better than this.
         max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
         /// A voltage further from its prediction than this many standard deviations moves nothing.
