@@ -47,7 +47,7 @@ fn configuration() -> MonitorConfig {
     enlarge(&mut config.model, scale);
     config.estimator.initial_capacity_ah *= scale;
     config.estimator.initial_capacity_std_ah *= scale;
-    config.estimator.gap_rest_current_a *= scale;
+    config.estimator.rest_current_a *= scale;
     config.health.capacity.noise_ah_per_cycle = NOISE_AH_PER_CYCLE;
     config.estimator.model_error_v_sqrt_s = MODEL_ERROR_V_SQRT_S;
     config.health.transition.dead_band_a *= scale;

@@ -5,7 +5,7 @@
 //! Ageing multiplies R0 and every branch resistance by one ratio and leaves the time constants alone.
 
 use super::config::Discretisation;
-use super::model::{CellModel, Place};
+use super::model::{CellModel, Place, Row};
 
 /// SOC after `charge_as` ampere-seconds were taken out of `capacity_ah`.
 pub fn soc_after(soc: f64, charge_as: f64, capacity_ah: f64) -> f64 {
@@ -46,19 +46,13 @@ pub fn terminal_v(model: &CellModel, place: &Place, resistance_ratio: f64, branc
 }
 
 /// The same of a cell that has aged to `capacity_ah`: its open-circuit curve has shifted ([`CellModel::ocv_soc`]).
-pub fn aged_terminal_v(
-    model: &CellModel,
-    state: (f64, f64, f64),
-    temperature_c: f64,
-    branches_v: f64,
-    current_a: f64,
-) -> f64 {
+pub fn aged_terminal_v(model: &CellModel, state: (f64, f64, f64), row: &Row, branches_v: f64, current_a: f64) -> f64 {
     let (soc, resistance_ratio, capacity_ah) = state;
-    let place = model.place(soc, temperature_c);
+    let place = model.place_in(row, soc);
     if model.ocv_ageing_shift == 0.0 {
         return terminal_v(model, &place, resistance_ratio, branches_v, current_a);
     }
-    let ocv_v = model.ocv_v(&model.place(model.ocv_soc(soc, capacity_ah), temperature_c));
+    let ocv_v = model.ocv_v(&model.place_in(row, model.ocv_soc(soc, capacity_ah)));
     ocv_v - branches_v - model.r0_ohm(&place) * resistance_ratio * current_a
 }
 

@@ -54,12 +54,15 @@ pub struct EstimatorConfig {
     /// SOC process noise while nobody measures the current, fraction per sqrt(s).
     pub gap_noise_per_sqrt_s: f64,
     /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. A per cell.
-    pub gap_rest_current_a: f64,
+    pub rest_current_a: f64,
     /// White part of a voltage reading's error, V (sensor noise), per sample.
     pub voltage_noise_v: f64,
-    /// Slow model error expressed as information per second: standard deviation of a 1 s average, V.
+    /// Slow model error expressed as information per second: standard deviation of a 1 s average, V. Holds where the
+    /// cell model has no error of its own.
     pub model_error_v_sqrt_s: f64,
-    /// The same in proportion to the voltage the load drops in the cell: fraction of it, over one second.
+    /// The same in proportion to the voltage lost in the cell at the reading: fraction of it, over one second.
+    pub drop_error_sqrt_s: f64,
+    /// The same in proportion to the voltage the load of the last minutes drops in the cell.
     pub load_error_sqrt_s: f64,
     /// How long the model's error outlives the load that made it (slow diffusion), s.
     pub load_memory_s: f64,

@@ -15,9 +15,11 @@
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
 //! Effect: the sample rate does not change the result.
 //!
-//! Deviation 4: model^2 grows with the voltage the load drops in the cell, and with the load of the last minutes:
-//! model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record that
-//! begins under load, or the constant-voltage part of a charge, no longer passes for exact.
+//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's own error over SOC and
+//! temperature where its fit has left one; the drop is the voltage lost in the cell now, the load that of the last
+//! minutes: model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record
+//! that begins under load, or the constant-voltage part of a charge, no longer passes for exact, nor does the cold.
+//! At rest the error repeats instead of averaging out: a rest of t adds the information of t_100 ln(1 + t/t_100) only.
 //! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model says so. Effect: top
 //! and bottom of an aged cell agree about its capacity.
 //!
@@ -29,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use super::circuit::{self, BranchAt};
 use super::config::{CapacityState, EstimatorConfig};
-use super::model::{CellModel, MAX_BRANCHES, Place};
+use super::model::{CellModel, ERROR_WINDOW_S, MAX_BRANCHES, Place, Row};
 use crate::filter::{Belief, FilterError, Gaussian, Noise, Spread, Update};
 
 /// A variance that stands for "known": small against any noise, large against rounding.
@@ -104,6 +106,9 @@ struct Memory {
     mean_nis: f64,
     /// Time the next voltage reading speaks for, s: since the last one that was used.
     information_s: f64,
+    /// How long the cell has rested, s.
+    #[serde(default)]
+    rest_s: f64,
     /// Readings beyond the gate in a row, and since how long, s.
     rejected: u32,
     rejected_s: f64,
@@ -148,6 +153,7 @@ impl CellEstimator {
                 load_a: 0.0,
                 mean_nis: 0.0,
                 information_s: config.max_information_s,
+                rest_s: 0.0,
                 rejected: 0,
                 rejected_s: 0.0,
                 rejected_after_gap: false,
@@ -184,15 +190,28 @@ impl CellEstimator {
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
         }
         self.remember_load(model, config, step);
-        self.memory.information_s += step.measured_s + step.unmeasured_s;
+        self.memory.information_s += self.new_information_s(config, step);
         self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
         let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
         let load_a = self.memory.load_a;
-        let reading = Reading { voltage_v: step.voltage_v, current_a, load_a, temperature_c, information_s };
+        let row = model.row(temperature_c);
+        let reading = Reading { voltage_v: step.voltage_v, current_a, load_a, row, information_s };
         let update = each!(filter, x => update(x, model, config, &reading))?;
         self.watch(config, step, &update);
         Ok(Some(update))
+    }
+
+    /// Time for which the present reading says something new, s: all of it under load, ever less of a rest.
+    fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
+        let elapsed_s = step.measured_s + step.unmeasured_s;
+        if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
+            self.memory.rest_s = 0.0;
+            return elapsed_s;
+        }
+        let before_s = self.memory.rest_s;
+        self.memory.rest_s += elapsed_s;
+        ERROR_WINDOW_S * libm::log((ERROR_WINDOW_S + self.memory.rest_s) / (ERROR_WINDOW_S + before_s))
     }
 
     /// Follows the load; after a gap with a load beside it, what went on in the gap may have been the heaviest usual one.
@@ -206,7 +225,7 @@ impl CellEstimator {
         if step.unmeasured_s > 0.0 {
             memory.load_a *= keep(step.unmeasured_s);
             let beside_a = memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-            if beside_a > config.gap_rest_current_a {
+            if beside_a > config.rest_current_a {
                 memory.load_a = memory.load_a.max(beside_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
             }
         }
@@ -429,7 +448,7 @@ fn predict<const N: usize>(
         // Nobody knows the current of that time: none assumed, but a load beside the gap may have gone on in it.
         propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
         let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[N - 1]);
-        let load_std = if gap_load_a > config.gap_rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
+        let load_std = if gap_load_a > config.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
         let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s + square(load_std) / 3.0;
         x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
     }
@@ -446,11 +465,12 @@ fn propagate<const N: usize>(
     charge_as: f64,
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
+    let row = model.row(temperature_c);
     let f = |x: &SVector<f64, N>| {
         let mut next = *x;
         next[0] = circuit::soc_after(x[0], charge_as, x[N - 1]);
         // The branch's parameters at the middle of the step's SOC.
-        let place = model.place(0.5 * (x[0] + next[0]), temperature_c);
+        let place = model.place_in(&row, 0.5 * (x[0] + next[0]));
         let ratio = libm::exp(x[N - 2]);
         for i in 0..N - 3 {
             let branch = BranchAt::new(model, i, &place, ratio);
@@ -458,7 +478,7 @@ fn propagate<const N: usize>(
         }
         next
     };
-    let q = process_noise::<N>(model, config, &model.place(x.mean[0], temperature_c), dt_s);
+    let q = process_noise::<N>(model, config, &model.place_in(&row, x.mean[0]), dt_s);
     x.predict(&spread::<N>(config), f, &q)
 }
 
@@ -485,7 +505,7 @@ struct Reading {
     voltage_v: f64,
     current_a: f64,
     load_a: f64,
-    temperature_c: f64,
+    row: Row,
     information_s: f64,
 }
 
@@ -498,12 +518,17 @@ fn update<const N: usize>(
     let h = |x: &SVector<f64, N>| {
         let branches_v: f64 = (1..N - 2).fold(0.0, |sum, i| sum + x[i]);
         let state = (x[0], libm::exp(x[N - 2]), x[N - 1]);
-        circuit::aged_terminal_v(model, state, reading.temperature_c, branches_v, reading.current_a)
+        circuit::aged_terminal_v(model, state, &reading.row, branches_v, reading.current_a)
     };
-    let place = model.place(x.mean[0], reading.temperature_c);
+    let place = model.place_in(&reading.row, x.mean[0]);
     let slope_v = model.ocv_slope_v(&place);
-    let load_v = model.settled_ohm(&place) * libm::exp(x.mean[N - 2]) * reading.load_a;
-    let model_variance = square(config.model_error_v_sqrt_s) + square(config.load_error_sqrt_s * load_v);
+    let ratio = libm::exp(x.mean[N - 2]);
+    let drop_v = (1..N - 2).fold(model.r0_ohm(&place) * ratio * reading.current_a, |sum, i| sum + x.mean[i]);
+    let load_v = model.settled_ohm(&place) * ratio * reading.load_a;
+    let base_v_sqrt_s =
+        model.voltage_error_v(&place).map_or(config.model_error_v_sqrt_s, |error_v| error_v * ERROR_WINDOW_S.sqrt());
+    let model_variance =
+        square(base_v_sqrt_s) + square(config.drop_error_sqrt_s * drop_v) + square(config.load_error_sqrt_s * load_v);
     let sensor_variance = square(config.voltage_noise_v);
     let noise = Noise {
         variance: sensor_variance + model_variance / reading.information_s,

@@ -250,12 +250,14 @@ section! {
         log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("3e-4");
         /// Process noise of the SOC while nobody measures the current (asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
-        /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. Without it: the rated capacity over 50 h (C/50), per cell.
-        gap_rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
+        /// A current up to this is rest; one beyond it beside a gap may have gone on in it. Without it: the rated capacity over 50 h (C/50), per cell.
+        rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
-        /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this.
+        /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this. Where the cell model has a `voltage_error_v`, that holds instead.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Slow error of the cell model, as part of the voltage lost in the cell at the reading: standard deviation of its average over one second.
+        drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
         /// Slow error of the cell model under load, as part of the voltage the load drops in the cell: standard deviation of its average over one second.
         load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
         /// How long that error outlives the load (slow diffusion).

@@ -31,9 +31,10 @@ pub fn usable_ah(
     let step_s = 3600.0 * step_ah / config.current_a;
     let mut branch_v = [0.0; MAX_BRANCHES];
     let mut soc = full_soc;
+    let row = model.row(config.temperature_c);
     let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
         let state = (soc, resistance_ratio, capacity_ah);
-        aged_terminal_v(model, state, config.temperature_c, branch_v.iter().sum(), config.current_a)
+        aged_terminal_v(model, state, &row, branch_v.iter().sum(), config.current_a)
     };
     let mut before_v = voltage(soc, &branch_v);
     if before_v <= config.cutoff_v {
@@ -41,7 +42,7 @@ pub fn usable_ah(
     }
     for k in 0..MAX_STEPS {
         let next = soc_after(soc, 3600.0 * step_ah, capacity_ah);
-        let place = model.place(0.5 * (soc + next), config.temperature_c);
+        let place = model.place_in(&row, 0.5 * (soc + next));
         for (i, v) in branch_v.iter_mut().enumerate().take(model.branches.len()) {
             let branch = BranchAt::new(model, i, &place, resistance_ratio);
             *v = branch.voltage_after(Discretisation::Exact, *v, config.current_a, step_s);
