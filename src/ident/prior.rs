@@ -1,0 +1,158 @@
+//! What is believed before the data: smooth tables, Arrhenius' law between temperatures, an OCV near the slow test's.
+//!
+//! Each belief is a linear combination of node parameters with a target and a standard deviation. Curvature is
+//! measured as the integral of the squared second derivative over SOC, so the belief does not depend on the grid.
+
+use super::grid::{Grid, arrhenius};
+use super::parameters::Layout;
+use super::pass::Normal;
+
+/// Standard deviations of the beliefs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Beliefs {
+    /// Curvature of the OCV over SOC, V (root of the integral of (d2/ds2)^2): of the curve itself without a slow
+    /// test, of the correction with one.
+    pub ocv_curvature_v: f64,
+    /// Difference of the OCV (of the correction) between temperatures 10 K apart, V.
+    pub ocv_by_temperature_v: f64,
+    /// Pull of the OCV to the slow test, V per node; unused without one.
+    pub ocv_pull_v: f64,
+    /// Curvature of ln R0 over SOC.
+    pub r0_curvature: f64,
+    /// Curvature of each ln R over SOC.
+    pub r_curvature: f64,
+    /// Curvature of each ln tau over SOC.
+    pub tau_curvature: f64,
+    /// Difference of ln R from Arrhenius' law between temperatures 10 K apart.
+    pub r_by_temperature: f64,
+    /// Difference of ln tau between temperatures 10 K apart.
+    pub tau_by_temperature: f64,
+    /// Distance of ln R from its starting value.
+    pub r_level: f64,
+    /// Distance of ln tau from its starting value.
+    pub tau_level: f64,
+}
+
+impl Beliefs {
+    /// Without a slow test: the OCV is whatever the data say.
+    pub const FREE_OCV: Self = Self {
+        ocv_curvature_v: 50.0,
+        ocv_by_temperature_v: 0.01,
+        ocv_pull_v: f64::INFINITY,
+        r0_curvature: 30.0,
+        r_curvature: 40.0,
+        tau_curvature: 10.0,
+        r_by_temperature: 0.3,
+        tau_by_temperature: 0.3,
+        r_level: 3.0,
+        tau_level: 1.0,
+    };
+
+    /// With a slow test: a smooth correction of it that fades where there are no drives.
+    pub const SLOW_TEST: Self =
+        Self { ocv_curvature_v: 3.0, ocv_by_temperature_v: 0.02, ocv_pull_v: 0.03, ..Self::FREE_OCV };
+}
+
+/// One belief: sum of factor x parameter = target, within sigma.
+#[derive(Debug, Clone, PartialEq)]
+struct Belief {
+    terms: Vec<(usize, f64)>,
+    target: f64,
+    sigma: f64,
+}
+
+/// All beliefs of one fit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Prior(Vec<Belief>);
+
+impl Prior {
+    /// Beliefs round the starting values `start`; `slow_test` = the OCV of `start` is a measured one.
+    pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, beliefs: &Beliefs) -> Self {
+        let mut prior = Self(Vec::new());
+        let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };
+        prior.curvature(grid, 0, reference, beliefs.ocv_curvature_v);
+        prior.by_temperature(grid, 0, reference, beliefs.ocv_by_temperature_v);
+        if slow_test {
+            prior.level(0, reference, beliefs.ocv_pull_v);
+        }
+        let arrhenius_ln = per_node(grid, |t| libm::log(arrhenius(t)));
+        let flat = vec![0.0; layout.nodes];
+        let level = |first: usize| &start[first..first + layout.nodes];
+        prior.curvature(grid, layout.r0(), &flat, beliefs.r0_curvature);
+        prior.by_temperature(grid, layout.r0(), &arrhenius_ln, beliefs.r_by_temperature);
+        prior.level(layout.r0(), level(layout.r0()), beliefs.r_level);
+        for i in 0..layout.branches {
+            let (r, tau) = (layout.branch_r(i), layout.branch_tau(i));
+            prior.curvature(grid, r, &flat, beliefs.r_curvature);
+            prior.by_temperature(grid, r, &arrhenius_ln, beliefs.r_by_temperature);
+            prior.level(r, level(r), beliefs.r_level);
+            prior.curvature(grid, tau, &flat, beliefs.tau_curvature);
+            prior.by_temperature(grid, tau, &flat, beliefs.tau_by_temperature);
+            prior.level(tau, level(tau), beliefs.tau_level);
+        }
+        prior
+    }
+
+    /// Adds the beliefs' cost and derivatives at `theta`.
+    pub fn accumulate(&self, theta: &[f64], normal: &mut Normal) {
+        let (mut index, mut j) = (Vec::new(), Vec::new());
+        for belief in &self.0 {
+            index.clear();
+            j.clear();
+            let mut residual = -belief.target;
+            for &(at, factor) in &belief.terms {
+                residual += factor * theta[at];
+                index.push(at);
+                j.push(factor);
+            }
+            let weight = 1.0 / (belief.sigma * belief.sigma);
+            normal.cost += 0.5 * weight * residual * residual;
+            normal.add(&index, &j, residual, weight);
+        }
+    }
+
+    fn push(&mut self, terms: Vec<(usize, f64)>, first: usize, reference: &[f64], sigma: f64) {
+        let target = terms.iter().map(|&(at, factor)| factor * reference[at - first]).sum();
+        self.0.push(Belief { terms, target, sigma });
+    }
+
+    /// Second derivative over SOC as that of `reference`.
+    fn curvature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
+        let columns = grid.soc.len();
+        for row in 0..grid.temperature_c.len() {
+            for (s, soc) in grid.soc.windows(3).enumerate() {
+                let (a, b) = (soc[1] - soc[0], soc[2] - soc[1]);
+                let width = 0.5 * (a + b);
+                let scale = width.sqrt() / width;
+                let at = first + row * columns + s;
+                let terms =
+                    vec![(at, scale / a), (at + 1, -scale * (1.0 / a + 1.0 / b)), (at + 2, scale / b)];
+                self.push(terms, first, reference, sigma);
+            }
+        }
+    }
+
+    /// Difference between neighbouring temperatures as that of `reference`; a random walk over temperature.
+    fn by_temperature(&mut self, grid: &Grid, first: usize, reference: &[f64], sigma: f64) {
+        let columns = grid.soc.len();
+        for (row, pair) in grid.temperature_c.windows(2).enumerate() {
+            let widened = sigma * ((pair[1] - pair[0]) / 10.0).sqrt();
+            for s in 0..columns {
+                let at = first + row * columns + s;
+                self.push(vec![(at, -1.0), (at + columns, 1.0)], first, reference, widened);
+            }
+        }
+    }
+
+    /// Near `reference` itself.
+    fn level(&mut self, first: usize, reference: &[f64], sigma: f64) {
+        for at in first..first + reference.len() {
+            self.push(vec![(at, 1.0)], first, reference, sigma);
+        }
+    }
+}
+
+/// A value per temperature, for every node.
+pub(crate) fn per_node(grid: &Grid, value: impl Fn(f64) -> f64) -> Vec<f64> {
+    grid.temperature_c.iter().flat_map(|&t| vec![value(t); grid.soc.len()]).collect()
+}
