@@ -1,9 +1,10 @@
 //! SOC of every raw row, by explicit rules; a file whose beginning is unknown is refused.
 //!
-//! 1. A stretch must begin with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within [`LOAD_SAG_V`] of it when
-//!    current flows already.
-//! 2. With the cycler's counter, SOC = 1 - (counter - c0) / capacity, c0 being 0 when the counter begins within
-//!    [`COUNTER_NEAR`] of 0 (what little it shows was really taken out) and the first value otherwise (it was reset elsewhere).
+//! 1. A stretch must begin with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
+//!    [`LOAD_SAG_V`] of it when current flows already.
+//! 2. With the cycler's counter, SOC = 1 - counter / capacity when the counter begins within [`COUNTER_NEAR`] of 0: what
+//!    little it shows was really taken out. A counter that begins lower was reset before the charge: differences count.
+//!    One that begins higher was reset at full and says that the cell is not full any more: refused.
 //! 3. Without a counter the current is integrated from 1.
 
 use super::charge_ah;
@@ -13,7 +14,7 @@ const REST_SAG_V: f64 = 0.1;
 /// A full cell under load, V.
 const LOAD_SAG_V: f64 = 0.35;
 /// Current from which a cell is under load, as a share of its capacity per hour.
-const LOAD_SHARE: f64 = 0.1;
+const LOAD_SHARE: f64 = 0.02;
 /// A counter that begins within this share of the capacity counts from the full cell.
 const COUNTER_NEAR: f64 = 0.003;
 
@@ -27,6 +28,12 @@ pub enum AnchorError {
         voltage_v: f64,
         /// Least voltage of a full cell, V.
         needed_v: f64,
+    },
+    /// Its counter says that charge was taken out before.
+    #[error("discharged_ah begins at {counter_ah} Ah, expected 0 or below: charge was taken out before the first row")]
+    TakenBefore {
+        /// First value, Ah.
+        counter_ah: f64,
     },
 }
 
@@ -47,15 +54,18 @@ impl Stretch<'_> {
     /// Charge taken out since full at every row, Ah.
     ///
     /// # Errors
-    /// When it does not begin full.
+    /// When it does not begin full, or so that it cannot be told.
     pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, AnchorError> {
         self.begins_full(voltage_max_v, capacity_hint_ah)?;
         if self.discharged_ah[0].is_nan() {
             return Ok(charge_ah(self.time_s, self.current_a));
         }
         let first_ah = self.discharged_ah[0];
-        let near = first_ah.abs() <= COUNTER_NEAR * capacity_hint_ah;
-        let zero_ah = if near { 0.0 } else { first_ah };
+        let near_ah = COUNTER_NEAR * capacity_hint_ah;
+        if first_ah > near_ah {
+            return Err(AnchorError::TakenBefore { counter_ah: first_ah });
+        }
+        let zero_ah = if first_ah >= -near_ah { 0.0 } else { first_ah };
         let mut last = first_ah - zero_ah;
         // An empty field keeps the counter where it was.
         let mut hold = |counter: f64| {
@@ -92,6 +102,11 @@ mod tests {
         assert_eq!(taken_out(4.17, 0.1, [0.002, 0.5]), Ok(vec![0.002, 0.5]));
         assert_eq!(taken_out(4.17, 0.1, [-0.5, 0.5]), Ok(vec![0.0, 1.0]));
         assert_eq!(taken_out(3.95, 2.0, [-1.0, 0.5]), Ok(vec![0.0, 1.5]));
+    }
+
+    #[test]
+    fn a_counter_that_shows_charge_taken_out_is_refused() {
+        assert_eq!(taken_out(4.15, 0.1, [0.12, 0.5]), Err(AnchorError::TakenBefore { counter_ah: 0.12 }));
     }
 
     #[test]

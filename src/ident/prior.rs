@@ -48,6 +48,11 @@ impl Beliefs {
         tau_level: 1.0,
     };
 
+    /// Discharges and charges at one current each tell R0 from the branch only at their beginnings: R0 hardly bends,
+    /// the time constant stays where it is.
+    pub const AGEING: Self =
+        Self { r0_curvature: 3.0, tau_curvature: 0.1, tau_level: 0.02, ..Self::FREE_OCV };
+
     /// With a slow test: a smooth correction of it that fades where there are no drives.
     pub const SLOW_TEST: Self =
         Self { ocv_curvature_v: 3.0, ocv_by_temperature_v: 0.02, ocv_pull_v: 0.03, ..Self::FREE_OCV };

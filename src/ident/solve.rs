@@ -12,10 +12,11 @@ use super::pass::Normal;
 /// Most passes over the data.
 const MAX_PASSES: usize = 60;
 /// Relative fall of the cost below which the fit has converged, twice running.
-const CONVERGED: f64 = 1e-5;
+const CONVERGED: f64 = 3e-4;
 /// Damping at the start, relative to the curvature's diagonal; it falls and grows by the factors after it.
-const DAMPING_START: f64 = 1e-3;
+const DAMPING_START: f64 = 0.3;
 const DAMPING_FALL: f64 = 0.1;
+const DAMPING_MIN: f64 = 1e-4;
 const DAMPING_GROWTH: f64 = 8.0;
 /// Damping at which no step helps any more.
 const DAMPING_MAX: f64 = 1e8;
@@ -115,6 +116,7 @@ pub fn minimise(
         let y = space.to_steps(&theta);
         let (h, g) = space.pull_back(&normal);
         loop {
+            if std::env::var("DBGFIT").is_ok() { eprintln!("damping {damping:e} cost {}", normal.cost); }
             let step = bounded_step(&h, &g, damping, &y, space);
             let trial = step.map(|step| {
                 let moved: Vec<f64> = y.iter().zip(step.iter()).map(|(y, d)| y + d).collect();
@@ -126,7 +128,7 @@ pub fn minimise(
                 let fall = (normal.cost - better.cost) / normal.cost;
                 still = if fall < CONVERGED { still + 1 } else { 0 };
                 (theta, normal) = (trial, better);
-                damping *= DAMPING_FALL;
+                damping = (damping * DAMPING_FALL).max(DAMPING_MIN);
                 progress(passes, normal.cost);
                 break;
             }

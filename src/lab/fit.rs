@@ -186,7 +186,11 @@ fn settings(request: &Request, prepared: &prepare::Prepared<'_>) -> Result<Setti
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
         empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
-        beliefs: if slow_test { Beliefs::SLOW_TEST } else { Beliefs::FREE_OCV },
+        beliefs: match (ageing, slow_test) {
+            (true, _) => Beliefs::AGEING,
+            (false, true) => Beliefs::SLOW_TEST,
+            (false, false) => Beliefs::FREE_OCV,
+        },
     })
 }
 
@@ -226,7 +230,7 @@ fn by_file(
 
 fn add_notes(outcome: &mut Outcome) {
     if outcome.thermal.is_none() {
-        outcome.notes.push("no thermal parameters: no file with temperature warms by 2 K from rest".into());
+        outcome.notes.push("no thermal parameters: no file's temperature tells them".into());
     }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {
