@@ -3,10 +3,11 @@
 //! The way of the numbers: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, places in
 //! the tables, weights) -> [`pass`] (residuals and the exact Jacobian by sensitivity recursion) with [`prior`]
 //! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (the whole, residuals per file, nodes without data).
-//! [`thermal`] fits heat capacity and thermal resistance afterwards.
+//! [`error_table`] says how wrong the result is, [`thermal`] fits heat capacity and thermal resistance afterwards.
 
 pub mod ageing;
 pub mod anchor;
+pub mod error_table;
 pub mod fit;
 pub mod grid;
 pub mod parameters;

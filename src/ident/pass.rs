@@ -17,7 +17,7 @@ pub const HUBER_V: f64 = 0.05;
 /// Residual whose independent occurrence costs one half, V: the size of a good circuit's model error.
 const SIGMA_V: f64 = 0.010;
 /// Seconds over which model error repeats itself: one independent residual in this time.
-const REPEATS_S: f64 = 20.0;
+const REPEATS_S: f64 = 50.0;
 
 /// Normal equations in the nodes' own parameters.
 #[derive(Debug, Clone)]

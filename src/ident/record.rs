@@ -109,6 +109,39 @@ impl Record {
     }
 }
 
+/// Time for which a whole discharge counts, s: a drive's. What takes longer says no more about the tables.
+const WHOLE_S: f64 = 8000.0;
+/// What slow and pulse tests count next to drives: the model is to follow drives.
+const TEST_SHARE: f64 = 0.3;
+/// Share of the time in which current flows, and variation of its size relative to its mean, of a drive.
+const DRIVE: (f64, f64) = (0.5, 0.3);
+
+/// 1 for a drive (current flows most of the time, at varying strength), less for rests with pulses and for constant current.
+pub fn share(record: &Record) -> f64 {
+    let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
+    let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
+    for row in &record.rows {
+        let size = row.mean_current_a.abs();
+        all += row.dt_s;
+        if size > REST_SHARE * largest {
+            flowing += row.dt_s;
+            first += size * row.dt_s;
+            second += size * size * row.dt_s;
+        }
+    }
+    let variation = (second * flowing / (first * first) - 1.0).max(0.0).sqrt();
+    if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
+}
+
+/// What a second of the record weighs: by the SOC it covers, not by how long it takes, times its [`share`].
+pub fn weight(record: &Record) -> f64 {
+    let judged = record.rows.iter().filter(|row| row.weight_s > 0.0);
+    let (low, high, seconds) = judged.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), row| {
+        (f64::min(low, row.soc), f64::max(high, row.soc), sum + row.weight_s)
+    });
+    if seconds > 0.0 { share(record) * (high - low) * WHOLE_S / seconds } else { 0.0 }
+}
+
 /// The raw rows at which blocks end; the first row is a block of its own.
 fn block_ends(raw: &Raw<'_>, largest_a: f64) -> Vec<usize> {
     let (time_s, current_a) = (raw.time_s, raw.current_a);

@@ -16,8 +16,8 @@ use crate::cell::Thermal;
 use crate::ident::fit::{Fit, Residual, Settings};
 use crate::ident::grid::Grid;
 use crate::ident::prior::Beliefs;
-use crate::ident::record::Record;
-use crate::ident::{fit, thermal};
+use crate::ident::record::{self, Record};
+use crate::ident::{error_table, fit, thermal};
 
 /// Least part of the SOC range the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
@@ -26,6 +26,8 @@ const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9,
     0.95, 0.975, 1.0,
 ];
+/// The same where slow tests give the OCV's shape.
+const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
 /// The same for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
@@ -98,7 +100,11 @@ pub struct Outcome {
     pub voltage_v: (f64, f64),
     /// Thermal parameters where the data tell them.
     pub thermal: Option<Thermal>,
-    /// Per file.
+    /// Standard deviation of the model's error averaged over 100 s, V, in node order.
+    pub voltage_error_v: Vec<f64>,
+    /// Of an ageing cell: residuals of discharges and of charges.
+    pub by_kind: Option<(Residual, Residual)>,
+    /// Per file, slow tests last.
     pub files: Vec<FileResidual>,
     /// The records fitted, in the order of the files; for plots.
     pub records: Vec<Record>,
@@ -130,11 +136,17 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(Progress::Pass(pass, cost)));
     let fitted = fitted.map_err(|error| FitFailure(error.to_string()))?;
     let thermal = thermal::fit(&records, &fitted.tables);
-    let files = by_file(&files, &prepared, &records, &fitted);
+    let shares: Vec<f64> = records.iter().map(record::share).collect();
+    let voltage_error_v = error_table::table(&fitted, &records, &shares, prepared.capacity_ah);
+    let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
+    let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
+    let files = by_file(&all, &prepared, &records, &fitted);
     let mut outcome = Outcome {
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
         thermal,
+        voltage_error_v,
+        by_kind,
         files,
         records,
         notes: prepared.notes,
@@ -176,21 +188,21 @@ fn settings(request: &Request, prepared: &prepare::Prepared<'_>) -> Result<Setti
         (Some(tau_s), _) => tau_s.clone(),
         (None, branches) => TAU_S[branches.unwrap_or(if ageing { 1 } else { 2 }) - 1].to_vec(),
     };
-    let usual = if ageing { AGEING_SOC_NODES.to_vec() } else { SOC_NODES.to_vec() };
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let slow_test = !prepared.ocv.is_empty();
+    let (usual, beliefs): (&[f64], _) = match (ageing, slow_test) {
+        (true, _) => (&AGEING_SOC_NODES, Beliefs::AGEING),
+        (false, true) => (&SLOW_TEST_SOC_NODES, Beliefs::SLOW_TEST),
+        (false, false) => (&SOC_NODES, Beliefs::FREE_OCV),
+    };
     Ok(Settings {
-        grid: Grid { soc: request.soc.clone().unwrap_or(usual), temperature_c },
+        grid: Grid { soc: request.soc.clone().unwrap_or_else(|| usual.to_vec()), temperature_c },
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
         empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
-        beliefs: match (ageing, slow_test) {
-            (true, _) => Beliefs::AGEING,
-            (false, true) => Beliefs::SLOW_TEST,
-            (false, false) => Beliefs::FREE_OCV,
-        },
+        beliefs,
     })
 }
 
@@ -209,12 +221,12 @@ fn check_range(records: &[Record]) -> Result<(), FitFailure> {
 }
 
 fn by_file(
-    files: &[MeasuredFile],
+    files: &[&MeasuredFile],
     prepared: &prepare::Prepared<'_>,
     records: &[Record],
     fitted: &Fit,
 ) -> Vec<FileResidual> {
-    let of_file = |(number, file): (usize, &MeasuredFile)| {
+    let of_file = |(number, file): (usize, &&MeasuredFile)| {
         let own = || prepared.sources.iter().enumerate().filter(move |(_, source)| source.file == number);
         let only: Vec<Record> = own().map(|(i, _)| records[i].clone()).collect();
         FileResidual {

@@ -4,9 +4,9 @@ use super::{FitFailure, Request};
 use crate::ident::Raw;
 use crate::ident::ageing::{self, HalfCycle};
 use crate::ident::anchor::Stretch;
-use crate::ident::fit::OcvCurve;
+use crate::ident::fit::{self, Fit, OcvCurve, Residual};
 use crate::ident::grid::Grid;
-use crate::ident::record::{Limits, Record};
+use crate::ident::record::{self, Limits, Record};
 use crate::lab::measured::{MeasuredFile, Part};
 
 /// Temperature taken where a file has none, degrees C.
@@ -29,7 +29,8 @@ pub(super) struct Source<'a> {
     part: Clean<'a>,
     soc: Vec<f64>,
     judged: Vec<bool>,
-    scale: f64,
+    /// What each second weighs; `None` = by the SOC it covers and by what it is.
+    scale: Option<f64>,
 }
 
 /// Everything that is known before the grid is.
@@ -94,7 +95,7 @@ impl<'a> Clean<'a> {
 pub(super) fn prepare<'a>(
     request: &Request,
     files: &'a [MeasuredFile],
-    slow: &[MeasuredFile],
+    slow: &'a [MeasuredFile],
 ) -> Result<Prepared<'a>, FitFailure> {
     let voltage_v = voltage_limits(request, files)?;
     let mut notes = Vec::new();
@@ -129,9 +130,11 @@ pub(super) fn prepare<'a>(
         soc: out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect(),
         part,
         judged: vec![],
-        scale: 1.0,
+        scale: None,
     });
-    let sources = sources.collect();
+    let mut sources: Vec<Source<'a>> = sources.collect();
+    let slow_sources = slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
+    sources.extend(slow_sources.collect::<Result<Vec<_>, _>>()?);
     let ocv = tests.iter().map(|test| test.curve(capacity_ah)).collect();
     Ok(Prepared { sources, capacity_ah, voltage_v, ocv, notes })
 }
@@ -225,6 +228,23 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, F
     Ok(test)
 }
 
+/// A slow test's discharge as data beside the drives.
+fn slow_source(
+    file: &MeasuredFile,
+    number: usize,
+    voltage_max_v: f64,
+    capacity_ah: f64,
+) -> Result<Source<'_>, FitFailure> {
+    let part = Clean::new(&file.parts[0]);
+    let out_ah = part.stretch().taken_out_ah(voltage_max_v, capacity_ah);
+    let out_ah = out_ah.map_err(|e| FitFailure(format!("{}: {e}", file.path.display())))?;
+    let most = (0..out_ah.len()).fold(0, |most, k| if out_ah[k] > out_ah[most] { k } else { most });
+    // What follows the discharge is judged by nobody.
+    let judged = (0..out_ah.len()).map(|k| k <= most).collect();
+    let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
+    Ok(Source { file: number, part, soc, judged, scale: None })
+}
+
 fn ageing_sources<'a>(
     files: &'a [MeasuredFile],
     first: usize,
@@ -252,7 +272,7 @@ fn ageing_sources<'a>(
             let Some(mut part) = early[half.index].take() else { continue };
             let scale = if part.part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
             part.current_a = half.current_a;
-            prepared.sources.push(Source { file: number, part, soc: half.soc, judged: half.judged, scale });
+            prepared.sources.push(Source { file: number, part, soc: half.soc, judged: half.judged, scale: Some(scale) });
         }
     }
     Ok(prepared)
@@ -285,7 +305,20 @@ impl Prepared<'_> {
             };
             Record::prepare(&raw, &source.judged, grid, &limits)
         };
-        (self.sources.iter().map(record).collect(), self.sources.iter().map(|source| source.scale).collect())
+        let records: Vec<Record> = self.sources.iter().map(record).collect();
+        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| record::weight(r)));
+        let scale = scale.collect();
+        (records, scale)
+    }
+
+    /// Residuals of the discharges and of the charges.
+    pub(super) fn by_kind(&self, records: &[Record], fitted: &Fit) -> (Residual, Residual) {
+        let of_kind = |discharge: bool| {
+            let own = self.sources.iter().zip(records).filter(|(s, _)| (s.part.part.kind == "discharge") == discharge);
+            let own: Vec<Record> = own.map(|(_, record)| record.clone()).collect();
+            fit::judge(&own, &fitted.tables).1
+        };
+        (of_kind(true), of_kind(false))
     }
 
     /// Temperatures the files were taken at: the coldest decile of each (cells warm under load), those close
@@ -307,6 +340,6 @@ impl Prepared<'_> {
             }
             last = t;
         }
-        nodes.iter().map(|(sum, count)| (sum / count).round()).collect()
+        nodes.iter().map(|(sum, count)| (sum / count).round() + 0.0).collect()
     }
 }

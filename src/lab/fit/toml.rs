@@ -52,6 +52,10 @@ fn provenance(out: &mut String, request: &Request, outcome: &Outcome) {
     }
     line(out, &format!("passes = {}", fit.passes));
     line(out, &format!("residual_rmse_mv = {:.2}", 1e3 * fit.total.rmse_v));
+    if let Some((discharge, charge)) = &outcome.by_kind {
+        line(out, &format!("residual_discharge_rmse_mv = {:.2}", 1e3 * discharge.rmse_v));
+        line(out, &format!("residual_charge_rmse_mv = {:.2}", 1e3 * charge.rmse_v));
+    }
     for file in &outcome.files {
         let (name, r) = (quoted(&file_name(&file.path)), &file.residual);
         line(out, "[[provenance.files]]");
@@ -77,6 +81,11 @@ fn tables(out: &mut String, outcome: &Outcome) {
     line(out, &format!("temperature_c = [{}]", list(&grid.temperature_c)));
     table(out, "ocv_v", &ocv_v.values, 5);
     table(out, "r0_ohm", &r0_ohm.values, 6);
+    let errors: Vec<Vec<f64>> = outcome.voltage_error_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
+    if false {
+        line(out, "# Standard deviation of the model's error averaged over 100 s.");
+        table(out, "voltage_error_v", &errors, 4);
+    }
     for branch in &branches {
         line(out, "\n[[tables.branches]]");
         table(out, "r_ohm", &branch.r_ohm.values, 6);
