@@ -56,6 +56,9 @@ pub(crate) struct Args {
     /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
     #[arg(long, value_name = "N")]
     first_cycles: Option<usize>,
+    /// Plot of the residuals to write
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -101,6 +104,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     bar.clear();
     let outcome = result.map_err(|error| Failure::new(error.to_string()))?;
     write_model(args, &fit::text(&request, &outcome)).map_err(|error| Failure::new(error.to_string()))?;
+    if let Some(path) = &args.plot {
+        fit::write_plot(path, &outcome).map_err(|error| Failure::new(error.to_string()))?;
+    }
     let seconds = begin.elapsed().as_secs_f64();
     let shown = if args.json { report::json(&outcome, seconds) } else { report::table(&outcome, seconds, &args.out) };
     shown.map_err(|error| Failure::new(format!("standard output: {error}")))

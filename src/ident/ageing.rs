@@ -145,8 +145,7 @@ mod tests {
         let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
         let fall = |k: f64| if k < 90.0 { 4.2 - 0.01 * k } else { 3.3 - 0.06 * (k - 90.0) };
         let voltage_v: Vec<f64> = (0..=100).map(|k| fall(f64::from(k))).collect();
-        let discharge =
-            |current_a| HalfCycle { discharge: true, time_s: &time_s, current_a, voltage_v: &voltage_v };
+        let discharge = |current_a| HalfCycle { discharge: true, time_s: &time_s, current_a, voltage_v: &voltage_v };
         let (fresh, faded, charging) = ([2.0; 101], [1.9; 101], [-2.1; 101]);
         let charge = HalfCycle { discharge: false, current_a: &charging, ..discharge(&fresh) };
         let cycles = [discharge(&fresh), charge, discharge(&faded)];

@@ -205,7 +205,11 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         let voltages: Vec<f64> = (0..curves.len()).map(|c| curve_at(curves, c, soc)).collect();
         interpolate(&temperatures, &voltages, t)
     };
-    grid.temperature_c.iter().flat_map(|&t| grid.soc.iter().map(move |&soc| (t, soc))).map(|(t, soc)| at(t, soc)).collect()
+    grid.temperature_c
+        .iter()
+        .flat_map(|&t| grid.soc.iter().map(move |&soc| (t, soc)))
+        .map(|(t, soc)| at(t, soc))
+        .collect()
 }
 
 /// A curve's voltage; below the SOC at which a cold test ended, the shape of the next warmer one hangs on to it.
@@ -241,8 +245,7 @@ fn space(settings: &Settings, layout: &Layout, start: &[f64]) -> Space {
     let (least_v, most_v) = settings.voltage_v;
     for row in 0..grid.temperature_c.len() {
         let first = row * layout.columns;
-        (low[first], high[first]) =
-            settings.empty_ocv_v.map_or((0.5 * least_v, most_v), |v| (v - 1e-6, v + 1e-6));
+        (low[first], high[first]) = settings.empty_ocv_v.map_or((0.5 * least_v, most_v), |v| (v - 1e-6, v + 1e-6));
         for s in 1..layout.columns {
             let width = grid.soc[s] - grid.soc[s - 1];
             let slope = settings.min_slope_v.iter().filter(|(from, _)| grid.soc[s] > *from).map(|(_, slope)| *slope);

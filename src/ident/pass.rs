@@ -215,11 +215,7 @@ fn derivatives(
 /// Cost of a residual and the weight its square gets in the normal equations.
 fn huber(residual: f64) -> (f64, f64) {
     let size = residual.abs();
-    if size <= HUBER_V {
-        (0.5 * residual * residual, 1.0)
-    } else {
-        (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size)
-    }
+    if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }
 }
 
 /// Seconds of judged rows near each node.

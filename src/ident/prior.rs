@@ -68,6 +68,7 @@ impl Beliefs {
         r0_curvature: 0.005,
         r_curvature: 0.5,
         tau_curvature: 0.01,
+        r_level: 0.7,
         tau_level: 0.01,
         ..Self::FREE_OCV
     };
@@ -144,8 +145,7 @@ impl Prior {
                 let (a, b) = (soc[1] - soc[0], soc[2] - soc[1]);
                 let scale = 0.5 * (a + b);
                 let at = first + row * columns + s;
-                let terms =
-                    vec![(at, scale / a), (at + 1, -scale * (1.0 / a + 1.0 / b)), (at + 2, scale / b)];
+                let terms = vec![(at, scale / a), (at + 1, -scale * (1.0 / a + 1.0 / b)), (at + 2, scale / b)];
                 self.push(terms, first, reference, sigma);
             }
         }

@@ -116,7 +116,6 @@ pub fn minimise(
         let y = space.to_steps(&theta);
         let (h, g) = space.pull_back(&normal);
         loop {
-            if std::env::var("DBGFIT").is_ok() { eprintln!("damping {damping:e} cost {}", normal.cost); }
             let step = bounded_step(&h, &g, damping, &y, space);
             let trial = step.map(|step| {
                 let moved: Vec<f64> = y.iter().zip(step.iter()).map(|(y, d)| y + d).collect();
@@ -253,8 +252,7 @@ mod tests {
             }
             normal
         };
-        let space =
-            Space { low: vec![-10.0, 0.5, 0.5, 0.5], high: vec![10.0, 9.0, 9.0, 9.0], rising: vec![(0, 4)] };
+        let space = Space { low: vec![-10.0, 0.5, 0.5, 0.5], high: vec![10.0, 9.0, 9.0, 9.0], rising: vec![(0, 4)] };
         let solution = minimise(&space, &[0.0, 1.0, 2.0, 3.0], evaluate, |_, _| {});
         // Points 2 and 1.9 move apart to a rise of 0.5 about their middle of 1.95.
         for (found, expected) in solution.theta.iter().zip([0.0, 1.7, 2.2, 4.0]) {

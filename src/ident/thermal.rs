@@ -20,10 +20,7 @@ pub fn fit(records: &[Record], tables: &Tables) -> Option<Thermal> {
     let told = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
     let (mut capacities, mut resistances): (Vec<f64>, Vec<f64>) =
         told.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
-    Some(Thermal {
-        heat_capacity_j_per_k: median(&mut capacities)?,
-        resistance_k_per_w: median(&mut resistances)?,
-    })
+    Some(Thermal { heat_capacity_j_per_k: median(&mut capacities)?, resistance_k_per_w: median(&mut resistances)? })
 }
 
 fn median(values: &mut [f64]) -> Option<f64> {
@@ -75,8 +72,7 @@ mod tests {
     #[test]
     fn known_parameters_are_found_again_in_spite_of_a_record_that_began_cold() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
-        let tables =
-            Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], c_farad: vec![] };
+        let tables = Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], c_farad: vec![] };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = |start_c: f64| {
             let time_s: Vec<f64> = (0..3000).map(f64::from).collect();

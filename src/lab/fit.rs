@@ -4,11 +4,13 @@
 //! [`Outcome`] with the model's tables, residuals per file and everything the written TOML says ([`toml`]).
 //! Files whose SOC cannot be known are refused, all at once, with the reason.
 
+mod picture;
 mod prepare;
 mod toml;
 
 use std::path::PathBuf;
 
+pub use picture::write as write_plot;
 pub use toml::text;
 
 use super::measured::{MeasuredError, MeasuredFile};
@@ -23,8 +25,8 @@ use crate::ident::{error_table, fit, thermal};
 const MIN_SOC_RANGE: f64 = 0.5;
 /// SOC breakpoints when none are given: closer where the OCV bends.
 const SOC_NODES: [f64; 24] = [
-    0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9,
-    0.95, 0.975, 1.0,
+    0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
+    0.9, 0.95, 0.975, 1.0,
 ];
 /// The same where slow tests give the OCV's shape.
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
@@ -108,6 +110,8 @@ pub struct Outcome {
     pub files: Vec<FileResidual>,
     /// The records fitted, in the order of the files; for plots.
     pub records: Vec<Record>,
+    /// The file of each record, as an index into `files`.
+    pub file_of_record: Vec<usize>,
     /// Notes and warnings for people.
     pub notes: Vec<String>,
 }
@@ -149,6 +153,7 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
         by_kind,
         files,
         records,
+        file_of_record: prepared.sources.iter().map(|source| source.file).collect(),
         notes: prepared.notes,
         fit: fitted,
     };
@@ -255,9 +260,9 @@ fn add_notes(outcome: &mut Outcome) {
     for &t in &outcome.fit.grid.temperature_c {
         let soc: Vec<String> = weak.iter().filter(|node| node.0 == t).map(|node| format!("{}", node.1)).collect();
         if !soc.is_empty() {
-            let what = format!("no data near {t} degrees C at soc {}: these nodes follow their neighbours", soc.join(", "));
+            let what =
+                format!("no data near {t} degrees C at soc {}: these nodes follow their neighbours", soc.join(", "));
             outcome.notes.push(what);
         }
     }
 }
-

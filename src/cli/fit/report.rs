@@ -25,7 +25,6 @@ impl Bar {
             Progress::Read(done, all) => format!("read {done} of {all} files"),
             Progress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
         });
-        if std::env::var("DBGFIT").is_ok() { eprintln!("{progress:?}"); }
         self.0.tick();
     }
 

@@ -99,7 +99,8 @@ pub(super) fn prepare<'a>(
 ) -> Result<Prepared<'a>, FitFailure> {
     let voltage_v = voltage_limits(request, files)?;
     let mut notes = Vec::new();
-    let dropped: usize = files.iter().map(|f| f.rows() - f.parts.iter().map(|p| Clean::new(p).time_s.len()).sum::<usize>()).sum();
+    let dropped: usize =
+        files.iter().map(|f| f.rows() - f.parts.iter().map(|p| Clean::new(p).time_s.len()).sum::<usize>()).sum();
     if dropped > 0 {
         notes.push(format!("{dropped} rows left out: without current or voltage, or back in time"));
     }
@@ -133,7 +134,8 @@ pub(super) fn prepare<'a>(
         scale: None,
     });
     let mut sources: Vec<Source<'a>> = sources.collect();
-    let slow_sources = slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
+    let slow_sources =
+        slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
     sources.extend(slow_sources.collect::<Result<Vec<_>, _>>()?);
     let ocv = tests.iter().map(|test| test.curve(capacity_ah)).collect();
     Ok(Prepared { sources, capacity_ah, voltage_v, ocv, notes })
@@ -171,19 +173,49 @@ fn rough_capacity(part: &Clean<'_>) -> f64 {
 
 /// Given limits, else those the data keep to but for a few stray rows.
 fn voltage_limits(request: &Request, files: &[MeasuredFile]) -> Result<(f64, f64), FitFailure> {
-    let parts = files.iter().flat_map(|file| &file.parts);
-    let mut seen: Vec<f64> = parts.flat_map(|p| &p.voltage_v).copied().filter(|&v| v > DISCONNECTED_V).collect();
-    if seen.is_empty() {
-        return Err(FitFailure("no voltage in the data".into()));
+    let (low, high) = match request.first_cycles {
+        Some(first) => cycle_limits(files, first),
+        None => seen_limits(files),
     }
-    seen.sort_by(f64::total_cmp);
-    let stray = seen.len() / 10_000;
-    let low = request.voltage_min_v.unwrap_or((seen[stray] * 100.0).floor() / 100.0);
-    let high = request.voltage_max_v.unwrap_or((seen[seen.len() - 1 - stray] * 100.0).ceil() / 100.0);
+    .ok_or_else(|| FitFailure("no voltage in the data".into()))?;
+    let (low, high) = (request.voltage_min_v.unwrap_or(low), request.voltage_max_v.unwrap_or(high));
     if low >= high {
         return Err(FitFailure(format!("lowest voltage {low} V, highest {high} V: must be below it")));
     }
     Ok((low, high))
+}
+
+fn seen_limits(files: &[MeasuredFile]) -> Option<(f64, f64)> {
+    let parts = files.iter().flat_map(|file| &file.parts);
+    let mut seen: Vec<f64> = parts.flat_map(|p| &p.voltage_v).copied().filter(|&v| v > DISCONNECTED_V).collect();
+    seen.sort_by(f64::total_cmp);
+    let stray = seen.len() / 10_000;
+    let (low, high) = (seen.get(stray)?, seen.get(seen.len().checked_sub(1 + stray)?)?);
+    Some(((low * 100.0).floor() / 100.0, (high * 100.0).ceil() / 100.0))
+}
+
+/// Limits of whole cycles: every discharge ends with its first row below the cut-off, which comes in steps of 0.1 V, so
+/// the highest of these rows tells it; charges hold their voltage, of which the middle one counts.
+fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(f64, f64)> {
+    let early =
+        || files.iter().flat_map(|f| &f.parts).filter(move |p| p.key.parse().is_ok_and(|cycle: usize| cycle <= first));
+    let extreme = |part: &Part, sign: f64| {
+        let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
+        let rows = part.current_a.iter().zip(&part.voltage_v);
+        let loaded = rows.filter(|(i, _)| *i * sign > 0.02 * most_a).map(|(_, v)| -v * sign);
+        loaded.fold(f64::NEG_INFINITY, f64::max) * -sign
+    };
+    let sorted = |discharge: bool| {
+        let sign = if discharge { 1.0 } else { -1.0 };
+        let own = early().filter(|part| (part.kind == "discharge") == discharge);
+        let mut all: Vec<f64> = own.map(|part| extreme(part, sign)).filter(|v| v.is_finite()).collect();
+        all.sort_by(f64::total_cmp);
+        all
+    };
+    let charges = sorted(false);
+    let low = (sorted(true).last()? * 10.0).ceil() / 10.0;
+    let high = charges.get(charges.len() / 2).copied().or_else(|| seen_limits(files).map(|(_, high)| high))?;
+    Some((low, (high * 20.0).round() / 20.0))
 }
 
 /// The discharge branch of a slow test.
@@ -272,7 +304,13 @@ fn ageing_sources<'a>(
             let Some(mut part) = early[half.index].take() else { continue };
             let scale = if part.part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
             part.current_a = half.current_a;
-            prepared.sources.push(Source { file: number, part, soc: half.soc, judged: half.judged, scale: Some(scale) });
+            prepared.sources.push(Source {
+                file: number,
+                part,
+                soc: half.soc,
+                judged: half.judged,
+                scale: Some(scale),
+            });
         }
     }
     Ok(prepared)
