@@ -143,8 +143,11 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
         if whole.alarms().snapshot() != restored.alarms().snapshot() {
             found.push(format!("split {split}: alarm states differ at the end"));
         }
-        if whole.pack() != restored.pack() || whole.recharge_period_s() != restored.recharge_period_s() {
-            found.push(format!("split {split}: pack or recharge period differ at the end"));
+        if whole.pack() != restored.pack()
+            || whole.recharge_period_s() != restored.recharge_period_s()
+            || whole.normalised_recharge_period() != restored.normalised_recharge_period()
+        {
+            found.push(format!("split {split}: pack or a recharge period differ at the end"));
         }
     }
     found

@@ -315,7 +315,7 @@ fn recharge_period_does_not_run_over_time_away() {
     b.restart(6.0 * 3600.0);
     b.run(-1.3, 2000);
     for e in &b.events {
-        if let EventKind::RechargePeriod { seconds } = e.kind {
+        if let EventKind::RechargePeriod { seconds: Some(seconds), .. } = e.kind {
             assert!(seconds < 4500.0, "{seconds}");
         }
     }

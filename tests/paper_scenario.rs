@@ -15,16 +15,14 @@ use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS}
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
-/// Cycles in which the filters may still settle from what they start with.
-const SETTLING_CYCLES: usize = 3;
-/// Largest |SOC error| allowed while the true capacity is above [`LATE_LIFE_AH`]; the paper's figures: 0.05.
-const MAX_SOC_ERROR: f64 = 0.01;
-/// The same from there to the end; the paper's figures: 0.20.
-const MAX_SOC_ERROR_LATE: f64 = 0.02;
-/// Below this the 10 mA offset and the loss of up to a fifth of the capacity in one cycle weigh heavily, Ah.
-const LATE_LIFE_AH: f64 = 1.0;
-/// Largest |capacity error| at a cycle's end, Ah: about one cycle's loss.
-const MAX_CAPACITY_ERROR_AH: f64 = 0.06;
+/// Cycles in which the filter may still settle from what it starts with.
+const SETTLING_CYCLES: usize = 1;
+/// Cycles until the sensor's offset and the loss per cycle are known.
+const LEARNING_CYCLES: usize = 3;
+/// Largest |SOC error| at any sample; the paper's figures: 0.05, at the end of life 0.20.
+const MAX_SOC_ERROR: f64 = 0.005;
+/// Largest |capacity error| after a half-cycle, relative; the current sensor's gain error alone is half of it.
+const MAX_CAPACITY_ERROR: f64 = 0.01;
 /// Smallest share of cycles whose true capacity lies within two stated standard deviations.
 const MIN_COVERAGE: f64 = 0.90;
 
@@ -109,10 +107,9 @@ fn paper_scenario_is_estimated_within_the_papers_own_errors() {
     let settled = &cycles[SETTLING_CYCLES..];
     for (i, c) in settled.iter().enumerate() {
         let cycle = SETTLING_CYCLES + i + 1;
-        let allowed = if c.true_ah > LATE_LIFE_AH { MAX_SOC_ERROR } else { MAX_SOC_ERROR_LATE };
-        assert!(c.max_soc_error <= allowed, "cycle {cycle}: SOC error {}, allowed {allowed}", c.max_soc_error);
-        let error_ah = c.estimated_ah - c.true_ah;
-        assert!(error_ah.abs() <= MAX_CAPACITY_ERROR_AH, "cycle {cycle}: capacity error {error_ah} Ah");
+        assert!(c.max_soc_error <= MAX_SOC_ERROR, "cycle {cycle}: SOC error {}", c.max_soc_error);
+        let error = c.estimated_ah / c.true_ah - 1.0;
+        assert!(cycle <= LEARNING_CYCLES || error.abs() <= MAX_CAPACITY_ERROR, "cycle {cycle}: capacity error {error}");
     }
     let covered = settled.iter().filter(|c| (c.estimated_ah - c.true_ah).abs() <= 2.0 * c.std_ah).count();
     let share = covered as f64 / settled.len() as f64;

@@ -45,6 +45,23 @@ pub fn terminal_v(model: &CellModel, place: &Place, resistance_ratio: f64, branc
     model.ocv_v(place) - branches_v - model.r0_ohm(place) * resistance_ratio * current_a
 }
 
+/// The same of a cell that has aged to `capacity_ah`: its open-circuit curve has shifted ([`CellModel::ocv_soc`]).
+pub fn aged_terminal_v(
+    model: &CellModel,
+    state: (f64, f64, f64),
+    temperature_c: f64,
+    branches_v: f64,
+    current_a: f64,
+) -> f64 {
+    let (soc, resistance_ratio, capacity_ah) = state;
+    let place = model.place(soc, temperature_c);
+    if model.ocv_ageing_shift == 0.0 {
+        return terminal_v(model, &place, resistance_ratio, branches_v, current_a);
+    }
+    let ocv_v = model.ocv_v(&model.place(model.ocv_soc(soc, capacity_ah), temperature_c));
+    ocv_v - branches_v - model.r0_ohm(&place) * resistance_ratio * current_a
+}
+
 /// Temperature after `dt_s` of the lumped thermal model C dT/dt = losses - (T - ambient)/R, exact for
 /// constant losses (W).
 pub fn temperature_after(

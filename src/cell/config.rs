@@ -59,6 +59,10 @@ pub struct EstimatorConfig {
     pub voltage_noise_v: f64,
     /// Slow model error expressed as information per second: standard deviation of a 1 s average, V.
     pub model_error_v_sqrt_s: f64,
+    /// The same in proportion to the voltage the load drops in the cell: fraction of it, over one second.
+    pub load_error_sqrt_s: f64,
+    /// How long the model's error outlives the load that made it (slow diffusion), s.
+    pub load_memory_s: f64,
     /// Longest time one voltage reading may speak for, s: readings further apart are no better than this.
     pub max_information_s: f64,
     /// A voltage innovation beyond this many standard deviations moves nothing.

@@ -15,6 +15,12 @@
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
 //! Effect: the sample rate does not change the result.
 //!
+//! Deviation 4: model^2 grows with the voltage the load drops in the cell, and with the load of the last minutes:
+//! model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record that
+//! begins under load, or the constant-voltage part of a charge, no longer passes for exact.
+//! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model says so. Effect: top
+//! and bottom of an aged cell agree about its capacity.
+//!
 //! A reading beyond the gate moves nothing. When every reading has been beyond it for `lost_after_s`, the filter
 //! has lost its cell: SOC and branches start again from the voltage, resistance and capacity are kept.
 
@@ -40,6 +46,9 @@ const MIN_REJECTED: u32 = 3;
 
 /// The same when the first came right after a gap: a record is missing, most likely.
 const MIN_REJECTED_AFTER_GAP: u32 = 2;
+
+/// Load, per rated capacity, that may have gone on in a gap when there is any beside it: 1 C.
+const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Largest standard deviation a load that may have gone on through a gap adds to the SOC, fraction.
 const MAX_GAP_LOAD_STD: f64 = 0.3;
@@ -88,6 +97,9 @@ struct Memory {
     log_resistance: Belief,
     temperature_c: Option<f64>,
     last_current_a: f64,
+    /// |current| low-passed over `load_memory_s`, A: what slow diffusion still feels.
+    #[serde(default)]
+    load_a: f64,
     /// Mean normalised innovation squared over the consistency window.
     mean_nis: f64,
     /// Time the next voltage reading speaks for, s: since the last one that was used.
@@ -133,6 +145,7 @@ impl CellEstimator {
                 log_resistance: Belief { mean: 0.0, variance: (log_std * log_std).max(KNOWN_VARIANCE) },
                 temperature_c: None,
                 last_current_a: 0.0,
+                load_a: 0.0,
                 mean_nis: 0.0,
                 information_s: config.max_information_s,
                 rejected: 0,
@@ -170,14 +183,33 @@ impl CellEstimator {
             let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
         }
+        self.remember_load(model, config, step);
         self.memory.information_s += step.measured_s + step.unmeasured_s;
         self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
         let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
-        let reading = Reading { voltage_v: step.voltage_v, current_a, temperature_c, information_s };
+        let load_a = self.memory.load_a;
+        let reading = Reading { voltage_v: step.voltage_v, current_a, load_a, temperature_c, information_s };
         let update = each!(filter, x => update(x, model, config, &reading))?;
         self.watch(config, step, &update);
         Ok(Some(update))
+    }
+
+    /// Follows the load; after a gap with a load beside it, what went on in the gap may have been the heaviest usual one.
+    fn remember_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
+        let memory = &mut self.memory;
+        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
+        if step.measured_s > 0.0 {
+            let mean_a = step.charge_as.abs() / step.measured_s;
+            memory.load_a = mean_a + (memory.load_a - mean_a) * keep(step.measured_s);
+        }
+        if step.unmeasured_s > 0.0 {
+            memory.load_a *= keep(step.unmeasured_s);
+            let beside_a = memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            if beside_a > config.gap_rest_current_a {
+                memory.load_a = memory.load_a.max(beside_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
+            }
+        }
     }
 
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
@@ -452,6 +484,7 @@ fn process_noise<const N: usize>(
 struct Reading {
     voltage_v: f64,
     current_a: f64,
+    load_a: f64,
     temperature_c: f64,
     information_s: f64,
 }
@@ -463,14 +496,17 @@ fn update<const N: usize>(
     reading: &Reading,
 ) -> Result<Update, FilterError> {
     let h = |x: &SVector<f64, N>| {
-        let place = model.place(x[0], reading.temperature_c);
         let branches_v: f64 = (1..N - 2).fold(0.0, |sum, i| sum + x[i]);
-        circuit::terminal_v(model, &place, libm::exp(x[N - 2]), branches_v, reading.current_a)
+        let state = (x[0], libm::exp(x[N - 2]), x[N - 1]);
+        circuit::aged_terminal_v(model, state, reading.temperature_c, branches_v, reading.current_a)
     };
-    let slope_v = model.ocv_slope_v(&model.place(x.mean[0], reading.temperature_c));
+    let place = model.place(x.mean[0], reading.temperature_c);
+    let slope_v = model.ocv_slope_v(&place);
+    let load_v = model.settled_ohm(&place) * libm::exp(x.mean[N - 2]) * reading.load_a;
+    let model_variance = square(config.model_error_v_sqrt_s) + square(config.load_error_sqrt_s * load_v);
     let sensor_variance = square(config.voltage_noise_v);
     let noise = Noise {
-        variance: sensor_variance + square(config.model_error_v_sqrt_s) / reading.information_s,
+        variance: sensor_variance + model_variance / reading.information_s,
         gate_variance: sensor_variance + square(config.gate_model_error_v) + square(config.gate_soc_error * slope_v),
         gate_sigma: config.gate_sigma,
     };

@@ -7,4 +7,4 @@ pub mod model;
 
 pub use config::{CapacityState, Discretisation, EstimatorConfig};
 pub use estimator::{CellEstimator, CellState, CellStep, StepResult};
-pub use model::{Branch, CellModel, MAX_BRANCHES, Place, Table, Thermal};
+pub use model::{Branch, CellModel, ERROR_WINDOW_S, MAX_BRANCHES, Place, Row, Table, Thermal, arrhenius};

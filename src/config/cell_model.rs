@@ -7,7 +7,7 @@
 use std::path::Path;
 
 use super::document::{Document, Faults, Place};
-use super::schema::Presence::{Optional, Required};
+use super::schema::Presence::{Default, Optional, Required};
 use super::schema::{Section as _, SectionInfo, Walk, section};
 use super::setting::Allowed::{Above, Between, NotEmpty};
 use super::{ConfigFaults, ReadFile, read_text};
@@ -28,6 +28,8 @@ section! {
         rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
         /// Charge of a new cell from full to empty open-circuit voltage.
         capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        /// How far the open-circuit curve shifts as the cell loses capacity: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
+        ocv_ageing_shift: f64, "", Between(0.0, 1.0), Default("0.0");
         /// Lowest voltage under load.
         voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
         /// Highest voltage under charge.
@@ -46,6 +48,8 @@ section! {
         ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
         /// Series resistance of a new cell.
         r0_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` finds it. Without it the estimator's `model_error_v_sqrt_s` holds.
+        voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
     }
 }
 
@@ -123,9 +127,11 @@ fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Optio
         voltage_max_v: head.voltage_max_v,
         soc: tables.soc,
         temperature_c: tables.temperature_c,
+        ocv_ageing_shift: head.ocv_ageing_shift,
         ocv_v: Table { values: tables.ocv_v },
         r0_ohm: Table { values: tables.r0_ohm },
         branches: branches.into_iter().map(branch).collect(),
+        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
         thermal: thermal.map(|t| Thermal {
             heat_capacity_j_per_k: t.heat_capacity_j_per_k,
             resistance_k_per_w: t.resistance_k_per_w,
@@ -155,6 +161,9 @@ fn check_tables(tables: &Tables, faults: &mut Faults) {
     }
     check_shape(place, "ocv_v", &tables.ocv_v, tables, faults);
     check_shape(place, "r0_ohm", &tables.r0_ohm, tables, faults);
+    if let Some(voltage_error_v) = &tables.voltage_error_v {
+        check_shape(place, "voltage_error_v", voltage_error_v, tables, faults);
+    }
     for (row, t) in tables.ocv_v.iter().zip(&tables.temperature_c) {
         if let Some((a, b)) = first_not_rising(row) {
             place.note(faults, "ocv_v", &format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));

@@ -101,7 +101,7 @@ pub(crate) fn monitor(
         health: HealthConfig {
             transition: transition(raw.transition.as_ref()?, rated_ah * f64::from(pack.strings)),
             capacity: capacity(raw.capacity.as_ref()?, rated_ah),
-            recharge: recharge(raw.recharge.as_ref()?),
+            recharge: recharge(raw.recharge.as_ref()?, rated_ah),
             usable: raw.usable.as_ref().map(|keys| usable(keys, rated_ah)),
         },
         rules: rules?,
@@ -206,6 +206,8 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
         gap_rest_current_a: keys.gap_rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
         voltage_noise_v: keys.voltage_noise_v,
         model_error_v_sqrt_s: keys.model_error_v_sqrt_s,
+        load_error_sqrt_s: keys.load_error_sqrt_s,
+        load_memory_s: keys.load_memory_s,
         max_information_s: keys.max_information_s,
         gate_sigma: keys.gate_sigma,
         gate_model_error_v: keys.gate_model_error_v,
@@ -239,11 +241,20 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
         noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(usual_noise_ah),
         noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah),
         current_gain_std: keys.current_gain_std,
+        current_offset_std_a: keys.current_offset_std_a.unwrap_or(0.005 * rated_ah),
+        fade_std_ah_per_cycle: keys.fade_std_ah_per_cycle,
+        fade_noise_ah_per_cycle: keys.fade_noise_ah_per_cycle,
     }
 }
 
-fn recharge(keys: &Recharge) -> RechargeConfig {
-    RechargeConfig { from_soc: keys.from_soc, to_soc: keys.to_soc }
+fn recharge(keys: &Recharge, rated_ah: f64) -> RechargeConfig {
+    RechargeConfig {
+        from_soc: keys.from_soc,
+        to_soc: keys.to_soc,
+        reference_current_a: keys.reference_current_a.unwrap_or(rated_ah / 2.0),
+        min_coverage: keys.min_coverage,
+        alarm_on: keys.alarm_on,
+    }
 }
 
 fn usable(keys: &Usable, rated_ah: f64) -> UsableConfig {

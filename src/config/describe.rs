@@ -11,6 +11,7 @@ use super::{Config, InterfaceConfig};
 use crate::alarm::{Rule, RuleConfig, Severity};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
+use crate::health::{RechargeAlarm, RechargeConfig};
 use crate::quantity::Channel;
 use crate::sample::VoltageSource;
 
@@ -264,14 +265,18 @@ fn limits(config: &Config) -> Vec<String> {
 }
 
 fn alarms(config: &Config) -> Vec<String> {
-    config.monitor.rules.iter().map(|rule| alarm(rule, config.monitor.model.rated_capacity_ah)).collect()
+    let monitor = &config.monitor;
+    monitor.rules.iter().map(|rule| alarm(rule, monitor.model.rated_capacity_ah, &monitor.health.recharge)).collect()
 }
 
-fn alarm(rule: &RuleConfig, rated_ah: f64) -> String {
+fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String {
     let (what, unit, below) = match rule.rule {
         Rule::CapacityLow => ("a cell's capacity", " Ah", true),
         Rule::UsableCapacityLow => ("a cell's usable capacity", " Ah", true),
-        Rule::RechargePeriodLow => ("the recharge period", " s", true),
+        Rule::RechargePeriodLow => match recharge.alarm_on {
+            RechargeAlarm::Raw => ("the recharge period", " s", true),
+            RechargeAlarm::Normalised => ("the normalised recharge period", " s", true),
+        },
         Rule::InputMissing => ("the age of an input", " s", false),
         Rule::InputImplausible => ("the share of bad readings of an input", "", false),
         Rule::EstimateUntrusted => ("a cell's mean normalised innovation squared", "", false),

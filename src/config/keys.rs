@@ -9,6 +9,7 @@ use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
 use crate::alarm::{Rule, Severity};
 use crate::cell::{CapacityState, Discretisation};
+use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
 
 /// Coldest and hottest temperature anybody may configure, degrees C.
@@ -38,6 +39,7 @@ choice!(Positive { "charge" => Self::Charge, "discharge" => Self::Discharge });
 choice!(Method { "swing" => Self::Swing, "nominal" => Self::Nominal });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
+choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
 choice!(Severity { "info" => Self::Info, "warning" => Self::Warning, "severe" => Self::Severe });
 choice!(Rule {
     "capacity_low" => Self::CapacityLow,
@@ -254,6 +256,10 @@ section! {
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second bring no more information than this.
         model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Slow error of the cell model under load, as part of the voltage the load drops in the cell: standard deviation of its average over one second.
+        load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
+        /// How long that error outlives the load (slow diffusion).
+        load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
         /// Longest time one voltage reading may speak for: readings further apart are no better than this.
         max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
         /// A voltage further from its prediction than this many standard deviations moves nothing.
@@ -300,16 +306,28 @@ section! {
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;
         /// Standard deviation of the current sensor's gain: no capacity is known better than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
+        /// Standard deviation of the current sensor's offset, per cell: what charges and discharges disagree by is learned and taken off the current ("swing" only; 0 = not learned). Without it: the rated capacity over 200 h (0.5 % of 1 C).
+        current_offset_std_a: Option<f64>, "A", DEVIATION, Optional;
+        /// Standard deviation of what a full cycle takes, at the start: the loss is learned and expected at the end of each charge ("swing" only; 0 = not learned). For cells that lose several percent in a cycle; in others, capacity that comes back in rest would be taken for it.
+        fade_std_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
+        /// How fast the fade may change: standard deviation gained per equivalent full cycle.
+        fade_noise_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
     }
 }
 
 section! {
-    /// The SOC window whose charging time is the recharge period.
+    /// The SOC window whose charging time is the recharge period: raw, as the charge at hand took, and normalised, as a reference charger would take.
     Recharge at "recharge" {
         /// Lower SOC.
         from_soc: f64, "fraction", Between(0.0, 1.0), Default("0.3");
         /// Upper SOC.
         to_soc: f64, "fraction", Between(0.0, 1.0), Default("0.9");
+        /// Current of the reference charger, per cell, which it holds over the whole window: the normalised period is the window's share of the learned capacity over it. Without it: the rated capacity over 2 h (C/2).
+        reference_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional;
+        /// Part of the window that a charge must cover to be told with a normalised period (a raw one needs all of it).
+        min_coverage: f64, "fraction", Above(0.0, 1.0), Default("0.5");
+        /// What the alarm `recharge_period_low` compares. "raw": each period as soon as the charge leaves the window; a stronger charger looks like a worn pack, a weaker one hides it. "normalised": what the reference charger would need, at the end of each charge that covered enough.
+        alarm_on: RechargeAlarm, "", Any, Default("\"raw\"");
     }
 }
 

@@ -9,7 +9,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::can::{CanId, Frame};
-use crate::health::CapacityMethod;
+use crate::health::{CapacityMethod, RechargeAlarm};
 use crate::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex};
 use crate::sample::VoltageSource;
 
@@ -98,7 +98,9 @@ fn a_good_file_becomes_settings_with_defaults() {
     assert_eq!((monitor.sample.cells, monitor.sample.voltage_source), (4, VoltageSource::Cells));
     assert_eq!(monitor.sample.sensor_of_cell, [Some(SensorIndex(0)); 4]);
     assert_eq!((monitor.estimator.initial_capacity_ah, monitor.estimator.initial_capacity_std_ah), (1.9, 0.19));
-    assert_eq!((monitor.health.recharge.from_soc, monitor.health.recharge.to_soc), (0.3, 0.9));
+    let recharge = monitor.health.recharge;
+    assert_eq!((recharge.from_soc, recharge.to_soc, recharge.reference_current_a), (0.3, 0.9, 1.0), "C/2 of 2 Ah");
+    assert_eq!((recharge.min_coverage, recharge.alarm_on), (0.5, RechargeAlarm::Raw));
     assert_eq!(monitor.health.transition.dead_band_a, 0.04, "C/50 of the label's 2 Ah");
     assert_eq!(monitor.health.capacity.method, CapacityMethod::Swing);
     assert_eq!((monitor.health.usable, monitor.rules.len()), (None, 0));

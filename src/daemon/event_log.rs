@@ -121,7 +121,9 @@ fn log_learned(kind: &EventKind) {
                 "capacity"
             );
         }
-        EventKind::RechargePeriod { seconds } => tracing::info!(seconds, "recharge period"),
+        EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
+            tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");
+        }
         _ => {}
     }
 }

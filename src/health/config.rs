@@ -39,6 +39,21 @@ pub struct CapacityConfig {
     pub noise_ah_per_rest_day: f64,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
     pub current_gain_std: f64,
+    /// Standard deviation of the current sensor's offset at the start, per cell, A; 0 = not learned. Not used by `Nominal`.
+    pub current_offset_std_a: f64,
+    /// Standard deviation of the fade at the start, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
+    pub fade_std_ah_per_cycle: f64,
+    /// How fast the fade may change: standard deviation gained per equivalent full cycle, Ah per full cycle.
+    pub fade_noise_ah_per_cycle: f64,
+}
+
+/// Which recharge period the rule about it compares.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RechargeAlarm {
+    /// As it was, with the charger at hand.
+    Raw,
+    /// What the reference charger would need.
+    Normalised,
 }
 
 /// SOC window whose charging time is the recharge period.
@@ -48,6 +63,12 @@ pub struct RechargeConfig {
     pub from_soc: f64,
     /// Upper SOC, fraction (0.9).
     pub to_soc: f64,
+    /// Current of the reference charger per cell, A, positive.
+    pub reference_current_a: f64,
+    /// Part of the window a charge must cover to be told as a normalised period, fraction.
+    pub min_coverage: f64,
+    /// What the rule about the recharge period compares.
+    pub alarm_on: RechargeAlarm,
 }
 
 /// The load at which the usable capacity is stated.

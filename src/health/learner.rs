@@ -11,6 +11,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::drift::Drift;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::CellEstimator;
 use crate::filter::{Belief, Measurement};
@@ -82,11 +83,13 @@ pub struct Learner {
     joining: bool,
     /// Whether a half-cycle has taught something about each cell.
     learned: Vec<bool>,
+    /// Capacity with what drifts beside it (`Swing`).
+    drift: Vec<Drift>,
 }
 
 impl Learner {
     /// For cells that start from these beliefs.
-    pub fn new(cells: usize, initial_capacity: Belief) -> Self {
+    pub fn new(config: &CapacityConfig, cells: usize, initial_capacity: Belief) -> Self {
         Self {
             totals: vec![CellMark::default(); cells],
             start: None,
@@ -97,6 +100,7 @@ impl Learner {
             mode_since: None,
             joining: false,
             learned: vec![false; cells],
+            drift: vec![Drift::new(config, initial_capacity); cells],
         }
     }
 
@@ -192,18 +196,21 @@ impl Learner {
     ) -> Option<Measurement> {
         let after = estimator.capacity();
         let measurement = self.prior[cell].information_until(&after);
-        let mut belief = self.prior[cell];
-        match measurement {
-            Some(z) => belief.update(z),
-            None => belief = after,
+        let drift = &mut self.drift[cell];
+        if let Some(z) = measurement {
+            drift.update(z, half_cycle.mean_current_a);
         }
-        self.capacity[cell] = belief;
+        self.capacity[cell] = drift.capacity();
         let cycles = half_cycle.charge_ah / (2.0 * after.mean);
         let rest_days = (self.rest_s / 86_400.0).min(1.0);
-        estimator.widen_capacity(
-            config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
-                + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days,
-        );
+        let walk = config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
+            + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days;
+        let charged = if half_cycle.mode == Mode::Charge { 2.0 * cycles } else { 0.0 };
+        drift.pass(config, cycles, charged, walk);
+        // The sample filter goes on from what is known now; it never becomes surer by that.
+        let known = drift.capacity();
+        estimator.hold_capacity(known.mean);
+        estimator.widen_capacity((known.variance - after.variance).max(0.0));
         self.prior[cell] = estimator.capacity();
         measurement
     }
@@ -216,9 +223,14 @@ impl Learner {
         Belief { mean: belief.mean, variance: belief.variance + gain_ah * gain_ah }
     }
 
+    /// Offset of the current as a cell's half-cycles tell it, per cell, A: measured less true.
+    pub fn current_offset_a(&self, cell: usize) -> f64 {
+        self.drift[cell].offset_a()
+    }
+
     /// Whether the totals are for this many cells.
     pub fn fits(&self, cells: usize) -> bool {
-        [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len()] == [cells; 4]
+        [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
     }
 
@@ -280,9 +292,12 @@ mod tests {
             noise_ah_per_cycle: 0.01,
             noise_ah_per_rest_day: 0.0,
             current_gain_std: 0.0,
+            current_offset_std_a: 0.0,
+            fade_std_ah_per_cycle: 0.0,
+            fade_noise_ah_per_cycle: 0.0,
         };
         let mut estimator = CellEstimator::new(&estimator_config());
-        let mut learner = Learner::new(1, estimator.capacity());
+        let mut learner = Learner::new(&config, 1, estimator.capacity());
         let at = |soc| CellMark { soc: Some(Belief::from_std(soc, 0.01)), ..CellMark::default() };
         let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
         discharge(&mut estimator);

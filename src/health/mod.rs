@@ -1,14 +1,17 @@
 //! What a battery loses over its life: half-cycles, capacity, recharge period, usable capacity.
 
 pub mod config;
+pub mod drift;
 pub mod learner;
 pub mod pack;
 pub mod recharge;
 pub mod transition;
 pub mod usable;
 
-pub use config::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
+pub use config::{
+    CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
+};
 pub use learner::{CapacityUpdate, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
-pub use recharge::RechargeTimer;
+pub use recharge::{Charged, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

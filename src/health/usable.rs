@@ -6,7 +6,7 @@
 //! propagation of (capacity, ln rho) with their covariance.
 
 use super::UsableConfig;
-use crate::cell::circuit::{BranchAt, soc_after, terminal_v};
+use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
 use crate::cell::{CellEstimator, CellModel, Discretisation, MAX_BRANCHES};
 use crate::filter::Belief;
 
@@ -32,8 +32,8 @@ pub fn usable_ah(
     let mut branch_v = [0.0; MAX_BRANCHES];
     let mut soc = full_soc;
     let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
-        let place = model.place(soc, config.temperature_c);
-        terminal_v(model, &place, resistance_ratio, branch_v.iter().sum(), config.current_a)
+        let state = (soc, resistance_ratio, capacity_ah);
+        aged_terminal_v(model, state, config.temperature_c, branch_v.iter().sum(), config.current_a)
     };
     let mut before_v = voltage(soc, &branch_v);
     if before_v <= config.cutoff_v {

@@ -229,7 +229,7 @@ impl Monitor {
             capacity_std_ah: capacity.map(|c| c.std()),
             soh: capacity.map(|c| c.mean / self.config.model.rated_capacity_ah),
             recharge_period_s,
-            normalized_recharge_period_s: None,
+            normalized_recharge_period_s: self.normalised_recharge.map(|period| period.mean),
             usable_capacity_ah: usable.map(|u| u.mean),
             usable_capacity_std_ah: usable.map(|u| u.std()),
             resistance_ratio: log_resistance.map(libm::exp),

@@ -4,8 +4,9 @@
 use super::{CellSlot, Event, EventKind, Monitor, Outputs};
 use crate::alarm::Rule;
 use crate::filter::Belief;
+use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
-use crate::health::{CapacityUpdate, CellShare, HalfCycle, ModeChange, pack};
+use crate::health::{CapacityUpdate, CellShare, HalfCycle, ModeChange, PackState, RechargeAlarm, pack};
 use crate::quantity::{CellIndex, Mode};
 use crate::sample::CellSample;
 
@@ -33,6 +34,9 @@ impl Monitor {
         self.learner.complete(&self.config.health.transition, rated_ah, change.from, &mut half_cycles);
         for (index, half_cycle) in half_cycles.iter().enumerate() {
             self.learn_cell(index, half_cycle, out);
+        }
+        if change.from == Mode::Charge {
+            self.finish_charge(!half_cycles.is_empty(), out);
         }
         if !half_cycles.is_empty() {
             self.learner.finish();
@@ -78,8 +82,22 @@ impl Monitor {
         }
     }
 
-    /// The pack's values from its cells', and the recharge period they make.
+    /// The pack's values from its cells', and the raw recharge period they make.
     pub(super) fn combine_pack(&mut self, out: &mut Outputs) {
+        let known = self.sampler.voltages_fresh(self.now);
+        self.pack = if known { self.combined() } else { None };
+        let Some(pack) = self.pack else { return };
+        let config = &self.config.health.recharge;
+        if let Some(seconds) = self.recharge.observe(config, self.now, self.detector.mode(), pack.soc) {
+            self.recharge_period_s = Some(seconds);
+            if config.alarm_on == RechargeAlarm::Raw {
+                self.observe_alarm(Rule::RechargePeriodLow, None, Some(seconds), true, out);
+            }
+        }
+    }
+
+    /// The pack as the latest estimates of its cells make it, however old they are.
+    fn combined(&self) -> Option<PackState> {
         let config = &self.config.health;
         let shares = self.cells.iter().zip(0..).filter_map(|(slot, index)| {
             let soc = slot.estimator.soc()?;
@@ -92,13 +110,32 @@ impl Monitor {
                 capacity_std_ah: capacity.std(),
             })
         });
-        let known = self.sampler.voltages_fresh(self.now);
-        self.pack = if known { pack::combine(shares) } else { None };
-        let Some(pack) = self.pack else { return };
-        if let Some(seconds) = self.recharge.observe(&config.recharge, self.now, self.detector.mode(), pack.soc) {
-            self.recharge_period_s = Some(seconds);
-            out.events.push(Event { time: self.now, kind: EventKind::RechargePeriod { seconds } });
-            self.observe_alarm(Rule::RechargePeriodLow, None, Some(seconds), true, out);
+        pack::combine(shares)
+    }
+
+    /// A charge is over, and its cells have `learned` from it or not: its recharge period, raw and normalised.
+    fn finish_charge(&mut self, learned: bool, out: &mut Outputs) {
+        let config = &self.config.health.recharge;
+        let charged = self.recharge.finish(config);
+        let told = charged.coverage >= config.min_coverage && learned && self.learner.has_learned_all();
+        let pack = if told { self.combined() } else { None };
+        let normalised = pack.map(|pack| {
+            let capacity = Belief::from_std(pack.capacity_ah, pack.capacity_std_ah);
+            normalised_period(config, capacity)
+        });
+        if charged.raw_s.is_none() && normalised.is_none() {
+            return;
+        }
+        let kind = EventKind::RechargePeriod {
+            seconds: charged.raw_s,
+            normalised_s: normalised.map(|period| period.mean),
+            normalised_std_s: normalised.as_ref().map(Belief::std),
+        };
+        out.events.push(Event { time: self.now, kind });
+        let Some(period) = normalised else { return };
+        self.normalised_recharge = Some(period);
+        if self.config.health.recharge.alarm_on == RechargeAlarm::Normalised {
+            self.observe_alarm(Rule::RechargePeriodLow, None, Some(period.mean), true, out);
         }
     }
 }

@@ -89,6 +89,7 @@ pub struct Monitor {
     learner: Learner,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
+    normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
     /// Cells with a new estimate since the pack's values were last combined.
     updated_cells: usize,
@@ -123,7 +124,7 @@ impl Monitor {
         };
         Self {
             sampler: Sampler::new(config.sample.clone()),
-            learner: Learner::new(cells, slot.estimator.capacity()),
+            learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
             started: false,
@@ -132,6 +133,7 @@ impl Monitor {
             detector: TransitionDetector::default(),
             recharge: RechargeTimer::default(),
             recharge_period_s: None,
+            normalised_recharge: None,
             pack: None,
             updated_cells: 0,
             schedule: Schedule::default(),
@@ -184,6 +186,11 @@ impl Monitor {
     /// The last recorded recharge period, s.
     pub fn recharge_period_s(&self) -> Option<f64> {
         self.recharge_period_s
+    }
+
+    /// What the reference charger would need for the window, s, after the last charge that covered enough of it.
+    pub fn normalised_recharge_period(&self) -> Option<Belief> {
+        self.normalised_recharge
     }
 
     /// Usable capacity of a cell after its last half-cycle.
@@ -304,11 +311,13 @@ impl Monitor {
         }
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         slot.consumed = Some(Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured });
+        // What charges and discharges have shown to be the sensor's, not the cell's.
+        let offset_a = self.learner.current_offset_a(index);
         let step = CellStep {
             measured_s,
-            charge_as,
+            charge_as: charge_as - offset_a * measured_s,
             unmeasured_s,
-            current_a: sample.current_a,
+            current_a: sample.current_a.map(|current_a| current_a - offset_a),
             temperature_c: sample.temperature_c,
             ambient_c: self.config.sample.ambient_c,
             voltage_v: sample.voltage_v,
@@ -318,7 +327,7 @@ impl Monitor {
         if result.reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
-            self.recharge.interrupt();
+            self.recharge.discard();
         }
         self.learner.observe(index, soc, sample.temperature_c, measured_s);
         self.note_taper(sample);

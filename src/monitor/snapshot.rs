@@ -28,6 +28,8 @@ pub struct Snapshot {
     learner: Learner,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
+    #[serde(default)]
+    normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
     updated_cells: usize,
     time_backwards: u64,
@@ -90,6 +92,7 @@ impl Monitor {
             learner: self.learner.clone(),
             recharge: self.recharge.clone(),
             recharge_period_s: self.recharge_period_s,
+            normalised_recharge: self.normalised_recharge,
             pack: self.pack,
             updated_cells: self.updated_cells,
             time_backwards: self.time_backwards,
@@ -139,6 +142,7 @@ impl Monitor {
         self.learner = snapshot.learner;
         self.recharge = snapshot.recharge;
         self.recharge_period_s = snapshot.recharge_period_s;
+        self.normalised_recharge = snapshot.normalised_recharge;
         self.pack = snapshot.pack;
         self.updated_cells = snapshot.updated_cells;
         self.time_backwards = snapshot.time_backwards;

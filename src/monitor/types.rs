@@ -164,10 +164,15 @@ pub enum EventKind {
         /// Its standard deviation.
         resistance_ratio_std: f64,
     },
-    /// A charge covered the recharge window.
+    /// A charge is over that covered the recharge window, or enough of it to be told.
     RechargePeriod {
-        /// Seconds between the two configured SOC values.
-        seconds: f64,
+        /// Seconds between the two configured SOC values; `None` = it did not cover the whole window in one go.
+        seconds: Option<f64>,
+        /// Seconds the reference charger would need; `None` = not every cell's capacity was learned yet, or the
+        /// charge covered too little.
+        normalised_s: Option<f64>,
+        /// Its standard deviation, s.
+        normalised_std_s: Option<f64>,
     },
     /// An alarm was raised, changed severity or cleared.
     Alarm {

@@ -25,6 +25,8 @@ pub(crate) fn config() -> EstimatorConfig {
         gap_rest_current_a: 0.04,
         voltage_noise_v: 0.005,
         model_error_v_sqrt_s: 0.15,
+        load_error_sqrt_s: 0.5,
+        load_memory_s: 1200.0,
         max_information_s: 100.0,
         gate_sigma: 5.0,
         gate_model_error_v: 0.06,
