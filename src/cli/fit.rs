@@ -1,11 +1,136 @@
 //! `packwatch fit`: measured data to a cell model.
+//!
+//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is whole.
+
+mod report;
+
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::time::Instant;
 
 use super::Failure;
+use crate::cell::MAX_BRANCHES;
+use crate::io::result_file::ResultFile;
+use crate::lab::fit::{self, Request};
 
+/// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+pub(crate) struct Args {
+    /// Measured files: CSV, plain or compressed, with time_s, current_a (positive = discharge), voltage_v, and where there
+    /// are temperature_c, discharged_ah, cycle and type. Each begins with a full cell
+    #[arg(required = true, value_name = "FILES")]
+    files: Vec<PathBuf>,
+    /// Cell model to write
+    #[arg(short, long, value_name = "MODEL.toml")]
+    out: PathBuf,
+    /// What people call the cell
+    #[arg(long)]
+    name: String,
+    /// Capacity SOC divides by, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
+    #[arg(long, value_name = "AH", value_parser = positive)]
+    capacity: Option<f64>,
+    /// Capacity on the label, Ah [default: the capacity]
+    #[arg(long, value_name = "AH", value_parser = positive)]
+    rated: Option<f64>,
+    /// Lowest voltage under load [default: from the data]
+    #[arg(long, value_name = "V", value_parser = positive)]
+    voltage_min: Option<f64>,
+    /// Highest voltage under charge [default: from the data]
+    #[arg(long, value_name = "V", value_parser = positive)]
+    voltage_max: Option<f64>,
+    /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
+    #[arg(long, value_name = "FILE")]
+    ocv: Vec<PathBuf>,
+    /// RC branches [default: 2, for an ageing cell 1]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=MAX_BRANCHES as i64))]
+    branches: Option<u8>,
+    /// Starting time constants, s, rising
+    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = positive)]
+    tau: Option<Vec<f64>>,
+    /// Temperature nodes, degrees C, rising [default: from the data]
+    #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
+    temperatures: Option<Vec<f64>>,
+    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 24, closer near both ends]
+    #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
+    soc_nodes: Option<SocNodes>,
+    /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
+    #[arg(long, value_name = "N")]
+    first_cycles: Option<usize>,
+    /// Plot of the residuals to write
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// SOC breakpoints as checked on the command line.
+#[derive(Debug, Clone)]
+struct SocNodes(Vec<f64>);
+
+fn finite(text: &str) -> Result<f64, String> {
+    text.parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "must be a finite number".to_owned())
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    finite(text).ok().filter(|&x| x > 0.0).ok_or_else(|| "must be a finite number above 0".to_owned())
+}
+
+fn soc_nodes(text: &str) -> Result<SocNodes, String> {
+    if let Ok(count) = text.parse::<u16>() {
+        let last = count.checked_sub(1).filter(|last| (1..=100).contains(last)).ok_or("must be 2 to 101 nodes")?;
+        return Ok(SocNodes((0..count).map(|k| f64::from(k) / f64::from(last)).collect()));
+    }
+    let nodes = text.split(',').map(finite).collect::<Result<Vec<f64>, _>>()?;
+    let rising = nodes.windows(2).all(|pair| pair[0] < pair[1]);
+    let whole = nodes.len() >= 2 && nodes[0] == 0.0 && nodes[nodes.len() - 1] == 1.0;
+    if rising && whole { Ok(SocNodes(nodes)) } else { Err("must rise from 0 to 1".to_owned()) }
+}
 
 /// Runs the command.
-pub(crate) fn run(_: &Args) -> Result<(), Failure> {
-    Err(Failure::new("not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    for (key, list) in [("--tau", &args.tau), ("--temperatures", &args.temperatures)] {
+        if let Some([a, b]) = list.as_ref().and_then(|list| list.array_windows().find(|[a, b]| a >= b)) {
+            return Err(Failure::new(format!("{key}: {b} follows {a}, must rise")));
+        }
+    }
+    if args.tau.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
+        return Err(Failure::new(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
+    }
+    let begin = Instant::now();
+    let request = request(args);
+    let bar = report::Bar::new();
+    let result = fit::run(&request, |progress| bar.show(progress));
+    bar.clear();
+    let outcome = result.map_err(|error| Failure::new(error.to_string()))?;
+    write_model(args, &fit::text(&request, &outcome)).map_err(|error| Failure::new(error.to_string()))?;
+    if let Some(path) = &args.plot {
+        fit::write_plot(path, &outcome).map_err(|error| Failure::new(error.to_string()))?;
+    }
+    let seconds = begin.elapsed().as_secs_f64();
+    let shown = if args.json { report::json(&outcome, seconds) } else { report::table(&outcome, seconds, &args.out) };
+    shown.map_err(|error| Failure::new(format!("standard output: {error}")))
+}
+
+fn request(args: &Args) -> Request {
+    Request {
+        name: args.name.clone(),
+        capacity_ah: args.capacity,
+        rated_ah: args.rated,
+        voltage_min_v: args.voltage_min,
+        voltage_max_v: args.voltage_max,
+        ocv: args.ocv.clone(),
+        branches: args.branches.map(usize::from),
+        tau_s: args.tau.clone(),
+        temperature_c: args.temperatures.clone(),
+        soc: args.soc_nodes.as_ref().map(|nodes| nodes.0.clone()),
+        first_cycles: args.first_cycles,
+        files: args.files.clone(),
+    }
+}
+
+fn write_model(args: &Args, text: &str) -> std::io::Result<()> {
+    let mut file = ResultFile::create(&args.out)?;
+    file.write_all(text.as_bytes())?;
+    file.finish()
 }

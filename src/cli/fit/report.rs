@@ -1,0 +1,79 @@
+//! What `fit` shows: progress on the terminal, the table of residuals, JSON.
+
+use std::io::{self, Write as _};
+use std::path::Path;
+
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::ident::fit::Residual;
+use crate::lab::fit::{Outcome, Progress};
+
+/// Live line on the terminal; nothing where standard error is none.
+pub(super) struct Bar(ProgressBar);
+
+impl Bar {
+    pub(super) fn new() -> Self {
+        let bar = ProgressBar::new_spinner();
+        if let Ok(style) = ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
+            bar.set_style(style);
+        }
+        Self(bar)
+    }
+
+    pub(super) fn show(&self, progress: Progress) {
+        self.0.set_message(match progress {
+            Progress::Read(done, all) => format!("read {done} of {all} files"),
+            Progress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
+        });
+        self.0.tick();
+    }
+
+    pub(super) fn clear(&self) {
+        self.0.finish_and_clear();
+    }
+}
+
+/// Residuals per file, notes, and how the fit went.
+pub(super) fn table(outcome: &Outcome, seconds: f64, path: &Path) -> io::Result<()> {
+    let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
+    let width = names.iter().map(String::len).max().unwrap_or(0).max(5);
+    let mut out = io::stdout().lock();
+    let head = ["rows", "seconds", "RMSE mV", "mean mV", "worst mV"];
+    writeln!(out, "{:width$} {:>9} {:>9} {:>8} {:>8} {:>8}", "file", head[0], head[1], head[2], head[3], head[4])?;
+    let mut line = |name: &str, rows: usize, file_s: f64, r: &Residual| {
+        let (rmse, mean, worst) = (1e3 * r.rmse_v, 1e3 * r.mean_v, 1e3 * r.worst_v);
+        writeln!(out, "{name:width$} {rows:>9} {file_s:>9.0} {rmse:>8.2} {mean:>8.2} {worst:>8.1}")
+    };
+    for (name, file) in names.iter().zip(&outcome.files) {
+        line(name, file.rows, file.seconds, &file.residual)?;
+    }
+    let (rows, all_s) = outcome.files.iter().fold((0, 0.0), |(n, s), file| (n + file.rows, s + file.seconds));
+    line("all", rows, all_s, &outcome.fit.total)?;
+    for note in &outcome.notes {
+        writeln!(out, "note: {note}")?;
+    }
+    let fit = &outcome.fit;
+    let ended = if fit.converged { "converged" } else { "stopped" };
+    writeln!(out, "{ended} after {} passes, {seconds:.1} s; written to {}", fit.passes, path.display())
+}
+
+/// The same for programs.
+pub(super) fn json(outcome: &Outcome, seconds: f64) -> io::Result<()> {
+    let of_file = |file: &crate::lab::fit::FileResidual| {
+        let r = &file.residual;
+        serde_json::json!({
+            "path": file.path, "rows": file.rows, "seconds": file.seconds, "outliers": file.outliers,
+            "rmse_v": r.rmse_v, "mean_v": r.mean_v, "worst_v": r.worst_v,
+        })
+    };
+    let value = serde_json::json!({
+        "files": outcome.files.iter().map(of_file).collect::<Vec<_>>(),
+        "rmse_v": outcome.fit.total.rmse_v,
+        "capacity_ah": outcome.capacity_ah,
+        "passes": outcome.fit.passes,
+        "converged": outcome.fit.converged,
+        "notes": outcome.notes,
+        "seconds": seconds,
+    });
+    writeln!(io::stdout().lock(), "{value}")
+}

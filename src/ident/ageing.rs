@@ -1,0 +1,170 @@
+//! SOC for the first cycles of an ageing cell: full charges and discharges one after the other, no counter.
+//!
+//! Anchors: SOC 1 at the end of every full charge (the state this charger leaves), and the knee of each discharge (where the voltage
+//! falls fastest comes with so little charge left that the knee is a mark on the SOC axis) at one common SOC. That takes the fade
+//! from cycle to cycle and the charger's own gain error out of the curves. Charge left below the cut-off under load is
+//! taken to be [`SOC_LEFT`]. What comes before the first discharge has no known beginning and is left out.
+
+use super::charge_ah;
+
+/// SOC left at the cut-off under load when new.
+const SOC_LEFT: f64 = 0.045;
+/// The knee, as a share of the way from the lowest to the highest voltage: 3.0 V for 2.7 to 4.2 V.
+const KNEE_SHARE: f64 = 0.2;
+/// Current that counts as discharge, as a share of the discharge's median.
+const LOADED_SHARE: f64 = 0.5;
+/// Step of current between rows from which voltage and current were not taken at one instant, A per Ah.
+const STEP_PER_AH: f64 = 0.25;
+/// Recovery with the load off after the cut-off is slower than any branch here: not judged below this SOC.
+const RECOVERY_SOC: f64 = 0.5;
+
+/// One half-cycle as measured: slices of equal length.
+#[derive(Debug, Clone, Copy)]
+pub struct HalfCycle<'a> {
+    /// A discharge, else a charge.
+    pub discharge: bool,
+    /// Seconds.
+    pub time_s: &'a [f64],
+    /// Current, A, positive = discharge.
+    pub current_a: &'a [f64],
+    /// Terminal voltage, V.
+    pub voltage_v: &'a [f64],
+}
+
+/// A half-cycle with its SOC.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Anchored {
+    /// Which of the half-cycles given.
+    pub index: usize,
+    /// Current without a charger's load pulses, A.
+    pub current_a: Vec<f64>,
+    /// SOC of every row.
+    pub soc: Vec<f64>,
+    /// Whether the row's voltage is to be judged.
+    pub judged: Vec<bool>,
+}
+
+/// Why the cycles cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum AgeingError {
+    /// Nothing to anchor on.
+    #[error("no discharge among the first cycles")]
+    NoDischarge,
+    /// A discharge that does not go down to the knee.
+    #[error("discharge number {number} does not fall to {knee_v:.2} V under load: its end is no anchor")]
+    NoKnee {
+        /// Counted from 1.
+        number: usize,
+        /// Voltage of the knee.
+        knee_v: f64,
+    },
+}
+
+/// Marks of one discharge, Ah from its beginning.
+struct Marks {
+    knee_ah: f64,
+    cut_off_ah: f64,
+}
+
+/// Capacity (Ah, mean of the discharges) and every half-cycle from the first discharge on, with SOC.
+///
+/// # Errors
+/// No discharge, or one without a knee.
+pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, Vec<Anchored>), AgeingError> {
+    let first = cycles.iter().position(|cycle| cycle.discharge).ok_or(AgeingError::NoDischarge)?;
+    let knee_v = voltage_v.0 + KNEE_SHARE * (voltage_v.1 - voltage_v.0);
+    let discharges = cycles.iter().filter(|cycle| cycle.discharge);
+    let marks: Vec<Marks> = discharges
+        .enumerate()
+        .map(|(n, cycle)| marks(cycle, knee_v, voltage_v.0).ok_or(AgeingError::NoKnee { number: n + 1, knee_v }))
+        .collect::<Result<_, _>>()?;
+    let mean = |value: &dyn Fn(&Marks) -> f64| marks.iter().map(value).sum::<f64>() / marks.len() as f64;
+    let beyond_ah = mean(&|m| m.cut_off_ah - m.knee_ah);
+    let capacity_ah = (mean(&|m| m.knee_ah) + beyond_ah) / (1.0 - SOC_LEFT);
+    let knee_soc = SOC_LEFT + beyond_ah / capacity_ah;
+    let (mut anchored, mut left, mut number) = (Vec::new(), 1.0, 0);
+    for (index, cycle) in cycles.iter().enumerate().skip(first) {
+        if cycle.time_s.is_empty() {
+            continue;
+        }
+        let current_a = without_load_pulses(cycle, capacity_ah);
+        let out_ah = charge_ah(cycle.time_s, &current_a);
+        let soc: Vec<f64> = if cycle.discharge {
+            let per_ah = (1.0 - knee_soc) / marks[number].knee_ah;
+            number += 1;
+            out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
+        } else {
+            let all_ah = out_ah[out_ah.len() - 1];
+            out_ah.iter().map(|ah| left + (1.0 - left) * ah / all_ah).collect()
+        };
+        left = soc[soc.len() - 1];
+        let judged = judged(cycle.discharge, &current_a, &soc, capacity_ah);
+        anchored.push(Anchored { index, current_a, soc, judged });
+    }
+    Ok((capacity_ah, anchored))
+}
+
+fn marks(cycle: &HalfCycle<'_>, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
+    let mut sorted = cycle.current_a.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let loaded_a = LOADED_SHARE * sorted.get(sorted.len() / 2)?;
+    let loaded: Vec<usize> = (0..cycle.time_s.len()).filter(|&k| cycle.current_a[k] > loaded_a).collect();
+    let out_ah = charge_ah(cycle.time_s, cycle.current_a);
+    let crossing = |level_v: f64| {
+        let at = loaded.iter().position(|&k| cycle.voltage_v[k] <= level_v)?;
+        let (k, before) = (loaded[at], loaded[at.checked_sub(1)?]);
+        let along = (cycle.voltage_v[before] - level_v) / (cycle.voltage_v[before] - cycle.voltage_v[k]);
+        Some(out_ah[before] + along * (out_ah[k] - out_ah[before]))
+    };
+    let last_ah = out_ah[*loaded.last()?];
+    Some(Marks { knee_ah: crossing(knee_v)?, cut_off_ah: crossing(cut_off_v).unwrap_or(last_ah) })
+}
+
+/// Chargers test themselves with a short load: no charge worth counting, and no trapezoid over seconds.
+fn without_load_pulses(cycle: &HalfCycle<'_>, capacity_ah: f64) -> Vec<f64> {
+    let pulse = |i: f64| !cycle.discharge && i > STEP_PER_AH * capacity_ah;
+    cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()
+}
+
+fn judged(discharge: bool, current_a: &[f64], soc: &[f64], capacity_ah: f64) -> Vec<bool> {
+    let step = STEP_PER_AH * capacity_ah;
+    let of_row = |k: usize| {
+        let before_a = if k == 0 { current_a[0] } else { current_a[k - 1] };
+        let recovering = discharge && current_a[k] < 2.0 * step && soc[k] < RECOVERY_SOC;
+        (current_a[k] - before_a).abs() < step && !recovering
+    };
+    (0..soc.len()).map(of_row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn knees_lie_at_one_soc_and_a_charge_ends_full_whatever_its_charger_counts() {
+        let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
+        let fall = |k: f64| if k < 90.0 { 4.2 - 0.01 * k } else { 3.3 - 0.06 * (k - 90.0) };
+        let voltage_v: Vec<f64> = (0..=100).map(|k| fall(f64::from(k))).collect();
+        let discharge = |current_a| HalfCycle { discharge: true, time_s: &time_s, current_a, voltage_v: &voltage_v };
+        let (fresh, faded, charging) = ([2.0; 101], [1.9; 101], [-2.1; 101]);
+        let charge = HalfCycle { discharge: false, current_a: &charging, ..discharge(&fresh) };
+        let cycles = [discharge(&fresh), charge, discharge(&faded)];
+        let (capacity_ah, anchored) = anchor(&cycles, (2.7, 4.2)).expect("anchored");
+        assert!((capacity_ah - 1.95 / 0.955).abs() < 1e-9, "{capacity_ah}");
+        let knee = 95;
+        assert!((anchored[0].soc[knee] - anchored[2].soc[knee]).abs() < 1e-12);
+        assert_eq!((anchored[1].soc[0], anchored[1].soc[100]), (anchored[0].soc[100], 1.0));
+    }
+
+    #[test]
+    fn a_discharge_without_a_knee_is_refused() {
+        let cycle = HalfCycle {
+            discharge: true,
+            time_s: &[0.0, 100.0, 200.0],
+            current_a: &[2.0; 3],
+            voltage_v: &[4.0, 3.9, 3.8],
+        };
+        let error = anchor(&[cycle], (2.7, 4.2)).expect_err("no knee").to_string();
+        assert_eq!(error, "discharge number 1 does not fall to 3.00 V under load: its end is no anchor");
+    }
+}

@@ -1,0 +1,122 @@
+//! SOC of every raw row, by explicit rules; a file whose beginning is unknown is refused.
+//!
+//! 1. A stretch must begin with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
+//!    [`LOAD_SAG_V`] of it when current flows already.
+//! 2. With the cycler's counter, SOC = 1 - counter / capacity when the counter begins within [`COUNTER_NEAR`] of 0: what
+//!    little it shows was really taken out. A counter that begins lower was reset before the charge: differences count.
+//!    One that begins higher was reset at full and says that the cell is not full any more: refused.
+//! 3. Without a counter the current is integrated from 1.
+
+use super::charge_ah;
+
+/// A resting full cell is at most this far below the highest voltage, V: relaxation, cold charge that ended early.
+const REST_SAG_V: f64 = 0.1;
+/// A full cell under load, V.
+const LOAD_SAG_V: f64 = 0.35;
+/// Current from which a cell is under load, as a share of its capacity per hour.
+const LOAD_SHARE: f64 = 0.02;
+/// A counter that begins within this share of the capacity counts from the full cell.
+const COUNTER_NEAR: f64 = 0.003;
+
+/// Why a stretch has no SOC.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum AnchorError {
+    /// It does not begin full.
+    #[error("begins at {voltage_v} V, expected a full cell (at least {needed_v:.2} V): its SOC is unknown")]
+    NotFull {
+        /// First voltage, V.
+        voltage_v: f64,
+        /// Least voltage of a full cell, V.
+        needed_v: f64,
+    },
+    /// Its counter says that charge was taken out before.
+    #[error("discharged_ah begins at {counter_ah} Ah, expected 0 or below: charge was taken out before the first row")]
+    TakenBefore {
+        /// First value, Ah.
+        counter_ah: f64,
+    },
+}
+
+/// What is known of a stretch: slices of equal length, not empty.
+#[derive(Debug, Clone, Copy)]
+pub struct Stretch<'a> {
+    /// Seconds.
+    pub time_s: &'a [f64],
+    /// Current, A, positive = discharge.
+    pub current_a: &'a [f64],
+    /// Terminal voltage, V.
+    pub voltage_v: &'a [f64],
+    /// The cycler's counter, Ah taken out; NaN in its first row = there is none.
+    pub discharged_ah: &'a [f64],
+}
+
+impl Stretch<'_> {
+    /// Charge taken out since full at every row, Ah.
+    ///
+    /// # Errors
+    /// When it does not begin full, or so that it cannot be told.
+    pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, AnchorError> {
+        self.begins_full(voltage_max_v, capacity_hint_ah)?;
+        if self.discharged_ah[0].is_nan() {
+            return Ok(charge_ah(self.time_s, self.current_a));
+        }
+        let first_ah = self.discharged_ah[0];
+        let near_ah = COUNTER_NEAR * capacity_hint_ah;
+        if first_ah > near_ah {
+            return Err(AnchorError::TakenBefore { counter_ah: first_ah });
+        }
+        let zero_ah = if first_ah >= -near_ah { 0.0 } else { first_ah };
+        let mut last = first_ah - zero_ah;
+        // An empty field keeps the counter where it was.
+        let mut hold = |counter: f64| {
+            last = if counter.is_nan() { last } else { counter - zero_ah };
+            last
+        };
+        Ok(self.discharged_ah.iter().map(|&counter| hold(counter)).collect())
+    }
+
+    fn begins_full(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<(), AnchorError> {
+        let loaded = self.current_a[0] > LOAD_SHARE * capacity_hint_ah;
+        let needed_v = voltage_max_v - if loaded { LOAD_SAG_V } else { REST_SAG_V };
+        let voltage_v = self.voltage_v[0];
+        if voltage_v >= needed_v { Ok(()) } else { Err(AnchorError::NotFull { voltage_v, needed_v }) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn taken_out(voltage_v: f64, current_a: f64, counter: [f64; 2]) -> Result<Vec<f64>, AnchorError> {
+        let stretch = Stretch {
+            time_s: &[0.0, 3600.0],
+            current_a: &[current_a; 2],
+            voltage_v: &[voltage_v; 2],
+            discharged_ah: &counter,
+        };
+        stretch.taken_out_ah(4.2, 2.0)
+    }
+
+    #[test]
+    fn the_counter_is_used_as_it_stands_near_zero_and_by_differences_elsewhere() {
+        assert_eq!(taken_out(4.17, 0.1, [0.002, 0.5]), Ok(vec![0.002, 0.5]));
+        assert_eq!(taken_out(4.17, 0.1, [-0.5, 0.5]), Ok(vec![0.0, 1.0]));
+        assert_eq!(taken_out(3.95, 2.0, [-1.0, 0.5]), Ok(vec![0.0, 1.5]));
+    }
+
+    #[test]
+    fn a_counter_that_shows_charge_taken_out_is_refused() {
+        assert_eq!(taken_out(4.15, 0.1, [0.12, 0.5]), Err(AnchorError::TakenBefore { counter_ah: 0.12 }));
+    }
+
+    #[test]
+    fn without_a_counter_the_current_is_integrated_from_full() {
+        assert_eq!(taken_out(4.2, 1.5, [f64::NAN; 2]), Ok(vec![0.0, 1.5]));
+    }
+
+    #[test]
+    fn a_beginning_that_is_not_full_is_refused() {
+        let refused = taken_out(3.45, 0.0, [0.0, -2.3]).expect_err("not full").to_string();
+        assert!(refused.starts_with("begins at 3.45 V, expected a full cell (at least 4.10 V)"), "{refused}");
+    }
+}

@@ -1,0 +1,144 @@
+//! How wrong the fitted model is, over SOC and temperature: the standard deviation of its voltage error averaged over [`BLOCK_S`].
+//!
+//! Model error repeats itself within minutes, so blocks of 100 s are what counts. A block weighs by the charge that moved in
+//! it, spread over the nodes round it; a node with little of it leans on the mean of its temperature. A fit's own residuals understate
+//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node). A temperature without
+//! data takes the nearest one's, scaled by a power of Arrhenius' factor.
+
+use super::fit::Fit;
+use super::grid::{Grid, arrhenius};
+use super::pass::residuals;
+use super::record::Record;
+
+/// Length of a block, s.
+const BLOCK_S: f64 = 100.0;
+/// Error beyond which a block counts no more, V.
+const MOST_V: f64 = 0.1;
+/// Charge, as SOC, with which the mean of a temperature counts at each of its nodes.
+const LEAN_SOC: f64 = 1.0;
+/// Growth of the variance for data not fitted: 1 + this / files.
+const UNSEEN: f64 = 3.0;
+/// A file visits a node when so much charge moved near it, as SOC.
+const VISIT_SOC: f64 = 0.005;
+/// Power of Arrhenius' factor by which error grows with cold.
+const COLD_POWER: f64 = 0.7;
+/// Least error a model is believed to have, V.
+const LEAST_V: f64 = 0.001;
+
+/// Sums per node.
+struct Sums {
+    square: Vec<f64>,
+    weight: Vec<f64>,
+    files: Vec<f64>,
+}
+
+/// The table in node order, V; `shares` = what each record counts.
+pub fn table(fit: &Fit, records: &[Record], shares: &[f64], capacity_ah: f64) -> Vec<f64> {
+    let nodes = fit.grid.nodes();
+    let mut sums = Sums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
+    for (record, share) in records.iter().zip(shares) {
+        let before = sums.weight.clone();
+        add_record(&mut sums, fit, record, *share, capacity_ah);
+        for ((files, now), before) in sums.files.iter_mut().zip(&sums.weight).zip(&before) {
+            *files += f64::from(u8::from(now - before > share * VISIT_SOC));
+        }
+    }
+    let columns = fit.grid.soc.len();
+    let rows: Vec<Option<Vec<f64>>> = (0..fit.grid.temperature_c.len()).map(|t| row(&sums, t, columns)).collect();
+    fill(&fit.grid, &rows)
+}
+
+fn add_record(sums: &mut Sums, fit: &Fit, record: &Record, share: f64, capacity_ah: f64) {
+    let errors = residuals(record, &fit.tables);
+    let mut block = Block::default();
+    for (row, error) in record.rows.iter().zip(errors) {
+        if block.seconds + row.weight_s > BLOCK_S {
+            block.close(sums, &fit.grid, share);
+        }
+        if row.weight_s > 0.0 {
+            block.error += row.weight_s * error;
+            block.soc += row.weight_s * row.soc;
+            block.temperature += row.weight_s * row.temperature_c;
+            block.seconds += row.weight_s;
+            block.moved_soc += row.mean_current_a.abs() * row.dt_s / 3600.0 / capacity_ah;
+        }
+    }
+    block.close(sums, &fit.grid, share);
+}
+
+/// Weighted sums over a block.
+#[derive(Default)]
+struct Block {
+    error: f64,
+    soc: f64,
+    temperature: f64,
+    seconds: f64,
+    moved_soc: f64,
+}
+
+impl Block {
+    fn close(&mut self, sums: &mut Sums, grid: &Grid, share: f64) {
+        let block = std::mem::take(self);
+        if block.seconds <= 0.0 {
+            return;
+        }
+        let error_v = (block.error / block.seconds).clamp(-MOST_V, MOST_V);
+        let place = grid.place((block.soc / block.seconds).clamp(0.0, 1.0), block.temperature / block.seconds);
+        for (node, corner) in grid.ocv_corners(&place).iter() {
+            let weight = share * block.moved_soc * corner;
+            sums.square[node] += weight * error_v * error_v;
+            sums.weight[node] += weight;
+        }
+    }
+}
+
+/// One temperature's errors; `None` = no data.
+fn row(sums: &Sums, t: usize, columns: usize) -> Option<Vec<f64>> {
+    let range = t * columns..(t + 1) * columns;
+    let weight: f64 = sums.weight[range.clone()].iter().sum();
+    let most_files = sums.files[range.clone()].iter().fold(0.0_f64, |most, n| most.max(*n));
+    if most_files == 0.0 {
+        return None;
+    }
+    let mean = sums.square[range.clone()].iter().sum::<f64>() / weight;
+    let of_node = |node: usize| {
+        let files = if sums.files[node] > 0.0 { sums.files[node] } else { most_files };
+        let variance = (sums.square[node] + LEAN_SOC * mean) / (sums.weight[node] + LEAN_SOC);
+        (variance * (1.0 + UNSEEN / files)).sqrt().max(LEAST_V)
+    };
+    Some(range.map(of_node).collect())
+}
+
+/// Rows without data from the nearest with some.
+fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
+    let temperatures = &grid.temperature_c;
+    let known = || rows.iter().zip(temperatures).filter_map(|(row, &t)| row.as_ref().map(|row| (row, t)));
+    let of_row = |&t: &f64| {
+        let nearest = known().min_by(|a, b| (a.1 - t).abs().total_cmp(&(b.1 - t).abs()));
+        let (row, from) = nearest.map_or((vec![MOST_V; grid.soc.len()], t), |(row, from)| (row.clone(), from));
+        let colder = libm::pow(arrhenius(t) / arrhenius(from), COLD_POWER);
+        row.into_iter().map(move |error| error * colder)
+    };
+    temperatures.iter().flat_map(of_row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_temperature_without_data_is_as_wrong_as_its_neighbour_and_more_in_the_cold() {
+        let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![-20.0, 0.0, 25.0] };
+        let found = fill(&grid, &[None, Some(vec![0.01, 0.02]), Some(vec![0.005; 2])]);
+        assert!(found[0] > 1.5 * 0.01 && found[1] == 2.0 * found[0], "{found:?}");
+        assert_eq!(found[2..], [0.01, 0.02, 0.005, 0.005]);
+    }
+
+    #[test]
+    fn few_files_and_little_charge_make_a_node_less_certain() {
+        let sums = Sums { square: vec![4e-4, 0.0], weight: vec![4.0, 0.0], files: vec![4.0, 0.0] };
+        let row = row(&sums, 0, 2).expect("data");
+        assert!((row[0] - 0.01 * 1.75_f64.sqrt()).abs() < 1e-12, "{row:?}");
+        assert_eq!(row[0], row[1]);
+    }
+}

@@ -1,0 +1,344 @@
+//! The fit as a whole: starting values, prior, passes over all records in parallel, residuals, nodes without data.
+
+use super::grid::{Grid, Place, arrhenius, interpolate};
+use super::parameters::{Layout, Tables};
+use super::pass::{Normal, accumulate, residuals, visits};
+use super::prior::{Beliefs, Prior, per_node};
+use super::record::Record;
+use super::solve::{Space, minimise};
+
+/// Groups of records that are summed apart and then in order: the result does not depend on the number of cores.
+const GROUPS: usize = 4;
+/// Fewest judged rows a fit may rest on.
+pub const MIN_ROWS: usize = 50;
+/// Seconds near a node below which no data support it.
+pub const SUPPORTED_S: f64 = 30.0;
+/// Factor within which a time constant stays round its starting value.
+const TAU_FACTOR: f64 = 5.0;
+/// Least rise of the OCV, V per unit of SOC.
+pub const MIN_SLOPE_V: f64 = 0.02;
+/// Steepest rise of the OCV, V per unit of SOC.
+const MAX_SLOPE_V: f64 = 60.0;
+/// Resistances stay within this factor of the starting value.
+const R_FACTOR: f64 = 300.0;
+
+/// An OCV test: voltage over rising SOC at one temperature.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OcvCurve {
+    /// Cell temperature, degrees C.
+    pub temperature_c: f64,
+    /// SOC, strictly rising.
+    pub soc: Vec<f64>,
+    /// Voltage, V.
+    pub voltage_v: Vec<f64>,
+}
+
+/// What is to be fitted.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Breakpoints.
+    pub grid: Grid,
+    /// Starting time constants, s, one per branch, rising.
+    pub tau_s: Vec<f64>,
+    /// Lowest and highest voltage under load, V.
+    pub voltage_v: (f64, f64),
+    /// Slow tests, by rising temperature; none = the OCV comes from the data alone.
+    pub ocv: Vec<OcvCurve>,
+    /// Least rise of the OCV, V per unit of SOC, from a SOC on: `(from, slope)`, the last that holds.
+    pub min_slope_v: Vec<(f64, f64)>,
+    /// OCV at SOC 0 held here, where no data reach it.
+    pub empty_ocv_v: Option<f64>,
+    /// Smoothness.
+    pub beliefs: Beliefs,
+}
+
+/// How well one record is met.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Residual {
+    /// Judged seconds.
+    pub seconds: f64,
+    /// Root mean square, V, weighted by time.
+    pub rmse_v: f64,
+    /// Mean, measured less model, V.
+    pub mean_v: f64,
+    /// Largest by size, V.
+    pub worst_v: f64,
+}
+
+/// A fitted set of tables.
+#[derive(Debug, Clone)]
+pub struct Fit {
+    /// Breakpoints.
+    pub grid: Grid,
+    /// Values in node order.
+    pub tables: Tables,
+    /// Per record, in their order.
+    pub residuals: Vec<Residual>,
+    /// Over all records.
+    pub total: Residual,
+    /// Seconds of data near each node.
+    pub visits_s: Vec<f64>,
+    /// Passes over the data.
+    pub passes: usize,
+    /// Whether the cost had stopped falling.
+    pub converged: bool,
+}
+
+/// Why there is no fit.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum FitError {
+    /// Too few rows.
+    #[error("{found} rows can be judged, at least {MIN_ROWS} are needed")]
+    TooFewRows {
+        /// Judged rows.
+        found: usize,
+    },
+    /// The current never changes enough to tell a resistance.
+    #[error("the current does not change: no resistance can be told from the open-circuit voltage")]
+    NoExcitation,
+}
+
+/// Fits tables to `records` with weights `scale` per record; `progress` is told pass and RMS-like cost.
+///
+/// # Errors
+/// Too few rows, or a current that tells nothing.
+pub fn fit(
+    settings: &Settings,
+    records: &[Record],
+    scale: &[f64],
+    progress: impl FnMut(usize, f64),
+) -> Result<Fit, FitError> {
+    let judged = records.iter().flat_map(|r| &r.rows).filter(|row| row.weight_s > 0.0).count();
+    if judged < MIN_ROWS {
+        return Err(FitError::TooFewRows { found: judged });
+    }
+    let layout = Layout::new(&settings.grid, settings.tau_s.len());
+    let start = start(settings, &layout, records)?;
+    let space = space(settings, &layout, &start);
+    let start = space.inside(&start);
+    let prior = Prior::new(&settings.grid, &layout, &start, !settings.ocv.is_empty(), &settings.beliefs);
+    let groups = groups(records, scale);
+    let evaluate = |theta: &[f64]| {
+        let mut normal = sum_of_groups(&groups, &layout, theta);
+        prior.accumulate(theta, &mut normal);
+        normal
+    };
+    let solution = minimise(&space, &start, evaluate, progress);
+    let tables = Tables::new(&layout, &solution.theta);
+    let (each, total) = judge(records, &tables);
+    let all: Vec<&Record> = records.iter().collect();
+    Ok(Fit {
+        grid: settings.grid.clone(),
+        residuals: each,
+        total,
+        visits_s: visits(&all, layout.nodes),
+        tables,
+        passes: solution.passes,
+        converged: solution.converged,
+    })
+}
+
+type Group<'a> = Vec<(&'a Record, f64)>;
+
+/// Records dealt out to [`GROUPS`], the longest first to the emptiest, so that all take about as long.
+fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
+    let mut order: Vec<usize> = (0..records.len()).collect();
+    order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
+    let mut groups: Vec<Group<'a>> = vec![Vec::new(); GROUPS.min(records.len()).max(1)];
+    let mut filled = vec![0; groups.len()];
+    for i in order {
+        let emptiest = (0..groups.len()).min_by_key(|&g| filled[g]).unwrap_or(0);
+        filled[emptiest] += records[i].rows.len();
+        groups[emptiest].push((&records[i], scale[i]));
+    }
+    groups
+}
+
+fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal {
+    let tables = &Tables::new(layout, theta);
+    let of_group = |group: &Group<'_>| {
+        let mut normal = Normal::new(layout.len());
+        for (record, scale) in group {
+            accumulate(record, *scale, layout, tables, &mut normal);
+        }
+        normal
+    };
+    std::thread::scope(|scope| {
+        let workers: Vec<_> = groups.iter().map(|group| scope.spawn(move || of_group(group))).collect();
+        let mut sum = Normal::new(layout.len());
+        for worker in workers {
+            match worker.join() {
+                Ok(normal) => sum.add_all(&normal),
+                Err(panic) => std::panic::resume_unwind(panic),
+            }
+        }
+        sum
+    })
+}
+
+/// Starting values: OCV of the slow test or a straight line, resistances from steps of current.
+fn start(settings: &Settings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, FitError> {
+    let grid = &settings.grid;
+    let mut theta = match settings.ocv.is_empty() {
+        true => grid.temperature_c.iter().flat_map(|_| straight_ocv(settings)).collect(),
+        false => ocv_nodes(grid, &settings.ocv),
+    };
+    let r0_ohm = resistance_of_steps(records).ok_or(FitError::NoExcitation)?;
+    let ln_r = |ohm: f64| per_node(grid, |t| libm::log(ohm * arrhenius(t)));
+    theta.extend(ln_r(r0_ohm));
+    for &tau_s in &settings.tau_s {
+        theta.extend(ln_r(0.5 * r0_ohm));
+        theta.extend(vec![libm::log(tau_s); layout.nodes]);
+    }
+    Ok(theta)
+}
+
+fn straight_ocv(settings: &Settings) -> Vec<f64> {
+    let (low, high) = settings.voltage_v;
+    settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
+}
+
+/// OCV at every node from slow tests: linear between their temperatures, the nearest beyond.
+pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
+    let temperatures: Vec<f64> = curves.iter().map(|c| c.temperature_c).collect();
+    let at = |t: f64, soc: f64| {
+        let voltages: Vec<f64> = (0..curves.len()).map(|c| curve_at(curves, c, soc)).collect();
+        interpolate(&temperatures, &voltages, t)
+    };
+    grid.temperature_c
+        .iter()
+        .flat_map(|&t| grid.soc.iter().map(move |&soc| (t, soc)))
+        .map(|(t, soc)| at(t, soc))
+        .collect()
+}
+
+/// A curve's voltage; below the SOC at which a cold test ended, the shape of the next warmer one hangs on to it.
+fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
+    let curve = &curves[which];
+    let end = curve.soc[0];
+    if soc >= end || which + 1 >= curves.len() {
+        return interpolate(&curve.soc, &curve.voltage_v, soc);
+    }
+    curve.voltage_v[0] + curve_at(curves, which + 1, soc) - curve_at(curves, which + 1, end)
+}
+
+/// Median resistance at 25 degrees C that steps of current show from one row to the next; `None` = there are no steps.
+fn resistance_of_steps(records: &[Record]) -> Option<f64> {
+    let mut found = Vec::new();
+    for record in records {
+        let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
+        for pair in record.rows.windows(2).filter(|pair| pair[1].dt_s <= 20.0) {
+            let step_a = pair[1].current_a - pair[0].current_a;
+            let ohm = (pair[0].voltage_v - pair[1].voltage_v) / step_a;
+            if step_a.abs() > 0.2 * largest && ohm > 0.0 && ohm.is_finite() {
+                found.push(ohm / arrhenius(pair[1].temperature_c));
+            }
+        }
+    }
+    found.sort_by(f64::total_cmp);
+    found.get(found.len() / 2).copied()
+}
+
+fn space(settings: &Settings, layout: &Layout, start: &[f64]) -> Space {
+    let grid = &settings.grid;
+    let (mut low, mut high) = (start.to_vec(), start.to_vec());
+    let (least_v, most_v) = settings.voltage_v;
+    for row in 0..grid.temperature_c.len() {
+        let first = row * layout.columns;
+        (low[first], high[first]) = settings.empty_ocv_v.map_or((0.5 * least_v, most_v), |v| (v - 1e-6, v + 1e-6));
+        for s in 1..layout.columns {
+            let width = grid.soc[s] - grid.soc[s - 1];
+            let slope = settings.min_slope_v.iter().filter(|(from, _)| grid.soc[s] > *from).map(|(_, slope)| *slope);
+            low[first + s] = width * slope.fold(MIN_SLOPE_V, f64::max);
+            high[first + s] = width * MAX_SLOPE_V;
+        }
+    }
+    let mut within = |first: usize, factor: f64| {
+        for at in first..first + layout.nodes {
+            (low[at], high[at]) = (start[at] - libm::log(factor), start[at] + libm::log(factor));
+        }
+    };
+    within(layout.r0(), R_FACTOR);
+    for i in 0..layout.branches {
+        within(layout.branch_r(i), R_FACTOR);
+        within(layout.branch_tau(i), TAU_FACTOR);
+    }
+    let rising = (0..grid.temperature_c.len()).map(|row| (row * layout.columns, layout.columns)).collect();
+    Space { low, high, rising }
+}
+
+/// Residuals of every record and of all together.
+pub fn judge(records: &[Record], tables: &Tables) -> (Vec<Residual>, Residual) {
+    let mut total = Sums::default();
+    let each = records.iter().map(|record| {
+        let mut sums = Sums::default();
+        for (row, e) in record.rows.iter().zip(residuals(record, tables)) {
+            sums.add(row.weight_s, e);
+        }
+        total.join(&sums);
+        sums.residual()
+    });
+    let each = each.collect();
+    (each, total.residual())
+}
+
+/// Running sums of weighted residuals.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Sums {
+    weight: f64,
+    first: f64,
+    second: f64,
+    worst: f64,
+}
+
+impl Sums {
+    /// One residual and the seconds it stands for.
+    pub fn add(&mut self, weight_s: f64, e: f64) {
+        if weight_s > 0.0 {
+            self.weight += weight_s;
+            self.first += weight_s * e;
+            self.second += weight_s * e * e;
+            self.worst = if e.abs() > self.worst.abs() { e } else { self.worst };
+        }
+    }
+
+    /// Those of another stretch.
+    pub fn join(&mut self, other: &Self) {
+        self.weight += other.weight;
+        self.first += other.first;
+        self.second += other.second;
+        self.worst = if other.worst.abs() > self.worst.abs() { other.worst } else { self.worst };
+    }
+
+    /// What they say.
+    pub fn residual(&self) -> Residual {
+        if self.weight == 0.0 {
+            return Residual::default();
+        }
+        Residual {
+            seconds: self.weight,
+            rmse_v: (self.second / self.weight).sqrt(),
+            mean_v: self.first / self.weight,
+            worst_v: self.worst,
+        }
+    }
+}
+
+impl Fit {
+    /// Nodes no data support: temperature and SOC.
+    pub fn unsupported(&self) -> Vec<(f64, f64)> {
+        let columns = self.grid.soc.len();
+        let weak = self.visits_s.iter().enumerate().filter(|(_, seconds)| **seconds < SUPPORTED_S);
+        weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
+    }
+
+    /// The model's resistance once all branches have settled, ohm, at a place.
+    pub fn settled_ohm(&self, place: &Place) -> f64 {
+        let corners = self.grid.resistance_corners(place);
+        let branches: f64 = self.tables.r_ohm.iter().map(|r| corners.at(r)).sum();
+        corners.at(&self.tables.r0_ohm) + branches
+    }
+}
+
+#[cfg(test)]
+mod tests;

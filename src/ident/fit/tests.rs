@@ -1,0 +1,217 @@
+use super::*;
+use crate::cell::circuit::BranchAt;
+use crate::cell::{CellModel, Discretisation};
+use crate::ident::Raw;
+use crate::ident::pass::accumulate;
+use crate::ident::record::Limits;
+
+const LIMITS: Limits = Limits { voltage_low_v: 1.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
+const CAPACITY_AH: f64 = 2.0;
+
+/// A cheap reproducible scatter in [-0.5, 0.5].
+fn scatter(k: usize) -> f64 {
+    let x = (k as f64 * 12.9898).sin() * 43758.5453;
+    x - x.floor() - 0.5
+}
+
+/// Current that steps every 40 s, rests, and takes 1.9 Ah in two hours; every second.
+fn currents() -> Vec<f64> {
+    let level = |k: usize| match (k / 40) % 5 {
+        0 => 0.0,
+        1 => 3.0,
+        2 => 0.4,
+        3 => -0.6,
+        _ => 1.9,
+    };
+    (0..7200).map(|k| level(k) + 0.02 * scatter(k / 40)).collect()
+}
+
+/// A record of `model` at `temperature_c`, with `noise_v` on its voltage.
+fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) -> Record {
+    let current_a = currents();
+    let time_s: Vec<f64> = (0..current_a.len()).map(|k| k as f64).collect();
+    let mut branches_v = vec![0.0; model.branches.len()];
+    let (mut soc, mut socs, mut voltage_v) = (1.0, vec![], vec![]);
+    for k in 0..current_a.len() {
+        let mean_a = if k == 0 { 0.0 } else { 0.5 * (current_a[k] + current_a[k - 1]) };
+        soc -= mean_a / 3600.0 / CAPACITY_AH;
+        let place = model.place(soc, temperature_c);
+        for (i, u) in branches_v.iter_mut().enumerate() {
+            let dt_s = if k == 0 { 0.0 } else { 1.0 };
+            *u = BranchAt::new(model, i, &place, 1.0).voltage_after(Discretisation::Exact, *u, mean_a, dt_s);
+        }
+        let sum: f64 = branches_v.iter().sum();
+        let clean = crate::cell::circuit::terminal_v(model, &place, 1.0, sum, current_a[k]);
+        voltage_v.push(clean + 2.0 * noise_v * scatter(k + 17));
+        socs.push(soc);
+    }
+    let temperatures = vec![temperature_c; time_s.len()];
+    let raw =
+        Raw { time_s: &time_s, current_a: &current_a, voltage_v: &voltage_v, temperature_c: &temperatures, soc: &socs };
+    Record::prepare(&raw, &[], grid, &LIMITS)
+}
+
+fn grid() -> Grid {
+    Grid { soc: vec![0.0, 0.1, 0.3, 0.6, 1.0], temperature_c: vec![5.0, 25.0] }
+}
+
+/// Two branches; resistances of size and shape as cells have them.
+fn truth() -> CellModel {
+    let grid = grid();
+    let theta = truth_theta(&grid);
+    let tables = Tables::new(&Layout::new(&grid, 2), &theta);
+    let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
+    CellModel {
+        soc: grid.soc,
+        temperature_c: grid.temperature_c,
+        ocv_v,
+        r0_ohm,
+        branches,
+        ..crate::cell::model::tests::small_model()
+    }
+}
+
+fn truth_theta(grid: &Grid) -> Vec<f64> {
+    let ocv = [3.1, 3.45, 3.62, 3.85, 4.18];
+    let shape = [0.5, 0.2, 0.0, 0.02, 0.1];
+    let mut theta: Vec<f64> = ocv.iter().map(|v| v - 0.01).chain(ocv).collect();
+    let ln_r = |ohm: f64| {
+        let of_row = move |t: f64| shape.map(|bend| libm::log(ohm * arrhenius(t)) + bend);
+        grid.temperature_c.iter().flat_map(move |&t| of_row(t)).collect::<Vec<f64>>()
+    };
+    theta.extend(ln_r(0.04));
+    for (ohm, tau_s) in [(0.02, 8.0), (0.03, 120.0)] {
+        theta.extend(ln_r(ohm));
+        theta.extend([libm::log(tau_s); 10]);
+    }
+    theta
+}
+
+fn settings(grid: Grid) -> Settings {
+    Settings {
+        grid,
+        tau_s: vec![10.0, 150.0],
+        voltage_v: (2.5, 4.2),
+        ocv: vec![],
+        min_slope_v: vec![],
+        empty_ocv_v: None,
+        beliefs: Beliefs::FREE_OCV,
+    }
+}
+
+#[test]
+fn the_gradient_is_that_of_finite_differences() {
+    let grid = grid();
+    let layout = Layout::new(&grid, 2);
+    // Between the temperature nodes, so that all four corners carry; offsets so that residuals are not small.
+    let record = {
+        let mut record = simulate(&truth(), 25.0, 0.005, &grid);
+        for row in &mut record.rows {
+            let place = grid.place(row.soc, 5.0 + 20.0 * row.soc);
+            (row.ocv, row.resistance) = (grid.ocv_corners(&place), grid.resistance_corners(&place));
+        }
+        record
+    };
+    let start = truth_theta(&grid);
+    let theta: Vec<f64> =
+        start.iter().enumerate().map(|(k, x)| x + if k < 10 { 0.02 } else { 0.2 } * scatter(k)).collect();
+    let prior = Prior::new(&grid, &layout, &start, true, &Beliefs::SLOW_TEST);
+    let evaluate = |theta: &[f64]| {
+        let mut normal = Normal::new(layout.len());
+        accumulate(&record, 0.7, &layout, &Tables::new(&layout, theta), &mut normal);
+        prior.accumulate(theta, &mut normal);
+        normal
+    };
+    let gradient = evaluate(&theta).g;
+    for k in 0..layout.len() {
+        let step = 1e-5;
+        let shifted = |by: f64| {
+            let mut moved = theta.clone();
+            moved[k] += by;
+            evaluate(&moved).cost
+        };
+        let difference = (shifted(step) - shifted(-step)) / (2.0 * step);
+        let scale = gradient[k].abs().max(1.0);
+        assert!((difference - gradient[k]).abs() < 2e-3 * scale, "{k}: {difference} {}", gradient[k]);
+    }
+}
+
+#[test]
+fn known_parameters_come_back_from_noisy_data() {
+    let grid = grid();
+    let truth = truth();
+    let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
+    let fitted = fit(&settings(grid.clone()), &records, &[1.0, 1.0], |_, _| {}).expect("a fit");
+    assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
+    let expected = truth_theta(&grid);
+    let layout = Layout::new(&grid, 2);
+    let true_tables = Tables::new(&layout, &expected);
+    for node in (0..10).filter(|node| node % 5 != 0) {
+        let ocv_error = fitted.tables.ocv_v[node] - true_tables.ocv_v[node];
+        assert!(ocv_error.abs() < 0.003, "OCV node {node}: {ocv_error}");
+        let r0 = fitted.tables.r0_ohm[node] / true_tables.r0_ohm[node];
+        assert!((r0 - 1.0).abs() < 0.03, "R0 node {node}: {r0}");
+        for i in 0..2 {
+            let r = fitted.tables.r_ohm[i][node] / true_tables.r_ohm[i][node];
+            assert!((r - 1.0).abs() < 0.15, "R{i} node {node}: {r}");
+        }
+    }
+}
+
+#[test]
+fn the_ocv_rises_even_where_the_data_say_it_falls() {
+    let grid = grid();
+    let mut records = vec![simulate(&truth(), 25.0, 0.0, &grid)];
+    for row in &mut records[0].rows {
+        // The top bends down by more than the curve rises.
+        row.voltage_v -= 0.8 * (row.soc - 0.6).max(0.0);
+    }
+    let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");
+    for row in fitted.tables.ocv_v.chunks(5) {
+        assert!(row.windows(2).all(|pair| pair[1] > pair[0]), "{row:?}");
+    }
+}
+
+#[test]
+fn nodes_without_data_follow_arrhenius_and_are_named() {
+    let grid = Grid { temperature_c: vec![-15.0, 5.0, 25.0], ..grid() };
+    let records = vec![simulate(&truth(), 25.0, 0.001, &grid)];
+    let fitted = fit(&settings(grid), &records, &[1.0], |_, _| {}).expect("a fit");
+    let unsupported = fitted.unsupported();
+    assert!(unsupported.contains(&(-15.0, 0.6)) && unsupported.contains(&(5.0, 0.6)), "{unsupported:?}");
+    assert!(!unsupported.contains(&(25.0, 0.6)), "{unsupported:?}");
+    let ratio = fitted.tables.r0_ohm[3] / fitted.tables.r0_ohm[13];
+    let arrhenius = arrhenius(-15.0) / arrhenius(25.0);
+    assert!((ratio / arrhenius - 1.0).abs() < 0.1, "{ratio} {arrhenius}");
+    assert!((fitted.tables.ocv_v[3] - fitted.tables.ocv_v[13]).abs() < 0.005);
+}
+
+#[test]
+fn without_drives_the_correction_of_a_slow_test_fades() {
+    let grid = grid();
+    let curve = |temperature_c: f64, offset_v: f64| OcvCurve {
+        temperature_c,
+        soc: grid.soc.clone(),
+        voltage_v: truth().ocv_v.values[1].iter().map(|v| v + offset_v).collect(),
+    };
+    let ocv = vec![curve(5.0, 0.0), curve(25.0, 0.05)];
+    let settings = Settings { ocv, beliefs: Beliefs::SLOW_TEST, ..settings(grid.clone()) };
+    let fitted = fit(&settings, &[simulate(&truth(), 25.0, 0.001, &grid)], &[1.0], |_, _| {}).expect("a fit");
+    let correction = |node: usize, curve: usize| fitted.tables.ocv_v[node] - settings.ocv[curve].voltage_v[3];
+    let (driven, undriven) = (correction(8, 1), correction(3, 0));
+    assert!((driven + 0.05).abs() < 0.01, "{driven}");
+    assert!(undriven.abs() < 0.8 * driven.abs() && undriven < 0.0, "{undriven}");
+}
+
+#[test]
+fn too_few_rows_and_a_current_that_never_changes_are_refused() {
+    let grid = grid();
+    let mut record = simulate(&truth(), 25.0, 0.0, &grid);
+    record.rows.truncate(20);
+    let refused = fit(&settings(grid.clone()), &[record], &[1.0], |_, _| {}).expect_err("too few");
+    assert!(matches!(refused, FitError::TooFewRows { .. }), "{refused}");
+    let mut record = simulate(&truth(), 25.0, 0.0, &grid);
+    record.rows.iter_mut().for_each(|row| (row.current_a, row.mean_current_a) = (1.0, 1.0));
+    let refused = fit(&settings(grid), &[record], &[1.0], |_, _| {}).expect_err("no steps");
+    assert_eq!(refused, FitError::NoExcitation);
+}

@@ -1,0 +1,90 @@
+//! The parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
+//!
+//! Kind by kind, each in node order (temperature row by temperature row). Capacitances follow as C = tau / R at the nodes,
+//! and between nodes R and C are interpolated each for itself, as [`crate::cell::CellModel`] does.
+
+use super::grid::Grid;
+use crate::cell::{Branch, Table};
+
+/// Where each kind of parameter lies in the vector.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Layout {
+    /// Nodes of one table.
+    pub nodes: usize,
+    /// SOC columns.
+    pub columns: usize,
+    /// RC branches.
+    pub branches: usize,
+}
+
+impl Layout {
+    /// For `branches` branches on `grid`.
+    pub fn new(grid: &Grid, branches: usize) -> Self {
+        Self { nodes: grid.nodes(), columns: grid.soc.len(), branches }
+    }
+
+    /// Parameters in all.
+    pub fn len(&self) -> usize {
+        self.nodes * (2 + 2 * self.branches)
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// First ln R0.
+    pub fn r0(&self) -> usize {
+        self.nodes
+    }
+
+    /// First ln R of branch `i`.
+    pub fn branch_r(&self, i: usize) -> usize {
+        self.nodes * (2 + 2 * i)
+    }
+
+    /// First ln tau of branch `i`.
+    pub fn branch_tau(&self, i: usize) -> usize {
+        self.nodes * (3 + 2 * i)
+    }
+}
+
+/// The tables a parameter vector stands for, in node order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Tables {
+    /// Open-circuit voltage, V.
+    pub ocv_v: Vec<f64>,
+    /// Series resistance, ohm.
+    pub r0_ohm: Vec<f64>,
+    /// Resistance of each branch, ohm.
+    pub r_ohm: Vec<Vec<f64>>,
+    /// Capacitance of each branch, farad.
+    pub c_farad: Vec<Vec<f64>>,
+}
+
+impl Tables {
+    /// The tables of `theta`.
+    pub fn new(layout: &Layout, theta: &[f64]) -> Self {
+        let exp = |first: usize| theta[first..first + layout.nodes].iter().map(|&x| libm::exp(x)).collect::<Vec<_>>();
+        let mut tables =
+            Self { ocv_v: theta[..layout.nodes].to_vec(), r0_ohm: exp(layout.r0()), r_ohm: vec![], c_farad: vec![] };
+        for i in 0..layout.branches {
+            let r_ohm = exp(layout.branch_r(i));
+            let tau_s = exp(layout.branch_tau(i));
+            tables.c_farad.push(tau_s.iter().zip(&r_ohm).map(|(tau, r)| tau / r).collect());
+            tables.r_ohm.push(r_ohm);
+        }
+        tables
+    }
+
+    /// As tables of a cell model: OCV, R0, branches.
+    pub fn model(&self, columns: usize) -> (Table, Table, Vec<Branch>) {
+        let table = |values: &[f64]| Table { values: values.chunks(columns).map(<[f64]>::to_vec).collect() };
+        let branches = self.r_ohm.iter().zip(&self.c_farad);
+        (
+            table(&self.ocv_v),
+            table(&self.r0_ohm),
+            branches.map(|(r, c)| Branch { r_ohm: table(r), c_farad: table(c) }).collect(),
+        )
+    }
+}

@@ -1,0 +1,233 @@
+//! One pass over the data: residuals, their exact Jacobian, and the normal equations.
+//!
+//! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). A branch runs exactly over each row's step,
+//! U' = R I + x (U - R I) with x = exp(-dt / (R C)), and so do its derivatives:
+//! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives fade with the branch: those below
+//! [`FADED_V`] are dropped, so a row touches a few nodes only and the work per row does not grow with the tables.
+//! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
+
+use super::grid::Corners;
+use super::parameters::{Layout, Tables};
+use super::record::{Record, Row};
+
+/// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage's resolution.
+const FADED_V: f64 = 1e-6;
+/// Residual from which on the cost grows linearly, V.
+pub const HUBER_V: f64 = 0.05;
+/// Residual whose independent occurrence costs one half, V: the size of a good circuit's model error.
+const SIGMA_V: f64 = 0.010;
+/// Seconds over which model error repeats itself: one independent residual in this time.
+const REPEATS_S: f64 = 50.0;
+
+/// Normal equations in the nodes' own parameters.
+#[derive(Debug, Clone)]
+pub struct Normal {
+    n: usize,
+    /// Row-major; a pair's product lies at either of its two places until [`Normal::symmetric`].
+    h: Vec<f64>,
+    /// Gradient of the cost.
+    pub g: Vec<f64>,
+    /// Cost: half the weighted sum of squares (beyond the Huber limit: linear).
+    pub cost: f64,
+}
+
+impl Normal {
+    /// Empty equations for `n` parameters.
+    pub fn new(n: usize) -> Self {
+        Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
+    }
+
+    /// Adds an observation with derivatives `j` of the residual e = measured - model by parameter (`index`), i.e. de/dtheta.
+    pub fn add(&mut self, index: &[usize], j: &[f64], residual: f64, weight: f64) {
+        for (a, &row) in index.iter().enumerate() {
+            let weighted = weight * j[a];
+            self.g[row] += weighted * residual;
+            let line = &mut self.h[row * self.n..(row + 1) * self.n];
+            for (&column, &value) in index[a..].iter().zip(&j[a..]) {
+                line[column] += weighted * value;
+            }
+        }
+    }
+
+    /// Adds other equations.
+    pub fn add_all(&mut self, other: &Self) {
+        self.h.iter_mut().zip(&other.h).for_each(|(a, b)| *a += b);
+        self.g.iter_mut().zip(&other.g).for_each(|(a, b)| *a += b);
+        self.cost += other.cost;
+    }
+
+    /// The full symmetric matrix, row-major.
+    pub fn symmetric(&self) -> Vec<f64> {
+        let n = self.n;
+        let mut full = self.h.clone();
+        for a in 0..n {
+            for b in a + 1..n {
+                let sum = self.h[a * n + b] + self.h[b * n + a];
+                (full[a * n + b], full[b * n + a]) = (sum, sum);
+            }
+        }
+        full
+    }
+}
+
+/// A branch's voltage and derivatives on the way through a record.
+struct BranchRun {
+    voltage_v: f64,
+    by_r: Vec<f64>,
+    by_tau: Vec<f64>,
+    alive: Vec<usize>,
+    is_alive: Vec<bool>,
+}
+
+impl BranchRun {
+    fn new(nodes: usize) -> Self {
+        let zero = vec![0.0; nodes];
+        Self { voltage_v: 0.0, by_r: zero.clone(), by_tau: zero, alive: Vec::new(), is_alive: vec![false; nodes] }
+    }
+
+    fn relax(&mut self) {
+        self.voltage_v = 0.0;
+        for node in self.alive.drain(..) {
+            (self.by_r[node], self.by_tau[node], self.is_alive[node]) = (0.0, 0.0, false);
+        }
+    }
+
+    /// Over a row's step, without derivatives. Returns R and tau there and the decay.
+    fn step_voltage(&mut self, row: &Row, r_ohm: &[f64], c_farad: &[f64]) -> Step {
+        let (r, c) = (row.resistance.at(r_ohm), row.resistance.at(c_farad));
+        let (tau, settled) = (r * c, r * row.mean_current_a);
+        let decay = libm::exp(-row.dt_s / tau);
+        let above = self.voltage_v - settled;
+        self.voltage_v = settled + decay * above;
+        Step { r, c, decay, by_tau: above * decay * row.dt_s / (tau * tau) }
+    }
+
+    fn step(&mut self, row: &Row, r_ohm: &[f64], c_farad: &[f64]) {
+        let Step { r, c, decay, by_tau } = self.step_voltage(row, r_ohm, c_farad);
+        self.fade(decay);
+        let by_r = (1.0 - decay) * row.mean_current_a;
+        for (node, weight) in row.resistance.iter() {
+            if !self.is_alive[node] {
+                self.is_alive[node] = true;
+                self.alive.push(node);
+            }
+            // C = tau / R at the node: ln R moves R up and C down.
+            let (dr, dc) = (weight * r_ohm[node], weight * c_farad[node]);
+            self.by_r[node] += by_r * dr + by_tau * (c * dr - r * dc);
+            self.by_tau[node] += by_tau * r * dc;
+        }
+    }
+
+    fn fade(&mut self, decay: f64) {
+        let Self { by_r, by_tau, alive, is_alive, .. } = self;
+        alive.retain(|&node| {
+            by_r[node] *= decay;
+            by_tau[node] *= decay;
+            let keep = by_r[node].abs() > FADED_V || by_tau[node].abs() > FADED_V;
+            if !keep {
+                (by_r[node], by_tau[node], is_alive[node]) = (0.0, 0.0, false);
+            }
+            keep
+        });
+    }
+}
+
+struct Step {
+    r: f64,
+    c: f64,
+    decay: f64,
+    /// dU'/dtau.
+    by_tau: f64,
+}
+
+/// Residuals of a record, V, one per row (also of rows that are not judged).
+pub fn residuals(record: &Record, tables: &Tables) -> Vec<f64> {
+    let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
+    let of_row = |row: &Row| {
+        let mut model_v = row.ocv.at(&tables.ocv_v) - row.resistance.at(&tables.r0_ohm) * row.current_a;
+        for (i, branch) in branches.iter_mut().enumerate() {
+            if row.relaxed {
+                branch.voltage_v = 0.0;
+            } else {
+                branch.step_voltage(row, &tables.r_ohm[i], &tables.c_farad[i]);
+            }
+            model_v -= branch.voltage_v;
+        }
+        row.voltage_v - model_v
+    };
+    record.rows.iter().map(of_row).collect()
+}
+
+/// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights.
+pub fn accumulate(record: &Record, scale: f64, layout: &Layout, tables: &Tables, normal: &mut Normal) {
+    let mut branches: Vec<_> = (0..layout.branches).map(|_| BranchRun::new(layout.nodes)).collect();
+    let (mut index, mut j) = (Vec::with_capacity(128), Vec::with_capacity(128));
+    for row in &record.rows {
+        let mut model_v = row.ocv.at(&tables.ocv_v) - row.resistance.at(&tables.r0_ohm) * row.current_a;
+        for (i, branch) in branches.iter_mut().enumerate() {
+            if row.relaxed {
+                branch.relax();
+            } else {
+                branch.step(row, &tables.r_ohm[i], &tables.c_farad[i]);
+            }
+            model_v -= branch.voltage_v;
+        }
+        if row.weight_s > 0.0 {
+            derivatives(row, layout, tables, &branches, &mut index, &mut j);
+            let residual = row.voltage_v - model_v;
+            let (cost, robust) = huber(residual);
+            let weight = scale * row.weight_s / (SIGMA_V * SIGMA_V * REPEATS_S);
+            normal.cost += weight * cost;
+            normal.add(&index, &j, residual, weight * robust);
+        }
+    }
+}
+
+/// Derivatives of the residual by every parameter the row feels.
+fn derivatives(
+    row: &Row,
+    layout: &Layout,
+    tables: &Tables,
+    branches: &[BranchRun],
+    index: &mut Vec<usize>,
+    j: &mut Vec<f64>,
+) {
+    index.clear();
+    j.clear();
+    let mut push = |at: usize, value: f64| {
+        index.push(at);
+        j.push(value);
+    };
+    for (node, weight) in row.ocv.iter() {
+        push(node, -weight);
+    }
+    for (node, weight) in row.resistance.iter() {
+        push(layout.r0() + node, weight * tables.r0_ohm[node] * row.current_a);
+    }
+    for (i, branch) in branches.iter().enumerate() {
+        for &node in &branch.alive {
+            push(layout.branch_r(i) + node, branch.by_r[node]);
+            push(layout.branch_tau(i) + node, branch.by_tau[node]);
+        }
+    }
+}
+
+/// Cost of a residual and the weight its square gets in the normal equations.
+fn huber(residual: f64) -> (f64, f64) {
+    let size = residual.abs();
+    if size <= HUBER_V { (0.5 * residual * residual, 1.0) } else { (HUBER_V * (size - 0.5 * HUBER_V), HUBER_V / size) }
+}
+
+/// Seconds of judged rows near each node.
+pub fn visits(records: &[&Record], nodes: usize) -> Vec<f64> {
+    let mut seconds = vec![0.0; nodes];
+    let mut visit = |corners: &Corners, weight_s: f64| {
+        for (node, weight) in corners.iter() {
+            seconds[node] += weight.clamp(0.0, 1.0) * weight_s;
+        }
+    };
+    for row in records.iter().flat_map(|record| &record.rows) {
+        visit(&row.resistance, row.weight_s);
+    }
+    seconds
+}

@@ -1,0 +1,253 @@
+//! Measured rows made ready for the fit: coarser, placed in the tables, weighted by the time they stand for.
+//!
+//! A block collects raw rows until it is [`BLOCK_S`] long. Its last row is kept as it was measured (voltage, current,
+//! temperature, SOC at that instant: the series resistance acts at once); the branches see the mean current of the
+//! block, so no charge is lost. Blocks end early before a current step that follows steady current, so that both sides of a
+//! pulse's edge are kept, and at gaps. Over a gap in which charge was moved that the rows do not show, the branches
+//! start again relaxed.
+
+use super::Raw;
+use super::grid::{Corners, Grid};
+
+/// Longest block, s: time constants of interest are several times longer, drives change about once a second.
+const BLOCK_S: f64 = 1.0;
+/// Step of current that ends a block early, as a share of the largest current, when the block before it was steady.
+const EDGE_SHARE: f64 = 0.1;
+/// A step is an edge to be kept when the current was steady for this long before it, s; in drives it seldom is.
+const STEADY_S: f64 = 3.0;
+/// Most seconds one row stands for: rests at one row a minute must not outweigh what moves.
+const MAX_WEIGHT_S: f64 = 20.0;
+/// A gap this long may hide charge the rows do not show, s.
+const GAP_S: f64 = 60.0;
+/// Charge hidden in a gap from which the branches' state is unknown, as SOC.
+const HIDDEN_SOC: f64 = 0.002;
+/// After such a gap under current the branches are wrong for this long, s: rows are not judged.
+const UNKNOWN_S: f64 = 600.0;
+/// Current below which a cell counts as resting, as a share of the largest.
+const REST_SHARE: f64 = 0.02;
+
+/// One row of the fit.
+#[derive(Debug, Clone, Copy)]
+pub struct Row {
+    /// Seconds since the file's beginning.
+    pub time_s: f64,
+    /// Seconds since the row before it.
+    pub dt_s: f64,
+    /// Branches are relaxed at this row whatever came before.
+    pub relaxed: bool,
+    /// Mean current since the row before it, A.
+    pub mean_current_a: f64,
+    /// Current at this instant, A.
+    pub current_a: f64,
+    /// Measured voltage, V.
+    pub voltage_v: f64,
+    /// Cell temperature, degrees C.
+    pub temperature_c: f64,
+    /// State of charge.
+    pub soc: f64,
+    /// Seconds it stands for; 0 = carries the branches on and is not judged.
+    pub weight_s: f64,
+    /// Nodes of the OCV.
+    pub ocv: Corners,
+    /// Nodes of resistances and capacitances.
+    pub resistance: Corners,
+}
+
+/// Rows of one file's stretch.
+#[derive(Debug, Clone, Default)]
+pub struct Record {
+    /// In time order.
+    pub rows: Vec<Row>,
+    /// Rows as measured.
+    pub raw_rows: usize,
+    /// Rows whose voltage no cell of this type can have (sensor disconnected), left out.
+    pub outliers: usize,
+}
+
+/// What a record is cut by.
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Lowest credible voltage, V.
+    pub voltage_low_v: f64,
+    /// Highest credible voltage, V.
+    pub voltage_high_v: f64,
+    /// Capacity that turns current into SOC, Ah.
+    pub capacity_ah: f64,
+}
+
+impl Record {
+    /// Prepares a stretch. `judged[k]` = false keeps raw row k's current but not its voltage; empty = all are judged.
+    pub fn prepare(raw: &Raw<'_>, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
+        let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
+        let ends = block_ends(raw, largest_a);
+        let mut record = Self { raw_rows: raw.time_s.len(), ..Self::default() };
+        let mut unknown_until_s = f64::NEG_INFINITY;
+        let mut before = 0;
+        for &end in &ends {
+            let mut row = block_row(raw, before, end, grid);
+            if end > before && hides_charge(raw, before, end, limits.capacity_ah) {
+                row.relaxed = true;
+                if row.current_a.abs() > REST_SHARE * largest_a {
+                    unknown_until_s = row.time_s + UNKNOWN_S;
+                }
+            }
+            let credible = (limits.voltage_low_v..=limits.voltage_high_v).contains(&row.voltage_v);
+            record.outliers += usize::from(!credible);
+            if !credible || row.time_s < unknown_until_s || judged.get(end) == Some(&false) {
+                row.weight_s = -1.0;
+            }
+            record.rows.push(row);
+            before = end;
+        }
+        weigh(&mut record.rows);
+        record
+    }
+
+    /// Seconds from the first row to the last.
+    pub fn seconds(&self) -> f64 {
+        self.rows.iter().map(|row| row.dt_s).sum()
+    }
+}
+
+/// Time for which a whole discharge counts, s: a drive's. What takes longer says no more about the tables.
+const WHOLE_S: f64 = 8000.0;
+/// What slow and pulse tests count next to drives: the model is to follow drives.
+const TEST_SHARE: f64 = 0.3;
+/// Share of the time in which current flows, and variation of its size relative to its mean, of a drive.
+const DRIVE: (f64, f64) = (0.5, 0.3);
+
+/// 1 for a drive (current flows most of the time, at varying strength), less for rests with pulses and for constant current.
+pub fn share(record: &Record) -> f64 {
+    let largest = record.rows.iter().fold(0.0_f64, |most, row| most.max(row.current_a.abs()));
+    let (mut all, mut flowing, mut first, mut second) = (0.0, 0.0, 0.0, 0.0);
+    for row in &record.rows {
+        let size = row.mean_current_a.abs();
+        all += row.dt_s;
+        if size > REST_SHARE * largest {
+            flowing += row.dt_s;
+            first += size * row.dt_s;
+            second += size * size * row.dt_s;
+        }
+    }
+    let variation = (second * flowing / (first * first) - 1.0).max(0.0).sqrt();
+    if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
+}
+
+/// What a second of the record weighs: by the SOC it covers, not by how long it takes, times its [`share`].
+pub fn weight(record: &Record) -> f64 {
+    let judged = record.rows.iter().filter(|row| row.weight_s > 0.0);
+    let (low, high, seconds) = judged.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), row| {
+        (f64::min(low, row.soc), f64::max(high, row.soc), sum + row.weight_s)
+    });
+    if seconds > 0.0 { share(record) * (high - low) * WHOLE_S / seconds } else { 0.0 }
+}
+
+/// The raw rows at which blocks end; the first row is a block of its own.
+fn block_ends(raw: &Raw<'_>, largest_a: f64) -> Vec<usize> {
+    let (time_s, current_a) = (raw.time_s, raw.current_a);
+    let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
+    for k in 1..time_s.len() {
+        let step = (current_a[k] - current_a[k - 1]).abs() > EDGE_SHARE * largest_a;
+        let edge = step && time_s[k] - last_step_s >= STEADY_S;
+        if k - 1 > last && (edge || time_s[k] - time_s[k - 1] > BLOCK_S) {
+            ends.push(k - 1);
+            last = k - 1;
+        }
+        if edge || time_s[k] - time_s[last] >= BLOCK_S - 1e-6 || k + 1 == time_s.len() {
+            ends.push(k);
+            last = k;
+        }
+        if step {
+            last_step_s = time_s[k];
+        }
+    }
+    ends
+}
+
+fn block_row(raw: &Raw<'_>, before: usize, end: usize, grid: &Grid) -> Row {
+    let dt_s = raw.time_s[end] - raw.time_s[before];
+    let charge_as: f64 = (before + 1..=end)
+        .map(|k| 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * (raw.time_s[k] - raw.time_s[k - 1]))
+        .sum();
+    let place = grid.place(raw.soc[end], raw.temperature_c[end]);
+    Row {
+        time_s: raw.time_s[end],
+        dt_s,
+        relaxed: end == 0,
+        mean_current_a: if dt_s > 0.0 { charge_as / dt_s } else { raw.current_a[end] },
+        current_a: raw.current_a[end],
+        voltage_v: raw.voltage_v[end],
+        temperature_c: raw.temperature_c[end],
+        soc: raw.soc[end],
+        weight_s: 0.0,
+        ocv: grid.ocv_corners(&place),
+        resistance: grid.resistance_corners(&place),
+    }
+}
+
+/// Whether SOC moved over a gap otherwise than the current of its two ends says.
+fn hides_charge(raw: &Raw<'_>, before: usize, end: usize, capacity_ah: f64) -> bool {
+    (before + 1..=end).any(|k| {
+        let dt_s = raw.time_s[k] - raw.time_s[k - 1];
+        let shown = 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * dt_s / 3600.0 / capacity_ah;
+        dt_s > GAP_S && (raw.soc[k - 1] - raw.soc[k] - shown).abs() > HIDDEN_SOC
+    })
+}
+
+/// Half the time to both neighbours, at most [`MAX_WEIGHT_S`]; rows marked by a negative weight get none.
+fn weigh(rows: &mut [Row]) {
+    for k in 0..rows.len() {
+        let after_s = rows.get(k + 1).map_or(0.0, |row| row.dt_s);
+        let row = &mut rows[k];
+        row.weight_s = if row.weight_s < 0.0 { 0.0 } else { (0.5 * (row.dt_s + after_s)).min(MAX_WEIGHT_S) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grid() -> Grid {
+        Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] }
+    }
+
+    const LIMITS: Limits = Limits { voltage_low_v: 2.0, voltage_high_v: 4.5, capacity_ah: 1.0 };
+
+    fn prepare(time_s: &[f64], current_a: &[f64], voltage_v: &[f64], soc: &[f64]) -> Record {
+        let temperature_c = vec![25.0; time_s.len()];
+        let raw = Raw { time_s, current_a, voltage_v, temperature_c: &temperature_c, soc };
+        Record::prepare(&raw, &[], &grid(), &LIMITS)
+    }
+
+    #[test]
+    fn blocks_keep_every_ampere_second_and_both_sides_of_an_edge() {
+        let time_s: Vec<f64> = (0..200).map(|k| 0.1 * f64::from(k)).collect();
+        let current_a: Vec<f64> = time_s.iter().map(|&t| if t >= 9.95 { 2.0 } else { 0.0 }).collect();
+        let soc = vec![0.5; 200];
+        let record = prepare(&time_s, &current_a, &[3.6; 200], &soc);
+        assert!(record.rows.len() < 30, "{}", record.rows.len());
+        let charge: f64 = record.rows.iter().map(|row| row.mean_current_a * row.dt_s).sum();
+        let raw_charge = 3600.0 * super::super::charge_ah(&time_s, &current_a)[199];
+        assert!((charge - raw_charge).abs() < 1e-9, "{charge} {raw_charge}");
+        let edge = record.rows.windows(2).find(|pair| pair[1].current_a > 1.0).expect("an edge");
+        assert!((edge[1].dt_s - 0.1).abs() < 1e-9 && edge[0].current_a == 0.0, "{edge:?}");
+    }
+
+    #[test]
+    fn a_disconnected_sensor_is_counted_and_not_judged() {
+        let record = prepare(&[0.0, 1.0, 2.0], &[0.1; 3], &[3.6, -0.0006, 3.6], &[0.5; 3]);
+        assert_eq!(record.outliers, 1);
+        assert_eq!(record.rows[1].weight_s, 0.0);
+        assert!(record.rows[2].weight_s > 0.0);
+    }
+
+    #[test]
+    fn a_gap_that_hides_charge_relaxes_the_branches_and_a_plain_rest_does_not() {
+        let hidden = prepare(&[0.0, 1.0, 7000.0], &[0.0; 3], &[3.6; 3], &[0.5, 0.5, 0.4]);
+        assert!(hidden.rows[2].relaxed && hidden.rows[2].weight_s > 0.0);
+        let rest = prepare(&[0.0, 1.0, 7000.0], &[0.0; 3], &[3.6; 3], &[0.5; 3]);
+        assert!(!rest.rows[2].relaxed);
+        let driving = prepare(&[0.0, 1.0, 500.0, 501.0], &[0.0, 0.0, 1.0, 1.0], &[3.6; 4], &[0.5, 0.5, 0.4, 0.4]);
+        assert!(driving.rows[2].relaxed && driving.rows[3].weight_s == 0.0);
+    }
+}

@@ -1,0 +1,263 @@
+//! Projected Levenberg-Marquardt on normal equations, with bounds.
+//!
+//! The solver works in steps instead of node values where a block is given as *rising* (the OCV over SOC): first value, then
+//! the rise to each next node. A bound on a rise keeps the curve monotone. The damped quadratic model is minimised
+//! inside the bounds by exchanging the set of parameters held at a bound (block pivoting) with a Cholesky
+//! factorisation of the free ones each time; the step is taken when the true cost falls.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::pass::Normal;
+
+/// Most passes over the data.
+const MAX_PASSES: usize = 60;
+/// Relative fall of the cost below which the fit has converged, twice running.
+const CONVERGED: f64 = 3e-4;
+/// Damping at the start, relative to the curvature's diagonal; it falls and grows by the factors after it.
+const DAMPING_START: f64 = 0.3;
+const DAMPING_FALL: f64 = 0.1;
+const DAMPING_MIN: f64 = 1e-4;
+const DAMPING_GROWTH: f64 = 8.0;
+/// Damping at which no step helps any more.
+const DAMPING_MAX: f64 = 1e8;
+/// Most exchanges of the held set in one step; what is left then is cut off at the bounds.
+const MAX_EXCHANGES: usize = 30;
+
+/// Bounds and structure of the parameters.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Space {
+    /// Lowest values; of a rising block: of its first value, then of each rise.
+    pub low: Vec<f64>,
+    /// Highest values.
+    pub high: Vec<f64>,
+    /// Rising blocks: first index and length.
+    pub rising: Vec<(usize, usize)>,
+}
+
+impl Space {
+    /// Node values to first value and rises.
+    fn to_steps(&self, theta: &[f64]) -> Vec<f64> {
+        let mut y = theta.to_vec();
+        for &(first, len) in &self.rising {
+            for k in (first + 1..first + len).rev() {
+                y[k] -= y[k - 1];
+            }
+        }
+        y
+    }
+
+    /// And back.
+    fn to_nodes(&self, y: &[f64]) -> Vec<f64> {
+        let mut theta = y.to_vec();
+        for &(first, len) in &self.rising {
+            for k in first + 1..first + len {
+                theta[k] += theta[k - 1];
+            }
+        }
+        theta
+    }
+
+    /// `theta` moved into the bounds.
+    pub fn inside(&self, theta: &[f64]) -> Vec<f64> {
+        let mut y = self.to_steps(theta);
+        for (k, y) in y.iter_mut().enumerate() {
+            *y = y.clamp(self.low[k], self.high[k]);
+        }
+        self.to_nodes(&y)
+    }
+
+    /// Gradient and matrix by first values and rises: every node feels all rises below it.
+    fn pull_back(&self, normal: &Normal) -> (DMatrix<f64>, DVector<f64>) {
+        let n = normal.g.len();
+        let mut h = DMatrix::from_vec(n, n, normal.symmetric());
+        let mut g = DVector::from_column_slice(&normal.g);
+        for &(first, len) in &self.rising {
+            for k in (first..first + len - 1).rev() {
+                g[k] += g[k + 1];
+                for other in 0..n {
+                    h[(other, k)] += h[(other, k + 1)];
+                }
+            }
+            for column in 0..n {
+                for k in (first..first + len - 1).rev() {
+                    h[(k, column)] += h[(k + 1, column)];
+                }
+            }
+        }
+        (h, g)
+    }
+}
+
+/// How a fit ended.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Solution {
+    /// Node values.
+    pub theta: Vec<f64>,
+    /// Cost there.
+    pub cost: f64,
+    /// Passes over the data.
+    pub passes: usize,
+    /// Whether the cost had stopped falling.
+    pub converged: bool,
+}
+
+/// Minimises the cost that `evaluate` gives, from `start`; `progress` is told pass and cost.
+pub fn minimise(
+    space: &Space,
+    start: &[f64],
+    evaluate: impl Fn(&[f64]) -> Normal,
+    mut progress: impl FnMut(usize, f64),
+) -> Solution {
+    let mut theta = space.inside(start);
+    let mut normal = evaluate(&theta);
+    let (mut damping, mut passes, mut still) = (DAMPING_START, 1, 0);
+    progress(passes, normal.cost);
+    'outer: while passes < MAX_PASSES && still < 2 {
+        let y = space.to_steps(&theta);
+        let (h, g) = space.pull_back(&normal);
+        loop {
+            let step = bounded_step(&h, &g, damping, &y, space);
+            let trial = step.map(|step| {
+                let moved: Vec<f64> = y.iter().zip(step.iter()).map(|(y, d)| y + d).collect();
+                space.to_nodes(&moved)
+            });
+            let evaluated = trial.map(|trial| (evaluate(&trial), trial));
+            passes += 1;
+            if let Some((better, trial)) = evaluated.filter(|(trial, _)| trial.cost < normal.cost) {
+                let fall = (normal.cost - better.cost) / normal.cost;
+                still = if fall < CONVERGED { still + 1 } else { 0 };
+                (theta, normal) = (trial, better);
+                damping = (damping * DAMPING_FALL).max(DAMPING_MIN);
+                progress(passes, normal.cost);
+                break;
+            }
+            damping *= DAMPING_GROWTH;
+            if damping > DAMPING_MAX {
+                still = 2;
+                break 'outer;
+            }
+            if passes >= MAX_PASSES {
+                break 'outer;
+            }
+        }
+    }
+    Solution { theta, cost: normal.cost, passes, converged: still >= 2 }
+}
+
+/// Where a parameter is in the bounded step.
+#[derive(Clone, Copy, PartialEq)]
+enum Held {
+    Free,
+    Low,
+    High,
+}
+
+/// Minimiser of g d + d'(H + damping diag H)d / 2 with low <= y + d <= high; `None` when the matrix cannot be factorised.
+fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], space: &Space) -> Option<DVector<f64>> {
+    let n = y.len();
+    let mut damped = h.clone();
+    for k in 0..n {
+        damped[(k, k)] += damping * h[(k, k)] + f64::MIN_POSITIVE;
+    }
+    let mut held = vec![Held::Free; n];
+    for k in 0..n {
+        if y[k] <= space.low[k] && g[k] > 0.0 {
+            held[k] = Held::Low;
+        } else if y[k] >= space.high[k] && g[k] < 0.0 {
+            held[k] = Held::High;
+        }
+    }
+    let mut d = DVector::zeros(n);
+    for _ in 0..MAX_EXCHANGES {
+        solve_free(&damped, g, y, space, &held, &mut d)?;
+        if !exchange(&damped, g, y, space, &mut held, &d) {
+            break;
+        }
+    }
+    for k in 0..n {
+        d[k] = d[k].clamp(space.low[k] - y[k], space.high[k] - y[k]);
+    }
+    Some(d)
+}
+
+/// Solves for the free parameters with the held ones at their bounds.
+fn solve_free(
+    damped: &DMatrix<f64>,
+    g: &DVector<f64>,
+    y: &[f64],
+    space: &Space,
+    held: &[Held],
+    d: &mut DVector<f64>,
+) -> Option<()> {
+    let free: Vec<usize> = (0..y.len()).filter(|&k| held[k] == Held::Free).collect();
+    for k in 0..y.len() {
+        d[k] = match held[k] {
+            Held::Free => 0.0,
+            Held::Low => space.low[k] - y[k],
+            Held::High => space.high[k] - y[k],
+        };
+    }
+    let pushed = damped * &*d + g;
+    // Scaled to a unit diagonal: volts and logarithms differ by orders of magnitude.
+    let scale: Vec<f64> = free.iter().map(|&k| 1.0 / damped[(k, k)].sqrt()).collect();
+    let matrix = DMatrix::from_fn(free.len(), free.len(), |a, b| damped[(free[a], free[b])] * scale[a] * scale[b]);
+    let right = DVector::from_fn(free.len(), |a, _| -pushed[free[a]] * scale[a]);
+    let solved = matrix.cholesky()?.solve(&right);
+    for (a, &k) in free.iter().enumerate() {
+        d[k] = solved[a] * scale[a];
+    }
+    d.iter().all(|d| d.is_finite()).then_some(())
+}
+
+/// Holds what left its bounds, frees what is pushed inwards; whether anything changed.
+fn exchange(
+    damped: &DMatrix<f64>,
+    g: &DVector<f64>,
+    y: &[f64],
+    space: &Space,
+    held: &mut [Held],
+    d: &DVector<f64>,
+) -> bool {
+    let gradient = damped * d + g;
+    let mut changed = false;
+    for k in 0..y.len() {
+        let tolerance = 1e-12 * (1.0 + y[k].abs());
+        let now = match held[k] {
+            Held::Free if y[k] + d[k] < space.low[k] - tolerance => Held::Low,
+            Held::Free if y[k] + d[k] > space.high[k] + tolerance => Held::High,
+            Held::Low if gradient[k] < 0.0 => Held::Free,
+            Held::High if gradient[k] > 0.0 => Held::Free,
+            same => same,
+        };
+        changed |= now != held[k];
+        held[k] = now;
+    }
+    changed
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A straight line through points by first value and rises, each rise at least 0.5.
+    #[test]
+    fn a_rising_block_stays_rising_and_meets_the_bounded_optimum() {
+        let points = [0.0, 2.0, 1.9, 4.0];
+        let evaluate = |theta: &[f64]| {
+            let mut normal = Normal::new(4);
+            for (k, point) in points.iter().enumerate() {
+                let residual = theta[k] - point;
+                normal.cost += 0.5 * residual * residual;
+                normal.add(&[k], &[1.0], residual, 1.0);
+            }
+            normal
+        };
+        let space = Space { low: vec![-10.0, 0.5, 0.5, 0.5], high: vec![10.0, 9.0, 9.0, 9.0], rising: vec![(0, 4)] };
+        let solution = minimise(&space, &[0.0, 1.0, 2.0, 3.0], evaluate, |_, _| {});
+        // Points 2 and 1.9 move apart to a rise of 0.5 about their middle of 1.95.
+        for (found, expected) in solution.theta.iter().zip([0.0, 1.7, 2.2, 4.0]) {
+            assert!((found - expected).abs() < 1e-6, "{:?}", solution.theta);
+        }
+        assert!(solution.converged);
+    }
+}

@@ -1,0 +1,96 @@
+//! Heat capacity and thermal resistance: C dT/dt = I (OCV - V) - (T - Ta)/R, integrated, by linear least squares.
+//!
+//! The surroundings are taken to be at the temperature a record begins with. That does not hold for every record
+//! (some begin in a cell still warm or cold), so each discharge is fitted alone and the medians of what is credible are
+//! taken. Reversible heat is left out: the values are effective ones of the duty in the data.
+
+use super::parameters::Tables;
+use super::record::Record;
+use crate::cell::Thermal;
+
+/// Least warming of a record that tells anything, K.
+const MIN_RISE_K: f64 = 2.0;
+/// Most a record may cool below its beginning, K: else it began warmer than its surroundings.
+const MAX_FALL_K: f64 = 1.0;
+/// Values outside are no cell's: J/K, K/W.
+const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
+
+/// Fits both; `None` when no discharge warms enough or the answers are no cell's.
+pub fn fit(records: &[Record], tables: &Tables) -> Option<Thermal> {
+    let told = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
+    let (mut capacities, mut resistances): (Vec<f64>, Vec<f64>) =
+        told.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
+    Some(Thermal { heat_capacity_j_per_k: median(&mut capacities)?, resistance_k_per_w: median(&mut resistances)? })
+}
+
+fn median(values: &mut [f64]) -> Option<f64> {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
+
+/// T - T0 = heat / C + (-above) / (R C): normal equations of two unknowns.
+fn of_record(record: &Record, tables: &Tables) -> Option<Thermal> {
+    let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    let start_c = record.rows[0].temperature_c;
+    let (mut heat, mut above) = (0.0, 0.0);
+    // From where charge moved unseen, what it heated is unknown.
+    for row in record.rows.iter().skip(1).take_while(|row| !row.relaxed) {
+        let rise = row.temperature_c - start_c;
+        heat += row.mean_current_a * (row.ocv.at(&tables.ocv_v) - row.voltage_v) * row.dt_s;
+        above += rise * row.dt_s;
+        let w = row.weight_s;
+        hh += w * heat * heat;
+        ha -= w * heat * above;
+        aa += w * above * above;
+        ht += w * heat * rise;
+        at -= w * above * rise;
+    }
+    let determinant = hh * aa - ha * ha;
+    let g = (ht * aa - at * ha) / determinant;
+    let f = (at * hh - ht * ha) / determinant;
+    let (capacity, resistance) = (1.0 / g, g / f);
+    let credible = |x: f64, (low, high): (f64, f64)| (low..=high).contains(&x);
+    (credible(capacity, CREDIBLE[0]) && credible(resistance, CREDIBLE[1]))
+        .then_some(Thermal { heat_capacity_j_per_k: capacity, resistance_k_per_w: resistance })
+}
+
+fn warms(record: &Record) -> bool {
+    let (Some(first), Some(last)) = (record.rows.first(), record.rows.last()) else { return false };
+    let temperatures = record.rows.iter().map(|row| row.temperature_c);
+    let (low, high) = temperatures.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), t| (low.min(t), high.max(t)));
+    let discharge = last.soc < first.soc;
+    discharge && high - first.temperature_c >= MIN_RISE_K && first.temperature_c - low <= MAX_FALL_K
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ident::Raw;
+    use crate::ident::grid::Grid;
+    use crate::ident::record::Limits;
+
+    #[test]
+    fn known_parameters_are_found_again_in_spite_of_a_record_that_began_cold() {
+        let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
+        let tables = Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], c_farad: vec![] };
+        let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
+        let record = |start_c: f64| {
+            let time_s: Vec<f64> = (0..3000).map(f64::from).collect();
+            let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
+            let warm = |t: f64| 25.0 + 4.0 + (start_c - 29.0) * libm::exp(-t / 400.0);
+            let temperature_c: Vec<f64> = time_s.iter().map(|&t| warm(t)).collect();
+            // 0.4 W through 10 K/W with 40 J/K.
+            let raw = Raw {
+                time_s: &time_s,
+                current_a: &[2.0; 3000],
+                voltage_v: &[3.4; 3000],
+                temperature_c: &temperature_c,
+                soc: &soc,
+            };
+            Record::prepare(&raw, &[], &grid, &limits)
+        };
+        let found = fit(&[record(25.0), record(25.0), record(15.0)], &tables).expect("warms");
+        assert!((found.heat_capacity_j_per_k - 40.0).abs() < 0.4, "{found:?}");
+        assert!((found.resistance_k_per_w - 10.0).abs() < 0.1, "{found:?}");
+    }
+}

@@ -1,0 +1,383 @@
+//! From measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
+
+use super::{FitFailure, Request};
+use crate::ident::Raw;
+use crate::ident::ageing::{self, HalfCycle};
+use crate::ident::anchor::Stretch;
+use crate::ident::fit::{self, Fit, OcvCurve, Residual};
+use crate::ident::grid::Grid;
+use crate::ident::record::{self, Limits, Record};
+use crate::lab::measured::{MeasuredFile, Part};
+
+/// Temperature taken where a file has none, degrees C.
+const USUAL_C: f64 = 25.0;
+/// Temperatures of files closer than this share a node, K.
+const NODE_GAP_K: f64 = 5.0;
+/// Voltages this far beyond the cell's limits are no cell's, V.
+const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
+/// Voltages below this are a sensor that hangs free, V.
+const DISCONNECTED_V: f64 = 0.5;
+/// A charge counts less than a discharge of an ageing cell: its voltage carries slower relaxation.
+const AGEING_CHARGE_SCALE: f64 = 0.6;
+/// Share of the capacity a slow test must have taken out.
+const SLOW_TEST_SHARE: f64 = 0.5;
+
+/// One stretch of a file, ready but for the grid.
+pub(super) struct Source<'a> {
+    /// Number of its file.
+    pub(super) file: usize,
+    part: Clean<'a>,
+    soc: Vec<f64>,
+    judged: Vec<bool>,
+    /// What each second weighs; `None` = by the SOC it covers and by what it is.
+    scale: Option<f64>,
+}
+
+/// Everything that is known before the grid is.
+pub(super) struct Prepared<'a> {
+    pub(super) sources: Vec<Source<'a>>,
+    pub(super) capacity_ah: f64,
+    pub(super) voltage_v: (f64, f64),
+    pub(super) ocv: Vec<OcvCurve>,
+    pub(super) notes: Vec<String>,
+}
+
+/// A part without the rows that lack current or voltage or whose time runs backwards.
+struct Clean<'a> {
+    part: &'a Part,
+    time_s: Vec<f64>,
+    current_a: Vec<f64>,
+    voltage_v: Vec<f64>,
+    temperature_c: Vec<f64>,
+    discharged_ah: Vec<f64>,
+}
+
+impl<'a> Clean<'a> {
+    fn new(part: &'a Part) -> Self {
+        let mut clean = Self {
+            part,
+            time_s: vec![],
+            current_a: vec![],
+            voltage_v: vec![],
+            temperature_c: vec![],
+            discharged_ah: vec![],
+        };
+        let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
+        let mut temperature_c = known.unwrap_or(USUAL_C);
+        for k in 0..part.len() {
+            let backwards = clean.time_s.last().is_some_and(|&last| part.time_s[k] < last);
+            if backwards || part.current_a[k].is_nan() || part.voltage_v[k].is_nan() {
+                continue;
+            }
+            if part.temperature_c[k].is_finite() {
+                temperature_c = part.temperature_c[k];
+            }
+            clean.time_s.push(part.time_s[k]);
+            clean.current_a.push(part.current_a[k]);
+            clean.voltage_v.push(part.voltage_v[k]);
+            clean.temperature_c.push(temperature_c);
+            clean.discharged_ah.push(part.discharged_ah[k]);
+        }
+        clean
+    }
+
+    fn stretch(&self) -> Stretch<'_> {
+        Stretch {
+            time_s: &self.time_s,
+            current_a: &self.current_a,
+            voltage_v: &self.voltage_v,
+            discharged_ah: &self.discharged_ah,
+        }
+    }
+}
+
+/// Finds out everything but the grid.
+pub(super) fn prepare<'a>(
+    request: &Request,
+    files: &'a [MeasuredFile],
+    slow: &'a [MeasuredFile],
+) -> Result<Prepared<'a>, FitFailure> {
+    let voltage_v = voltage_limits(request, files)?;
+    let mut notes = Vec::new();
+    let dropped: usize =
+        files.iter().map(|f| f.rows() - f.parts.iter().map(|p| Clean::new(p).time_s.len()).sum::<usize>()).sum();
+    if dropped > 0 {
+        notes.push(format!("{dropped} rows left out: without current or voltage, or back in time"));
+    }
+    if let Some(first) = request.first_cycles {
+        return ageing_sources(files, first, voltage_v, notes);
+    }
+    let mut tests = slow.iter().map(|file| slow_test(file, voltage_v.1)).collect::<Result<Vec<_>, _>>()?;
+    tests.sort_by(|a, b| a.temperature_c.total_cmp(&b.temperature_c));
+    let mut taken = taken_out(request, files, voltage_v.1)?;
+    let deepest_ah = taken.iter().flat_map(|(_, _, out)| out).fold(0.0_f64, |most, ah| most.max(*ah));
+    let nearest = tests.iter().min_by(|a, b| (a.temperature_c - 25.0).abs().total_cmp(&(b.temperature_c - 25.0).abs()));
+    let capacity_ah = match (request.capacity_ah, nearest) {
+        (Some(given), _) => given,
+        (None, Some(test)) => {
+            notes.push(format!("capacity from the slow test at {:.0} degrees C", test.temperature_c));
+            test.out_ah[test.out_ah.len() - 1]
+        }
+        (None, None) => {
+            notes.push("capacity is the deepest discharge in the data, for want of --capacity".into());
+            deepest_ah
+        }
+    };
+    if capacity_ah <= 0.0 {
+        return Err(FitFailure("no discharge in the data".into()));
+    }
+    let sources = taken.drain(..).map(|(file, part, out_ah)| Source {
+        file,
+        soc: out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect(),
+        part,
+        judged: vec![],
+        scale: None,
+    });
+    let mut sources: Vec<Source<'a>> = sources.collect();
+    let slow_sources =
+        slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
+    sources.extend(slow_sources.collect::<Result<Vec<_>, _>>()?);
+    let ocv = tests.iter().map(|test| test.curve(capacity_ah)).collect();
+    Ok(Prepared { sources, capacity_ah, voltage_v, ocv, notes })
+}
+
+/// Charge taken out since full, of every part of every file; files that do not begin full are refused together.
+type TakenOut<'a> = (usize, Clean<'a>, Vec<f64>);
+
+fn taken_out<'a>(
+    request: &Request,
+    files: &'a [MeasuredFile],
+    voltage_max_v: f64,
+) -> Result<Vec<TakenOut<'a>>, FitFailure> {
+    let (mut taken, mut refused) = (Vec::new(), Vec::new());
+    for (number, file) in files.iter().enumerate() {
+        for part in file.parts.iter().map(Clean::new).filter(|part| !part.time_s.is_empty()) {
+            let hint_ah = request.capacity_ah.or(request.rated_ah).unwrap_or_else(|| rough_capacity(&part));
+            match part.stretch().taken_out_ah(voltage_max_v, hint_ah) {
+                Ok(out_ah) => taken.push((number, part, out_ah)),
+                Err(error) => refused.push(format!("{}{}: {error}", file.path.display(), key_text(part.part))),
+            }
+        }
+    }
+    if refused.is_empty() { Ok(taken) } else { Err(FitFailure(refused.join("\n"))) }
+}
+
+fn key_text(part: &Part) -> String {
+    if part.key.is_empty() { String::new() } else { format!(" part {}", part.key) }
+}
+
+fn rough_capacity(part: &Clean<'_>) -> f64 {
+    let out = crate::ident::charge_ah(&part.time_s, &part.current_a);
+    out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
+}
+
+/// Given limits, else those the data keep to but for a few stray rows.
+fn voltage_limits(request: &Request, files: &[MeasuredFile]) -> Result<(f64, f64), FitFailure> {
+    let (low, high) = match request.first_cycles {
+        Some(first) => cycle_limits(files, first),
+        None => seen_limits(files),
+    }
+    .ok_or_else(|| FitFailure("no voltage in the data".into()))?;
+    let (low, high) = (request.voltage_min_v.unwrap_or(low), request.voltage_max_v.unwrap_or(high));
+    if low >= high {
+        return Err(FitFailure(format!("lowest voltage {low} V, highest {high} V: must be below it")));
+    }
+    Ok((low, high))
+}
+
+fn seen_limits(files: &[MeasuredFile]) -> Option<(f64, f64)> {
+    let parts = files.iter().flat_map(|file| &file.parts);
+    let mut seen: Vec<f64> = parts.flat_map(|p| &p.voltage_v).copied().filter(|&v| v > DISCONNECTED_V).collect();
+    seen.sort_by(f64::total_cmp);
+    let stray = seen.len() / 10_000;
+    let (low, high) = (seen.get(stray)?, seen.get(seen.len().checked_sub(1 + stray)?)?);
+    Some(((low * 100.0).floor() / 100.0, (high * 100.0).ceil() / 100.0))
+}
+
+/// Limits of whole cycles: every discharge ends with its first row below the cut-off, which comes in steps of 0.1 V, so
+/// the highest of these rows tells it; charges hold their voltage, of which the middle one counts.
+fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(f64, f64)> {
+    let early =
+        || files.iter().flat_map(|f| &f.parts).filter(move |p| p.key.parse().is_ok_and(|cycle: usize| cycle <= first));
+    let extreme = |part: &Part, sign: f64| {
+        let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
+        let rows = part.current_a.iter().zip(&part.voltage_v);
+        let loaded = rows.filter(|(i, _)| *i * sign > 0.02 * most_a).map(|(_, v)| -v * sign);
+        loaded.fold(f64::NEG_INFINITY, f64::max) * -sign
+    };
+    let sorted = |discharge: bool| {
+        let sign = if discharge { 1.0 } else { -1.0 };
+        let own = early().filter(|part| (part.kind == "discharge") == discharge);
+        let mut all: Vec<f64> = own.map(|part| extreme(part, sign)).filter(|v| v.is_finite()).collect();
+        all.sort_by(f64::total_cmp);
+        all
+    };
+    let charges = sorted(false);
+    let low = (sorted(true).last()? * 10.0).ceil() / 10.0;
+    let high = charges.get(charges.len() / 2).copied().or_else(|| seen_limits(files).map(|(_, high)| high))?;
+    Some((low, (high * 20.0).round() / 20.0))
+}
+
+/// The discharge branch of a slow test.
+struct SlowDischarge {
+    temperature_c: f64,
+    /// Rising.
+    out_ah: Vec<f64>,
+    voltage_v: Vec<f64>,
+}
+
+impl SlowDischarge {
+    fn curve(&self, capacity_ah: f64) -> OcvCurve {
+        let soc = self.out_ah.iter().rev().map(|ah| 1.0 - ah / capacity_ah).collect();
+        let voltage_v = self.voltage_v.iter().rev().copied().collect();
+        OcvCurve { temperature_c: self.temperature_c, soc, voltage_v }
+    }
+}
+
+fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, FitFailure> {
+    let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
+    let part = Clean::new(&file.parts[0]);
+    if part.time_s.is_empty() {
+        return Err(fail("no row with current and voltage".into()));
+    }
+    let out_ah = part.stretch().taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(|e| fail(e.to_string()))?;
+    let begin = part.current_a.iter().position(|&i| i > 0.0).ok_or_else(|| fail("no discharge".into()))?;
+    let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
+    let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
+    let mut sum_c = 0.0;
+    for k in begin..begin + len {
+        if test.out_ah.last().is_none_or(|&last| out_ah[k] > last) && part.voltage_v[k] > DISCONNECTED_V {
+            test.out_ah.push(out_ah[k]);
+            test.voltage_v.push(part.voltage_v[k]);
+            sum_c += part.temperature_c[k];
+        }
+    }
+    let whole_ah = out_ah.iter().fold(0.0_f64, |most, ah| most.max(*ah));
+    if test.out_ah.len() < 10 || test.out_ah[test.out_ah.len() - 1] < SLOW_TEST_SHARE * whole_ah {
+        return Err(fail(format!("its first discharge has {} rows, expected a whole slow one", test.out_ah.len())));
+    }
+    test.temperature_c = sum_c / test.out_ah.len() as f64;
+    Ok(test)
+}
+
+/// A slow test's discharge as data beside the drives.
+fn slow_source(
+    file: &MeasuredFile,
+    number: usize,
+    voltage_max_v: f64,
+    capacity_ah: f64,
+) -> Result<Source<'_>, FitFailure> {
+    let part = Clean::new(&file.parts[0]);
+    let out_ah = part.stretch().taken_out_ah(voltage_max_v, capacity_ah);
+    let out_ah = out_ah.map_err(|e| FitFailure(format!("{}: {e}", file.path.display())))?;
+    let most = (0..out_ah.len()).fold(0, |most, k| if out_ah[k] > out_ah[most] { k } else { most });
+    // What follows the discharge is judged by nobody.
+    let judged = (0..out_ah.len()).map(|k| k <= most).collect();
+    let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
+    Ok(Source { file: number, part, soc, judged, scale: None })
+}
+
+fn ageing_sources<'a>(
+    files: &'a [MeasuredFile],
+    first: usize,
+    voltage_v: (f64, f64),
+    notes: Vec<String>,
+) -> Result<Prepared<'a>, FitFailure> {
+    let mut prepared = Prepared { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
+    for (number, file) in files.iter().enumerate() {
+        let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
+        if file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()) {
+            return Err(fail("--first-cycles needs the columns cycle and type".into()));
+        }
+        let mut early = Vec::new();
+        for part in &file.parts {
+            let cycle: usize = part.key.parse().map_err(|_| fail(format!("cycle {:?}: not a number", part.key)))?;
+            if cycle <= first {
+                early.push(Clean::new(part));
+            }
+        }
+        let cycles: Vec<HalfCycle<'_>> = early.iter().map(half_cycle).collect();
+        let (capacity_ah, anchored) = ageing::anchor(&cycles, voltage_v).map_err(|e| fail(e.to_string()))?;
+        prepared.capacity_ah += capacity_ah / files.len() as f64;
+        let mut early: Vec<Option<Clean<'a>>> = early.into_iter().map(Some).collect();
+        for half in anchored {
+            let Some(mut part) = early[half.index].take() else { continue };
+            let scale = if part.part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
+            part.current_a = half.current_a;
+            prepared.sources.push(Source {
+                file: number,
+                part,
+                soc: half.soc,
+                judged: half.judged,
+                scale: Some(scale),
+            });
+        }
+    }
+    Ok(prepared)
+}
+
+fn half_cycle<'b>(part: &'b Clean<'_>) -> HalfCycle<'b> {
+    HalfCycle {
+        discharge: part.part.kind == "discharge",
+        time_s: &part.time_s,
+        current_a: &part.current_a,
+        voltage_v: &part.voltage_v,
+    }
+}
+
+impl Prepared<'_> {
+    /// The records with their places in `grid`, and the weight of each.
+    pub(super) fn records(&self, grid: &Grid) -> (Vec<Record>, Vec<f64>) {
+        let limits = Limits {
+            voltage_low_v: (self.voltage_v.0 - CREDIBLE_BEYOND_V.0).max(DISCONNECTED_V),
+            voltage_high_v: self.voltage_v.1 + CREDIBLE_BEYOND_V.1,
+            capacity_ah: self.capacity_ah,
+        };
+        let record = |source: &Source<'_>| {
+            let raw = Raw {
+                time_s: &source.part.time_s,
+                current_a: &source.part.current_a,
+                voltage_v: &source.part.voltage_v,
+                temperature_c: &source.part.temperature_c,
+                soc: &source.soc,
+            };
+            Record::prepare(&raw, &source.judged, grid, &limits)
+        };
+        let records: Vec<Record> = self.sources.iter().map(record).collect();
+        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| record::weight(r)));
+        let scale = scale.collect();
+        (records, scale)
+    }
+
+    /// Residuals of the discharges and of the charges.
+    pub(super) fn by_kind(&self, records: &[Record], fitted: &Fit) -> (Residual, Residual) {
+        let of_kind = |discharge: bool| {
+            let own = self.sources.iter().zip(records).filter(|(s, _)| (s.part.part.kind == "discharge") == discharge);
+            let own: Vec<Record> = own.map(|(_, record)| record.clone()).collect();
+            fit::judge(&own, &fitted.tables).1
+        };
+        (of_kind(true), of_kind(false))
+    }
+
+    /// Temperatures the files were taken at: the coldest decile of each (cells warm under load), those close
+    /// together as one.
+    pub(super) fn temperature_nodes(&self) -> Vec<f64> {
+        let coldest = |source: &Source<'_>| {
+            let mut seen = source.part.temperature_c.clone();
+            seen.sort_by(f64::total_cmp);
+            seen[seen.len() / 10]
+        };
+        let mut all: Vec<f64> = self.sources.iter().map(coldest).collect();
+        all.sort_by(f64::total_cmp);
+        let mut nodes: Vec<(f64, f64)> = Vec::new();
+        let mut last = f64::NEG_INFINITY;
+        for t in all {
+            match nodes.last_mut() {
+                Some((sum, count)) if t - last < NODE_GAP_K => (*sum, *count) = (*sum + t, *count + 1.0),
+                _ => nodes.push((t, 1.0)),
+            }
+            last = t;
+        }
+        nodes.iter().map(|(sum, count)| (sum / count).round() + 0.0).collect()
+    }
+}

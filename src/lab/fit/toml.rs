@@ -1,0 +1,110 @@
+//! The cell model file: tables, thermal parameters, provenance. Holds no date: the same data give the same bytes.
+
+use std::fmt::Write as _;
+
+use super::{Outcome, Request};
+
+/// The whole file.
+pub fn text(request: &Request, outcome: &Outcome) -> String {
+    let mut out = String::new();
+    head(&mut out, request, outcome);
+    provenance(&mut out, request, outcome);
+    tables(&mut out, outcome);
+    if let Some(thermal) = &outcome.thermal {
+        line(&mut out, "\n[thermal]");
+        line(&mut out, &format!("heat_capacity_j_per_k = {:.2}", thermal.heat_capacity_j_per_k));
+        line(&mut out, &format!("resistance_k_per_w = {:.3}", thermal.resistance_k_per_w));
+    }
+    out
+}
+
+fn line(out: &mut String, text: &str) {
+    out.push_str(text);
+    out.push('\n');
+}
+
+fn quoted(text: &str) -> String {
+    toml::Value::String(text.to_owned()).to_string()
+}
+
+fn head(out: &mut String, request: &Request, outcome: &Outcome) {
+    line(out, "# Written by `packwatch fit`; fit again rather than edit.");
+    line(out, "format = 1");
+    line(out, &format!("name = {}", quoted(&request.name)));
+    line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
+    line(out, &format!("capacity_ah = {:.4}", outcome.capacity_ah));
+    line(out, &format!("voltage_min_v = {}", outcome.voltage_v.0));
+    line(out, &format!("voltage_max_v = {}", outcome.voltage_v.1));
+}
+
+fn provenance(out: &mut String, request: &Request, outcome: &Outcome) {
+    let fit = &outcome.fit;
+    line(out, "\n[provenance]");
+    line(out, &format!("program = \"packwatch {}\"", env!("CARGO_PKG_VERSION")));
+    let method = "bounded nonlinear least squares in log parameters, exact sensitivities, smoothness priors";
+    line(out, &format!("method = \"{method}\""));
+    if !request.ocv.is_empty() {
+        let names: Vec<String> = request.ocv.iter().map(|path| quoted(&file_name(path))).collect();
+        line(out, &format!("ocv = [{}]", names.join(", ")));
+    }
+    if let Some(first) = request.first_cycles {
+        line(out, &format!("first_cycles = {first}"));
+    }
+    line(out, &format!("passes = {}", fit.passes));
+    line(out, &format!("residual_rmse_mv = {:.2}", 1e3 * fit.total.rmse_v));
+    if let Some((discharge, charge)) = &outcome.by_kind {
+        line(out, &format!("residual_discharge_rmse_mv = {:.2}", 1e3 * discharge.rmse_v));
+        line(out, &format!("residual_charge_rmse_mv = {:.2}", 1e3 * charge.rmse_v));
+    }
+    for file in &outcome.files {
+        let (name, r) = (quoted(&file_name(&file.path)), &file.residual);
+        line(out, "[[provenance.files]]");
+        line(out, &format!("name = {name}"));
+        line(out, &format!("rows = {}", file.rows));
+        line(out, &format!("rmse_mv = {:.2}", 1e3 * r.rmse_v));
+        line(out, &format!("mean_mv = {:.2}", 1e3 * r.mean_v));
+    }
+}
+
+/// The file and the folder it lies in: enough to know it, nothing of the machine.
+fn file_name(path: &std::path::Path) -> String {
+    let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
+    parts[parts.len().saturating_sub(2)..].join("/")
+}
+
+fn tables(out: &mut String, outcome: &Outcome) {
+    let grid = &outcome.fit.grid;
+    let (ocv_v, r0_ohm, branches) = outcome.fit.tables.model(grid.soc.len());
+    let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");
+    line(out, "\n# Rows: temperature. Columns: SOC.\n[tables]");
+    line(out, &format!("soc = [{}]", list(&grid.soc)));
+    line(out, &format!("temperature_c = [{}]", list(&grid.temperature_c)));
+    table(out, "ocv_v", &ocv_v.values, 5);
+    table(out, "r0_ohm", &r0_ohm.values, 6);
+    let errors: Vec<Vec<f64>> = outcome.voltage_error_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
+    if false {
+        line(out, "# Standard deviation of the model's error averaged over 100 s.");
+        table(out, "voltage_error_v", &errors, 4);
+    }
+    for branch in &branches {
+        line(out, "\n[[tables.branches]]");
+        table(out, "r_ohm", &branch.r_ohm.values, 6);
+        table(out, "c_farad", &branch.c_farad.values, 2);
+    }
+}
+
+/// `key = [[..], [..]]` with at least `digits` decimals; smaller numbers keep five figures.
+fn table(out: &mut String, key: &str, rows: &[Vec<f64>], digits: usize) {
+    line(out, &format!("{key} = ["));
+    for row in rows {
+        let mut text = String::new();
+        for (k, value) in row.iter().enumerate() {
+            let figures = 4.0 - value.abs().log10().floor();
+            let decimals = if figures > digits as f64 { figures as usize } else { digits };
+            let separator = if k == 0 { "" } else { ", " };
+            let _ = write!(text, "{separator}{value:.decimals$}");
+        }
+        line(out, &format!("    [{text}],"));
+    }
+    line(out, "]");
+}
