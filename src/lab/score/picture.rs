@@ -21,7 +21,7 @@ pub(super) fn draw(
         panels.extend([soc_panel(&title, samples), error_panel(samples)]);
     }
     panels.extend(life.into_iter().flat_map(|life| life_panels(&title, &life.each)));
-    let path = folder.join(format!("{}_{}.svg", name.replace('/', "_"), describe(case, "_").replace(' ', "")));
+    let path = folder.join(format!("{}_{}.svg", name.replace('/', "_"), describe(case, "_").replace([' ', '%'], "")));
     plot::write(&path, &panels)?;
     Ok(path)
 }
