@@ -29,12 +29,7 @@ impl Colour {
     pub(crate) const BLUE: Self = Self(0, 114, 178);
     pub(crate) const ORANGE: Self = Self(213, 94, 0);
     pub(crate) const GREEN: Self = Self(0, 158, 115);
-    pub(crate) const PINK: Self = Self(204, 121, 167);
-    pub(crate) const YELLOW: Self = Self(230, 159, 0);
     pub(crate) const SKY: Self = Self(86, 180, 233);
-    pub(crate) const GREY: Self = Self(128, 128, 128);
-    /// For series without a meaning of their own, in this order.
-    pub(crate) const SERIES: [Self; 6] = [Self::BLUE, Self::ORANGE, Self::GREEN, Self::PINK, Self::YELLOW, Self::SKY];
 
     fn rgb(self) -> RGBColor {
         RGBColor(self.0, self.1, self.2)

@@ -18,7 +18,7 @@ mod soc;
 mod window;
 
 use std::path::PathBuf;
-use std::sync::Mutex;
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 pub use case::{Case, CaseScore, Start};
@@ -107,22 +107,22 @@ pub fn run(
     progress: &(dyn Fn(usize, f64) + Sync),
 ) -> Result<Vec<CaseScore>, ScoreError> {
     let next = AtomicUsize::new(0);
-    let results: Vec<Mutex<Option<Result<Vec<CaseScore>, ScoreError>>>> =
-        jobs.iter().map(|_| Mutex::new(None)).collect();
+    let results: Vec<OnceLock<Outcome>> = jobs.iter().map(|_| OnceLock::new()).collect();
     let work = || {
-        loop {
-            let index = next.fetch_add(1, Ordering::Relaxed);
-            let (Some(job), Some(result)) = (jobs.get(index), results.get(index)) else { return };
-            let scores = score_file(job, cases, settings, &|part| progress(index, part));
-            *result.lock().unwrap_or_else(std::sync::PoisonError::into_inner) = Some(scores);
+        while let Some((index, job)) = Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|i| Some((i, jobs.get(i)?)))
+        {
+            let outcome = score_file(job, cases, settings, &|part| progress(index, part));
+            // Each index is handed out once: nobody has set it before.
+            let _ = results[index].set(outcome);
         }
     };
     let workers = std::thread::available_parallelism().map_or(1, usize::from).min(jobs.len());
     std::thread::scope(|scope| (0..workers).for_each(|_| drop(scope.spawn(work))));
-    let of = |result: Mutex<Option<_>>| result.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-    let lists: Result<Vec<_>, _> = results.into_iter().filter_map(of).collect();
+    let lists: Result<Vec<_>, _> = results.into_iter().filter_map(OnceLock::into_inner).collect();
     Ok(lists?.into_iter().flatten().collect())
 }
+
+type Outcome = Result<Vec<CaseScore>, ScoreError>;
 
 fn score_file(
     job: &Job,
