@@ -111,16 +111,14 @@ impl Shown<'_> {
     pub(super) fn table(&self) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let settings = self.settings;
-        writeln!(
-            out,
-            "cell model {}; SOC in points of {} Ah, after {:.0} s; converged = within {CONVERGED_POINTS} points for {:.0} min",
-            settings.monitor.model.name,
-            settings.truth_capacity_ah,
-            settings.settle_s,
-            CONVERGED_HOLD_S / 60.0
-        )?;
+        writeln!(out, "cell model {}", settings.monitor.model.name)?;
         if self.scores.iter().any(|score| score.soc.is_some()) {
-            writeln!(out)?;
+            let (truth_ah, settle_s, hold_min) =
+                (settings.truth_capacity_ah, settings.settle_s, CONVERGED_HOLD_S / 60.0);
+            writeln!(
+                out,
+                "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min"
+            )?;
             write_table(&mut out, &self.soc_rows())?;
         }
         if self.scores.iter().any(|score| score.life.is_some()) {
@@ -211,7 +209,8 @@ impl Shown<'_> {
         }
         let plots = self.scores.iter().filter(|score| score.plot.is_some()).count();
         if let (1.., Some(folder)) = (plots, &self.settings.plots) {
-            writeln!(out, "{plots} plots in {}", folder.display())?;
+            let noun = if plots == 1 { "plot" } else { "plots" };
+            writeln!(out, "{plots} {noun} in {}", folder.display())?;
         }
         Ok(())
     }
