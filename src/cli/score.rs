@@ -1,11 +1,136 @@
 //! `packwatch score`: measured files against truth.
 
-use super::Failure;
+mod args;
+mod report;
 
-#[derive(Debug, clap::Args)]
-pub(crate) struct Args {}
+use std::path::{Path, PathBuf};
+
+pub(crate) use args::Args;
+
+use super::Failure;
+use crate::config::{self, Config, ConfigFaults};
+use crate::health::UsableConfig;
+use crate::lab::score::{self, Case, CycleTable, Job, Settings};
+
+/// The configuration used when none is given, and what it names; the cell model comes from the command line.
+const BUILT_IN: [(&str, &[u8]); 2] = [
+    ("score.toml", include_bytes!("../../config/score.toml")),
+    ("measured.dbc", include_bytes!("../../config/measured.dbc")),
+];
 
 /// Runs the command.
-pub(crate) fn run(_: &Args) -> Result<(), Failure> {
-    Err(Failure::new("not built yet"))
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    args.check()?;
+    let config = configuration(args)?;
+    let settings = settings(args, &config)?;
+    let jobs = jobs(args)?;
+    let cases = args.cases();
+    if let Some(folder) = &settings.plots {
+        std::fs::create_dir_all(folder)
+            .map_err(|e| Failure::new(format!("{}: cannot be made: {e}", folder.display())))?;
+    }
+    let bar = report::Bar::new(&jobs);
+    let scores = score::run(&jobs, &cases, &settings, &|index, part| bar.advance(index, part));
+    bar.clear();
+    let scores = scores.map_err(|error| Failure::new(error.to_string()))?;
+    let shown = report::Shown { config: &config, settings: &settings, cases: &cases, scores: &scores };
+    match if args.json { shown.json() } else { shown.table() } {
+        // The reader of our output has seen enough: no failure.
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.map_err(|error| Failure::new(error.to_string())),
+    }
+}
+
+/// The configuration asked for, with the cell model of --cell in place of its own.
+fn configuration(args: &Args) -> Result<Config, Failure> {
+    let built_in = args.config.is_none();
+    let path = args.config.clone().unwrap_or_else(|| PathBuf::from("score.toml"));
+    let Some(cell) = &args.cell else { return Ok(config::load(&path)?) };
+    // Faults of the model are told with its own name.
+    config::cell_model::load(cell)?;
+    let read = |file: &Path| {
+        let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
+        known.map_or_else(|| std::fs::read(file), |(_, bytes)| Ok(bytes.to_vec()))
+    };
+    let named = named_cell(&path, &read)?;
+    let read = |file: &Path| if file == named { std::fs::read(cell) } else { read(file) };
+    Ok(config::load_with(&path, &read)?)
+}
+
+/// The path of the cell model that a configuration names.
+fn named_cell(path: &Path, read: config::ReadFile<'_>) -> Result<PathBuf, ConfigFaults> {
+    let fault = |what: String| ConfigFaults(vec![format!("{}: {what}", path.display())]);
+    let bytes = read(path).map_err(|e| fault(format!("cannot be read: {e}")))?;
+    let named = String::from_utf8(bytes).ok().and_then(|text| text.parse::<toml::Table>().ok()).and_then(|table| {
+        let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
+        Some(path.parent().unwrap_or(Path::new("")).join(model))
+    });
+    // Without one, reading the configuration says what is wrong with it.
+    Ok(named.unwrap_or_default())
+}
+
+fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
+    let mut monitor = config.monitor.clone();
+    if monitor.sample.cells != 1 {
+        let found = monitor.sample.cells;
+        return Err(Failure::new(format!(
+            "{}: pack.cells = {found}, must be 1 to score files of one cell",
+            config.path.display()
+        )));
+    }
+    if let Some(load) = args.load {
+        let taper_current_a =
+            monitor.health.usable.map_or(monitor.model.rated_capacity_ah / 20.0, |u| u.taper_current_a);
+        let (current_a, temperature_c, cutoff_v) = (load.current_a, load.temperature_c, load.cutoff_v);
+        monitor.health.usable = Some(UsableConfig { current_a, temperature_c, cutoff_v, taper_current_a });
+    }
+    if !args.cycles.is_empty() && monitor.health.usable.is_none() {
+        return Err(Failure::new(
+            "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
+        ));
+    }
+    Ok(Settings {
+        truth_capacity_ah: args.truth_capacity.unwrap_or(monitor.model.capacity_ah),
+        monitor,
+        remove: args.remove,
+        settle_s: args.settle,
+        soc_std: args.soc_std.map(|points| points / 100.0),
+        capacity_std: args.capacity_std.map(|percent| percent / 100.0),
+        sleep_gap_s: args.sleep_gap,
+        threshold_ah: args.threshold,
+        skip_cycles: args.skip_cycles,
+        window: args.window,
+        plots: args.plot.clone(),
+    })
+}
+
+fn jobs(args: &Args) -> Result<Vec<Job>, Failure> {
+    let names = args::names(&args.files);
+    let tables = args.cycles.iter().map(|path| CycleTable::read(path).map(Some));
+    let tables: Result<Vec<_>, _> = tables.collect();
+    let mut tables = tables.map_err(|error| Failure::new(error.to_string()))?;
+    tables.resize(args.files.len(), None);
+    let jobs = args.files.iter().zip(names).zip(tables);
+    Ok(jobs.map(|((path, name), cycles)| Job { path: path.clone(), cycles, name }).collect())
+}
+
+impl Args {
+    /// Every combination, in the order of the lists.
+    fn cases(&self) -> Vec<Case> {
+        let seeds = if self.window.is_some() { self.seed.iter().map(|&seed| Some(seed)).collect() } else { vec![None] };
+        let mut cases = Vec::new();
+        for start in &self.start {
+            for told in &self.told {
+                for &capacity_error_percent in &self.capacity_error {
+                    cases.extend(seeds.iter().map(|&seed| Case {
+                        start: (*start).into(),
+                        told_points: told.0,
+                        capacity_error_percent,
+                        seed,
+                    }));
+                }
+            }
+        }
+        cases
+    }
 }

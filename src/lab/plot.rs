@@ -29,12 +29,7 @@ impl Colour {
     pub(crate) const BLUE: Self = Self(0, 114, 178);
     pub(crate) const ORANGE: Self = Self(213, 94, 0);
     pub(crate) const GREEN: Self = Self(0, 158, 115);
-    pub(crate) const PINK: Self = Self(204, 121, 167);
-    pub(crate) const YELLOW: Self = Self(230, 159, 0);
     pub(crate) const SKY: Self = Self(86, 180, 233);
-    pub(crate) const GREY: Self = Self(128, 128, 128);
-    /// For series without a meaning of their own, in this order.
-    pub(crate) const SERIES: [Self; 6] = [Self::BLUE, Self::ORANGE, Self::GREEN, Self::PINK, Self::YELLOW, Self::SKY];
 
     fn rgb(self) -> RGBColor {
         RGBColor(self.0, self.1, self.2)
@@ -116,15 +111,19 @@ type DrawError<'b> = DrawingAreaErrorKind<<SVGBackend<'b> as DrawingBackend>::Er
 
 fn draw_panel<'b>(area: &Area<'b>, panel: &Panel) -> Result<(), DrawError<'b>> {
     let (x_range, y_range) = ranges(panel);
-    let mut chart = ChartBuilder::on(area)
+    let mut chart = ChartBuilder::on(area);
+    chart
         .caption(&panel.title, ("sans-serif", 16))
         .margin(8)
         .margin_right(16)
         .x_label_area_size(36)
-        .y_label_area_size(64)
-        .build_cartesian_2d(x_range, y_range)?;
+        .y_label_area_size(64);
+    let (x_digits, y_digits) = (digits(&x_range), digits(&y_range));
+    let mut chart = chart.build_cartesian_2d(x_range, y_range)?;
     chart
         .configure_mesh()
+        .x_label_formatter(&|x| format!("{x:.x_digits$}"))
+        .y_label_formatter(&|y| format!("{y:.y_digits$}"))
         .x_desc(&panel.x_label)
         .y_desc(&panel.y_label)
         .label_style(("sans-serif", 12))
@@ -138,7 +137,7 @@ fn draw_panel<'b>(area: &Area<'b>, panel: &Panel) -> Result<(), DrawError<'b>> {
     if labelled.filter(|label| !label.is_empty()).count() > 0 {
         chart
             .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
+            .position(if rises(panel) { SeriesLabelPosition::LowerRight } else { SeriesLabelPosition::UpperRight })
             .background_style(WHITE.mix(0.85))
             .border_style(BLACK.mix(0.2))
             .label_font(("sans-serif", 12))
@@ -172,6 +171,22 @@ fn draw_line<'b>(chart: &mut Chart<'_, 'b>, line: &Line) -> Result<(), DrawError
         }
     }
     Ok(())
+}
+
+/// Decimals that tell about ten marks on an axis apart.
+fn digits(range: &Range<f64>) -> usize {
+    let step = (range.end - range.start) / 10.0;
+    (0..6).find(|&digits| step >= 10.0_f64.powi(-digits)).map_or(6, |digits| digits as usize)
+}
+
+/// Whether the data end higher than they begin, so that the legend would hide them at the upper right.
+fn rises(panel: &Panel) -> bool {
+    let finite = |line: &&Line| line.points.iter().filter(|p| p.1.is_finite()).count() > 1;
+    let change = |line: &Line| {
+        let finite = || line.points.iter().map(|p| p.1).filter(|y| y.is_finite());
+        finite().next_back().unwrap_or(0.0) - finite().next().unwrap_or(0.0)
+    };
+    panel.lines.iter().filter(finite).map(change).sum::<f64>() > 0.0
 }
 
 /// Stretches of points without a hole.

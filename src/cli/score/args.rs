@@ -1,0 +1,234 @@
+//! What `score` can be told.
+
+use std::path::{Path, PathBuf};
+
+use crate::cli::Failure;
+use crate::lab::score;
+
+/// Where in a file the estimator starts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(crate) enum Start {
+    /// At the file's first row
+    Full,
+    /// Where --remove has been taken out; the rows before are dropped
+    Middle,
+}
+
+impl From<Start> for score::Start {
+    fn from(start: Start) -> Self {
+        match start {
+            Start::Full => Self::Full,
+            Start::Middle => Self::Middle,
+        }
+    }
+}
+
+/// Error of the SOC told, points; `None` = nothing told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Told(pub(crate) Option<f64>);
+
+/// The load of the table's capacities.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Load {
+    pub(crate) current_a: f64,
+    pub(crate) temperature_c: f64,
+    pub(crate) cutoff_v: f64,
+}
+
+/// Arguments of `score`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "The truth of the SOC is 1 - discharged_ah / C, with the cycler's own counter and one C for all \
+                        files (--truth-capacity). Every list makes more cases: each file is run in every combination. \
+                        Statistics count every sample after --settle once."
+)]
+pub(crate) struct Args {
+    /// Measured files: CSV (.gz, .zst) with time_s, current_a (positive = discharge), voltage_v, temperature_c, discharged_ah
+    #[arg(required = true, value_name = "FILE")]
+    pub(crate) files: Vec<PathBuf>,
+    /// Configuration of one cell, with the input signals of measured.dbc; a built-in one with every estimator key at its default when not given
+    #[arg(short, long, value_name = "FILE.toml", required_unless_present = "cell")]
+    pub(crate) config: Option<PathBuf>,
+    /// Cell model, instead of the configuration's
+    #[arg(long, value_name = "MODEL.toml")]
+    pub(crate) cell: Option<PathBuf>,
+
+    /// Where in each file the estimator starts
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "full", help_heading = "Starts")]
+    pub(crate) start: Vec<Start>,
+    /// Part of the full charge already taken out where a start in the middle begins
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = part, help_heading = "Starts")]
+    pub(crate) remove: f64,
+    /// Error of the SOC the estimator is told, points (-20: told 20 points less than true); "none": it is told nothing
+    /// and starts from its first voltage
+    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = told,
+          allow_hyphen_values = true, help_heading = "Starts")]
+    pub(crate) told: Vec<Told>,
+    /// Standard deviation told with the SOC, points; as large as --told says when not given, and 5 at least
+    #[arg(long, value_name = "POINTS", value_parser = percent_above_0, help_heading = "Starts")]
+    pub(crate) soc_std: Option<f64>,
+    /// Error of the capacity the estimator starts with, percent of the model's
+    #[arg(long, value_name = "PERCENT", value_delimiter = ',', default_value = "0", value_parser = capacity_error,
+          allow_hyphen_values = true, help_heading = "Starts")]
+    pub(crate) capacity_error: Vec<f64>,
+    /// Standard deviation that goes with it, percent of the model's; the configuration's when not given
+    #[arg(long, value_name = "PERCENT", value_parser = percent_above_0, help_heading = "Starts")]
+    pub(crate) capacity_std: Option<f64>,
+
+    /// Time after the start that no statistic counts: 600, 600s, 10min or 1h
+    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration, help_heading = "Truth and statistics")]
+    pub(crate) settle: f64,
+    /// Charge from full to empty that the truth is stated in, Ah; the cell model's capacity_ah when not given
+    #[arg(long, value_name = "AH", value_parser = above_0, help_heading = "Truth and statistics")]
+    pub(crate) truth_capacity: Option<f64>,
+    /// A hole in a file longer than this means that nobody measured, s
+    #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0, help_heading = "Truth and statistics")]
+    pub(crate) sleep_gap: f64,
+
+    /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the files' order
+    #[arg(long, value_name = "TABLE.csv", help_heading = "Cell lives")]
+    pub(crate) cycles: Vec<PathBuf>,
+    /// Load at which the table's capacities were measured, A, degrees C, V: 2,24,2.7; the configuration's [usable] when not given
+    #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load, help_heading = "Cell lives")]
+    pub(crate) load: Option<Load>,
+    /// Report the first discharge below this capacity, Ah
+    #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0, help_heading = "Cell lives")]
+    pub(crate) threshold: f64,
+    /// Discharges before the statistics of the capacity begin
+    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Cell lives")]
+    pub(crate) skip_cycles: usize,
+    /// Each half-cycle is seen only in a random window of this part of its charge: 0.4,0.7
+    #[arg(long, value_name = "LEAST,MOST", value_parser = window, help_heading = "Cell lives")]
+    pub(crate) window: Option<(f64, f64)>,
+    /// Seeds of the windows
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1", help_heading = "Cell lives")]
+    pub(crate) seed: Vec<u64>,
+
+    /// Print the scores as JSON
+    #[arg(long, help_heading = "Output")]
+    pub(crate) json: bool,
+    /// Write an SVG per file and case into this folder
+    #[arg(long, value_name = "FOLDER", help_heading = "Output")]
+    pub(crate) plot: Option<PathBuf>,
+}
+
+impl Args {
+    /// What one argument alone cannot tell.
+    pub(super) fn check(&self) -> Result<(), Failure> {
+        let (files, tables) = (self.files.len(), self.cycles.len());
+        if tables != 0 && tables != files {
+            return Err(Failure::new(format!(
+                "--cycles given {tables} times for {files} files, must be once per file"
+            )));
+        }
+        for (index, file) in self.files.iter().enumerate() {
+            if self.files[..index].contains(file) {
+                return Err(Failure::new(format!("{}: named twice", file.display())));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Short names that tell the files apart: folder and name without endings, the whole path where two are the same.
+pub(super) fn names(files: &[PathBuf]) -> Vec<String> {
+    let short = |path: &PathBuf| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let name = name.split('.').next().unwrap_or_default().to_owned();
+        let folder = path.parent().and_then(Path::file_name).map(|folder| folder.to_string_lossy().into_owned());
+        folder.map_or(name.clone(), |folder| format!("{folder}/{name}"))
+    };
+    let all: Vec<String> = files.iter().map(short).collect();
+    let twice = |name: &String| all.iter().filter(|other| *other == name).count() > 1;
+    let full = |(name, path): (&String, &PathBuf)| if twice(name) { path.display().to_string() } else { name.clone() };
+    all.iter().zip(files).map(full).collect()
+}
+
+fn number(text: &str) -> Result<f64, String> {
+    let value: f64 = text.trim().parse().map_err(|_| "must be a number".to_owned())?;
+    if value.is_finite() { Ok(value) } else { Err("must be finite".to_owned()) }
+}
+
+fn above_0(text: &str) -> Result<f64, String> {
+    number(text).and_then(|value| if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) })
+}
+
+/// Strictly between 0 and 1.
+fn part(text: &str) -> Result<f64, String> {
+    let within = |value: &f64| *value > 0.0 && *value < 1.0;
+    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and below 1".to_owned()))
+}
+
+fn percent_above_0(text: &str) -> Result<f64, String> {
+    let within = |value: &f64| *value > 0.0 && *value <= 100.0;
+    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and at most 100".to_owned()))
+}
+
+fn told(text: &str) -> Result<Told, String> {
+    if text == "none" {
+        return Ok(Told(None));
+    }
+    let value = number(text).map_err(|_| "must be a number of points or none".to_owned())?;
+    if value.abs() <= 100.0 { Ok(Told(Some(value))) } else { Err("must be -100 to 100".to_owned()) }
+}
+
+fn capacity_error(text: &str) -> Result<f64, String> {
+    let within = |value: &f64| *value > -100.0 && *value <= 100.0;
+    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above -100 and at most 100".to_owned()))
+}
+
+/// Seconds of `600`, `600s`, `10min`, `1h`.
+fn duration(text: &str) -> Result<f64, String> {
+    const UNITS: [(&str, f64); 3] = [("min", 60.0), ("h", 3600.0), ("s", 1.0)];
+    let text = text.trim();
+    let (digits, unit) =
+        UNITS.iter().find_map(|(unit, seconds)| Some((text.strip_suffix(unit)?, *seconds))).unwrap_or((text, 1.0));
+    let value = number(digits).map_err(|_| "must be like 600, 600s, 10min or 1h".to_owned())?;
+    if value >= 0.0 { Ok(value * unit) } else { Err("must be at least 0".to_owned()) }
+}
+
+fn window(text: &str) -> Result<(f64, f64), String> {
+    const EXPECTED: &str = "must be two parts above 0 and at most 1, the smaller first, like 0.4,0.7";
+    let (least, most) = text.split_once(',').ok_or(EXPECTED)?;
+    let (least, most) = (number(least).map_err(|_| EXPECTED)?, number(most).map_err(|_| EXPECTED)?);
+    if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(EXPECTED.to_owned()) }
+}
+
+fn load(text: &str) -> Result<Load, String> {
+    const EXPECTED: &str = "must be amperes above 0, degrees C and volts above 0, like 2,24,2.7";
+    let values: Result<Vec<f64>, String> = text.split(',').map(number).collect();
+    match values.as_deref() {
+        Ok(&[current_a, temperature_c, cutoff_v]) if current_a > 0.0 && cutoff_v > 0.0 => {
+            Ok(Load { current_a, temperature_c, cutoff_v })
+        }
+        _ => Err(EXPECTED.to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_have_units() {
+        assert_eq!(duration("10min"), Ok(600.0));
+        assert_eq!((duration("90"), duration("90 s"), duration("0.5h")), (Ok(90.0), Ok(90.0), Ok(1800.0)));
+        assert!(duration("-1s").is_err() && duration("soon").is_err() && duration("min").is_err());
+    }
+
+    #[test]
+    fn lists_and_ranges_are_checked() {
+        assert_eq!(window("0.4,0.7"), Ok((0.4, 0.7)));
+        assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
+        assert_eq!(load("2,-10,2.7"), Ok(Load { current_a: 2.0, temperature_c: -10.0, cutoff_v: 2.7 }));
+        assert!(["2,24", "0,24,2.7", "2,24,2.7,1", "a,b,c"].iter().all(|text| load(text).is_err()));
+        assert_eq!((told("none"), told("-20")), (Ok(Told(None)), Ok(Told(Some(-20.0)))));
+        assert!(told("-101").is_err() && told("NaN").is_err() && part("1").is_err() && capacity_error("-100").is_err());
+    }
+
+    #[test]
+    fn names_tell_files_apart() {
+        let files = ["a/25C/x.csv.gz", "a/10C/x.csv.gz", "b/10C/x.csv", "y.csv"].map(PathBuf::from);
+        assert_eq!(names(&files), ["25C/x", "a/10C/x.csv.gz", "b/10C/x.csv", "y"]);
+    }
+}

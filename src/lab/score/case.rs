@@ -1,0 +1,285 @@
+//! One file in one case: the run through the core and what it came to.
+
+use std::ops::Range;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::feed::Feeder;
+use super::life::{Life, LifeScore};
+use super::soc::{self, Sample, SocScore};
+use super::{Job, ScoreError, Settings, picture, window};
+use crate::lab::measured::{MeasuredFile, Part};
+use crate::monitor::{EventKind, MonitorConfig};
+use crate::quantity::Timestamp;
+
+/// A part whose beginning nobody knows is put this long after the record so far.
+const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
+/// Rows between two reports of progress.
+const REPORT_EVERY: usize = 4096;
+/// A told SOC beyond 0 or 1 by no more than this is taken as that end (a counter that does not start at 0).
+const TOLD_SLACK: f64 = 0.005;
+
+/// Where in a file the estimator starts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// At its first row.
+    Full,
+    /// Where a part of the charge has been taken out; the rows before are not there.
+    Middle,
+}
+
+/// How an estimator is started.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Case {
+    /// Where.
+    pub start: Start,
+    /// Error of the SOC it is told, points; `None` = it is told nothing and starts from the first voltage.
+    pub told_points: Option<f64>,
+    /// Error of the capacity it starts with, percent of the model's.
+    pub capacity_error_percent: f64,
+    /// Seed of the windows; `None` = no windows.
+    pub seed: Option<u64>,
+}
+
+/// One file in one case.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CaseScore {
+    /// The file.
+    pub path: PathBuf,
+    /// Its short name.
+    pub name: String,
+    /// The case.
+    #[serde(flatten)]
+    pub case: Case,
+    /// Rows handed to the core.
+    pub rows: usize,
+    /// Values that no frame could carry.
+    pub uncarried_values: usize,
+    /// Times the filter lost its cell and started again.
+    pub resets: usize,
+    /// Capacity believed at the end, Ah, and its standard deviation; `None` = no estimate.
+    pub final_capacity_ah: Option<f64>,
+    /// Standard deviation, Ah.
+    pub final_capacity_std_ah: Option<f64>,
+    /// Resistance at the end relative to new; `None` = no estimate.
+    pub final_resistance_ratio: Option<f64>,
+    /// Its standard deviation.
+    pub final_resistance_ratio_std: Option<f64>,
+    /// The SOC; `None` = the file has no ampere-hour counter.
+    pub soc: Option<SocScore>,
+    /// The usable capacity; `None` = there is no table.
+    pub life: Option<LifeScore>,
+    /// The plot.
+    pub plot: Option<PathBuf>,
+}
+
+/// Runs `file` through the core.
+///
+/// # Errors
+/// The file has no truth, never comes to the start asked for, or the SOC to be told is none; a plot cannot be written.
+pub(super) fn run(
+    job: &Job,
+    file: &MeasuredFile,
+    case: &Case,
+    settings: &Settings,
+    progress: &dyn Fn(f64),
+) -> Result<CaseScore, ScoreError> {
+    let begin = Beginning::find(job, file, case, settings)?;
+    let config = configure(job, case, settings, begin.truth)?;
+    let mut run = Run::new(job, settings, config);
+    let (mut done, rows) = (0, file.rows().max(1));
+    for (index, part) in file.parts.iter().enumerate().skip(begin.part) {
+        let mut seen = case.seed.zip(settings.window).map_or(0..part.len(), |(s, w)| window::rows(part, index, s, w));
+        if index == begin.part {
+            seen.start = seen.start.max(begin.row);
+        }
+        run.part(part, seen, &mut |fed| {
+            done += fed;
+            progress(fed as f64 / rows as f64);
+        });
+    }
+    progress(rows.saturating_sub(done) as f64 / rows as f64);
+    run.finish(case)
+}
+
+/// Where a case begins.
+struct Beginning {
+    part: usize,
+    row: usize,
+    /// SOC there, fraction; NaN where there is no counter.
+    truth: f64,
+}
+
+impl Beginning {
+    fn find(job: &Job, file: &MeasuredFile, case: &Case, settings: &Settings) -> Result<Self, ScoreError> {
+        let unfit = |what: String| Err(ScoreError::Unfit(format!("{}: {what}", job.path.display())));
+        let truths = || {
+            let rows =
+                file.parts.iter().enumerate().flat_map(|(p, part)| (0..part.len()).map(move |row| (p, row, part)));
+            rows.map(|(p, row, part)| Self { part: p, row, truth: truth(part, row, settings) })
+        };
+        let Some(first) = truths().find(|at| at.truth.is_finite()) else {
+            if job.cycles.is_none() {
+                return unfit(
+                    "no column discharged_ah with values, and no table with --cycles: nothing to score against".into(),
+                );
+            }
+            return match (case.start, case.told_points) {
+                (Start::Middle, _) => {
+                    unfit("no column discharged_ah with values: a start in the middle cannot be found".into())
+                }
+                (_, Some(_)) => unfit("no column discharged_ah with values: no SOC to tell a wrong one from".into()),
+                _ => Ok(Self { part: 0, row: 0, truth: f64::NAN }),
+            };
+        };
+        let wanted = 1.0 - settings.remove;
+        match case.start {
+            Start::Full => Ok(first),
+            Start::Middle => match truths().find(|at| at.truth <= wanted) {
+                Some(at) => Ok(at),
+                None => unfit(format!(
+                    "never down to a SOC of {:.3}: no start in the middle with --remove {}",
+                    wanted, settings.remove
+                )),
+            },
+        }
+    }
+}
+
+/// SOC by the counter, fraction; NaN where it has no value.
+fn truth(part: &Part, row: usize, settings: &Settings) -> f64 {
+    1.0 - part.discharged_ah[row] / settings.truth_capacity_ah
+}
+
+/// The core as the case wants it.
+fn configure(job: &Job, case: &Case, settings: &Settings, truth: f64) -> Result<MonitorConfig, ScoreError> {
+    let mut config = settings.monitor.clone();
+    let estimator = &mut config.estimator;
+    if let Some(points) = case.told_points {
+        let told = truth + points / 100.0;
+        if !(-TOLD_SLACK..=1.0 + TOLD_SLACK).contains(&told) {
+            let (path, truth) = (job.path.display(), 100.0 * truth);
+            return Err(ScoreError::Unfit(format!(
+                "{path}: started at {truth:.1} % and told {points:+} points: {:.1} %, must be 0 to 100 %",
+                100.0 * told
+            )));
+        }
+        estimator.initial_soc = Some(told.clamp(0.0, 1.0));
+        estimator.initial_soc_std = settings.told_std(points);
+    }
+    if case.capacity_error_percent != 0.0 {
+        estimator.initial_capacity_ah = config.model.capacity_ah * (1.0 + case.capacity_error_percent / 100.0);
+    }
+    if let Some(std) = settings.capacity_std {
+        estimator.initial_capacity_std_ah = std * config.model.capacity_ah;
+    }
+    Ok(config)
+}
+
+/// A run under way.
+struct Run<'a> {
+    job: &'a Job,
+    settings: &'a Settings,
+    feeder: Feeder,
+    /// First and latest stamp fed.
+    span: Option<(Timestamp, Timestamp)>,
+    rows: usize,
+    left_out: usize,
+    resets: usize,
+    samples: Vec<Sample>,
+    life: Life,
+    last: Option<crate::monitor::Estimate>,
+}
+
+impl<'a> Run<'a> {
+    fn new(job: &'a Job, settings: &'a Settings, config: MonitorConfig) -> Self {
+        let feeder = Feeder::new(config, settings.sleep_gap_s);
+        let (samples, life) = (Vec::new(), Life::default());
+        Self { job, settings, feeder, span: None, rows: 0, left_out: 0, resets: 0, samples, life, last: None }
+    }
+
+    /// The rows `seen` of one part; `report` is told how many were fed.
+    fn part(&mut self, part: &Part, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
+        let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
+        let known = self.job.cycles.as_ref().and_then(|table| table.start(&part.key));
+        let base = match (known, self.span) {
+            (Some(start), _) => start,
+            (None, None) => Timestamp::ZERO,
+            (None, Some((_, latest))) => {
+                let base = latest.plus_nanos(UNKNOWN_GAP_NS).plus_secs(-first_s);
+                self.feeder.unknown_gap(base.plus_secs(first_s));
+                self.take_events();
+                base
+            }
+        };
+        for row in seen {
+            self.row(part, row, base.plus_secs(part.time_s[row]));
+            if self.rows.is_multiple_of(REPORT_EVERY) {
+                report(REPORT_EVERY);
+            }
+        }
+    }
+
+    fn row(&mut self, part: &Part, row: usize, time: Timestamp) {
+        let (began, latest) = self.span.unwrap_or((time, time));
+        self.span = Some((began, latest.max(time)));
+        self.rows += 1;
+        self.feeder.row(time, part.current_a[row], part.voltage_v[row], part.temperature_c[row]);
+        self.take_events();
+        let truth = truth(part, row, self.settings);
+        let estimate = self.feeder.out.estimates.pop();
+        self.feeder.out.clear();
+        self.last = estimate.or(self.last);
+        match estimate {
+            Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => self.samples.push(Sample {
+                time_s: time.since(began),
+                truth,
+                soc: e.soc,
+                soc_std: e.soc_std,
+                nis: (e.innovation_v / e.innovation_std_v).powi(2),
+            }),
+            _ => self.left_out += 1,
+        }
+    }
+
+    fn take_events(&mut self) {
+        for event in self.feeder.out.events.drain(..) {
+            self.resets += usize::from(matches!(event.kind, EventKind::FilterReset { .. }));
+            if let Some(table) = &self.job.cycles {
+                self.life.observe(&event, table);
+            }
+        }
+    }
+
+    fn finish(mut self, case: &Case) -> Result<CaseScore, ScoreError> {
+        if let Some((_, latest)) = self.span {
+            self.feeder.finish(latest);
+            self.take_events();
+        }
+        let (job, settings, last) = (self.job, self.settings, self.last);
+        let soc = (!self.samples.is_empty()).then(|| soc::score(&self.samples, settings.settle_s, self.left_out));
+        let life = job.cycles.as_ref().map(|table| self.life.score(table, settings));
+        let plot = settings
+            .plots
+            .as_deref()
+            .map(|folder| picture::draw(folder, &job.name, case, &self.samples, life.as_ref()))
+            .transpose()?;
+        Ok(CaseScore {
+            path: job.path.clone(),
+            name: job.name.clone(),
+            case: *case,
+            rows: self.rows,
+            uncarried_values: self.feeder.uncarried,
+            resets: self.resets,
+            final_capacity_ah: last.map(|e| e.capacity_ah),
+            final_capacity_std_ah: last.map(|e| e.capacity_std_ah),
+            final_resistance_ratio: last.map(|e| e.resistance_ratio),
+            final_resistance_ratio_std: last.map(|e| e.resistance_ratio_std),
+            soc,
+            life,
+            plot,
+        })
+    }
+}

@@ -1,0 +1,125 @@
+//! Tables of published capacities: CSV with `cycle`, `type`, `start` and `capacity_ah_source`, a line per cycle.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use super::ScoreError;
+use crate::io::stamp;
+use crate::quantity::Timestamp;
+
+/// A discharge of the table.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Discharge {
+    /// When it began.
+    pub(super) start: Timestamp,
+    /// Published capacity, Ah; `None` = not stated.
+    pub(super) capacity_ah: Option<f64>,
+}
+
+/// When each part of a measured file began, and what its discharges delivered.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CycleTable {
+    starts: HashMap<String, Timestamp>,
+    /// In order of time; discharge number n is the n-th, from 1.
+    pub(super) discharges: Vec<Discharge>,
+}
+
+impl CycleTable {
+    /// Reads a table.
+    ///
+    /// # Errors
+    /// It cannot be read, a column is missing or a field is wrong, with file and line; it names no discharge.
+    pub fn read(path: &Path) -> Result<Self, ScoreError> {
+        let name = path.display();
+        let fail = |line: u64, what: String| ScoreError::Unfit(format!("{name}:{line}: {what}"));
+        let text = std::fs::read(path).map_err(|e| ScoreError::Unfit(format!("{name}: cannot be read: {e}")))?;
+        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(text.as_slice());
+        let headers = reader.headers().map_err(|e| fail(1, e.to_string()))?.clone();
+        let column = |wanted: &str| {
+            let found = || headers.iter().collect::<Vec<_>>().join(",");
+            let index = headers.iter().position(|header| header.trim_start_matches('\u{feff}') == wanted);
+            index.ok_or_else(|| fail(1, format!("no column {wanted}, found {}", found())))
+        };
+        let [cycle, kind, start, capacity] =
+            [column("cycle")?, column("type")?, column("start")?, column("capacity_ah_source")?];
+        let mut table = Self { starts: HashMap::new(), discharges: Vec::new() };
+        for record in reader.records() {
+            let record = record.map_err(|e| ScoreError::Unfit(format!("{name}: {e}")))?;
+            let line = record.position().map_or(0, csv::Position::line);
+            let field = |column: usize| record.get(column).unwrap_or_default();
+            let (found_start, found_capacity) = (field(start), field(capacity));
+            let start = stamp::parse_stamp(found_start).ok_or_else(|| {
+                fail(line, format!("start = {found_start:?}, must be like 2008-04-02T13:08:17.921 or seconds"))
+            })?;
+            let capacity_ah = parse_capacity(found_capacity).ok_or_else(|| {
+                fail(line, format!("capacity_ah_source = {found_capacity:?}, must be a number above 0 or nothing"))
+            })?;
+            table.starts.insert(field(cycle).to_owned(), start);
+            if field(kind) == "discharge" {
+                table.discharges.push(Discharge { start, capacity_ah });
+            }
+        }
+        table.discharges.sort_by_key(|discharge| discharge.start);
+        if table.discharges.iter().all(|discharge| discharge.capacity_ah.is_none()) {
+            return Err(ScoreError::Unfit(format!("{name}: no discharge with a capacity_ah_source")));
+        }
+        Ok(table)
+    }
+
+    /// When the part with this key began; `None` = not in the table.
+    pub(super) fn start(&self, key: &str) -> Option<Timestamp> {
+        self.starts.get(key).copied()
+    }
+
+    /// Number, from 1, of the latest discharge begun by `time`; 0 = before the first.
+    pub(super) fn number_at(&self, time: Timestamp) -> usize {
+        self.discharges.partition_point(|discharge| discharge.start <= time)
+    }
+}
+
+/// Nothing is `Some(None)`, no capacity is `None`.
+fn parse_capacity(text: &str) -> Option<Option<f64>> {
+    if text.is_empty() {
+        return Some(None);
+    }
+    text.parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0).map(Some)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<CycleTable, String> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cycles.csv");
+        std::fs::write(&path, text).expect("written");
+        CycleTable::read(&path).map_err(|e| e.to_string().replace(&format!("{}/", folder.path().display()), ""))
+    }
+
+    #[test]
+    fn discharges_are_numbered_by_their_time() {
+        let table = read(
+            "cycle,type,start,capacity_ah_source\n0,charge,0,\n1,discharge,100,1.9\n2,impedance,200,\n3,discharge,300,\n",
+        );
+        let table = table.expect("reads");
+        let at = |seconds: f64| table.number_at(Timestamp::from_secs(seconds));
+        assert_eq!([at(99.0), at(100.0), at(299.0), at(1e9)], [0, 1, 1, 2]);
+        assert_eq!(table.discharges[1].capacity_ah, None);
+        assert_eq!((table.start("2"), table.start("9")), (Some(Timestamp::from_secs(200.0)), None));
+    }
+
+    #[test]
+    fn a_fault_names_its_line_and_what_was_found() {
+        let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,soon,1.9\n");
+        assert_eq!(
+            fault,
+            Err("cycles.csv:2: start = \"soon\", must be like 2008-04-02T13:08:17.921 or seconds".into())
+        );
+        let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,1,-1\n");
+        assert_eq!(fault, Err("cycles.csv:2: capacity_ah_source = \"-1\", must be a number above 0 or nothing".into()));
+        let fault = read("cycle,type,start\n1,discharge,1\n");
+        assert_eq!(fault, Err("cycles.csv:1: no column capacity_ah_source, found cycle,type,start".into()));
+        let fault = read("cycle,type,start,capacity_ah_source\n1,charge,1,\n");
+        assert_eq!(fault, Err("cycles.csv: no discharge with a capacity_ah_source".into()));
+    }
+}

@@ -1,0 +1,68 @@
+//! Rows of a measured file into the core: frames as they would have come over a bus, and the driver's ticks between them.
+
+use crate::can::Frame;
+use crate::can::decode::SensorIndex;
+use crate::can::encode::InputEncoder;
+use crate::io::ticks::Ticks;
+use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
+
+/// A core and what stands round it in a replay.
+pub(super) struct Feeder {
+    monitor: Monitor,
+    encoder: InputEncoder,
+    ticks: Ticks,
+    frames: Vec<(BusIndex, Frame)>,
+    /// What came out since the caller last emptied it.
+    pub(super) out: Outputs,
+    /// Values that no frame could carry.
+    pub(super) uncarried: usize,
+}
+
+impl Feeder {
+    pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
+        Self {
+            encoder: InputEncoder::new(&config.input),
+            monitor: Monitor::new(config),
+            ticks: Ticks::new(TICK_PERIOD_MS, sleep_gap_s),
+            frames: Vec::new(),
+            out: Outputs { want_estimates: true, ..Outputs::default() },
+            uncarried: 0,
+        }
+    }
+
+    /// One row: A (positive = discharge), V, degrees C; NaN = no value.
+    pub(super) fn row(&mut self, time: Timestamp, current_a: f64, voltage_v: f64, temperature_c: f64) {
+        self.ticks.advance(time);
+        self.make_ticks();
+        let values = [
+            (Channel::Current, Some(current_a)),
+            (Channel::CellVoltage(CellIndex(0)), Some(voltage_v)),
+            (Channel::Temperature(SensorIndex(0)), Some(temperature_c)),
+        ];
+        let mut frames = std::mem::take(&mut self.frames);
+        self.uncarried += self.encoder.encode(&values, &mut frames);
+        for (bus, frame) in frames.drain(..) {
+            self.monitor.handle(Input::Frame { time, bus, frame: &frame }, &mut self.out);
+        }
+        self.frames = frames;
+    }
+
+    /// The record goes on at `time` after a gap that nobody knows.
+    pub(super) fn unknown_gap(&mut self, time: Timestamp) {
+        self.ticks.sleep();
+        self.make_ticks();
+        self.monitor.handle(Input::UnknownGap { time }, &mut self.out);
+    }
+
+    /// The record ends: what is due up to its last row, and a gap, which completes the half-cycle at hand.
+    pub(super) fn finish(&mut self, latest: Timestamp) {
+        self.unknown_gap(latest);
+    }
+
+    fn make_ticks(&mut self) {
+        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+            self.monitor.handle(Input::Tick { time }, &mut self.out);
+        }
+    }
+}

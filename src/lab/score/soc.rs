@@ -1,0 +1,156 @@
+//! Errors of the SOC, and whether the interval that came with it held.
+
+use serde::Serialize;
+
+use super::STD_OF_95;
+
+/// An estimate this near the truth is right, points (percent of full).
+pub const CONVERGED_POINTS: f64 = 2.0;
+/// It must stay so near for this long, s: a wrong estimate that only crosses the truth has not converged.
+pub const CONVERGED_HOLD_S: f64 = 600.0;
+
+/// One estimate beside its truth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Sample {
+    /// Since the start, s.
+    pub(super) time_s: f64,
+    /// Fraction.
+    pub(super) truth: f64,
+    /// Fraction.
+    pub(super) soc: f64,
+    /// Fraction.
+    pub(super) soc_std: f64,
+    /// Innovation over its standard deviation, squared; NaN where there was no innovation.
+    pub(super) nis: f64,
+}
+
+impl Sample {
+    /// Points.
+    pub(super) fn error_points(&self) -> f64 {
+        100.0 * (self.soc - self.truth)
+    }
+
+    /// Half of the 95 % interval, points.
+    pub(super) fn half_width_points(&self) -> f64 {
+        100.0 * STD_OF_95 * self.soc_std
+    }
+}
+
+/// What a run's SOC was worth. Statistics are over the samples after settling; NaN (JSON: null) where there are none.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SocScore {
+    /// Samples in the statistics.
+    pub samples: usize,
+    /// Rows left out: no truth or no estimate.
+    pub left_out_rows: usize,
+    /// Error of the first estimate, points.
+    pub first_error_points: f64,
+    /// Root of the mean squared error, points.
+    pub rmse_points: f64,
+    /// Mean error (estimate - truth), points.
+    pub mean_error_points: f64,
+    /// Mean |error|, points.
+    pub mean_abs_error_points: f64,
+    /// Largest |error|, points.
+    pub max_abs_error_points: f64,
+    /// From when on |error| stayed within 2 points for 10 min, s after the start; `None` = never.
+    pub converge_s: Option<f64>,
+    /// Share of samples whose 95 % interval holds the truth, fraction.
+    pub coverage: f64,
+    /// Mean half-width of that interval, points.
+    pub mean_half_width_points: f64,
+    /// Mean of (innovation / its standard deviation) squared: 1 when the filter's own statistics hold.
+    pub mean_normalised_innovation_squared: f64,
+}
+
+/// The mean; NaN of nothing.
+pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
+    let (sum, count) = values.fold((0.0, 0_u64), |(sum, count), value| (sum + value, count + 1));
+    sum / count as f64
+}
+
+/// The largest; NaN of nothing.
+pub(super) fn largest(values: impl Iterator<Item = f64>) -> f64 {
+    values.fold(f64::NAN, f64::max)
+}
+
+/// Judges a run whose samples are in order of time.
+pub(super) fn score(samples: &[Sample], settle_s: f64, left_out_rows: usize) -> SocScore {
+    let settled = &samples[samples.partition_point(|sample| sample.time_s < settle_s)..];
+    let errors = || settled.iter().map(Sample::error_points);
+    let held = |sample: &Sample| f64::from(sample.error_points().abs() <= sample.half_width_points());
+    SocScore {
+        samples: settled.len(),
+        left_out_rows,
+        first_error_points: samples.first().map_or(f64::NAN, Sample::error_points),
+        rmse_points: mean(errors().map(|e| e * e)).sqrt(),
+        mean_error_points: mean(errors()),
+        mean_abs_error_points: mean(errors().map(f64::abs)),
+        max_abs_error_points: largest(errors().map(f64::abs)),
+        converge_s: converged_at(samples),
+        coverage: mean(settled.iter().map(held)),
+        mean_half_width_points: mean(settled.iter().map(Sample::half_width_points)),
+        mean_normalised_innovation_squared: mean(settled.iter().map(|s| s.nis).filter(|nis| nis.is_finite())),
+    }
+}
+
+/// Start of the first stretch of [`CONVERGED_HOLD_S`] within [`CONVERGED_POINTS`].
+fn converged_at(samples: &[Sample]) -> Option<f64> {
+    let near = |sample: &Sample| sample.error_points().abs() <= CONVERGED_POINTS;
+    let stretches = samples.chunk_by(|a, b| near(a) == near(b)).filter(|stretch| near(&stretch[0]));
+    let ends = stretches.filter_map(|stretch| Some((stretch.first()?.time_s, stretch.last()?.time_s)));
+    ends.into_iter().find(|(begin, end)| end - begin >= CONVERGED_HOLD_S).map(|(begin, _)| begin)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Samples every 10 s with these errors, points, and a standard deviation of 1 point.
+    fn samples(errors: &[f64]) -> Vec<Sample> {
+        let of = |(index, error): (usize, &f64)| Sample {
+            time_s: 10.0 * index as f64,
+            truth: 0.5,
+            soc: 0.5 + error / 100.0,
+            soc_std: 0.01,
+            nis: if index % 2 == 0 { 2.0 } else { f64::NAN },
+        };
+        errors.iter().enumerate().map(of).collect()
+    }
+
+    fn near(a: f64, b: f64) -> bool {
+        (a - b).abs() < 1e-9
+    }
+
+    #[test]
+    fn statistics_are_those_of_the_samples_after_settling() {
+        let score = score(&samples(&[-20.0, 9.0, 3.0, -1.0, -1.0, 1.0]), 20.0, 7);
+        assert_eq!((score.samples, score.left_out_rows), (4, 7));
+        assert!(near(score.first_error_points, -20.0));
+        assert!(near(score.rmse_points, 3.0_f64.sqrt()), "{}", score.rmse_points); // (9 + 1 + 1 + 1) / 4
+        assert!(near(score.mean_error_points, 0.5) && near(score.mean_abs_error_points, 1.5));
+        assert!(near(score.max_abs_error_points, 3.0));
+        assert!(near(score.coverage, 0.75) && near(score.mean_half_width_points, 1.96));
+        assert!(near(score.mean_normalised_innovation_squared, 2.0));
+    }
+
+    #[test]
+    fn converged_is_where_the_error_begins_to_stay_small() {
+        let mut errors = vec![-20.0; 5];
+        errors.extend([1.0; 10]); // crosses the truth for 90 s
+        errors.extend([5.0; 5]);
+        errors.extend([1.9; 61]); // 600 s
+        assert_eq!(score(&samples(&errors), 0.0, 0).converge_s, Some(200.0));
+        errors.pop();
+        assert_eq!(score(&samples(&errors), 0.0, 0).converge_s, None);
+    }
+
+    #[test]
+    fn of_no_samples_there_are_no_numbers() {
+        let score = score(&samples(&[1.0]), 600.0, 0);
+        assert_eq!(score.samples, 0);
+        assert!(score.rmse_points.is_nan() && score.coverage.is_nan() && score.max_abs_error_points.is_nan());
+        let json = serde_json::to_value(&score).expect("JSON");
+        assert!(json["rmse_points"].is_null() && near(json["first_error_points"].as_f64().expect("number"), 1.0));
+    }
+}

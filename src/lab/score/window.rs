@@ -1,0 +1,87 @@
+//! Random windows: each half-cycle seen only in part, as a vehicle that starts and stops anywhere sees it.
+//!
+//! The window is a share of the charge that the part moves (|current| times time; a charger's long taper would dominate
+//! a share of time), uniform between two bounds, at a uniform place. Rows outside are not there at all: the core finds a
+//! hole in its record.
+
+use std::ops::Range;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::lab::measured::Part;
+
+/// The rows of part number `index` that are seen: never none of a part that has rows.
+pub(super) fn rows(part: &Part, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
+    let moved = moved_as(part);
+    let total = moved.last().copied().unwrap_or(0.0);
+    if total <= 0.0 {
+        return 0..part.len();
+    }
+    let mut generator = ChaCha8Rng::seed_from_u64(seed);
+    // A stream per part: a part more in the file moves no other part's window.
+    generator.set_stream(index as u64);
+    let share = least + (most - least) * uniform(&mut generator);
+    let begin = (1.0 - share) * uniform(&mut generator);
+    let first = moved.partition_point(|&charge| charge < begin * total).min(part.len() - 1);
+    let end = moved.partition_point(|&charge| charge <= (begin + share) * total);
+    first..end.max(first + 1)
+}
+
+/// Charge moved up to each row, A s, either way.
+fn moved_as(part: &Part) -> Vec<f64> {
+    let mut total = 0.0;
+    let mut before_s = part.time_s.first().copied().unwrap_or(0.0);
+    let mut step = |(&time_s, &current_a): (&f64, &f64)| {
+        if current_a.is_finite() {
+            total += current_a.abs() * (time_s - before_s).max(0.0);
+        }
+        before_s = time_s;
+        total
+    };
+    part.time_s.iter().zip(&part.current_a).map(&mut step).collect()
+}
+
+/// Uniform in [0, 1).
+fn uniform(generator: &mut ChaCha8Rng) -> f64 {
+    const UNIT: f64 = 1.0 / (1_u64 << 53) as f64;
+    (generator.next_u64() >> 11) as f64 * UNIT
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 1000 s at 2 A, then 1000 s of rest.
+    fn part() -> Part {
+        let time_s: Vec<f64> = (0..=2000).map(f64::from).collect();
+        let current_a = time_s.iter().map(|&t| if t <= 1000.0 { 2.0 } else { 0.0 }).collect();
+        Part { time_s, current_a, ..Part::default() }
+    }
+
+    #[test]
+    fn windows_hold_the_share_asked_for_wherever_they_lie() {
+        let mut begins = Vec::new();
+        for index in 0..400 {
+            let rows = rows(&part(), index, 7, (0.4, 0.7));
+            let share = (rows.len() - 1) as f64 / 1000.0;
+            assert!((0.395..0.705).contains(&share), "{share}");
+            begins.push(rows.start);
+        }
+        assert!(begins.iter().any(|&b| b < 30) && begins.iter().any(|&b| b > 500), "windows do not move");
+    }
+
+    #[test]
+    fn a_seed_gives_its_windows_and_another_one_others() {
+        let of = |seed: u64| (0..20).map(|index| rows(&part(), index, seed, (0.4, 0.7))).collect::<Vec<_>>();
+        assert_eq!(of(1), of(1));
+        assert_ne!(of(1), of(2));
+    }
+
+    #[test]
+    fn a_part_without_current_is_seen_whole() {
+        let rest = Part { time_s: vec![0.0, 1.0], current_a: vec![0.0, f64::NAN], ..Part::default() };
+        assert_eq!(rows(&rest, 0, 1, (0.4, 0.7)), 0..2);
+        assert_eq!(rows(&Part::default(), 0, 1, (0.4, 0.7)), 0..0);
+    }
+}
