@@ -358,11 +358,24 @@ impl CellEstimator {
             .map_or(0.0, |filter| each!(filter, x => x.covariance[(log_resistance_index(x), capacity_index(x))]))
     }
 
-    /// The capacity walks: its variance grows by `process_variance_ah2` (at transitions only).
-    pub fn widen_capacity(&mut self, process_variance_ah2: f64) {
-        self.memory.capacity.variance += process_variance_ah2;
+    /// Voltage the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
+    pub fn load_v(&self, model: &CellModel) -> f64 {
+        let Some(soc) = self.soc() else { return 0.0 };
+        let place = model.place(soc.mean, self.memory.temperature_c.unwrap_or(25.0));
+        model.settled_ohm(&place) * libm::exp(self.log_resistance().mean) * self.memory.load_a
+    }
+
+    /// Replaces what is believed of the capacity (at transitions only). The filter never becomes surer by that: the
+    /// evidence since the last time may have been worth less than it took it for.
+    pub fn restate_capacity(&mut self, belief: Belief) {
+        self.memory.capacity = belief;
         if let Some(filter) = &mut self.filter {
-            each!(filter, x => { let c = capacity_index(x); x.covariance[(c, c)] += process_variance_ah2; });
+            each!(filter, x => {
+                let c = capacity_index(x);
+                x.mean[c] = belief.mean;
+                // Never below what goes with the other states' covariances.
+                x.covariance[(c, c)] = x.covariance[(c, c)].max(belief.variance);
+            });
         }
     }
 

@@ -231,7 +231,7 @@ fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
 
 fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     let (method, usual_noise_ah) = match keys.method {
-        Method::Swing => (CapacityMethod::Swing, 0.004 * rated_ah),
+        Method::Swing => (CapacityMethod::Swing, 0.008 * rated_ah),
         Method::Nominal => {
             let (swing, variance_ah2) = (keys.nominal_swing, keys.nominal_variance_ah2);
             (CapacityMethod::Nominal { swing, variance_ah2 }, 1.0)
@@ -241,6 +241,9 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
         method,
         noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(usual_noise_ah),
         noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah),
+        end_error_v: keys.end_error_v,
+        end_load_error: keys.end_load_error,
+        ageing_shift_error: keys.ageing_shift_error,
         current_gain_std: keys.current_gain_std,
         current_offset_std_a: keys.current_offset_std_a.unwrap_or(0.005 * rated_ah),
         fade_std_ah_per_cycle: keys.fade_std_ah_per_cycle,

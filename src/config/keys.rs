@@ -302,10 +302,16 @@ section! {
         nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6");
         /// Measurement variance of method "nominal".
         nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1");
-        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.4 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
+        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.8 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional;
         /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 2 % of the rated capacity.
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;
+        /// Error of the cell model's open-circuit voltage at the ends of a half-cycle ("swing" only). It repeats, so it bounds what one half-cycle can tell.
+        end_error_v: f64, "V", DEVIATION, Default("0.005");
+        /// The same as part of the voltage the load drops in the cell ("swing" only).
+        end_load_error: f64, "", DEVIATION, Default("0.075");
+        /// Error of the cell model's `ocv_ageing_shift` ("swing" only): what the change of the curve's shape with lost capacity makes uncertain.
+        ageing_shift_error: f64, "", DEVIATION, Default("0.3");
         /// Standard deviation of the current sensor's gain: no capacity is known better than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
         /// Standard deviation of the current sensor's offset, per cell: what charges and discharges disagree by is learned and taken off the current ("swing" only; 0 = not learned). Without it: the rated capacity over 200 h (0.5 % of 1 C).

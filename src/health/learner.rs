@@ -13,9 +13,12 @@ use serde::{Deserialize, Serialize};
 
 use super::drift::Drift;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
-use crate::cell::CellEstimator;
+use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Belief, Measurement};
 use crate::quantity::{Mode, Timestamp};
+
+/// A half-cycle's ends are weighed over no less than this swing: below it the variance is beyond use anyway.
+const MIN_WEIGHED_SWING: f64 = 0.02;
 
 /// One completed half-cycle of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,12 +32,23 @@ pub struct HalfCycle {
     pub swing: Option<Belief>,
     /// SOC at its end, fraction.
     pub end_soc: Option<f64>,
+    /// Where its charge was weighed: both ends on the voltage curve; `None` when its beginning was not estimated.
+    pub ends: Option<[End; 2]>,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
     pub mean_current_a: f64,
     /// Mean temperature, degrees C; `None` when there was none.
     pub mean_temperature_c: Option<f64>,
+}
+
+/// One end of a half-cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct End {
+    /// State of charge, fraction.
+    pub soc: f64,
+    /// Voltage which the load of the minutes before dropped in the cell, V.
+    pub load_v: f64,
 }
 
 /// What the capacity filter made of a half-cycle.
@@ -50,6 +64,8 @@ pub struct CapacityUpdate {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<Belief>,
+    #[serde(default)]
+    load_v: f64,
     temperature_integral: f64,
     temperature_s: f64,
 }
@@ -105,9 +121,9 @@ impl Learner {
     }
 
     /// Takes a cell's new estimate into its totals.
-    pub fn observe(&mut self, cell: usize, soc: Belief, temperature_c: Option<f64>, elapsed_s: f64) {
+    pub fn observe(&mut self, cell: usize, soc: Belief, load_v: f64, temperature_c: Option<f64>, elapsed_s: f64) {
         let totals = &mut self.totals[cell];
-        totals.soc = Some(soc);
+        (totals.soc, totals.load_v) = (Some(soc), load_v);
         if let Some(temperature_c) = temperature_c {
             totals.temperature_integral += temperature_c * elapsed_s;
             totals.temperature_s += elapsed_s;
@@ -162,13 +178,14 @@ impl Learner {
     /// Runs the capacity filter of one cell over its completed half-cycle.
     pub fn learn(
         &mut self,
+        model: &CellModel,
         config: &CapacityConfig,
         cell: usize,
         estimator: &mut CellEstimator,
         half_cycle: &HalfCycle,
     ) -> CapacityUpdate {
         let measurement = match config.method {
-            CapacityMethod::Swing => self.learn_swing(config, cell, estimator, half_cycle),
+            CapacityMethod::Swing => self.learn_swing(model, config, cell, estimator, half_cycle),
             CapacityMethod::Nominal { swing, variance_ah2 } => {
                 let measurement = Measurement { value: half_cycle.charge_ah / swing, variance: variance_ah2 };
                 let belief = &mut self.capacity[cell];
@@ -189,13 +206,17 @@ impl Learner {
 
     fn learn_swing(
         &mut self,
+        model: &CellModel,
         config: &CapacityConfig,
         cell: usize,
         estimator: &mut CellEstimator,
         half_cycle: &HalfCycle,
     ) -> Option<Measurement> {
         let after = estimator.capacity();
-        let measurement = self.prior[cell].information_until(&after);
+        let measurement = self.prior[cell].information_until(&after).map(|z| Measurement {
+            value: z.value,
+            variance: z.variance + end_variance_ah2(model, config, half_cycle, after.mean),
+        });
         let drift = &mut self.drift[cell];
         if let Some(z) = measurement {
             drift.update(z, half_cycle.mean_current_a);
@@ -207,10 +228,8 @@ impl Learner {
             + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days;
         let charged = if half_cycle.mode == Mode::Charge { 2.0 * cycles } else { 0.0 };
         drift.pass(config, cycles, charged, walk);
-        // The sample filter goes on from what is known now; it never becomes surer by that.
-        let known = drift.capacity();
-        estimator.hold_capacity(known.mean);
-        estimator.widen_capacity((known.variance - after.variance).max(0.0));
+        // The sample filter goes on from what is known now.
+        estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
         measurement
     }
@@ -243,6 +262,22 @@ impl Learner {
     }
 }
 
+/// Variance which the voltage model's repeating error at both ends puts under a half-cycle's capacity, Ah^2:
+/// (C / swing)^2 times the variance of both ends' SOC.
+fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &HalfCycle, capacity_ah: f64) -> f64 {
+    let Some(ends) = &half_cycle.ends else { return 0.0 };
+    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
+    let lost = 1.0 - capacity_ah / model.capacity_ah;
+    let soc_variance = ends.iter().fold(0.0, |sum, end| {
+        let slope_v = model.ocv_slope_v(&model.place(end.soc, temperature_c));
+        let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
+        let shape = config.ageing_shift_error * lost * end.soc * (1.0 - end.soc);
+        sum + volts * volts + shape * shape
+    });
+    let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
+    (capacity_ah / swing) * (capacity_ah / swing) * soc_variance
+}
+
 /// One cell's half-cycle between two marks in which `moved_ah` left it.
 fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
     let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
@@ -255,6 +290,10 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .zip(b.soc)
             .map(|(a, b)| Belief { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
+        ends: a
+            .soc
+            .zip(b.soc)
+            .map(|(start, end)| [End { soc: start.mean, load_v: a.load_v }, End { soc: end.mean, load_v: b.load_v }]),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)
@@ -291,6 +330,9 @@ mod tests {
             method: CapacityMethod::Swing,
             noise_ah_per_cycle: 0.01,
             noise_ah_per_rest_day: 0.0,
+            end_error_v: 0.0,
+            end_load_error: 0.0,
+            ageing_shift_error: 0.0,
             current_gain_std: 0.0,
             current_offset_std_a: 0.0,
             fade_std_ah_per_cycle: 0.0,
@@ -302,10 +344,10 @@ mod tests {
         let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
         discharge(&mut estimator);
         assert!(!learner.has_learned_all());
-        let first = learner.learn(&config, 0, &mut estimator, &moved);
+        let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert!(first.measurement.is_some() && learner.has_learned_all());
         // Nothing was measured since: the same voltages must not be counted a second time.
-        let second = learner.learn(&config, 0, &mut estimator, &moved);
+        let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
     }

@@ -54,7 +54,13 @@ impl Monitor {
         if slot.estimator.soc().is_none() {
             return;
         }
-        let update = self.learner.learn(&self.config.health.capacity, index, &mut slot.estimator, half_cycle);
+        let update = self.learner.learn(
+            &self.config.model,
+            &self.config.health.capacity,
+            index,
+            &mut slot.estimator,
+            half_cycle,
+        );
         if half_cycle.mode == Mode::Charge && slot.tapered {
             slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
         }

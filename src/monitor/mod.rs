@@ -329,7 +329,8 @@ impl Monitor {
             // The SOC jumped: what it crosses on the way is no charging.
             self.recharge.discard();
         }
-        self.learner.observe(index, soc, sample.temperature_c, measured_s);
+        let load_v = slot.estimator.load_v(&self.config.model);
+        self.learner.observe(index, soc, load_v, sample.temperature_c, measured_s);
         self.note_taper(sample);
         self.judge_trust(sample.cell, out);
         let capacity = self.capacity(sample.cell);
