@@ -233,6 +233,9 @@ fn windowed(life: &Path, to: &Path, seed: u64, by_charge: bool) {
     writer.flush().unwrap();
 }
 
+/// Seed of the windows, and whether they are measured by charge.
+const RUNS: [(u64, bool); 4] = [(1, false), (2, false), (3, true), (4, true)];
+
 #[test]
 fn usable_capacity_is_learned_from_windows_of_the_swings() {
     let Some(data) = data() else { return };
@@ -240,7 +243,8 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
     let rows = folder.path().join("windows.csv");
     for cell in ["B0005", "B0006"] {
         let discharges = discharges(&data, cell);
-        for (seed, by_charge) in [(1, false), (2, false), (3, true), (4, true)] {
+        let (mut sum_ah, mut sum_covered) = (0.0, 0.0);
+        for (seed, by_charge) in RUNS {
             windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, by_charge);
             let config = configuration(folder.path(), cell, &[], "");
             let path = folder.path().join("events.jsonl");
@@ -252,9 +256,13 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
                 "{cell} in windows of its {by} (seed {seed}): mean absolute error {:.4} Ah, covered {:.3}",
                 life.mean_absolute_ah, life.covered
             );
-            assert!(life.mean_absolute_ah < 0.16, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
-            assert!(life.covered > 0.7, "{cell} {by} {seed}: {}", life.covered);
+            assert!(life.mean_absolute_ah < 0.08, "{cell} {by} {seed}: {} Ah", life.mean_absolute_ah);
+            (sum_ah, sum_covered) = (sum_ah + life.mean_absolute_ah, sum_covered + life.covered);
         }
+        // One set of windows can be unlucky for long, since each fault of the voltage curve repeats at its SOC.
+        let (mean_ah, covered) = (sum_ah / RUNS.len() as f64, sum_covered / RUNS.len() as f64);
+        assert!(mean_ah < 0.06, "{cell}: {mean_ah} Ah");
+        assert!(covered > 0.65, "{cell}: {covered}");
     }
 }
 

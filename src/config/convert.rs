@@ -231,7 +231,7 @@ fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
 
 fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
     let (method, usual_noise_ah) = match keys.method {
-        Method::Swing => (CapacityMethod::Swing, 0.008 * rated_ah),
+        Method::Swing => (CapacityMethod::Swing, 0.005 * rated_ah),
         Method::Nominal => {
             let (swing, variance_ah2) = (keys.nominal_swing, keys.nominal_variance_ah2);
             (CapacityMethod::Nominal { swing, variance_ah2 }, 1.0)

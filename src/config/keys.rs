@@ -302,7 +302,7 @@ section! {
         nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6");
         /// Measurement variance of method "nominal".
         nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1");
-        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.8 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
+        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.5 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
         noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional;
         /// Standard deviation gained in a day of rest, after which some capacity comes back ("swing" only). Without it: 2 % of the rated capacity.
         noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional;

@@ -26,7 +26,7 @@ KNEE_V = 3.0
 MIN_SLOPE, TOP_SLOPE = 0.2, 1.0   # V per unit SOC, the second above SOC 0.9: slow relaxation would bend the top down
 VOLTAGE_MIN, VOLTAGE_MAX = 2.7, 4.2
 SOC = np.array([0, .03, .045, .06, .075, .09, .105, .12, .14, .17, .2, .25, .3, .4, .5, .6, .7, .75, .8, .85, .9, .93, .96, .98, 1])
-AGEING_SHIFT = 0.4        # not fitted (a new cell does not show it): between even shrinking (0) and pure loss of lithium (1)
+AGEING_SHIFT = 0.5        # not fitted (a new cell does not show it): between even shrinking (0) and pure loss of lithium (1)
 CHARGE_WEIGHT = 0.6       # per second, relative to discharge
 SMOOTH_OCV, SMOOTH_R0, SMOOTH_R1 = 0.0005, 0.5, 0.02
 
