@@ -344,7 +344,10 @@ impl Prepared<'_> {
             Record::prepare(&raw, &source.judged, grid, &limits)
         };
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| record::weight(r)));
+        // Where there are no drives, the tests count in full.
+        let most = records.iter().map(record::share).fold(0.0, f64::max);
+        let usual = |r: &Record| record::weight(r) * record::share(r) / most;
+        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| usual(r)));
         let scale = scale.collect();
         (records, scale)
     }
