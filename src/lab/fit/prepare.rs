@@ -97,6 +97,9 @@ pub(super) fn prepare<'a>(
     files: &'a [MeasuredFile],
     slow: &'a [MeasuredFile],
 ) -> Result<Prepared<'a>, FitFailure> {
+    if request.first_cycles.is_some() {
+        need_cycles(files)?;
+    }
     let voltage_v = voltage_limits(request, files)?;
     let mut notes = Vec::new();
     let dropped: usize =
@@ -277,6 +280,13 @@ fn slow_source(
     Ok(Source { file: number, part, soc, judged, scale: None })
 }
 
+fn need_cycles(files: &[MeasuredFile]) -> Result<(), FitFailure> {
+    let without = files.iter().find(|file| file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()));
+    without.map_or(Ok(()), |file| {
+        Err(FitFailure(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
+    })
+}
+
 fn ageing_sources<'a>(
     files: &'a [MeasuredFile],
     first: usize,
@@ -286,9 +296,6 @@ fn ageing_sources<'a>(
     let mut prepared = Prepared { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
     for (number, file) in files.iter().enumerate() {
         let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
-        if file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()) {
-            return Err(fail("--first-cycles needs the columns cycle and type".into()));
-        }
         let mut early = Vec::new();
         for part in &file.parts {
             let cycle: usize = part.key.parse().map_err(|_| fail(format!("cycle {:?}: not a number", part.key)))?;
