@@ -273,7 +273,7 @@ fn slow_source(
     let part = Clean::new(&file.parts[0]);
     let out_ah = part.stretch().taken_out_ah(voltage_max_v, capacity_ah);
     let out_ah = out_ah.map_err(|e| FitFailure(format!("{}: {e}", file.path.display())))?;
-    let most = (0..out_ah.len()).fold(0, |most, k| if out_ah[k] > out_ah[most] { k } else { most });
+    let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
     // What follows the discharge is judged by nobody.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
     let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
