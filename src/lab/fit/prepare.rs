@@ -248,9 +248,9 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, F
     let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
     let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
     let mut sum_c = 0.0;
-    for k in begin..begin + len {
-        if test.out_ah.last().is_none_or(|&last| out_ah[k] > last) && part.voltage_v[k] > DISCONNECTED_V {
-            test.out_ah.push(out_ah[k]);
+    for (k, &ah) in out_ah.iter().enumerate().skip(begin).take(len) {
+        if test.out_ah.last().is_none_or(|&last| ah > last) && part.voltage_v[k] > DISCONNECTED_V {
+            test.out_ah.push(ah);
             test.voltage_v.push(part.voltage_v[k]);
             sum_c += part.temperature_c[k];
         }
