@@ -32,6 +32,9 @@ pub(crate) struct Args {
     /// Capacity on the label, Ah [default: the capacity]
     #[arg(long, value_name = "AH", value_parser = positive)]
     rated: Option<f64>,
+    /// How far the open-circuit curve shifts with lost capacity, 0 to 1; no fit tells it [default: 0, for an ageing cell 0.3]
+    #[arg(long, value_name = "SHARE", value_parser = share)]
+    ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: from the data]
     #[arg(long, value_name = "V", value_parser = positive)]
     voltage_min: Option<f64>,
@@ -74,6 +77,10 @@ fn finite(text: &str) -> Result<f64, String> {
 
 fn positive(text: &str) -> Result<f64, String> {
     finite(text).ok().filter(|&x| x > 0.0).ok_or_else(|| "must be a finite number above 0".to_owned())
+}
+
+fn share(text: &str) -> Result<f64, String> {
+    finite(text).ok().filter(|x| (0.0..=1.0).contains(x)).ok_or_else(|| "must be 0 to 1".to_owned())
 }
 
 fn soc_nodes(text: &str) -> Result<SocNodes, String> {
@@ -119,6 +126,7 @@ fn request(args: &Args) -> Request {
         rated_ah: args.rated,
         voltage_min_v: args.voltage_min,
         voltage_max_v: args.voltage_max,
+        ageing_shift: args.ageing_shift,
         ocv: args.ocv.clone(),
         branches: args.branches.map(usize::from),
         tau_s: args.tau.clone(),

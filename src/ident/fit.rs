@@ -20,7 +20,7 @@ pub const MIN_SLOPE_V: f64 = 0.02;
 /// Steepest rise of the OCV, V per unit of SOC.
 const MAX_SLOPE_V: f64 = 60.0;
 /// Resistances stay within this factor of the starting value.
-const R_FACTOR: f64 = 300.0;
+const R_FACTOR: f64 = 100.0;
 
 /// An OCV test: voltage over rising SOC at one temperature.
 #[derive(Debug, Clone, PartialEq)]

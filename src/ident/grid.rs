@@ -1,17 +1,10 @@
 //! The grid of the tables and the place of a SOC and a temperature in it.
 //!
-//! Along SOC everything is linear (the OCV goes on beyond 0 and 1, resistances hold their edge). Along temperature the OCV
-//! is linear and resistances follow a weight warped by Arrhenius' law, w = (a(T) - a(T0)) / (a(T1) - a(T0)) with
-//! a(T) = exp(Ea/R (1/T - 1/298.15 K)); outside the temperatures the nearest edge holds. The same rules as
-//! [`crate::cell::CellModel::place`].
+//! The same rules as [`CellModel::place`](crate::cell::CellModel::place): along SOC linear (the OCV goes on beyond 0 and 1, all else
+//! holds its edge); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
+//! temperatures the nearest edge holds.
 
-/// Activation energy over the gas constant, K: 25 kJ/mol.
-const ACTIVATION_K: f64 = 25_000.0 / 8.314_462_618;
-
-/// Resistance at a temperature relative to 25 degrees C, by Arrhenius' law.
-pub fn arrhenius(temperature_c: f64) -> f64 {
-    libm::exp(ACTIVATION_K * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
-}
+pub use crate::cell::arrhenius;
 
 /// Breakpoints of all tables.
 #[derive(Debug, Clone, PartialEq)]
@@ -89,7 +82,12 @@ impl Grid {
         self.corners(place, place.beyond_s, place.along_t)
     }
 
-    /// Corners for resistances and capacitances.
+    /// Corners for time constants.
+    pub fn tau_corners(&self, place: &Place) -> Corners {
+        self.corners(place, place.along_s, place.along_t)
+    }
+
+    /// Corners for resistances.
     pub fn resistance_corners(&self, place: &Place) -> Corners {
         self.corners(place, place.along_s, place.warped_t)
     }

@@ -1,7 +1,7 @@
 //! The parameter vector: for every node the OCV (V), ln R0, and ln R and ln tau of each branch.
 //!
-//! Kind by kind, each in node order (temperature row by temperature row). Capacitances follow as C = tau / R at the nodes,
-//! and between nodes R and C are interpolated each for itself, as [`crate::cell::CellModel`] does.
+//! Kind by kind, each in node order (temperature row by temperature row). Capacitances follow as C = tau / R at
+//! the nodes.
 
 use super::grid::Grid;
 use crate::cell::{Branch, Table};
@@ -58,33 +58,31 @@ pub struct Tables {
     pub r0_ohm: Vec<f64>,
     /// Resistance of each branch, ohm.
     pub r_ohm: Vec<Vec<f64>>,
-    /// Capacitance of each branch, farad.
-    pub c_farad: Vec<Vec<f64>>,
+    /// Time constant of each branch, s.
+    pub tau_s: Vec<Vec<f64>>,
 }
 
 impl Tables {
     /// The tables of `theta`.
     pub fn new(layout: &Layout, theta: &[f64]) -> Self {
         let exp = |first: usize| theta[first..first + layout.nodes].iter().map(|&x| libm::exp(x)).collect::<Vec<_>>();
-        let mut tables =
-            Self { ocv_v: theta[..layout.nodes].to_vec(), r0_ohm: exp(layout.r0()), r_ohm: vec![], c_farad: vec![] };
-        for i in 0..layout.branches {
-            let r_ohm = exp(layout.branch_r(i));
-            let tau_s = exp(layout.branch_tau(i));
-            tables.c_farad.push(tau_s.iter().zip(&r_ohm).map(|(tau, r)| tau / r).collect());
-            tables.r_ohm.push(r_ohm);
+        Self {
+            ocv_v: theta[..layout.nodes].to_vec(),
+            r0_ohm: exp(layout.r0()),
+            r_ohm: (0..layout.branches).map(|i| exp(layout.branch_r(i))).collect(),
+            tau_s: (0..layout.branches).map(|i| exp(layout.branch_tau(i))).collect(),
         }
-        tables
     }
 
     /// As tables of a cell model: OCV, R0, branches.
     pub fn model(&self, columns: usize) -> (Table, Table, Vec<Branch>) {
         let table = |values: &[f64]| Table { values: values.chunks(columns).map(<[f64]>::to_vec).collect() };
-        let branches = self.r_ohm.iter().zip(&self.c_farad);
+        let farad = |(r, tau): (&Vec<f64>, &Vec<f64>)| r.iter().zip(tau).map(|(r, tau)| tau / r).collect::<Vec<f64>>();
+        let branches = self.r_ohm.iter().zip(&self.tau_s);
         (
             table(&self.ocv_v),
             table(&self.r0_ohm),
-            branches.map(|(r, c)| Branch { r_ohm: table(r), c_farad: table(c) }).collect(),
+            branches.map(|(r, tau)| Branch { r_ohm: table(r), c_farad: table(&farad((r, tau))) }).collect(),
         )
     }
 }

@@ -1,7 +1,7 @@
 //! One pass over the data: residuals, their exact Jacobian, and the normal equations.
 //!
 //! The residual of a row is e = V - (OCV(s,T) - sum U_i - R0(s,T) I). A branch runs exactly over each row's step,
-//! U' = R I + x (U - R I) with x = exp(-dt / (R C)), and so do its derivatives:
+//! U' = R I + x (U - R I) with x = exp(-dt / tau), and so do its derivatives:
 //! dU' = x dU + (1 - x) I dR + (U - R I) x dt / tau^2 dtau. Derivatives fade with the branch: those below
 //! [`FADED_V`] are dropped, so a row touches a few nodes only and the work per row does not grow with the tables.
 //! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
@@ -92,29 +92,34 @@ impl BranchRun {
         }
     }
 
-    /// Over a row's step, without derivatives. Returns R and tau there and the decay.
-    fn step_voltage(&mut self, row: &Row, r_ohm: &[f64], c_farad: &[f64]) -> Step {
-        let (r, c) = (row.resistance.at(r_ohm), row.resistance.at(c_farad));
-        let (tau, settled) = (r * c, r * row.mean_current_a);
+    /// Over a row's step, without derivatives. Returns the decay and dU'/dtau.
+    fn step_voltage(&mut self, row: &Row, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
+        let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
+        let settled = r * row.mean_current_a;
         let decay = libm::exp(-row.dt_s / tau);
         let above = self.voltage_v - settled;
         self.voltage_v = settled + decay * above;
-        Step { r, c, decay, by_tau: above * decay * row.dt_s / (tau * tau) }
+        (decay, above * decay * row.dt_s / (tau * tau))
     }
 
-    fn step(&mut self, row: &Row, r_ohm: &[f64], c_farad: &[f64]) {
-        let Step { r, c, decay, by_tau } = self.step_voltage(row, r_ohm, c_farad);
+    fn step(&mut self, row: &Row, r_ohm: &[f64], tau_s: &[f64]) {
+        let (decay, by_tau) = self.step_voltage(row, r_ohm, tau_s);
         self.fade(decay);
         let by_r = (1.0 - decay) * row.mean_current_a;
         for (node, weight) in row.resistance.iter() {
-            if !self.is_alive[node] {
-                self.is_alive[node] = true;
-                self.alive.push(node);
-            }
-            // C = tau / R at the node: ln R moves R up and C down.
-            let (dr, dc) = (weight * r_ohm[node], weight * c_farad[node]);
-            self.by_r[node] += by_r * dr + by_tau * (c * dr - r * dc);
-            self.by_tau[node] += by_tau * r * dc;
+            self.wake(node);
+            self.by_r[node] += by_r * weight * r_ohm[node];
+        }
+        for (node, weight) in row.tau.iter() {
+            self.wake(node);
+            self.by_tau[node] += by_tau * weight * tau_s[node];
+        }
+    }
+
+    fn wake(&mut self, node: usize) {
+        if !self.is_alive[node] {
+            self.is_alive[node] = true;
+            self.alive.push(node);
         }
     }
 
@@ -132,14 +137,6 @@ impl BranchRun {
     }
 }
 
-struct Step {
-    r: f64,
-    c: f64,
-    decay: f64,
-    /// dU'/dtau.
-    by_tau: f64,
-}
-
 /// Residuals of a record, V, one per row (also of rows that are not judged).
 pub fn residuals(record: &Record, tables: &Tables) -> Vec<f64> {
     let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
@@ -149,7 +146,7 @@ pub fn residuals(record: &Record, tables: &Tables) -> Vec<f64> {
             if row.relaxed {
                 branch.voltage_v = 0.0;
             } else {
-                branch.step_voltage(row, &tables.r_ohm[i], &tables.c_farad[i]);
+                branch.step_voltage(row, &tables.r_ohm[i], &tables.tau_s[i]);
             }
             model_v -= branch.voltage_v;
         }
@@ -168,7 +165,7 @@ pub fn accumulate(record: &Record, scale: f64, layout: &Layout, tables: &Tables,
             if row.relaxed {
                 branch.relax();
             } else {
-                branch.step(row, &tables.r_ohm[i], &tables.c_farad[i]);
+                branch.step(row, &tables.r_ohm[i], &tables.tau_s[i]);
             }
             model_v -= branch.voltage_v;
         }

@@ -68,7 +68,6 @@ impl Beliefs {
         r0_curvature: 0.005,
         r_curvature: 0.5,
         tau_curvature: 0.01,
-        r_level: 0.7,
         tau_level: 0.01,
         ..Self::FREE_OCV
     };

@@ -49,8 +49,10 @@ pub struct Row {
     pub weight_s: f64,
     /// Nodes of the OCV.
     pub ocv: Corners,
-    /// Nodes of resistances and capacitances.
+    /// Nodes of resistances.
     pub resistance: Corners,
+    /// Nodes of time constants.
+    pub tau: Corners,
 }
 
 /// Rows of one file's stretch.
@@ -133,13 +135,13 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// What a second of the record weighs: by the SOC it covers, not by how long it takes, times its [`share`].
+/// What a second of a record weighs: by the SOC it covers, not by how long it takes.
 pub fn weight(record: &Record) -> f64 {
     let judged = record.rows.iter().filter(|row| row.weight_s > 0.0);
     let (low, high, seconds) = judged.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), row| {
         (f64::min(low, row.soc), f64::max(high, row.soc), sum + row.weight_s)
     });
-    if seconds > 0.0 { share(record) * (high - low) * WHOLE_S / seconds } else { 0.0 }
+    if seconds > 0.0 { (high - low) * WHOLE_S / seconds } else { 0.0 }
 }
 
 /// The raw rows at which blocks end; the first row is a block of its own.
@@ -182,6 +184,7 @@ fn block_row(raw: &Raw<'_>, before: usize, end: usize, grid: &Grid) -> Row {
         weight_s: 0.0,
         ocv: grid.ocv_corners(&place),
         resistance: grid.resistance_corners(&place),
+        tau: grid.tau_corners(&place),
     }
 }
 

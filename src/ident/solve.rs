@@ -16,8 +16,12 @@ const CONVERGED: f64 = 3e-4;
 /// Damping at the start, relative to the curvature's diagonal; it falls and grows by the factors after it.
 const DAMPING_START: f64 = 0.3;
 const DAMPING_FALL: f64 = 0.1;
+/// Fall after a step that had to be damped more first: the limit is near.
+const DAMPING_FALL_NEAR: f64 = 0.6;
 const DAMPING_MIN: f64 = 1e-4;
 const DAMPING_GROWTH: f64 = 8.0;
+/// Damping below which a step is nearly the undamped one.
+const DAMPING_WEAK: f64 = 0.02;
 /// Damping at which no step helps any more.
 const DAMPING_MAX: f64 = 1e8;
 /// Most exchanges of the held set in one step; what is left then is cut off at the bounds.
@@ -115,6 +119,7 @@ pub fn minimise(
     'outer: while passes < MAX_PASSES && still < 2 {
         let y = space.to_steps(&theta);
         let (h, g) = space.pull_back(&normal);
+        let mut fall_by = DAMPING_FALL;
         loop {
             let step = bounded_step(&h, &g, damping, &y, space);
             let trial = step.map(|step| {
@@ -125,13 +130,15 @@ pub fn minimise(
             passes += 1;
             if let Some((better, trial)) = evaluated.filter(|(trial, _)| trial.cost < normal.cost) {
                 let fall = (normal.cost - better.cost) / normal.cost;
-                still = if fall < CONVERGED { still + 1 } else { 0 };
+                // Under strong damping a small fall says nothing.
+                still = if fall < CONVERGED && damping <= DAMPING_WEAK { still + 1 } else { 0 };
                 (theta, normal) = (trial, better);
-                damping = (damping * DAMPING_FALL).max(DAMPING_MIN);
+                damping = (damping * fall_by).max(DAMPING_MIN);
                 progress(passes, normal.cost);
                 break;
             }
             damping *= DAMPING_GROWTH;
+            fall_by = DAMPING_FALL_NEAR;
             if damping > DAMPING_MAX {
                 still = 2;
                 break 'outer;

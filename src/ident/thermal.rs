@@ -72,7 +72,7 @@ mod tests {
     #[test]
     fn known_parameters_are_found_again_in_spite_of_a_record_that_began_cold() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
-        let tables = Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], c_farad: vec![] };
+        let tables = Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], tau_s: vec![] };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = |start_c: f64| {
             let time_s: Vec<f64> = (0..3000).map(f64::from).collect();

@@ -38,6 +38,10 @@ const AGEING_SOC_NODES: [f64; 25] = [
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
+/// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given: its first cycles do
+/// not tell it, so it is what serves both whole lives at hand.
+pub const AGEING_SHIFT: f64 = 0.3;
+
 /// What is asked.
 #[derive(Debug, Clone, Default)]
 pub struct Request {
@@ -51,6 +55,8 @@ pub struct Request {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
+    /// How far the open-circuit curve shifts with lost capacity; `None` = 0, of an ageing cell [`AGEING_SHIFT`].
+    pub ageing_shift: Option<f64>,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
     /// RC branches, 1 to 3; `None` = 2, of an ageing cell 1.

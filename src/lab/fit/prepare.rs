@@ -97,6 +97,9 @@ pub(super) fn prepare<'a>(
     files: &'a [MeasuredFile],
     slow: &'a [MeasuredFile],
 ) -> Result<Prepared<'a>, FitFailure> {
+    if request.first_cycles.is_some() {
+        need_cycles(files)?;
+    }
     let voltage_v = voltage_limits(request, files)?;
     let mut notes = Vec::new();
     let dropped: usize =
@@ -245,9 +248,9 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, F
     let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
     let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
     let mut sum_c = 0.0;
-    for k in begin..begin + len {
-        if test.out_ah.last().is_none_or(|&last| out_ah[k] > last) && part.voltage_v[k] > DISCONNECTED_V {
-            test.out_ah.push(out_ah[k]);
+    for (k, &ah) in out_ah.iter().enumerate().skip(begin).take(len) {
+        if test.out_ah.last().is_none_or(|&last| ah > last) && part.voltage_v[k] > DISCONNECTED_V {
+            test.out_ah.push(ah);
             test.voltage_v.push(part.voltage_v[k]);
             sum_c += part.temperature_c[k];
         }
@@ -270,11 +273,18 @@ fn slow_source(
     let part = Clean::new(&file.parts[0]);
     let out_ah = part.stretch().taken_out_ah(voltage_max_v, capacity_ah);
     let out_ah = out_ah.map_err(|e| FitFailure(format!("{}: {e}", file.path.display())))?;
-    let most = (0..out_ah.len()).fold(0, |most, k| if out_ah[k] > out_ah[most] { k } else { most });
+    let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
     // What follows the discharge is judged by nobody.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
     let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
     Ok(Source { file: number, part, soc, judged, scale: None })
+}
+
+fn need_cycles(files: &[MeasuredFile]) -> Result<(), FitFailure> {
+    let without = files.iter().find(|file| file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()));
+    without.map_or(Ok(()), |file| {
+        Err(FitFailure(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
+    })
 }
 
 fn ageing_sources<'a>(
@@ -286,9 +296,6 @@ fn ageing_sources<'a>(
     let mut prepared = Prepared { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
     for (number, file) in files.iter().enumerate() {
         let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
-        if file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()) {
-            return Err(fail("--first-cycles needs the columns cycle and type".into()));
-        }
         let mut early = Vec::new();
         for part in &file.parts {
             let cycle: usize = part.key.parse().map_err(|_| fail(format!("cycle {:?}: not a number", part.key)))?;
@@ -344,7 +351,10 @@ impl Prepared<'_> {
             Record::prepare(&raw, &source.judged, grid, &limits)
         };
         let records: Vec<Record> = self.sources.iter().map(record).collect();
-        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| record::weight(r)));
+        // Where there are no drives, the tests count in full.
+        let most = records.iter().map(record::share).fold(0.0, f64::max);
+        let usual = |r: &Record| record::weight(r) * record::share(r) / most;
+        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| usual(r)));
         let scale = scale.collect();
         (records, scale)
     }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::{Outcome, Request};
+use super::{AGEING_SHIFT, Outcome, Request};
 
 /// The whole file.
 pub fn text(request: &Request, outcome: &Outcome) -> String {
@@ -33,6 +33,9 @@ fn head(out: &mut String, request: &Request, outcome: &Outcome) {
     line(out, &format!("name = {}", quoted(&request.name)));
     line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
     line(out, &format!("capacity_ah = {:.4}", outcome.capacity_ah));
+    if let Some(shift) = request.ageing_shift.or(request.first_cycles.map(|_| AGEING_SHIFT)) {
+        line(out, &format!("ocv_ageing_shift = {shift}"));
+    }
     line(out, &format!("voltage_min_v = {}", outcome.voltage_v.0));
     line(out, &format!("voltage_max_v = {}", outcome.voltage_v.1));
 }
@@ -82,10 +85,8 @@ fn tables(out: &mut String, outcome: &Outcome) {
     table(out, "ocv_v", &ocv_v.values, 5);
     table(out, "r0_ohm", &r0_ohm.values, 6);
     let errors: Vec<Vec<f64>> = outcome.voltage_error_v.chunks(grid.soc.len()).map(<[f64]>::to_vec).collect();
-    if false {
-        line(out, "# Standard deviation of the model's error averaged over 100 s.");
-        table(out, "voltage_error_v", &errors, 4);
-    }
+    line(out, "# Standard deviation of the model's error averaged over 100 s.");
+    table(out, "voltage_error_v", &errors, 4);
     for branch in &branches {
         line(out, "\n[[tables.branches]]");
         table(out, "r_ohm", &branch.r_ohm.values, 6);
