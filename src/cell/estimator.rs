@@ -19,7 +19,7 @@
 //! temperature where its fit has left one; the drop is the voltage lost in the cell now, the load that of the last
 //! minutes: model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record
 //! that begins under load, or the constant-voltage part of a charge, no longer passes for exact, nor does the cold.
-//! At rest the error repeats instead of averaging out: a rest of t adds the information of t_100 ln(1 + t/t_100) only.
+//! At rest the error repeats instead of averaging out: a rest of t tells as much as t_r ln(1 + t/t_r) under load.
 //! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model says so. Effect: top
 //! and bottom of an aged cell agree about its capacity.
 //!
@@ -39,6 +39,9 @@ const KNOWN_VARIANCE: f64 = 1e-12;
 
 /// Variance of a SOC of which nothing is known: uniform over 0 to 1.
 const UNKNOWN_SOC_VARIANCE: f64 = 1.0 / 12.0;
+
+/// Rest after which a cell's voltage says little that is new, s: what still relaxes then is slower than the branches.
+const REST_REPEATS_S: f64 = 1000.0;
 
 /// Longest time for which the resistance walks between two readings, s: it does not age in a gap.
 const MAX_WALK_S: f64 = 600.0;
@@ -211,7 +214,7 @@ impl CellEstimator {
         }
         let before_s = self.memory.rest_s;
         self.memory.rest_s += elapsed_s;
-        ERROR_WINDOW_S * libm::log((ERROR_WINDOW_S + self.memory.rest_s) / (ERROR_WINDOW_S + before_s))
+        REST_REPEATS_S * libm::log((REST_REPEATS_S + self.memory.rest_s) / (REST_REPEATS_S + before_s))
     }
 
     /// Follows the load; after a gap with a load beside it, what went on in the gap may have been the heaviest usual one.

@@ -245,7 +245,7 @@ fn capacity(keys: &Capacity, rated_ah: f64) -> CapacityConfig {
         end_load_error: keys.end_load_error,
         ageing_shift_error: keys.ageing_shift_error,
         current_gain_std: keys.current_gain_std,
-        current_offset_std_a: keys.current_offset_std_a.unwrap_or(0.005 * rated_ah),
+        current_offset_std_a: keys.current_offset_std_a,
         fade_std_ah_per_cycle: keys.fade_std_ah_per_cycle,
         fade_noise_ah_per_cycle: keys.fade_noise_ah_per_cycle,
     }

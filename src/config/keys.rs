@@ -314,8 +314,8 @@ section! {
         ageing_shift_error: f64, "", DEVIATION, Default("0.3");
         /// Standard deviation of the current sensor's gain: no capacity is known better than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
-        /// Standard deviation of the current sensor's offset, per cell: what charges and discharges disagree by is learned and taken off the current ("swing" only; 0 = not learned). Without it: the rated capacity over 200 h (0.5 % of 1 C).
-        current_offset_std_a: Option<f64>, "A", DEVIATION, Optional;
+        /// Standard deviation of the current sensor's offset, per cell: what charges and discharges disagree by is learned and taken off the current ("swing" only; 0 = not learned). Where the model of the cell is good to a few mV.
+        current_offset_std_a: f64, "A", DEVIATION, Default("0.0");
         /// Standard deviation of what a full cycle takes, at the start: the loss is learned and expected at the end of each charge ("swing" only; 0 = not learned). For cells that lose several percent in a cycle; in others, capacity that comes back in rest would be taken for it.
         fade_std_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
         /// How fast the fade may change: standard deviation gained per equivalent full cycle.
