@@ -246,8 +246,8 @@ section! {
         charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
         /// Process noise of the branch voltages.
         branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
-        /// Process noise of the logarithm of the resistance: how fast a cell may age.
-        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("3e-4");
+        /// Process noise of the logarithm of the resistance: how fast a cell may age, and how far its resistance may be from the tables in the cold or in the next minutes of a drive.
+        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
         /// Process noise of the SOC while nobody measures the current (asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
         /// A current up to this is rest; one beyond it beside a gap may have gone on in it. Without it: the rated capacity over 50 h (C/50), per cell.
