@@ -32,7 +32,8 @@ pub(crate) struct Args {
     /// Capacity on the label, Ah [default: the capacity]
     #[arg(long, value_name = "AH", value_parser = positive)]
     rated: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity, 0 to 1; no fit tells it [default: 0, for an ageing cell 0.3]
+    /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
+    /// of a new cell tells it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: from the data]

@@ -2,8 +2,11 @@
 //!
 //! Model error repeats itself within minutes, so blocks of 100 s are what counts. A block weighs by the charge that moved in
 //! it, spread over the nodes round it; a node with little of it leans on the mean of its temperature. A fit's own residuals understate
-//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node). A temperature without
+//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node); an ageing cell's life is one file however
+//! many cycles it has. A temperature without
 //! data takes the nearest one's, scaled by a power of Arrhenius' factor.
+
+use std::collections::BTreeMap;
 
 use super::fit::Fit;
 use super::grid::{Grid, arrhenius};
@@ -32,15 +35,33 @@ struct Sums {
     files: Vec<f64>,
 }
 
-/// The table in node order, V; `shares` = what each record counts.
-pub fn table(fit: &Fit, records: &[Record], shares: &[f64], capacity_ah: f64) -> Vec<f64> {
+/// A record and where it comes from.
+#[derive(Debug, Clone, Copy)]
+pub struct Judged<'a> {
+    /// The rows.
+    pub record: &'a Record,
+    /// Number of its file: records of one file tell of one cell on one day.
+    pub file: usize,
+    /// What it counts.
+    pub share: f64,
+}
+
+/// The table in node order, V.
+pub fn table(fit: &Fit, records: &[Judged<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
     let mut sums = Sums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
-    for (record, share) in records.iter().zip(shares) {
+    let mut moved: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+    for judged in records {
         let before = sums.weight.clone();
-        add_record(&mut sums, fit, record, *share, capacity_ah);
-        for ((files, now), before) in sums.files.iter_mut().zip(&sums.weight).zip(&before) {
-            *files += f64::from(u8::from(now - before > share * VISIT_SOC));
+        add_record(&mut sums, fit, judged.record, judged.share, capacity_ah);
+        let of_file = moved.entry(judged.file).or_insert_with(|| vec![0.0; nodes]);
+        for ((moved, now), before) in of_file.iter_mut().zip(&sums.weight).zip(&before) {
+            *moved += (now - before) / judged.share;
+        }
+    }
+    for of_file in moved.values() {
+        for (files, moved) in sums.files.iter_mut().zip(of_file) {
+            *files += f64::from(u8::from(*moved > VISIT_SOC));
         }
     }
     let columns = fit.grid.soc.len();
@@ -125,6 +146,10 @@ fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ident::Raw;
+    use crate::ident::fit::Residual;
+    use crate::ident::parameters::Tables;
+    use crate::ident::record::Limits;
 
     #[test]
     fn a_temperature_without_data_is_as_wrong_as_its_neighbour_and_more_in_the_cold() {
@@ -132,6 +157,41 @@ mod tests {
         let found = fill(&grid, &[None, Some(vec![0.01, 0.02]), Some(vec![0.005; 2])]);
         assert!(found[0] > 1.5 * 0.01 && found[1] == 2.0 * found[0], "{found:?}");
         assert_eq!(found[2..], [0.01, 0.02, 0.005, 0.005]);
+    }
+
+    #[test]
+    fn files_count_and_not_their_records() {
+        let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
+        let tables = Tables { ocv_v: vec![3.6; 2], r0_ohm: vec![0.0; 2], r_ohm: vec![], tau_s: vec![] };
+        let time_s: Vec<f64> = (0..=3600).map(f64::from).collect();
+        let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
+        let raw = Raw {
+            time_s: &time_s,
+            current_a: &[2.0; 3601],
+            voltage_v: &[3.61; 3601],
+            temperature_c: &[25.0; 3601],
+            soc: &soc,
+        };
+        let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
+        let record = Record::prepare(&raw, &[], &grid, &limits);
+        let fit = Fit {
+            grid,
+            tables,
+            residuals: vec![],
+            total: Residual::default(),
+            visits_s: vec![],
+            passes: 0,
+            converged: true,
+        };
+        let error_v = |files: [usize; 4]| {
+            let judged = files.map(|file| Judged { record: &record, file, share: 0.5 });
+            table(&fit, &judged, 2.0)
+        };
+        // 10 mV everywhere: variance times four for one file, times 1.75 for four.
+        for (files, expected_v) in [([7; 4], 0.02), ([0, 1, 2, 3], 0.01 * 1.75_f64.sqrt())] {
+            let found = error_v(files);
+            assert!(found.iter().all(|v| (v - expected_v).abs() < 1e-9), "{files:?}: {found:?}");
+        }
     }
 
     #[test]

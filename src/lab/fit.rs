@@ -15,6 +15,7 @@ pub use toml::text;
 
 use super::measured::{MeasuredError, MeasuredFile};
 use crate::cell::Thermal;
+use crate::ident::error_table::Judged;
 use crate::ident::fit::{Fit, Residual, Settings};
 use crate::ident::grid::Grid;
 use crate::ident::prior::Beliefs;
@@ -38,9 +39,10 @@ const AGEING_SOC_NODES: [f64; 25] = [
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
-/// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given: its first cycles do
-/// not tell it, so it is what serves both whole lives at hand.
-pub const AGEING_SHIFT: f64 = 0.3;
+/// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given. A prior, not a result: no
+/// fit of a new cell tells it. 0 = the curve shrinks evenly, 1 = pure loss of lithium; between them, and chosen on the two
+/// whole lives at hand.
+pub const AGEING_SHIFT: f64 = 0.5;
 
 /// What is asked.
 #[derive(Debug, Clone, Default)]
@@ -146,8 +148,8 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(Progress::Pass(pass, cost)));
     let fitted = fitted.map_err(|error| FitFailure(error.to_string()))?;
     let thermal = thermal::fit(&records, &fitted.tables);
-    let shares: Vec<f64> = records.iter().map(record::share).collect();
-    let voltage_error_v = error_table::table(&fitted, &records, &shares, prepared.capacity_ah);
+    let file_of_record: Vec<usize> = prepared.sources.iter().map(|source| source.file).collect();
+    let voltage_error_v = error_table::table(&fitted, &judged(&records, &file_of_record), prepared.capacity_ah);
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
@@ -159,12 +161,17 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
         by_kind,
         files,
         records,
-        file_of_record: prepared.sources.iter().map(|source| source.file).collect(),
+        file_of_record,
         notes: prepared.notes,
         fit: fitted,
     };
     add_notes(&mut outcome);
     Ok(outcome)
+}
+
+fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<Judged<'a>> {
+    let each = records.iter().zip(file_of_record);
+    each.map(|(record, &file)| Judged { record, file, share: record::share(record) }).collect()
 }
 
 /// The files and the slow tests, read by as many threads as there are cores.
