@@ -2,7 +2,8 @@
 //!
 //! Model error repeats itself within minutes, so blocks of 100 s are what counts. A block weighs by the charge that moved in
 //! it, spread over the nodes round it; a node with little of it leans on the mean of its temperature. A fit's own residuals understate
-//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node); an ageing cell's life is one file however
+//! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node, a pulse or slow test counting
+//! as 0.3 of one: it says little about a drive); an ageing cell's life is one file however
 //! many cycles it has. A temperature without
 //! data takes the nearest one's, scaled by a power of Arrhenius' factor.
 
@@ -50,18 +51,19 @@ pub struct Judged<'a> {
 pub fn table(fit: &Fit, records: &[Judged<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
     let mut sums = Sums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
-    let mut moved: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+    let mut moved: BTreeMap<usize, (f64, Vec<f64>)> = BTreeMap::new();
     for judged in records {
         let before = sums.weight.clone();
         add_record(&mut sums, fit, judged.record, judged.share, capacity_ah);
-        let of_file = moved.entry(judged.file).or_insert_with(|| vec![0.0; nodes]);
+        let (share, of_file) = moved.entry(judged.file).or_insert_with(|| (0.0, vec![0.0; nodes]));
+        *share = judged.share.max(*share);
         for ((moved, now), before) in of_file.iter_mut().zip(&sums.weight).zip(&before) {
             *moved += (now - before) / judged.share;
         }
     }
-    for of_file in moved.values() {
+    for (share, of_file) in moved.values() {
         for (files, moved) in sums.files.iter_mut().zip(of_file) {
-            *files += f64::from(u8::from(*moved > VISIT_SOC));
+            *files += if *moved > VISIT_SOC { *share } else { 0.0 };
         }
     }
     let columns = fit.grid.soc.len();
@@ -184,7 +186,7 @@ mod tests {
             converged: true,
         };
         let error_v = |files: [usize; 4]| {
-            let judged = files.map(|file| Judged { record: &record, file, share: 0.5 });
+            let judged = files.map(|file| Judged { record: &record, file, share: 1.0 });
             table(&fit, &judged, 2.0)
         };
         // 10 mV everywhere: variance times four for one file, times 1.75 for four.
