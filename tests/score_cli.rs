@@ -122,6 +122,24 @@ fn a_start_in_the_middle_drops_the_rows_before_it() {
 }
 
 #[test]
+fn an_offset_of_the_current_is_added_before_the_core_sees_it() {
+    // 0.1 A of 2 Ah integrate to 7.5 points in 1.5 h.
+    let bench = Bench::new();
+    bench.write_discharge("drive.csv", 1.5, 0.0);
+    let args = ["drive.csv", "--told", "0", "--current-offset=-0.1,0,0.1"];
+    let document = bench.json(&args);
+    let offsets: Vec<_> =
+        document["scores"].as_array().unwrap().iter().map(|s| s["current_offset_a"].as_f64().unwrap()).collect();
+    assert_eq!(offsets, [-0.1, 0.0, 0.1]);
+    let errors: Vec<_> = (0..3).map(|i| number(&document["scores"][i], "mean_error_points")).collect();
+    // More charge seems to leave than does: below the truth; the voltage holds it far from the integral's 7.5 points.
+    assert!(errors[0] > errors[1] + 0.02 && errors[2] < errors[1] - 0.02, "{errors:?}");
+    assert!(errors.iter().all(|error| error.abs() < 1.5), "{errors:?}");
+    let table = String::from_utf8(bench.score(&args).success().get_output().stdout.clone()).unwrap();
+    assert!(table.contains("full told +0 I -0.1 A") && table.contains("full told +0 I +0.1 A"), "{table}");
+}
+
+#[test]
 fn every_case_is_run_on_every_file_in_order() {
     let bench = Bench::new();
     bench.write_discharge("a.csv", 1.0, 0.0);

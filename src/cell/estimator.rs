@@ -15,11 +15,7 @@
 //! sensor^2 + model^2 / dt: model error is slow, so information is counted per second, not per sample.
 //! Effect: the sample rate does not change the result.
 //!
-//! Deviation 4: model^2 = base^2 + (k drop)^2 + (k' load)^2. The base is the cell model's own error over SOC and
-//! temperature where its fit has left one; the drop is the voltage lost in the cell now, the load that of the last
-//! minutes: model error is mostly error of the resistances and of diffusion slower than the branches. Effect: a record
-//! that begins under load, or the constant-voltage part of a charge, no longer passes for exact, nor does the cold.
-//! At rest the error repeats instead of averaging out: a rest of t tells as much as t_r ln(1 + t/t_r) under load.
+//! What noise goes with a step and a reading (deviation 4): [`noise`].
 //! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model says so. Effect: top
 //! and bottom of an aged cell agree about its capacity.
 //!
@@ -31,8 +27,8 @@ use serde::{Deserialize, Serialize};
 
 use super::circuit::{self, BranchAt};
 use super::config::{CapacityState, EstimatorConfig};
-use super::model::{CellModel, ERROR_WINDOW_S, MAX_BRANCHES, Place, Row};
-use crate::filter::{Belief, FilterError, Gaussian, Noise, Spread, Update};
+use super::model::{CellModel, MAX_BRANCHES};
+use crate::filter::{Belief, FilterError, Gaussian, Spread, Update};
 
 /// A variance that stands for "known": small against any noise, large against rounding.
 const KNOWN_VARIANCE: f64 = 1e-12;
@@ -40,20 +36,11 @@ const KNOWN_VARIANCE: f64 = 1e-12;
 /// Variance of a SOC of which nothing is known: uniform over 0 to 1.
 const UNKNOWN_SOC_VARIANCE: f64 = 1.0 / 12.0;
 
-/// Rest after which a cell's voltage says little that is new, s: what still relaxes then is slower than the branches.
-const REST_REPEATS_S: f64 = 1000.0;
-
-/// Longest time for which the resistance walks between two readings, s: it does not age in a gap.
-const MAX_WALK_S: f64 = 600.0;
-
 /// Readings beyond the gate in a row before the filter may be called lost: one or two can be glitches.
 const MIN_REJECTED: u32 = 3;
 
 /// The same when the first came right after a gap: a record is missing, most likely.
 const MIN_REJECTED_AFTER_GAP: u32 = 2;
-
-/// Load, per rated capacity, that may have gone on in a gap when there is any beside it: 1 C.
-const GAP_LOAD_PER_H: f64 = 1.0;
 
 /// Largest standard deviation a load that may have gone on through a gap adds to the SOC, fraction.
 const MAX_GAP_LOAD_STD: f64 = 0.3;
@@ -138,6 +125,13 @@ macro_rules! each {
     };
 }
 
+mod noise;
+mod state;
+
+pub use state::CellState;
+
+use noise::Reading;
+
 impl CellEstimator {
     /// A cell of which nothing was measured yet.
     pub fn new(config: &EstimatorConfig) -> Self {
@@ -203,35 +197,6 @@ impl CellEstimator {
         let update = each!(filter, x => update(x, model, config, &reading))?;
         self.watch(config, step, &update);
         Ok(Some(update))
-    }
-
-    /// Time for which the present reading says something new, s: all of it under load, ever less of a rest.
-    fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
-        let elapsed_s = step.measured_s + step.unmeasured_s;
-        if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
-            self.memory.rest_s = 0.0;
-            return elapsed_s;
-        }
-        let before_s = self.memory.rest_s;
-        self.memory.rest_s += elapsed_s;
-        REST_REPEATS_S * libm::log((REST_REPEATS_S + self.memory.rest_s) / (REST_REPEATS_S + before_s))
-    }
-
-    /// Follows the load; after a gap with a load beside it, what went on in the gap may have been the heaviest usual one.
-    fn remember_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
-        let memory = &mut self.memory;
-        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
-        if step.measured_s > 0.0 {
-            let mean_a = step.charge_as.abs() / step.measured_s;
-            memory.load_a = mean_a + (memory.load_a - mean_a) * keep(step.measured_s);
-        }
-        if step.unmeasured_s > 0.0 {
-            memory.load_a *= keep(step.unmeasured_s);
-            let beside_a = memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-            if beside_a > config.rest_current_a {
-                memory.load_a = memory.load_a.max(beside_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
-            }
-        }
     }
 
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
@@ -494,35 +459,8 @@ fn propagate<const N: usize>(
         }
         next
     };
-    let q = process_noise::<N>(model, config, &model.place_in(&row, x.mean[0]), dt_s);
+    let q = noise::process::<N>(model, config, &model.place_in(&row, x.mean[0]), dt_s);
     x.predict(&spread::<N>(config), f, &q)
-}
-
-/// Covariance the random walks gain in `dt_s`; the capacity's is added at transitions.
-fn process_noise<const N: usize>(
-    model: &CellModel,
-    config: &EstimatorConfig,
-    place: &Place,
-    dt_s: f64,
-) -> SMatrix<f64, N, N> {
-    let mut q = SMatrix::zeros();
-    for i in 0..N - 3 {
-        // Noise fed into a decaying branch: bounded by tau/2 however long the step.
-        let half_tau_s = 0.5 * model.branch_tau_s(i, place);
-        let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
-        q[(1 + i, 1 + i)] = square(config.branch_noise_v_per_sqrt_s) * effective_s;
-    }
-    q[(N - 2, N - 2)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s.min(MAX_WALK_S);
-    q
-}
-
-/// A voltage reading with what is needed to predict it.
-struct Reading {
-    voltage_v: f64,
-    current_a: f64,
-    load_a: f64,
-    row: Row,
-    information_s: f64,
 }
 
 fn update<const N: usize>(
@@ -536,63 +474,7 @@ fn update<const N: usize>(
         let state = (x[0], libm::exp(x[N - 2]), x[N - 1]);
         circuit::aged_terminal_v(model, state, &reading.row, branches_v, reading.current_a)
     };
-    let place = model.place_in(&reading.row, x.mean[0]);
-    let slope_v = model.ocv_slope_v(&place);
-    let ratio = libm::exp(x.mean[N - 2]);
-    let drop_v = (1..N - 2).fold(model.r0_ohm(&place) * ratio * reading.current_a, |sum, i| sum + x.mean[i]);
-    let load_v = model.settled_ohm(&place) * ratio * reading.load_a;
-    let base_v_sqrt_s =
-        model.voltage_error_v(&place).map_or(config.model_error_v_sqrt_s, |error_v| error_v * ERROR_WINDOW_S.sqrt());
-    let model_variance =
-        square(base_v_sqrt_s) + square(config.drop_error_sqrt_s * drop_v) + square(config.load_error_sqrt_s * load_v);
-    let sensor_variance = square(config.voltage_noise_v);
-    let noise = Noise {
-        variance: sensor_variance + model_variance / reading.information_s,
-        gate_variance: sensor_variance + square(config.gate_model_error_v) + square(config.gate_soc_error * slope_v),
-        gate_sigma: config.gate_sigma,
-    };
-    x.update(&spread::<N>(config), reading.voltage_v, h, &noise)
-}
-
-/// The estimator's state as a document.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CellState {
-    /// Mean of the filter's state; empty before the first voltage.
-    mean: Vec<f64>,
-    /// Its covariance, row by row.
-    covariance: Vec<f64>,
-    memory: Memory,
-}
-
-impl CellEstimator {
-    /// The state, to be stored.
-    pub fn snapshot(&self) -> CellState {
-        let (mean, covariance) = self.filter.as_ref().map_or_else(
-            Default::default,
-            |filter| each!(filter, x => (x.mean.as_slice().to_vec(), x.covariance.as_slice().to_vec())),
-        );
-        CellState { mean, covariance, memory: self.memory }
-    }
-
-    /// A stored state taken up again; `None` when it is for another number of branches.
-    pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
-        let filter = match (state.mean.len(), branches) {
-            (0, _) => None,
-            (4, 1) => Some(Filter::One(gaussian(state)?)),
-            (5, 2) => Some(Filter::Two(gaussian(state)?)),
-            (6, 3) => Some(Filter::Three(gaussian(state)?)),
-            _ => return None,
-        };
-        Some(Self { filter, memory: state.memory })
-    }
-}
-
-fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
-    (state.mean.len() == N && state.covariance.len() == N * N).then(|| Gaussian {
-        mean: SVector::from_column_slice(&state.mean),
-        covariance: SMatrix::from_column_slice(&state.covariance),
-    })
+    x.update(&spread::<N>(config), reading.voltage_v, h, &reading.noise(x, model, config))
 }
 
 #[cfg(test)]

@@ -310,4 +310,29 @@ pub(crate) mod tests {
             assert!((model.soc_of_ocv(voltage, 17.0) - soc).abs() < 1e-9);
         }
     }
+
+    #[test]
+    fn lost_capacity_bends_the_curve_between_its_ends_and_leaves_them() {
+        let mut model = small_model();
+        assert_eq!(model.ocv_soc(0.4, 1.0), 0.4); // no shift: it only shrinks
+        model.ocv_ageing_shift = 0.8;
+        assert_eq!(model.ocv_soc(0.4, 2.0), 0.4); // a new cell
+        for soc in [-0.2, 0.0, 1.0, 1.3] {
+            assert_eq!(model.ocv_soc(soc, 1.5), soc);
+        }
+        // A quarter lost: a = 0.8 x 0.25 = 0.2.
+        assert!((model.ocv_soc(0.5, 1.5) - (0.5 + 0.2 * 0.25)).abs() < 1e-12);
+        let slope_at_full = (1.0 - model.ocv_soc(1.0 - 1e-6, 1.5)) / 1e-6;
+        assert!((slope_at_full - 0.8).abs() < 1e-5, "{slope_at_full}");
+    }
+
+    #[test]
+    fn the_bent_curve_rises_whatever_capacity_it_is_asked_for() {
+        let mut model = small_model();
+        model.ocv_ageing_shift = 5.0;
+        for capacity_ah in [0.1, 1.0, 2.0, 3.0, 9.0] {
+            let at = |i: i32| model.ocv_soc(f64::from(i) / 100.0, capacity_ah);
+            assert!((-10..110).all(|i| at(i + 1) > at(i)), "{capacity_ah} Ah");
+        }
+    }
 }

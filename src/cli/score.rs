@@ -122,12 +122,15 @@ impl Args {
         for start in &self.start {
             for told in &self.told {
                 for &capacity_error_percent in &self.capacity_error {
-                    cases.extend(seeds.iter().map(|&seed| Case {
-                        start: (*start).into(),
-                        told_points: told.0,
-                        capacity_error_percent,
-                        seed,
-                    }));
+                    for &current_offset_a in &self.current_offset {
+                        cases.extend(seeds.iter().map(|&seed| Case {
+                            start: (*start).into(),
+                            told_points: told.0,
+                            capacity_error_percent,
+                            current_offset_a,
+                            seed,
+                        }));
+                    }
                 }
             }
         }

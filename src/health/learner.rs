@@ -308,6 +308,21 @@ mod tests {
     use crate::cell::estimator::tests::config as estimator_config;
     use crate::cell::model::tests::small_model;
 
+    fn config() -> CapacityConfig {
+        CapacityConfig {
+            method: CapacityMethod::Swing,
+            noise_ah_per_cycle: 0.01,
+            noise_ah_per_rest_day: 0.0,
+            end_error_v: 0.0,
+            end_load_error: 0.0,
+            ageing_shift_error: 0.0,
+            current_gain_std: 0.0,
+            current_offset_std_a: 0.0,
+            fade_std_ah_per_cycle: 0.0,
+            fade_noise_ah_per_cycle: 0.0,
+        }
+    }
+
     /// An hour's discharge at 1 A whose voltages fall from 4.1 V to 3.5 V.
     fn discharge(estimator: &mut CellEstimator) {
         for k in 0..360 {
@@ -326,18 +341,7 @@ mod tests {
 
     #[test]
     fn a_half_cycle_is_measured_by_what_it_alone_has_told() {
-        let config = CapacityConfig {
-            method: CapacityMethod::Swing,
-            noise_ah_per_cycle: 0.01,
-            noise_ah_per_rest_day: 0.0,
-            end_error_v: 0.0,
-            end_load_error: 0.0,
-            ageing_shift_error: 0.0,
-            current_gain_std: 0.0,
-            current_offset_std_a: 0.0,
-            fade_std_ah_per_cycle: 0.0,
-            fade_noise_ah_per_cycle: 0.0,
-        };
+        let config = config();
         let mut estimator = CellEstimator::new(&estimator_config());
         let mut learner = Learner::new(&config, 1, estimator.capacity());
         let at = |soc| CellMark { soc: Some(Belief::from_std(soc, 0.01)), ..CellMark::default() };
@@ -350,5 +354,28 @@ mod tests {
         let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
+    }
+
+    #[test]
+    fn the_repeating_error_of_both_ends_weighs_by_slope_load_ageing_and_swing() {
+        let mut config = config();
+        (config.end_error_v, config.end_load_error, config.ageing_shift_error) = (0.004, 0.1, 0.5);
+        let model = small_model();
+        let mark = |soc, load_v| CellMark { soc: Some(Belief::from_std(soc, 0.01)), load_v, ..CellMark::default() };
+        let moved = half_cycle(1.0, 3600.0, &mark(0.9, 0.03), &mark(0.4, 0.0));
+        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. A tenth of 2 Ah is lost.
+        let (start_v2, end_v2) = (0.004 * 0.004 + 0.003 * 0.003, 0.004 * 0.004);
+        let shape = |soc: f64| 0.5 * 0.1 * soc * (1.0 - soc);
+        let soc_variance =
+            start_v2 / (1.075 * 1.075) + end_v2 / (1.325 * 1.325) + shape(0.9) * shape(0.9) + shape(0.4) * shape(0.4);
+        let swing: f64 = 1.0 / 1.8;
+        let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
+        let found = end_variance_ah2(&model, &config, &moved, 1.8);
+        assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
+        // A tiny swing weighs no worse than the least one; one whose beginning nobody estimated has no ends.
+        let tiny = HalfCycle { charge_ah: 0.001, ..moved };
+        let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;
+        assert!((end_variance_ah2(&model, &config, &tiny, 1.8) / least - 1.0).abs() < 1e-9);
+        assert_eq!(end_variance_ah2(&model, &config, &HalfCycle { ends: None, ..moved }, 1.8), 0.0);
     }
 }

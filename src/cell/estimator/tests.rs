@@ -1,5 +1,7 @@
 //! The estimator against its own model, driven by a small simulation without noise.
 
+mod robust;
+
 use super::*;
 use crate::cell::Discretisation;
 use crate::cell::model::tests::small_model;
@@ -234,4 +236,18 @@ fn two_and_three_branches_estimate_too() {
         assert!((soc(&estimator).mean - truth.soc).abs() < 0.02, "{branches} branches");
         assert_eq!(estimator.branch_v().iter().filter(|v| v.is_finite()).count(), branches as usize);
     }
+}
+
+#[test]
+fn a_restated_capacity_moves_the_mean_and_never_makes_the_filter_surer() {
+    let (config, mut truth) = (config(), truth());
+    let mut estimator = CellEstimator::new(&config);
+    estimator.restate_capacity(Belief::from_std(1.9, 0.1));
+    assert_eq!(estimator.capacity(), Belief::from_std(1.9, 0.1)); // before the first voltage it is simply so
+    cycle(&mut estimator, &config, &mut truth, 1.0, 2.0);
+    let before = estimator.capacity();
+    estimator.restate_capacity(Belief { mean: 1.5, variance: 0.1 * before.variance });
+    assert_eq!(estimator.capacity(), Belief { mean: 1.5, variance: before.variance });
+    estimator.restate_capacity(Belief { mean: 1.6, variance: 9.0 * before.variance });
+    assert_eq!(estimator.capacity(), Belief { mean: 1.6, variance: 9.0 * before.variance });
 }

@@ -74,6 +74,10 @@ pub(crate) struct Args {
     /// Standard deviation that goes with it, percent of the model's; the configuration's when not given
     #[arg(long, value_name = "PERCENT", value_parser = percent_above_0, help_heading = "Starts")]
     pub(crate) capacity_std: Option<f64>,
+    /// Offset of the current sensor, A: added to every measured current before the estimator sees it
+    #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = number,
+          allow_hyphen_values = true, help_heading = "Starts")]
+    pub(crate) current_offset: Vec<f64>,
 
     /// Time after the start that no statistic counts: 600, 600s, 10min or 1h
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration, help_heading = "Truth and statistics")]

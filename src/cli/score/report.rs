@@ -269,6 +269,7 @@ fn describe(case: &Case) -> String {
     }];
     words.extend(case.told_points.map(|points| format!("told {points:+}")));
     words.extend((case.capacity_error_percent != 0.0).then(|| format!("C {:+} %", case.capacity_error_percent)));
+    words.extend((case.current_offset_a != 0.0).then(|| format!("I {:+} A", case.current_offset_a)));
     words.extend(case.seed.map(|seed| format!("windows {seed}")));
     words.join(" ")
 }

@@ -39,6 +39,8 @@ pub struct Case {
     pub told_points: Option<f64>,
     /// Error of the capacity it starts with, percent of the model's.
     pub capacity_error_percent: f64,
+    /// Offset of the sensor: added to every measured current before the core sees it, A.
+    pub current_offset_a: f64,
     /// Seed of the windows; `None` = no windows.
     pub seed: Option<u64>,
 }
@@ -88,7 +90,7 @@ pub(super) fn run(
 ) -> Result<CaseScore, ScoreError> {
     let begin = Beginning::find(job, file, case, settings)?;
     let config = configure(job, case, settings, begin.truth)?;
-    let mut run = Run::new(job, settings, config);
+    let mut run = Run::new(job, settings, config, case.current_offset_a);
     let (mut done, rows) = (0, file.rows().max(1));
     for (index, part) in file.parts.iter().enumerate().skip(begin.part) {
         let mut seen = case.seed.zip(settings.window).map_or(0..part.len(), |(s, w)| window::rows(part, index, s, w));
@@ -183,6 +185,7 @@ struct Run<'a> {
     job: &'a Job,
     settings: &'a Settings,
     feeder: Feeder,
+    current_offset_a: f64,
     /// First and latest stamp fed.
     span: Option<(Timestamp, Timestamp)>,
     rows: usize,
@@ -194,10 +197,20 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    fn new(job: &'a Job, settings: &'a Settings, config: MonitorConfig) -> Self {
-        let feeder = Feeder::new(config, settings.sleep_gap_s);
-        let (samples, life) = (Vec::new(), Life::default());
-        Self { job, settings, feeder, span: None, rows: 0, left_out: 0, resets: 0, samples, life, last: None }
+    fn new(job: &'a Job, settings: &'a Settings, config: MonitorConfig, current_offset_a: f64) -> Self {
+        Self {
+            job,
+            settings,
+            feeder: Feeder::new(config, settings.sleep_gap_s),
+            current_offset_a,
+            span: None,
+            rows: 0,
+            left_out: 0,
+            resets: 0,
+            samples: Vec::new(),
+            life: Life::default(),
+            last: None,
+        }
     }
 
     /// The rows `seen` of one part; `report` is told how many were fed.
@@ -226,7 +239,12 @@ impl<'a> Run<'a> {
         let (began, latest) = self.span.unwrap_or((time, time));
         self.span = Some((began, latest.max(time)));
         self.rows += 1;
-        self.feeder.row(time, part.current_a[row], part.voltage_v[row], part.temperature_c[row]);
+        self.feeder.row(
+            time,
+            part.current_a[row] + self.current_offset_a,
+            part.voltage_v[row],
+            part.temperature_c[row],
+        );
         self.take_events();
         let truth = truth(part, row, self.settings);
         let estimate = self.feeder.out.estimates.pop();

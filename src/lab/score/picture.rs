@@ -34,6 +34,7 @@ pub(super) fn describe(case: &Case, separator: &str) -> String {
     }];
     words.extend(case.told_points.map(|points| format!("told {points:+}")));
     words.extend((case.capacity_error_percent != 0.0).then(|| format!("capacity {:+} %", case.capacity_error_percent)));
+    words.extend((case.current_offset_a != 0.0).then(|| format!("current {:+} A", case.current_offset_a)));
     words.extend(case.seed.map(|seed| format!("windows {seed}")));
     words.join(separator)
 }

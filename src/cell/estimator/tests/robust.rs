@@ -1,0 +1,134 @@
+//! Wrong starts, a current sensor with an offset, rests that still relax: a cell with a slow branch that the estimator's
+//! model lacks, without noise.
+
+use super::*;
+
+/// Slow polarisation that the estimator knows nothing of: its time constant, s, and its resistance, ohm.
+const SLOW: (f64, f64) = (1500.0, 0.03);
+
+/// Half of a 95 % interval, standard deviations.
+const STD_OF_95: f64 = 1.96;
+
+/// A cell with slow polarisation beside the estimator, behind a current sensor with an offset.
+struct Bench {
+    estimator: CellEstimator,
+    config: EstimatorConfig,
+    model: CellModel,
+    truth: Truth,
+    slow_v: f64,
+    offset_a: f64,
+}
+
+/// What a stretch was worth: points.
+#[derive(Debug, Clone, Copy, Default)]
+struct Seen {
+    largest_error: f64,
+    /// Largest |error| over the 95 % interval's half-width.
+    largest_ratio: f64,
+    /// Share of the samples within it.
+    covered: f64,
+}
+
+impl Bench {
+    fn new(soc: f64, told: Option<(f64, f64)>, offset_a: f64) -> Self {
+        let mut config = config();
+        if let Some((soc, std)) = told {
+            (config.initial_soc, config.initial_soc_std) = (Some(soc), std);
+        }
+        let truth = Truth { soc, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.1 };
+        let estimator = CellEstimator::new(&config);
+        Self { estimator, config, model: small_model(), truth, slow_v: 0.0, offset_a }
+    }
+
+    fn run(&mut self, current_a: f64, seconds: f64) -> Seen {
+        const DT_S: f64 = 5.0;
+        let steps = (seconds / DT_S) as u32;
+        let (mut seen, mut within) = (Seen::default(), 0_u32);
+        for _ in 0..steps {
+            let mut step = self.truth.step(&self.model, current_a, DT_S);
+            let (tau_s, ohm) = SLOW;
+            self.slow_v += (ohm * current_a - self.slow_v) * -libm::expm1(-DT_S / tau_s);
+            step.voltage_v -= self.slow_v;
+            step.charge_as += self.offset_a * DT_S;
+            step.current_a = Some(current_a + self.offset_a);
+            assert!(!self.estimator.step(&self.model, &self.config, &step).reset, "lost its cell");
+            let (error, half_width) = (self.error_points().abs(), self.half_width_points());
+            seen.largest_error = seen.largest_error.max(error);
+            seen.largest_ratio = seen.largest_ratio.max(error / half_width);
+            within += u32::from(error <= half_width);
+        }
+        seen.covered = f64::from(within) / f64::from(steps);
+        seen
+    }
+
+    fn error_points(&self) -> f64 {
+        100.0 * (soc(&self.estimator).mean - self.truth.soc)
+    }
+
+    fn half_width_points(&self) -> f64 {
+        100.0 * STD_OF_95 * soc(&self.estimator).std()
+    }
+}
+
+#[test]
+fn an_offset_of_the_current_sensor_does_not_walk_the_soc_away_in_three_days() {
+    // 0.5 % of 1 C of 2 Ah: 10 mA; in 72 h 0.72 Ah, 36 points.
+    for offset_a in [-0.01, 0.01] {
+        let mut bench = Bench::new(0.8, None, offset_a);
+        bench.run(1.0, 1800.0);
+        let mut worst = Seen { covered: 1.0, ..Seen::default() };
+        for _ in 0..36 {
+            for (current_a, seconds) in [(1.0, 1800.0), (0.0, 1800.0), (-1.0, 1800.0), (0.0, 1800.0)] {
+                let seen = bench.run(current_a, seconds);
+                worst.largest_error = worst.largest_error.max(seen.largest_error);
+                worst.largest_ratio = worst.largest_ratio.max(seen.largest_ratio);
+                worst.covered = worst.covered.min(seen.covered);
+            }
+        }
+        println!(
+            "offset {offset_a} A: {worst:?}, at the end {:.2} +/- {:.2}",
+            bench.error_points(),
+            bench.half_width_points()
+        );
+        assert!(worst.largest_error < 2.5, "{offset_a} A: {worst:?}");
+        assert!(worst.largest_ratio < 1.0, "{offset_a} A: {worst:?}");
+    }
+}
+
+#[test]
+fn thirty_points_wrong_recover_within_minutes_of_load_and_within_a_rest() {
+    for current_a in [1.0, -1.0, 0.0] {
+        for wrong in [-0.3, 0.3] {
+            let mut bench = Bench::new(0.5, Some((0.5 + wrong, 0.3)), 0.0);
+            bench.run(current_a, 300.0);
+            println!("{current_a} A, {wrong}: {:.2} +/- {:.2}", bench.error_points(), bench.half_width_points());
+            assert!(bench.error_points().abs() < 2.0, "{current_a} A, {wrong}: {}", bench.error_points());
+            assert!(bench.run(current_a, 600.0).largest_error < 3.0, "{current_a} A, {wrong}");
+        }
+    }
+}
+
+#[test]
+fn a_rest_that_still_relaxes_makes_the_estimate_no_surer_than_it_is_right() {
+    for current_a in [1.0, -1.0] {
+        // Nothing known before but the load: what the estimate then has, it has from voltages under way to rest.
+        let mut bench = Bench::new(0.5 + 0.3 * current_a, None, 0.0);
+        bench.run(current_a, 3600.0);
+        let mut rested_s = 0.0;
+        for until_s in [300.0, 1800.0, 36_000.0] {
+            let seen = bench.run(0.0, until_s - rested_s);
+            rested_s = until_s;
+            println!(
+                "{current_a} A, rest of {until_s} s: {seen:?}, {:.2} +/- {:.2}",
+                bench.error_points(),
+                bench.half_width_points()
+            );
+            assert!(seen.largest_ratio < 1.0, "{current_a} A, {until_s} s: {seen:?}");
+        }
+        // The slow branch has gone: now the voltage is the open circuit's, and the estimate has come to it.
+        assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
+        // Ten hours tell as much as 1000 s x ln 37 under load, not as ten hours would.
+        let least = 100.0 * STD_OF_95 * bench.config.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
+        assert!(bench.half_width_points() > least, "{current_a} A: {} {least}", bench.half_width_points());
+    }
+}
