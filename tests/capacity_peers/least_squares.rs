@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn both_total_least_squares_are_unbiased_and_honest_where_weighted_least_squares_are_not() {
+    fn both_total_least_squares_are_unbiased_and_their_intervals_hold_on_swings_as_they_assume() {
         let mut random = Random(11);
         let mut mean = [0.0; 3];
         let mut covered = [0.0; 3];

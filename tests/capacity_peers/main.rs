@@ -22,9 +22,11 @@ use least_squares::{Method, Peer, Swing};
 use swings::Weighed;
 
 /// Peers by name: fading memories bracket the best of each method on both kinds of life.
-const PEERS: [(&str, Method, f64); 6] = [
+const PEERS: [(&str, Method, f64); 8] = [
     ("WLS   gamma 0.95", Method::Wls, 0.95),
+    ("WLS   gamma 0.50", Method::Wls, 0.5),
     ("TLS   gamma 0.95", Method::Tls, 0.95),
+    ("TLS   gamma 0.50", Method::Tls, 0.5),
     ("AWTLS gamma 0.99", Method::Awtls, 0.99),
     ("AWTLS gamma 0.95", Method::Awtls, 0.95),
     ("AWTLS gamma 0.80", Method::Awtls, 0.8),

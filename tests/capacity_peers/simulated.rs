@@ -1,5 +1,8 @@
-//! Simulated lives, where the true capacity is known: the paper's and one that ages a tenth as fast, with the sensors of
-//! the paper's scenario (5 mV; 20 mA + 10 mA offset + 0.5 % gain), 1 s, SOC 30 to 90 %, started 20 % wrong.
+//! Simulated lives, where the true capacity is known: the paper's, one that ages a tenth as fast, and one that does
+//! not age (what total least squares assume), with the sensors of the paper's scenario (5 mV; 20 mA + 10 mA offset +
+//! 0.5 % gain), 1 s, SOC 30 to 90 %, started 20 % wrong.
+//!
+//! Third source of swings here: the filter's SOC with its capacity held at the wrong start.
 
 use std::path::Path;
 
@@ -7,13 +10,13 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CapacityState;
 use packwatch::config;
 use packwatch::filter::Belief;
+use packwatch::health::CapacityMethod;
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
-use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
 use crate::least_squares::Swing;
-use crate::swings::{Reading, charge_variance, weigh};
+use crate::swings::{Ends, Reading, charge_variance, weigh};
 use crate::{PEERS, Score, Source, follow, score};
 
 const NEW_AH: f64 = 2.6;
@@ -42,6 +45,8 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
     config.estimator.initial_capacity_std_ah = START_STD * NEW_AH;
     if held {
         config.estimator.capacity_state = CapacityState::Held;
+        config.health.capacity.method = CapacityMethod::Nominal { swing: 0.6, variance_ah2: 1e9 };
+        config.health.capacity.noise_ah_per_cycle = 0.0;
     }
     config.output = None;
     config
@@ -81,7 +86,6 @@ fn live(config: &MonitorConfig, settings: Settings) -> Life {
             });
         }
     }
-    assert!(monitor.capacity(CellIndex(0)).mean > 0.0);
     life
 }
 
@@ -137,40 +141,53 @@ fn print(life: &str, start: f64, name: &str, source: &str, (score, last): (Score
     );
 }
 
-/// The lives: name, capacity lost per cycle, Ah, and cycles.
-const LIVES: [(&str, f64, u32); 2] = [("0.05 Ah per cycle", 0.05, 48), ("0.005 Ah per cycle", 0.005, 48)];
+/// The lives: name and capacity lost per cycle, Ah.
+const LIVES: [(&str, f64); 3] = [("none", 0.0), ("0.005 Ah per cycle", 0.005), ("0.05 Ah per cycle", 0.05)];
+/// As many as the paper's life has.
+const CYCLES: u32 = 48;
+
+/// What a peer that is fed the filter's own SOC may be ahead by, relative: a tenth of a per cent. That SOC has been counted
+/// with the capacity learned here, and the current's gain error of half a per cent is in all of them.
+const NEAR: f64 = 0.001;
 
 #[test]
 fn simulated_capacity_is_no_worse_than_that_of_any_least_squares_on_its_swings() {
     println!("| loss | started at | method | swings | mean abs error % | in 95 % interval | last error % |");
     println!("| --- | --- | --- | --- | --- | --- | --- |");
-    for (name, loss_ah, cycles) in LIVES {
+    for (name, loss_ah) in LIVES {
         for start in [0.8, 1.2] {
             let mut settings = Settings::of(Scenario::Paper, NEW_AH);
             settings.pack.ageing.capacity_loss_ah_per_cycle = loss_ah;
-            settings.cycles = Some(cycles);
-            let config = configuration(start, false);
-            let life = live(&config, settings);
-            assert!(life.told.len() > 90 && life.filter.len() > 90, "{} told", life.told.len());
-            let ours = life.ours();
-            print(name, start, "packwatch", "-", ours);
-            let weighed = weigh(&config.model, &config.health.capacity, &life.readings);
-            assert!(weighed.len() > 90, "{} swings weighed", weighed.len());
-            let voltage: Vec<_> = weighed.into_iter().map(|swing| (swing.start_s, Source::Voltage(swing))).collect();
-            let held_config = configuration(start, true);
-            let held = live(&held_config, settings);
-            for (source, life, swings) in
-                [("voltage", &life, &voltage), ("filter", &life, &life.filter), ("filter, capacity held", &held, &held.filter)]
-            {
-                for ((peer, ..), scored) in PEERS.iter().zip(life.peers(&config, swings)) {
-                    print(name, start, peer, source, scored);
-                    if source == "voltage" {
-                        let (a, b) = (ours.0.mean_absolute, scored.0.mean_absolute);
-                        assert!(a <= b, "{name} from {start}: {a} against {b} of {peer}");
-                    }
-                }
-            }
-            assert!(ours.0.covered > 0.85, "{name} from {start}: {ours:?}");
+            settings.cycles = Some(CYCLES);
+            compare(name, start, settings);
         }
     }
+}
+
+/// Prints all rows of a life; fails when ours is worse, or when what is fed back passes for knowledge.
+fn compare(name: &str, start: f64, settings: Settings) {
+    let config = configuration(start, false);
+    let (life, held) = (live(&config, settings), live(&configuration(start, true), settings));
+    assert!(life.told.len() > 90 && life.filter.len() > 90, "{} told", life.told.len());
+    let weighed = weigh(&config.model, &config.health.capacity, Ends::Outer, &life.readings);
+    assert!(weighed.len() > 90, "{} swings weighed", weighed.len());
+    let voltage: Vec<_> = weighed.into_iter().map(|swing| (swing.start_s, Source::Voltage(swing))).collect();
+    let (ours, last) = life.ours();
+    print(name, start, "packwatch", "-", (ours, last));
+    let best = |source: &str, life: &Life, swings: &[(f64, Source)]| {
+        let mut best = f64::INFINITY;
+        for ((peer, ..), scored) in PEERS.iter().zip(life.peers(&config, swings)) {
+            print(name, start, peer, source, scored);
+            best = best.min(scored.0.mean_absolute);
+        }
+        best
+    };
+    let by_voltage = best("voltage", &life, &voltage);
+    let by_filter = best("filter", &life, &life.filter);
+    let fed_back = best("filter, capacity held", &held, &held.filter);
+    let error = ours.mean_absolute;
+    assert!(error <= by_voltage, "{name} from {start}: {error}, the best by voltage {by_voltage}");
+    assert!(error <= by_filter + NEAR, "{name} from {start}: {error}, the best on the filter's SOC {by_filter}");
+    assert!(fed_back > 0.1, "{name} from {start}: swings counted with a wrong capacity gave {fed_back}");
+    assert!(ours.covered > 0.9, "{name} from {start}: {ours:?}");
 }

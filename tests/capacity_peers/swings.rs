@@ -22,7 +22,7 @@ const END_S: f64 = 60.0;
 /// The charge that must flow back before a swing is over, part of the model's capacity.
 const REVERSAL: f64 = 0.02;
 /// The least swing used, part of the model's capacity.
-const MIN_SWING: f64 = 0.1;
+const MIN_SWING: f64 = 0.05;
 /// White noise of a voltage reading, V.
 const VOLTAGE_NOISE_V: f64 = 0.005;
 
@@ -68,7 +68,12 @@ impl Weighed {
         });
         let y_ah = (self.ends[1].charge_ah - self.ends[0].charge_ah).abs();
         let x = (a - b) * (self.ends[1].charge_ah - self.ends[0].charge_ah).signum();
-        Swing { x, x_variance: a_variance + b_variance, y_ah, y_variance: charge_variance(config, y_ah, self.end_s - self.start_s) }
+        Swing {
+            x,
+            x_variance: a_variance + b_variance,
+            y_ah,
+            y_variance: charge_variance(config, y_ah, self.end_s - self.start_s),
+        }
     }
 }
 
@@ -90,8 +95,17 @@ fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
     0.5 * (low + high)
 }
 
+/// Which readings make the ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ends {
+    /// The first and last there are, at rest where the cell rests.
+    Outer,
+    /// Those with current only.
+    Loaded,
+}
+
 /// All swings of a life.
-pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, readings: &[Reading]) -> Vec<Weighed> {
+pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, readings: &[Reading]) -> Vec<Weighed> {
     let mut swings = Vec::new();
     let mut points: Vec<Point> = Vec::new();
     let mut circuit = Circuit::default();
@@ -101,7 +115,9 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, readings: &[Read
             points.clear();
             circuit.begin(reading);
         }
-        points.push(circuit.step(model, config, reading));
+        let mut point = circuit.step(model, config, reading);
+        point.known &= ends == Ends::Outer || reading.current_a.abs() >= REST_A;
+        points.push(point);
         if let Some(turn) = reversal(model, &points) {
             let after = points.split_off(turn);
             swings.extend(between_ends(model, &points));
@@ -119,7 +135,8 @@ fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     if points.len() % 32 != 0 {
         return None;
     }
-    let by = |a: &usize, b: &usize| (points[*a].charge_ah - first).abs().total_cmp(&(points[*b].charge_ah - first).abs());
+    let by =
+        |a: &usize, b: &usize| (points[*a].charge_ah - first).abs().total_cmp(&(points[*b].charge_ah - first).abs());
     let turn = (0..points.len()).max_by(by)?;
     let back_ah = (points[turn].charge_ah - last).abs();
     let gone_ah = (points[turn].charge_ah - first).abs();
@@ -128,7 +145,7 @@ fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
 
 fn between_ends(model: &CellModel, points: &[Point]) -> Option<Weighed> {
     let start_s = points.iter().find(|point| point.known)?.time_s;
-    let end_s = points.last()?.time_s;
+    let end_s = points.iter().rfind(|point| point.known)?.time_s;
     if end_s - start_s < 2.0 * END_S {
         return None;
     }
