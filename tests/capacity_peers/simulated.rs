@@ -83,6 +83,8 @@ fn live(config: &MonitorConfig, settings: Settings) -> Life {
                 current_a: e.current_a,
                 temperature_c: e.temperature_c,
                 resistance_ratio: e.resistance_ratio,
+                soc: e.soc,
+                soc_variance: e.soc_std * e.soc_std,
             });
         }
     }

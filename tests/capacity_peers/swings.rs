@@ -34,6 +34,9 @@ pub(crate) struct Reading {
     pub(crate) current_a: f64,
     pub(crate) temperature_c: f64,
     pub(crate) resistance_ratio: f64,
+    /// The filter's SOC and its variance.
+    pub(crate) soc: f64,
+    pub(crate) soc_variance: f64,
 }
 
 /// What one reading says, or the mean of several.
@@ -46,6 +49,9 @@ struct Point {
     variance: f64,
     /// Charge taken out so far, Ah.
     charge_ah: f64,
+    /// The filter's SOC and its variance.
+    soc: f64,
+    soc_variance: f64,
     known: bool,
 }
 
@@ -66,14 +72,19 @@ impl Weighed {
             let shape = config.ageing_shift_error * lost * soc * (1.0 - soc);
             (soc, end.variance + shape * shape)
         });
-        let y_ah = (self.ends[1].charge_ah - self.ends[0].charge_ah).abs();
-        let x = (a - b) * (self.ends[1].charge_ah - self.ends[0].charge_ah).signum();
-        Swing {
-            x,
-            x_variance: a_variance + b_variance,
-            y_ah,
-            y_variance: charge_variance(config, y_ah, self.end_s - self.start_s),
-        }
+        self.between(config, a - b, a_variance + b_variance)
+    }
+
+    /// With the filter's own SOC at the same ends.
+    pub(crate) fn filter_swing(&self, config: &CapacityConfig) -> Swing {
+        let [a, b] = &self.ends;
+        self.between(config, a.soc - b.soc, a.soc_variance + b.soc_variance)
+    }
+
+    fn between(&self, config: &CapacityConfig, fall: f64, x_variance: f64) -> Swing {
+        let moved_ah = self.ends[1].charge_ah - self.ends[0].charge_ah;
+        let (x, y_ah) = (fall * moved_ah.signum(), moved_ah.abs());
+        Swing { x, x_variance, y_ah, y_variance: charge_variance(config, y_ah, self.end_s - self.start_s) }
     }
 }
 
@@ -131,8 +142,8 @@ pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, read
 /// Where the charge turned, when enough has flowed back by the last point.
 fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
     let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
-    // A swing is looked at twice a minute or so: turning points need no second's precision here.
-    if points.len() % 32 != 0 {
+    // Looked for at every 32nd point only: a turn lies in the past by far more when it counts.
+    if !points.len().is_multiple_of(32) {
         return None;
     }
     let by =
@@ -164,6 +175,8 @@ fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
         new_soc: of(|p| p.new_soc),
         variance: of(|p| p.variance),
         charge_ah: of(|p| p.charge_ah),
+        soc: of(|p| p.soc),
+        soc_variance: of(|p| p.soc_variance),
         known: true,
     }
 }
@@ -186,7 +199,7 @@ impl Circuit {
     }
 
     fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
-        let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio } = reading;
+        let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
         let mut load_v = self.branch_v.iter().sum::<f64>();
         // Resistances are those of the SOC the voltage tells; two passes settle it.
         let mut soc = 0.5;
@@ -214,6 +227,8 @@ impl Circuit {
             new_soc,
             variance: deviation * deviation,
             charge_ah: self.charge_ah,
+            soc: reading.soc,
+            soc_variance: reading.soc_variance,
             known: time_s >= self.known_from_s,
         }
     }
