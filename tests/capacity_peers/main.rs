@@ -1,8 +1,9 @@
 //! The capacity of `packwatch` beside recursive total least squares (Plett 2011) on the same swings.
 //!
-//! Two sources of swings for the peers: `filter`, charge and SOC swing with its deviation as the event `half_cycle` has
-//! them; `voltage`, both ends by inversion of the open-circuit curve (`swings`). Both lean on the capacity in use: the first
-//! because that SOC was counted with it, the second only for the curve's change of shape.
+//! Sources of swings for the peers: `filter`, the filter's own SOC at both ends (event `half_cycle`, with its deviation; in
+//! windows the same ends as below); `voltage`, both ends by inversion of the open-circuit curve (`swings`); `filter, capacity
+//! held`, the filter's SOC counted throughout with the wrong capacity it was started with. The second leans on the
+//! capacity in use only for the curve's change of shape.
 //! Measured lives publish what 2 A delivers, not the capacity between open-circuit voltages, so each peer's capacity goes
 //! through the product's own usable capacity (same resistance, same full SOC): only the capacities differ.
 //! `cargo test --release --test capacity_peers -- --nocapture` prints the tables of tests/candidates.md.
@@ -21,7 +22,7 @@ use packwatch::health::CapacityConfig;
 use least_squares::{Method, Peer, Swing};
 use swings::Weighed;
 
-/// Peers by name: fading memories bracket the best of each method on both kinds of life.
+/// Peers by name: none of these memories is the best on every life, so several of each are shown.
 const PEERS: [(&str, Method, f64); 8] = [
     ("WLS   gamma 0.95", Method::Wls, 0.95),
     ("WLS   gamma 0.50", Method::Wls, 0.5),
