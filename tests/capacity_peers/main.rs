@@ -23,15 +23,18 @@ use least_squares::{Method, Peer, Swing};
 use swings::Weighed;
 
 /// Peers by name: none of these memories is the best on every life, so several of each are shown.
-const PEERS: [(&str, Method, f64); 8] = [
+const PEERS: [(&str, Method, f64); 11] = [
     ("WLS   gamma 0.95", Method::Wls, 0.95),
     ("WLS   gamma 0.50", Method::Wls, 0.5),
+    ("WLS   gamma 0.20", Method::Wls, 0.2),
     ("TLS   gamma 0.95", Method::Tls, 0.95),
     ("TLS   gamma 0.50", Method::Tls, 0.5),
+    ("TLS   gamma 0.20", Method::Tls, 0.2),
     ("AWTLS gamma 0.99", Method::Awtls, 0.99),
     ("AWTLS gamma 0.95", Method::Awtls, 0.95),
     ("AWTLS gamma 0.80", Method::Awtls, 0.8),
     ("AWTLS gamma 0.50", Method::Awtls, 0.5),
+    ("AWTLS gamma 0.20", Method::Awtls, 0.2),
 ];
 
 /// A swing of either source, and when it began.

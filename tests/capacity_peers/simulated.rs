@@ -176,6 +176,9 @@ fn compare(name: &str, start: f64, settings: Settings) {
     let voltage: Vec<_> = weighed.into_iter().map(|swing| (swing.start_s, Source::Voltage(swing))).collect();
     let (ours, last) = life.ours();
     print(name, start, "packwatch", "-", (ours, last));
+    let mut without = config.clone();
+    (without.health.capacity.fade_std_ah_per_cycle, without.health.capacity.fade_noise_ah_per_cycle) = (0.0, 0.0);
+    print(name, start, "packwatch, fade not learned", "-", live(&without, settings).ours());
     let best = |source: &str, life: &Life, swings: &[(f64, Source)]| {
         let mut best = f64::INFINITY;
         for ((peer, ..), scored) in PEERS.iter().zip(life.peers(&config, swings)) {
