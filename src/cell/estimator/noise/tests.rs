@@ -82,3 +82,19 @@ fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
     assert!(near(q[(1, 1)], square(config.branch_noise_v_per_sqrt_s) * 0.5 * model.branch_tau_s(0, &place)));
     assert_eq!((q[(0, 0)], q[(3, 3)]), (0.0, 0.0));
 }
+
+#[test]
+fn a_reading_is_as_good_as_sensor_model_drop_and_load_leave_it() {
+    let (mut config, model) = (config(), small_model());
+    config.voltage_noise_v = 0.0;
+    let mut x = Gaussian::<4> { mean: nalgebra::SVector::zeros(), covariance: SMatrix::identity() };
+    (x.mean[0], x.mean[1], x.mean[3]) = (0.5, 0.05, 2.0);
+    let at = |load_a: f64, current_a: f64, information_s: f64| {
+        Reading { voltage_v: 3.6, current_a, load_a, row: model.row(0.0), information_s }.noise(&x, &model, &config)
+    };
+    // At 0 C and a SOC of 0.5: 60 + 20 mohm.
+    let (base, drop, load) = (0.15 * 0.15, square(0.3 * (0.06 * 2.0 + 0.05)), square(0.5 * 0.08 * 5.0));
+    assert!(near(at(5.0, 2.0, 10.0).variance, (base + drop + load) / 10.0));
+    assert!(near(at(0.0, 2.0, 1.0).variance, base + drop));
+    assert_eq!(at(5.0, 2.0, 10.0).gate_variance, at(0.0, 0.0, 1.0).gate_variance);
+}
