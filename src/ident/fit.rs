@@ -332,6 +332,16 @@ impl Fit {
         weak.map(|(node, _)| (self.grid.temperature_c[node / columns], self.grid.soc[node % columns])).collect()
     }
 
+    /// Open-circuit voltage over the whole SOC range, mean of the temperatures, V.
+    pub fn mean_ocv_v(&self) -> f64 {
+        let of_row = |row: &[f64]| -> f64 {
+            let pairs = row.windows(2).zip(self.grid.soc.windows(2));
+            pairs.map(|(v, soc)| 0.5 * (v[0] + v[1]) * (soc[1] - soc[0])).sum()
+        };
+        let rows = self.tables.ocv_v.chunks(self.grid.soc.len());
+        rows.map(of_row).sum::<f64>() / self.grid.temperature_c.len() as f64
+    }
+
     /// The model's resistance once all branches have settled, ohm, at a place.
     pub fn settled_ohm(&self, place: &Place) -> f64 {
         let corners = self.grid.resistance_corners(place);

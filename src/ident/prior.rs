@@ -62,11 +62,12 @@ impl Beliefs {
     };
 
     /// Discharges and charges at one current each tell R0 from the branch only at their beginnings: R0 hardly bends,
-    /// the time constant stays where it is.
+    /// the time constant stays where it is. Nor do they tell the branch from the OCV at the empty end, where both turn
+    /// steeply: the branch bends as little as drives allow ([`Beliefs::SLOW_TEST`]), so that the OCV takes the knee.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
-        r_curvature: 0.5,
+        r_curvature: Self::SLOW_TEST.r_curvature,
         tau_curvature: 0.01,
         tau_level: 0.01,
         ..Self::FREE_OCV

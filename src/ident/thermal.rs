@@ -15,8 +15,45 @@ const MAX_FALL_K: f64 = 1.0;
 /// Values outside are no cell's: J/K, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
-/// Fits both; `None` when no discharge warms enough or the answers are no cell's.
-pub fn fit(records: &[Record], tables: &Tables) -> Option<Thermal> {
+/// Heat capacity per stored energy of a cell, J/K per Wh: 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A sensor that
+/// sees a share of the warming only (between cell and moving air) gives a capacity too large and a resistance too small by
+/// that share, without a trace in the residuals; this is what tells it.
+const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
+
+/// Why there are no thermal parameters.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum Untold {
+    /// Too little warming, or no answer.
+    #[error("no thermal parameters: no file's temperature tells them")]
+    NoWarming,
+    /// The sensor does not show the cell's own temperature.
+    #[error(
+        "no thermal parameters: {found_j_per_k:.0} J/K fits, a cell of {energy_wh:.1} Wh has {} to {} J/K per Wh; \
+         the sensor does not see the cell's warming alone",
+        CELL_J_PER_K_WH.0,
+        CELL_J_PER_K_WH.1
+    )]
+    NoCell {
+        /// Heat capacity that fits, J/K.
+        found_j_per_k: f64,
+        /// Energy of the cell, Wh.
+        energy_wh: f64,
+    },
+}
+
+/// Fits both; `energy_wh` = what the cell stores.
+///
+/// # Errors
+/// No discharge warms enough, or the answer is no cell's.
+pub fn fit(records: &[Record], tables: &Tables, energy_wh: f64) -> Result<Thermal, Untold> {
+    let thermal = medians(records, tables).ok_or(Untold::NoWarming)?;
+    let found_j_per_k = thermal.heat_capacity_j_per_k;
+    let (least, most) = CELL_J_PER_K_WH;
+    let a_cell = (least..=most).contains(&(found_j_per_k / energy_wh));
+    if a_cell { Ok(thermal) } else { Err(Untold::NoCell { found_j_per_k, energy_wh }) }
+}
+
+fn medians(records: &[Record], tables: &Tables) -> Option<Thermal> {
     let told = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
     let (mut capacities, mut resistances): (Vec<f64>, Vec<f64>) =
         told.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
@@ -89,8 +126,11 @@ mod tests {
             };
             Record::prepare(&raw, &[], &grid, &limits)
         };
-        let found = fit(&[record(25.0), record(25.0), record(15.0)], &tables).expect("warms");
+        let records = [record(25.0), record(25.0), record(15.0)];
+        let found = fit(&records, &tables, 7.2).expect("warms");
         assert!((found.heat_capacity_j_per_k - 40.0).abs() < 0.4, "{found:?}");
         assert!((found.resistance_k_per_w - 10.0).abs() < 0.1, "{found:?}");
+        let refused = fit(&records, &tables, 2.9).expect_err("13.8 J/K per Wh").to_string();
+        assert!(refused.contains("40 J/K fits, a cell of 2.9 Wh has 2.5 to 12.5 J/K per Wh"), "{refused}");
     }
 }

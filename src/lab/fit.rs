@@ -147,7 +147,8 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
     check_range(&records)?;
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(Progress::Pass(pass, cost)));
     let fitted = fitted.map_err(|error| FitFailure(error.to_string()))?;
-    let thermal = thermal::fit(&records, &fitted.tables);
+    let energy_wh = prepared.capacity_ah * fitted.mean_ocv_v();
+    let thermal = thermal::fit(&records, &fitted.tables, energy_wh);
     let file_of_record: Vec<usize> = prepared.sources.iter().map(|source| source.file).collect();
     let voltage_error_v = error_table::table(&fitted, &judged(&records, &file_of_record), prepared.capacity_ah);
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
@@ -156,7 +157,7 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
     let mut outcome = Outcome {
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
-        thermal,
+        thermal: thermal.ok(),
         voltage_error_v,
         by_kind,
         files,
@@ -165,6 +166,7 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
         notes: prepared.notes,
         fit: fitted,
     };
+    outcome.notes.extend(thermal.err().map(|untold| untold.to_string()));
     add_notes(&mut outcome);
     Ok(outcome)
 }
@@ -259,9 +261,6 @@ fn by_file(
 }
 
 fn add_notes(outcome: &mut Outcome) {
-    if outcome.thermal.is_none() {
-        outcome.notes.push("no thermal parameters: no file's temperature tells them".into());
-    }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {
         outcome.notes.push(format!("{outliers} rows left out: no voltage this cell can have"));
