@@ -312,7 +312,7 @@ fn usable_capacity_of_whole_lives_is_no_worse_than_by_any_least_squares_on_their
 /// What the best of the peers, its memory chosen by the result, may be ahead by over all windows: here they are level.
 const LEVEL: f64 = 1.1;
 
-/// The filter's swings are those at the same ends here: a `half_cycle` that begins behind a gap has its SOC from before it.
+/// The filter's swings are those at the same ends here: behind a gap, swing and charge of a `half_cycle` can disagree.
 #[test]
 fn usable_capacity_from_windows_is_level_with_the_best_least_squares_on_them() {
     let Some(data) = data() else { return };
