@@ -51,6 +51,21 @@ pub struct End {
     pub load_v: f64,
 }
 
+/// A cell's new estimate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Observed {
+    /// State of charge.
+    pub soc: Belief,
+    /// Voltage which the load of the last minutes drops in the cell, V.
+    pub load_v: f64,
+    /// Temperature, degrees C; `None` = no valid sensor.
+    pub temperature_c: Option<f64>,
+    /// Time since the last estimate in which the current was measured, s.
+    pub measured_s: f64,
+    /// Whether there was time since then in which it was not.
+    pub after_gap: bool,
+}
+
 /// What the capacity filter made of a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -121,12 +136,18 @@ impl Learner {
     }
 
     /// Takes a cell's new estimate into its totals.
-    pub fn observe(&mut self, cell: usize, soc: Belief, load_v: f64, temperature_c: Option<f64>, elapsed_s: f64) {
+    pub fn observe(&mut self, cell: usize, seen: &Observed) {
         let totals = &mut self.totals[cell];
-        (totals.soc, totals.load_v) = (Some(soc), load_v);
-        if let Some(temperature_c) = temperature_c {
-            totals.temperature_integral += temperature_c * elapsed_s;
-            totals.temperature_s += elapsed_s;
+        (totals.soc, totals.load_v) = (Some(seen.soc), seen.load_v);
+        if let Some(temperature_c) = seen.temperature_c {
+            totals.temperature_integral += temperature_c * seen.measured_s;
+            totals.temperature_s += seen.measured_s;
+        }
+        if seen.after_gap
+            && let Some(mark) = &mut self.candidate
+        {
+            // What begins right behind a gap begins at this SOC, not at the one before the gap.
+            (mark.cells[cell].soc, mark.cells[cell].load_v) = (Some(seen.soc), seen.load_v);
         }
     }
 
@@ -337,6 +358,30 @@ mod tests {
             };
             estimator.step(&small_model(), &estimator_config(), &step);
         }
+    }
+
+    #[test]
+    fn what_begins_behind_a_gap_begins_at_the_soc_after_it() {
+        let transition =
+            TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
+        let mut learner = Learner::new(&config(), 1, Belief::from_std(2.0, 0.1));
+        let seen = |soc: f64, after_gap| Observed {
+            soc: Belief::from_std(soc, 0.01),
+            load_v: 0.0,
+            temperature_c: None,
+            measured_s: 10.0,
+            after_gap,
+        };
+        let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
+        learner.observe(0, &seen(0.1, false));
+        learner.mark_candidate(start, 0.0);
+        learner.observe(0, &seen(0.9, true));
+        let mut found = Vec::new();
+        learner.complete(&transition, 2.0, Mode::Unknown, &mut found);
+        learner.observe(0, &seen(0.4, false));
+        learner.mark_candidate(end, 3600.0);
+        learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
+        assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");
     }
 
     #[test]

@@ -11,7 +11,7 @@ pub mod usable;
 pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
-pub use learner::{CapacityUpdate, HalfCycle, Learner};
+pub use learner::{CapacityUpdate, HalfCycle, Learner, Observed};
 pub use pack::{CellShare, PackState};
 pub use recharge::{Charged, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

@@ -23,7 +23,7 @@ use crate::can::Frame;
 use crate::can::decode::InputMap;
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
-use crate::health::{HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
@@ -330,7 +330,9 @@ impl Monitor {
             self.recharge.discard();
         }
         let load_v = slot.estimator.load_v(&self.config.model);
-        self.learner.observe(index, soc, load_v, sample.temperature_c, measured_s);
+        let after_gap = unmeasured_s > 0.0;
+        let seen = Observed { soc, load_v, temperature_c: sample.temperature_c, measured_s, after_gap };
+        self.learner.observe(index, &seen);
         self.note_taper(sample);
         self.judge_trust(sample.cell, out);
         let capacity = self.capacity(sample.cell);

@@ -284,7 +284,7 @@ fn soc_row(score: &CaseScore, soc: &SocScore) -> Vec<String> {
         soc.converge_s.map_or_else(|| "not".to_owned(), |s| format!("{s:.0} s")),
         percent(soc.coverage),
         two(soc.mean_half_width_points),
-        two(soc.mean_normalised_innovation_squared),
+        format!("{:.4}", soc.mean_normalised_innovation_squared),
         score.resets.to_string(),
         soc.samples.to_string(),
     ]

@@ -59,7 +59,8 @@ pub struct SocScore {
     pub coverage: f64,
     /// Mean half-width of that interval, points.
     pub mean_half_width_points: f64,
-    /// Mean of (innovation / its standard deviation) squared: 1 when the filter's own statistics hold.
+    /// Mean of (innovation / its standard deviation) squared: at most about 1 when the filter's own statistics hold, and
+    /// far below it at high sample rates, since the filter counts information per second.
     pub mean_normalised_innovation_squared: f64,
 }
 
