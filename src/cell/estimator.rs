@@ -283,6 +283,7 @@ impl CellEstimator {
     /// The record goes on after a gap of unknown length: branches may or may not have relaxed, and of the SOC
     /// nothing is sure.
     pub fn handle_unknown_gap(&mut self) {
+        self.memory.rest_s = 0.0;
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);

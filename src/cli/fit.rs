@@ -54,11 +54,11 @@ pub(crate) struct Args {
     /// Temperature nodes, degrees C, rising [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
     temperatures: Option<Vec<f64>>,
-    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 24, closer near both ends]
+    /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 with a slow test, 25 for an ageing cell, else 24; closer near both ends]
     #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
     /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", conflicts_with_all = ["ocv", "capacity"])]
     first_cycles: Option<usize>,
     /// Plot of the residuals to write
     #[arg(long, value_name = "FILE.svg")]

@@ -1,7 +1,7 @@
 //! What each completed half-cycle teaches about each cell: charge moved, SOC swing, capacity.
 //!
 //! A half-cycle runs from where charge or discharge began to where it ended (both dated by the transition
-//! detector). The capacity filter (paper, section 3.3.4: random walk, A = C = 1, one step per half-cycle) gets
+//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; by `Swing` with fade and offset beside it, [`super::drift`]) gets
 //! its measurement by one of two rules:
 //! * `Swing`: the information which the voltages since the last half-cycle have given about the capacity. The
 //!   sample-by-sample filter carries the capacity with its correlation to the SOC; the measurement is what leads
@@ -32,7 +32,7 @@ pub struct HalfCycle {
     pub swing: Option<Belief>,
     /// SOC at its end, fraction.
     pub end_soc: Option<f64>,
-    /// Where its charge was weighed: both ends on the voltage curve; `None` when its beginning was not estimated.
+    /// Where its charge was weighed: both ends on the voltage curve; `None` when nothing was estimated.
     pub ends: Option<[End; 2]>,
     /// Duration, s.
     pub duration_s: f64,
@@ -54,6 +54,8 @@ pub struct End {
 /// A cell's new estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Observed {
+    /// When.
+    pub time: Timestamp,
     /// State of charge.
     pub soc: Belief,
     /// Voltage which the load of the last minutes drops in the cell, V.
@@ -62,8 +64,8 @@ pub struct Observed {
     pub temperature_c: Option<f64>,
     /// Time since the last estimate in which the current was measured, s.
     pub measured_s: f64,
-    /// Whether there was time since then in which it was not.
-    pub after_gap: bool,
+    /// Time since then in which it was not, s; infinite before the first estimate and after an unknown gap.
+    pub gap_s: f64,
 }
 
 /// What the capacity filter made of a half-cycle.
@@ -143,10 +145,10 @@ impl Learner {
             totals.temperature_integral += temperature_c * seen.measured_s;
             totals.temperature_s += seen.measured_s;
         }
-        if seen.after_gap
-            && let Some(mark) = &mut self.candidate
+        if let Some(mark) = &mut self.candidate
+            && seen.time.since(mark.time) < seen.gap_s
         {
-            // What begins right behind a gap begins at this SOC, not at the one before the gap.
+            // Marked since the gap: what begins right behind it begins at this SOC, not at the one before.
             (mark.cells[cell].soc, mark.cells[cell].load_v) = (Some(seen.soc), seen.load_v);
         }
     }
@@ -311,10 +313,11 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .zip(b.soc)
             .map(|(a, b)| Belief { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
-        ends: a
-            .soc
-            .zip(b.soc)
-            .map(|(start, end)| [End { soc: start.mean, load_v: a.load_v }, End { soc: end.mean, load_v: b.load_v }]),
+        ends: b.soc.map(|soc| {
+            let end = End { soc: soc.mean, load_v: b.load_v };
+            // A beginning that nobody saw is no better than the end.
+            [a.soc.map_or(end, |soc| End { soc: soc.mean, load_v: a.load_v }), end]
+        }),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
         mean_temperature_c: (temperature_s > 0.0)
@@ -365,20 +368,21 @@ mod tests {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
         let mut learner = Learner::new(&config(), 1, Belief::from_std(2.0, 0.1));
-        let seen = |soc: f64, after_gap| Observed {
+        let seen = |time_s: f64, soc: f64, gap_s: f64| Observed {
+            time: Timestamp::from_secs(time_s),
             soc: Belief::from_std(soc, 0.01),
             load_v: 0.0,
             temperature_c: None,
             measured_s: 10.0,
-            after_gap,
+            gap_s,
         };
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
-        learner.observe(0, &seen(0.1, false));
+        learner.observe(0, &seen(1000.0, 0.1, 0.0));
         learner.mark_candidate(start, 0.0);
-        learner.observe(0, &seen(0.9, true));
+        learner.observe(0, &seen(5000.1, 0.9, 4000.0));
         let mut found = Vec::new();
         learner.complete(&transition, 2.0, Mode::Unknown, &mut found);
-        learner.observe(0, &seen(0.4, false));
+        learner.observe(0, &seen(8600.0, 0.4, 0.0));
         learner.mark_candidate(end, 3600.0);
         learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
         assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");

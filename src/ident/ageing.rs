@@ -60,6 +60,9 @@ pub enum AgeingError {
     },
 }
 
+/// A charge that puts in this much of what was missing has filled the cell; any other is left out.
+const FULL_CHARGE: std::ops::RangeInclusive<f64> = 0.8..=1.25;
+
 /// Marks of one discharge, Ah from its beginning.
 struct Marks {
     knee_ah: f64,
@@ -95,6 +98,10 @@ pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, V
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
         } else {
             let all_ah = out_ah[out_ah.len() - 1];
+            // An aborted charge, or two samples of one: its end is no full cell.
+            if !FULL_CHARGE.contains(&(-all_ah / ((1.0 - left) * capacity_ah))) {
+                continue;
+            }
             out_ah.iter().map(|ah| left + (1.0 - left) * ah / all_ah).collect()
         };
         left = soc[soc.len() - 1];

@@ -93,6 +93,11 @@ pub enum FitError {
         /// Judged rows.
         found: usize,
     },
+    /// The equations have no finite value at the start.
+    #[error(
+        "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number"
+    )]
+    NotFinite,
     /// The current never changes enough to tell a resistance.
     #[error("the current does not change: no resistance can be told from the open-circuit voltage")]
     NoExcitation,
@@ -123,6 +128,9 @@ pub fn fit(
         prior.accumulate(theta, &mut normal);
         normal
     };
+    if !evaluate(&start).cost.is_finite() {
+        return Err(FitError::NotFinite);
+    }
     let solution = minimise(&space, &start, evaluate, progress);
     let tables = Tables::new(&layout, &solution.theta);
     let (each, total) = judge(records, &tables);

@@ -1,7 +1,7 @@
 //! Plots as SVG: panels one below the other, each with lines, bands and a legend.
 //!
 //! In: points in the units that the axis labels name; a point that is not finite interrupts its line. Out: one SVG file,
-//! replaced as a whole. A long series is cut down to its extremes in about a thousand bins along x, so that peaks survive
+//! written over what was there. A long series is cut down to its extremes in about a thousand bins along x, so that peaks survive
 //! and the file stays small.
 
 use std::ops::Range;

@@ -304,10 +304,13 @@ impl Monitor {
         let index = sample.cell.index();
         let slot = &mut self.cells[index];
         let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
+        // Before the first reading, and where a record goes on after it is unknown how long, nobody measured for ever.
+        let mut gap_s = f64::INFINITY;
         if let Some(before) = slot.consumed {
             charge_as = sample.charge_as - before.charge_as;
             unmeasured_s = sample.unmeasured_s - before.unmeasured_s;
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
+            gap_s = unmeasured_s;
         }
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         slot.consumed = Some(Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured });
@@ -330,8 +333,8 @@ impl Monitor {
             self.recharge.discard();
         }
         let load_v = slot.estimator.load_v(&self.config.model);
-        let after_gap = unmeasured_s > 0.0;
-        let seen = Observed { soc, load_v, temperature_c: sample.temperature_c, measured_s, after_gap };
+        let (time, temperature_c) = (sample.time, sample.temperature_c);
+        let seen = Observed { time, soc, load_v, temperature_c, measured_s, gap_s };
         self.learner.observe(index, &seen);
         self.note_taper(sample);
         self.judge_trust(sample.cell, out);

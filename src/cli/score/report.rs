@@ -284,7 +284,7 @@ fn soc_row(score: &CaseScore, soc: &SocScore) -> Vec<String> {
         soc.converge_s.map_or_else(|| "not".to_owned(), |s| format!("{s:.0} s")),
         percent(soc.coverage),
         two(soc.mean_half_width_points),
-        format!("{:.4}", soc.mean_normalised_innovation_squared),
+        four(soc.mean_normalised_innovation_squared),
         score.resets.to_string(),
         soc.samples.to_string(),
     ]
@@ -315,6 +315,10 @@ fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
 
 fn two(value: f64) -> String {
     if value.is_finite() { format!("{value:.2}") } else { "-".to_owned() }
+}
+
+fn four(value: f64) -> String {
+    if value.is_finite() { format!("{value:.4}") } else { "-".to_owned() }
 }
 
 fn signed(value: f64) -> String {
