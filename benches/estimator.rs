@@ -6,6 +6,10 @@ use packwatch::config;
 use packwatch::monitor::{Input, Monitor, Outputs};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
+/// Shows what a step allocates: nothing.
+#[global_allocator]
+static ALLOCATOR: divan::AllocProfiler = divan::AllocProfiler::system();
+
 fn main() {
     divan::main();
 }
