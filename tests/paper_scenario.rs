@@ -6,14 +6,14 @@
 //! `cargo test --release --test paper_scenario -- --nocapture` prints the table.
 #![expect(clippy::print_stdout, reason = "the table is the report")]
 
+mod common;
+
 use std::path::Path;
 
-use packwatch::can::encode::InputEncoder;
 use packwatch::config;
-use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::MonitorConfig;
 use packwatch::quantity::CellIndex;
-use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+use packwatch::sim::{Scenario, Settings};
 
 /// Cycles in which the filter may still settle from what it starts with.
 const SETTLING_CYCLES: usize = 1;
@@ -48,33 +48,19 @@ impl Cycle {
 }
 
 fn live(config: MonitorConfig, settings: Settings) -> Vec<Cycle> {
-    let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
-    let encoder = InputEncoder::new(&config.input);
-    let mut monitor = Monitor::new(config);
-    let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, 30.0), Outputs::default(), Vec::new());
     let (mut cycles, mut cycle, mut completed) = (Vec::new(), Cycle::default(), 0);
-    while let Some(moment) = sim.advance() {
+    common::live(config, settings, |_, sim, monitor, _| {
         if sim.pack().cycles() != completed {
             completed = sim.pack().cycles();
             cycles.push(std::mem::take(&mut cycle));
         }
-        frames.clear();
-        encoder.encode(sim.readings(), &mut frames);
-        ticks.advance(moment.time);
-        while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
-        }
-        for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
-        }
-        out.clear();
         let truth = sim.pack().cells()[0];
         let capacity = monitor.capacity(CellIndex(0));
         (cycle.true_ah, cycle.estimated_ah, cycle.std_ah) = (truth.capacity_ah, capacity.mean, capacity.std());
         if let Some(estimate) = monitor.latest().next().flatten() {
             cycle.add(estimate.soc - truth.soc, estimate.soc_std);
         }
-    }
+    });
     cycles.push(cycle);
     cycles
 }

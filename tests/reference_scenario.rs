@@ -7,15 +7,15 @@
 //! capacity's error that no estimator gets below.
 //! `cargo test --release --test reference_scenario -- --nocapture` prints the table.
 
+mod common;
+
 use std::path::Path;
 
-use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CellModel;
 use packwatch::config;
-use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::monitor::MonitorConfig;
 use packwatch::quantity::CellIndex;
-use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+use packwatch::sim::{Scenario, Settings};
 
 const CAPACITY_AH: f64 = 30.0;
 /// The simulated cell is the model: what is left is the sensor's noise and the tables' corners. With the default, which
@@ -74,26 +74,12 @@ fn run(seed: u64) -> Vec<Cycle> {
     let paper = Settings::of(Scenario::Paper, 2.6);
     let mut settings = Settings::of(Scenario::Reference, CAPACITY_AH);
     (settings.seed, settings.sensors) = (seed, paper.sensors);
-    let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
-    let encoder = InputEncoder::new(&config.input);
-    let mut monitor = Monitor::new(config);
-    let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, 30.0), Outputs::default(), Vec::new());
     let (mut cycles, mut cycle, mut completed) = (Vec::new(), Cycle::default(), 0);
-    while let Some(moment) = sim.advance() {
+    common::live(config, settings, |_, sim, monitor, _| {
         if sim.pack().cycles() != completed {
             completed = sim.pack().cycles();
             cycles.push(std::mem::take(&mut cycle));
         }
-        frames.clear();
-        encoder.encode(sim.readings(), &mut frames);
-        ticks.advance(moment.time);
-        while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
-        }
-        for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
-        }
-        out.clear();
         let truth = sim.pack().cells()[0];
         let capacity = monitor.capacity(CellIndex(0));
         (cycle.true_ah, cycle.estimated_ah, cycle.std_ah) = (truth.capacity_ah, capacity.mean, capacity.std());
@@ -101,7 +87,7 @@ fn run(seed: u64) -> Vec<Cycle> {
             cycle.end_soc_error = estimate.soc - truth.soc;
             cycle.max_soc_error = cycle.max_soc_error.max(cycle.end_soc_error.abs());
         }
-    }
+    });
     cycles.push(cycle);
     cycles
 }

@@ -165,6 +165,24 @@ mod tests {
     }
 
     #[test]
+    fn an_aborted_charge_is_left_out_and_changes_nothing() {
+        let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
+        let voltage_v: Vec<f64> = (0..=100).map(|k| 4.2 - 0.016 * f64::from(k)).collect();
+        let (out, back) = ([2.0; 101], [-2.0; 101]);
+        let discharge = HalfCycle { discharge: true, time_s: &time_s, current_a: &out, voltage_v: &voltage_v };
+        let charge = HalfCycle { discharge: false, current_a: &back, ..discharge };
+        let one_row = HalfCycle { time_s: &[0.0], current_a: &[-1.0], voltage_v: &[3.5], ..charge };
+        let trickle = [-0.01; 101];
+        let aborted = HalfCycle { current_a: &trickle, ..charge };
+        let whole = anchor(&[discharge, charge, discharge], (2.7, 4.2)).expect("anchored");
+        let found = anchor(&[discharge, one_row, aborted, charge, discharge], (2.7, 4.2)).expect("anchored");
+        assert_eq!(found.0, whole.0);
+        let socs = |anchored: &[Anchored]| anchored.iter().map(|a| a.soc.clone()).collect::<Vec<_>>();
+        assert_eq!(socs(&found.1), socs(&whole.1));
+        assert_eq!(found.1.iter().map(|a| a.index).collect::<Vec<_>>(), [0, 3, 4]);
+    }
+
+    #[test]
     fn a_discharge_without_a_knee_is_refused() {
         let cycle = HalfCycle {
             discharge: true,

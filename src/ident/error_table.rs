@@ -185,13 +185,14 @@ mod tests {
             passes: 0,
             converged: true,
         };
-        let error_v = |files: [usize; 4]| {
-            let judged = files.map(|file| Judged { record: &record, file, share: 1.0 });
+        let error_v = |files: [usize; 4], share: f64| {
+            let judged = files.map(|file| Judged { record: &record, file, share });
             table(&fit, &judged, 2.0)
         };
-        // 10 mV everywhere: variance times four for one file, times 1.75 for four.
-        for (files, expected_v) in [([7; 4], 0.02), ([0, 1, 2, 3], 0.01 * 1.75_f64.sqrt())] {
-            let found = error_v(files);
+        // 10 mV everywhere: variance times four for one drive, times 1.75 for four, times 11 for one pulse test.
+        let cases = [([7; 4], 1.0, 4.0_f64), ([0, 1, 2, 3], 1.0, 1.75), ([7; 4], 0.3, 11.0)];
+        for (files, share, growth) in cases {
+            let (found, expected_v) = (error_v(files, share), 0.01 * growth.sqrt());
             assert!(found.iter().all(|v| (v - expected_v).abs() < 1e-9), "{files:?}: {found:?}");
         }
     }

@@ -10,6 +10,8 @@
 #![expect(clippy::unwrap_used, reason = "helpers of tests: a missing piece is a failed test")]
 #![expect(clippy::print_stdout, reason = "the tables are the report")]
 
+#[path = "../common/mod.rs"]
+mod common;
 mod least_squares;
 mod measured;
 mod simulated;

@@ -6,15 +6,14 @@
 
 use std::path::Path;
 
-use packwatch::can::encode::InputEncoder;
 use packwatch::cell::CapacityState;
 use packwatch::config;
 use packwatch::filter::Belief;
 use packwatch::health::CapacityMethod;
-use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
-use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+use packwatch::monitor::{EventKind, MonitorConfig};
+use packwatch::sim::{Scenario, Settings};
 
+use crate::common;
 use crate::least_squares::Swing;
 use crate::swings::{Ends, Reading, charge_variance, weigh};
 use crate::{PEERS, Score, Source, follow, score};
@@ -53,32 +52,18 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
 }
 
 fn live(config: &MonitorConfig, settings: Settings) -> Life {
-    let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
-    let encoder = InputEncoder::new(&config.input);
-    let mut monitor = Monitor::new(config.clone());
-    let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, 30.0), Outputs::default(), Vec::new());
     let mut life = Life { told: Vec::new(), filter: Vec::new(), readings: Vec::new() };
     // The truth of a minute ago: a half-cycle is told after its end, when the loss has come.
     let mut past_ah = std::collections::VecDeque::from(vec![settings.pack.capacity_ah; 60]);
-    while let Some(moment) = sim.advance() {
+    common::live(config.clone(), settings, |time, sim, monitor, events| {
         past_ah.push_back(sim.pack().cells()[0].capacity_ah);
-        let true_ah = past_ah.pop_front().unwrap();
-        frames.clear();
-        encoder.encode(sim.readings(), &mut frames);
-        ticks.advance(moment.time);
-        while let Some(time) = ticks.pop(monitor.next_due()) {
-            monitor.handle(Input::Tick { time }, &mut out);
-        }
-        for (bus, frame) in &frames {
-            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
-        }
-        for event in &out.events {
+        let true_ah = past_ah.pop_front().unwrap_or(f64::NAN);
+        for event in events {
             life.take(config, event.time.secs(), &event.kind, true_ah);
         }
-        out.clear();
         if let Some(e) = monitor.latest().next().flatten() {
             life.readings.push(Reading {
-                time_s: moment.time.secs(),
+                time_s: time.secs(),
                 voltage_v: e.voltage_v,
                 current_a: e.current_a,
                 temperature_c: e.temperature_c,
@@ -87,7 +72,7 @@ fn live(config: &MonitorConfig, settings: Settings) -> Life {
                 soc_variance: e.soc_std * e.soc_std,
             });
         }
-    }
+    });
     life
 }
 

@@ -1,3 +1,5 @@
+//! The fit against simulated records whose tables are known, and what it refuses.
+
 use super::*;
 use crate::cell::circuit::BranchAt;
 use crate::cell::{CellModel, Discretisation};
@@ -217,4 +219,14 @@ fn too_few_rows_and_a_current_that_never_changes_are_refused() {
     record.rows.iter_mut().for_each(|row| (row.current_a, row.mean_current_a) = (1.0, 1.0));
     let refused = fit(&settings(grid), &[record], &[1.0], |_, _| {}).expect_err("no steps");
     assert_eq!(refused, FitError::NoExcitation);
+}
+
+#[test]
+fn what_is_no_number_is_refused_and_makes_no_model() {
+    let grid = grid();
+    let record = simulate(&truth(), 25.0, 0.0, &grid);
+    let curve = OcvCurve { temperature_c: 25.0, soc: vec![0.0, 1.0], voltage_v: vec![3.0, f64::NAN] };
+    let settings = Settings { ocv: vec![curve], ..settings(grid) };
+    let refused = fit(&settings, &[record], &[1.0], |_, _| {}).expect_err("a NaN");
+    assert_eq!(refused, FitError::NotFinite);
 }
