@@ -13,7 +13,7 @@ use packwatch::config;
 use packwatch::health::CapacityMethod;
 use packwatch::io::ticks::Ticks;
 use packwatch::monitor::{Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
-use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
+use packwatch::quantity::{CellIndex, Channel, Mode, SensorIndex, Timestamp};
 
 fn load(file: &str) -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(file);
@@ -336,6 +336,30 @@ fn half_cycle_before_an_unknown_gap_has_its_own_charge() {
             assert!((charge_ah - 0.5).abs() < 0.002 && (duration_s - 900.0).abs() < 5.0);
         }
     }
+}
+
+#[test]
+fn half_cycle_behind_an_unknown_gap_knows_how_little_it_knows_of_its_beginning() {
+    let mut c = load("measured.toml");
+    c.health.transition.min_duration_s = 10.0;
+    let mut b = Bench::new(c, 0.95);
+    b.run(0.0, 60);
+    b.run(2.0, 900);
+    // What nobody saw: the cell goes down to 30 %.
+    b.t += 3600.0;
+    b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
+    (b.soc, b.u1) = (0.3, 0.0);
+    b.run(-2.0, 1200);
+    b.run(0.0, 60);
+    let charge = b.events.iter().find_map(|e| match e.kind {
+        EventKind::HalfCycle { mode: Mode::Charge, charge_ah, swing, swing_std, .. } => {
+            Some((charge_ah, swing?, swing_std?))
+        }
+        _ => None,
+    });
+    let (charge_ah, swing, swing_std) = charge.expect("a charge with a swing");
+    let true_swing = charge_ah / b.capacity_ah;
+    assert!((swing - true_swing).abs() < 3.0 * swing_std, "{swing} +/- {swing_std}, true {true_swing}");
 }
 
 #[test]

@@ -47,7 +47,8 @@ impl Faults {
             0 => format!("{file}: {text}"),
             _ => format!("{file}:{line}: {text}"),
         };
-        sorted.iter().map(show).collect()
+        // A name in the file may hold a line break; a fault is one line all the same.
+        sorted.iter().map(|fault| show(fault).replace('\n', "\\n")).collect()
     }
 }
 

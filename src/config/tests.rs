@@ -225,6 +225,7 @@ fn single_faults_name_file_line_key_found_and_allowed() {
             "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0 and at most 100000",
         ),
         ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
+        ("\"cell.toml\"", "\"no\\ntoml\"", "no\\ntoml: cannot be read: entity not found"),
         ("[[interface]]", "[interface]", "pack.toml:4: interface = [interface], must be tables [[interface]]"),
         ("[input]", "[[input]]", "pack.toml:6: input = [[input]], must be one table [input]"),
         (

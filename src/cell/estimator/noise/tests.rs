@@ -2,6 +2,7 @@
 
 use super::super::tests::config;
 use super::*;
+use crate::cell::Table;
 use crate::cell::model::tests::small_model;
 
 fn step(current_a: f64, measured_s: f64, unmeasured_s: f64) -> CellStep {
@@ -85,16 +86,20 @@ fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
 
 #[test]
 fn a_reading_is_as_good_as_sensor_model_drop_and_load_leave_it() {
-    let (mut config, model) = (config(), small_model());
+    let (mut config, mut model) = (config(), small_model());
     config.voltage_noise_v = 0.0;
     let mut x = Gaussian::<4> { mean: nalgebra::SVector::zeros(), covariance: SMatrix::identity() };
     (x.mean[0], x.mean[1], x.mean[3]) = (0.5, 0.05, 2.0);
-    let at = |load_a: f64, current_a: f64, information_s: f64| {
-        Reading { voltage_v: 3.6, current_a, load_a, row: model.row(0.0), information_s }.noise(&x, &model, &config)
+    let of = |model: &CellModel, load_a: f64, current_a: f64, information_s: f64| {
+        Reading { voltage_v: 3.6, current_a, load_a, row: model.row(0.0), information_s }.noise(&x, model, &config)
     };
+    let at = |load_a: f64, current_a: f64, information_s: f64| of(&model, load_a, current_a, information_s);
     // At 0 C and a SOC of 0.5: 60 + 20 mohm.
     let (base, drop, load) = (0.15 * 0.15, square(0.3 * (0.06 * 2.0 + 0.05)), square(0.5 * 0.08 * 5.0));
     assert!(near(at(5.0, 2.0, 10.0).variance, (base + drop + load) / 10.0));
     assert!(near(at(0.0, 2.0, 1.0).variance, base + drop));
     assert_eq!(at(5.0, 2.0, 10.0).gate_variance, at(0.0, 0.0, 1.0).gate_variance);
+    // The model's own error is an average over 100 s: 20 mV there are 0.2 V over one second.
+    model.voltage_error_v = Some(Table { values: vec![vec![0.01, 0.02, 0.03]; 2] });
+    assert!(near(of(&model, 0.0, 2.0, 1.0).variance, 0.2 * 0.2 + drop));
 }
