@@ -111,6 +111,10 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage, V.
     CellVoltage(CellIndex),
+    /// SOC as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoc,
+    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoh,
 }
 
 /// Why a reading cannot be used. A bad reading is data, not an error.

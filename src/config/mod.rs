@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::monitor::MonitorConfig;
 
+mod alarm;
 pub mod cell_model;
 mod convert;
 mod cross;

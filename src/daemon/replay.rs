@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use super::event_log;
+use crate::alarm::Change;
 use crate::can::Frame;
 use crate::cell::MAX_BRANCHES;
 use crate::io::candump::{self, StampDigits};
@@ -427,11 +428,11 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             "capacity"
         }
         EventKind::RechargePeriod { .. } => "recharge_period",
-        EventKind::Alarm { active, .. } => {
-            if active && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
+        EventKind::Alarm { change, .. } => {
+            if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
                 summary.alarms_raised.push(*event);
             }
-            if active { "alarm_raised" } else { "alarm_cleared" }
+            alarm_change_name(change)
         }
         EventKind::SignalBad { .. } => "signal_bad",
         EventKind::SignalGood { bad_readings, .. } => {
@@ -443,8 +444,24 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",
         EventKind::Trust { .. } => "trust",
+        EventKind::Command { .. } => "command",
+        EventKind::Test { .. } => "test",
+        EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::Store { .. } => "store",
     };
     *summary.events.entry(name).or_default() += 1;
+}
+
+fn alarm_change_name(change: Change) -> &'static str {
+    match change {
+        Change::Raised => "alarm_raised",
+        Change::Suppressed => "alarm_suppressed",
+        Change::Resumed => "alarm_resumed",
+        Change::Latched => "alarm_latched",
+        Change::Cleared => "alarm_cleared",
+        Change::Acknowledged => "alarm_acknowledged",
+        Change::Forgotten => "alarm_forgotten",
+    }
 }
 
 fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {

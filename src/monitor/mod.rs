@@ -5,6 +5,8 @@
 //! charge/discharge transition runs the capacity filters; values go to the alarm rules; ticks send the cyclic
 //! frames. Bad input is an event and a count, never a panic.
 
+mod alarms;
+mod buses;
 mod cyclic;
 mod learning;
 mod output;
@@ -15,10 +17,12 @@ pub use output::OutputConfig;
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
-use cyclic::Schedule;
+use alarms::StoreState;
+use buses::Buses;
+use cyclic::{Schedule, Test};
 use snapshot::PendingRestore;
 
-use crate::alarm::{AlarmChange, AlarmEngine, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::Frame;
 use crate::can::decode::InputMap;
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
@@ -65,6 +69,29 @@ struct CellSlot {
     updated_in_round: bool,
 }
 
+impl CellSlot {
+    /// A cell of which nothing is known.
+    fn new(config: &EstimatorConfig) -> Self {
+        Self {
+            estimator: CellEstimator::new(config),
+            consumed: None,
+            latest: None,
+            trusted: true,
+            full_soc: 1.0,
+            tapered: false,
+            usable: None,
+            updated_in_round: false,
+        }
+    }
+
+    /// Resistance relative to new.
+    fn resistance(&self) -> Belief {
+        let log_resistance = self.estimator.log_resistance();
+        let ratio = libm::exp(log_resistance.mean);
+        Belief::from_std(ratio, ratio * log_resistance.std())
+    }
+}
+
 /// Totals of the sampler a cell has already taken in.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 struct Consumed {
@@ -94,6 +121,10 @@ pub struct Monitor {
     /// Cells with a new estimate since the pack's values were last combined.
     updated_cells: usize,
     alarms: AlarmEngine,
+    buses: Buses,
+    store: StoreState,
+    /// A test of an alarm frame that is running; it ends with the process.
+    test: Option<Test>,
     schedule: Schedule,
     pending: Option<PendingRestore>,
     scratch: Scratch,
@@ -112,16 +143,7 @@ impl Monitor {
     /// A monitor that knows nothing yet.
     pub fn new(config: MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
-        let slot = CellSlot {
-            estimator: CellEstimator::new(&config.estimator),
-            consumed: None,
-            latest: None,
-            trusted: true,
-            full_soc: 1.0,
-            tapered: false,
-            usable: None,
-            updated_in_round: false,
-        };
+        let slot = CellSlot::new(&config.estimator);
         Self {
             sampler: Sampler::new(config.sample.clone()),
             learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
@@ -136,6 +158,9 @@ impl Monitor {
             normalised_recharge: None,
             pack: None,
             updated_cells: 0,
+            buses: Buses::default(),
+            store: StoreState::default(),
+            test: None,
             schedule: Schedule::default(),
             pending: None,
             scratch: Scratch::default(),
@@ -148,7 +173,7 @@ impl Monitor {
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
         let time = input.time();
         if !self.started {
-            self.start(time);
+            self.start(time, out);
         }
         match input {
             Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => {}
@@ -161,8 +186,19 @@ impl Monitor {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
             }
+            Input::Command { command, .. } => {
+                self.advance(time, out);
+                self.handle_command(Source::Local, command, out);
+            }
+            Input::Store { works, .. } => {
+                self.advance(time, out);
+                if self.store.note(self.now, works) {
+                    out.events.push(Event { time: self.now, kind: EventKind::Store { works } });
+                }
+            }
             Input::Bus { bus, event, .. } => {
                 self.advance(time, out);
+                self.buses.handle_event(self.now, bus, event);
                 out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
             }
         }
@@ -214,10 +250,23 @@ impl Monitor {
     }
 
     /// The first input: its time is now; a stored state that waits is taken up and says when it was "now".
-    fn start(&mut self, time: Timestamp) {
+    fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        self.apply_pending(time);
+        if self.apply_pending(time) {
+            self.restate_learned(out);
+        }
+    }
+
+    /// Nothing is known of the cells any more; what comes in is judged as before.
+    fn forget_learned(&mut self) {
+        let slot = CellSlot::new(&self.config.estimator);
+        self.learner = Learner::new(&self.config.health.capacity, self.cells.len(), slot.estimator.capacity());
+        self.cells.fill(slot);
+        self.detector = TransitionDetector::default();
+        self.recharge = RechargeTimer::default();
+        (self.recharge_period_s, self.normalised_recharge) = (None, None);
+        self.forget_pack();
     }
 
     /// Moves the clock to an input's time: never back, and with an eye on time asleep (or away, after a restart).
@@ -273,6 +322,7 @@ impl Monitor {
     }
 
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        self.buses.handle_frame(bus);
         let mut readings = std::mem::take(&mut self.scratch.readings);
         self.config.input.decode(bus, frame, |reading| readings.push(reading));
         for reading in readings.drain(..) {
@@ -357,7 +407,7 @@ impl Monitor {
             slot.trusted = trusted;
             out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
         }
-        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Some(mean_nis), true, out);
+        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
     }
 
     /// Once every cell has a new estimate, or one has its second: the pack's values.

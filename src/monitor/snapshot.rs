@@ -126,9 +126,9 @@ impl Monitor {
         Ok(())
     }
 
-    /// Takes the waiting snapshot up; `now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp) {
-        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return };
+    /// Takes the waiting snapshot up, if there is one; `now` becomes when it was taken, on the present clock.
+    pub(super) fn apply_pending(&mut self, now: Timestamp) -> bool {
+        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return false };
         let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
         let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
         snapshot.rebase(by_nanos);
@@ -150,6 +150,7 @@ impl Monitor {
         self.schedule = snapshot.schedule;
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
+        true
     }
 }
 

@@ -156,5 +156,5 @@ fn write_alarm(out: &mut impl Write, event: &Event) -> io::Result<()> {
     let place = cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell.0 + 1));
     let value = value.map_or_else(|| "unknown".to_owned(), |value| format!("{value:.4}"));
     let seconds = event.time.secs();
-    writeln!(out, "alarm {rule:?} ({severity:?}) at {seconds:.3} s, {place}: {value}, threshold {threshold:.4}")
+    writeln!(out, "alarm {} ({severity:?}) at {seconds:.3} s, {place}: {value}, threshold {threshold:.4}", rule.name())
 }
