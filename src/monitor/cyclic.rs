@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::{Event, EventKind, Monitor, MonitorConfig, Outputs, Transmit, Validity};
 use crate::alarm::{ActiveAlarm, AlarmChange, Rule};
 use crate::can::Frame;
-use crate::can::encode::{AlarmFields, HealthFields, StatusFields};
+use crate::can::encode::{AlarmFields, HealthFields, SendCounters, StatusFields};
 use crate::quantity::{CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
@@ -20,6 +20,9 @@ pub(super) struct Schedule {
     alarm: Timestamp,
     /// Which of the raised alarms is next in the cycle.
     alarm_turn: usize,
+    /// Counters of the frames' end-to-end protection.
+    #[serde(default)]
+    counters: SendCounters,
 }
 
 impl Schedule {
@@ -175,7 +178,8 @@ impl Monitor {
                 threshold: change.threshold,
             };
             out.events.push(Event { time: self.now, kind });
-            self.send(self.alarm_frame(&change), out);
+            let frame = self.alarm_frame(&change);
+            self.send(frame, out);
         }
         self.scratch.alarm_changes = changes;
     }
@@ -197,10 +201,10 @@ impl Monitor {
         }
     }
 
-    fn status_frame(&self) -> Option<Frame> {
+    fn status_frame(&mut self) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
         let pack = self.pack.as_ref();
-        Some(output.plan.status(&StatusFields {
+        let fields = StatusFields {
             soc: pack.map(|pack| pack.soc),
             soc_std: pack.map(|pack| pack.soc_std),
             mode: Some(self.detector.mode()),
@@ -209,7 +213,9 @@ impl Monitor {
             highest_severity: self.alarms.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-        }))
+            unknown_rules: None,
+        };
+        Some(output.plan.status(&fields, &mut self.schedule.counters))
     }
 
     /// Health of the pack: its weakest cell's, once half-cycles have taught something about every cell.
@@ -236,11 +242,13 @@ impl Monitor {
         }
     }
 
-    fn send_health(&self, out: &mut Outputs) {
-        let Some(output) = &self.config.output else { return };
+    fn send_health(&mut self, out: &mut Outputs) {
         let fields = self.health_fields();
-        for page in 0..output.plan.health_pages() {
-            self.send(Some(output.plan.health(page, &fields)), out);
+        let pages = self.config.output.as_ref().map_or(0, |output| output.plan.health_pages());
+        for page in 0..pages {
+            let plan = self.config.output.as_ref().map(|output| &output.plan);
+            let frame = plan.map(|plan| plan.health(page, &fields, &mut self.schedule.counters));
+            self.send(frame, out);
         }
     }
 
@@ -256,17 +264,19 @@ impl Monitor {
         self.send(frame, out);
     }
 
-    fn alarm_frame(&self, alarm: &AlarmChange) -> Option<Frame> {
+    fn alarm_frame(&mut self, alarm: &AlarmChange) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
-        Some(output.plan.alarm(&AlarmFields {
+        let fields = AlarmFields {
             rule: alarm.rule as u8,
             state: Some(if alarm.active { 1 } else { 2 }),
             severity: Some(alarm.severity as u8),
             test: false,
+            acknowledged: false,
             cell: alarm.cell,
             value: alarm.value,
             threshold: Some(alarm.threshold),
-        }))
+        };
+        Some(output.plan.alarm(&fields, &mut self.schedule.counters))
     }
 }
 
