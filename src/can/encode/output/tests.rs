@@ -1,7 +1,8 @@
 //! What goes out reads back with the same DBC, and unknown never reads as a number.
 
 use super::*;
-use crate::can::encode::default_database;
+use crate::can::e2e::Profile;
+use crate::can::encode::{Base, E2eSetting, LayoutSettings, MessageSettings, default_database, layout};
 use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../config/packwatch.dbc");
@@ -354,4 +355,48 @@ fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() 
     assert_eq!(codes(None), (0x800, 255));
     assert_eq!(codes(Some(1e9)), (0x7FF, 254));
     assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is taken: the next one up");
+}
+
+#[test]
+fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        let settings = |data_id| MessageSettings {
+            fd: Some(true),
+            e2e: E2eSetting::On(Protection { profile, data_id }),
+            ..Default::default()
+        };
+        let settings = LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: None };
+        let database = layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
+        let plan = OutputPlan::new(&database).unwrap();
+        let [status, health, alarm] = plan.protections().map(Option::unwrap);
+        let (mut counters, mut expected) = (SendCounters::default(), 0);
+        for round in 0..600_u16 {
+            let fields = StatusFields { active_alarms: Some(round % 60), ..Default::default() };
+            let frame = plan.status(&fields, &mut counters);
+            assert_eq!(status.verified_counter(frame.data()), Some(expected), "{profile:?} {round}");
+            assert_eq!(health.verified_counter(frame.data()), None, "another frame's data id");
+            expected = profile.next_counter(expected);
+        }
+        let frame = plan.health(1, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(0));
+        let frame = plan.health(2, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(1), "pages share the identifier and the counter");
+        let frame = plan.alarm(&AlarmFields::default(), &mut counters);
+        assert_eq!(alarm.verified_counter(frame.data()), Some(0));
+        assert_eq!(frame.kind(), FrameFormat::Fd { brs: false }.kind());
+        assert_eq!(frame.len(), if profile == Profile::P05 { 12 } else { 8 });
+    }
+}
+
+#[test]
+fn counters_survive_a_restart_and_a_change_of_the_profile() {
+    let protection = Protection { profile: Profile::P01A, data_id: 9 };
+    let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
+    let settings = LayoutSettings { status, ..Default::default() };
+    let plan = OutputPlan::new(&layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
+    let mut counters: SendCounters = serde_json::from_str(r#"{"status":200,"health":0,"alarm":3}"#).unwrap();
+    let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
+    assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
+    let stored = serde_json::to_string(&counters).unwrap();
+    assert_eq!(stored, r#"{"status":1,"health":0,"alarm":3}"#, "unprotected frames count nothing");
 }
