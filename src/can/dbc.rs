@@ -1,7 +1,8 @@
 //! DBC text to messages and signals.
 //!
 //! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages with their signals,
-//! multiplexing resolved into conditions on raw selector codes, value tables, units and cycle times.
+//! multiplexing resolved into conditions on raw selector codes, value tables, units, cycle times, frame formats and
+//! end-to-end protection. [`Database::to_dbc`] is the way back; what a `Database` holds survives it.
 //!
 //! A file that is not a DBC, an identifier out of range, a name defined twice or multiplexing that cannot be resolved is
 //! a [`DbcError`] with its line. A signal that reaches past its message's end stays (decoding it gives
@@ -11,7 +12,11 @@
 use std::collections::HashMap;
 
 use crate::can::CanId;
+use crate::can::e2e::Protection;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
+
+mod attributes;
+mod write;
 
 /// Multiplexors that may hang one below the other; deeper nesting is taken for a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
@@ -32,8 +37,25 @@ pub struct DbcError {
 /// Messages of one DBC, in the file's order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Database {
+    /// `BU_`: the units on the bus.
+    pub nodes: Vec<String>,
+    /// `CM_` about the whole.
+    pub comment: Option<String>,
     /// The messages.
     pub messages: Vec<Message>,
+}
+
+/// What kind of frame carries a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum FrameFormat {
+    /// Classic, at most 8 bytes.
+    #[default]
+    Classic,
+    /// CAN FD, at most 64 bytes.
+    Fd {
+        /// Whether the data go at the higher bit rate.
+        brs: bool,
+    },
 }
 
 /// One message.
@@ -45,6 +67,12 @@ pub struct Message {
     pub name: String,
     /// Payload length the DBC states, bytes.
     pub len_bytes: u16,
+    /// The node that sends it.
+    pub sender: Option<String>,
+    /// `VFrameFormat` and `CANFD_BRS`.
+    pub format: FrameFormat,
+    /// `E2EProfile` and `E2EDataId`, as packwatch writes them.
+    pub e2e: Option<Protection>,
     /// In the file's order.
     pub signals: Vec<Signal>,
     /// `GenMsgCycleTime` (or its default), when above 0.
@@ -62,6 +90,8 @@ pub struct Signal {
     pub layout: SignalLayout,
     /// As written, may be empty.
     pub unit: String,
+    /// The nodes that read it.
+    pub receivers: Vec<String>,
     /// When the signal is in the payload.
     pub multiplex: Multiplex,
     /// Whether other signals' presence depends on this one.
@@ -103,7 +133,8 @@ impl Database {
         let messages = dbc.messages.iter().filter(|message| message.name != ORPHANS);
         let messages: Result<Vec<_>, _> =
             messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
-        let database = Self { messages: messages? };
+        let nodes = dbc.nodes.iter().map(|node| node.0.clone()).collect();
+        let database = Self { nodes, comment: plain_comment(&dbc), messages: messages? };
         database.check_names().map_err(|fault| fault.at(&closed))?;
         Ok(database)
     }
@@ -282,21 +313,20 @@ fn read_message(dbc: &can_dbc::Dbc, details: &Details, message: &can_dbc::Messag
         id,
         name: message.name.clone(),
         len_bytes,
+        sender: message.transmitter.clone(),
+        format: attributes::format(dbc, message.id),
+        e2e: attributes::e2e(dbc, message.id),
         signals: signals?,
-        cycle_time_ms: cycle_time_ms(dbc.resolved_message_attribute(message.id, "GenMsgCycleTime")),
+        cycle_time_ms: attributes::cycle_time_ms(dbc, message.id),
         comment: dbc.message_comment(message.id).map(str::to_owned),
     })
 }
 
-fn cycle_time_ms(value: Option<&can_dbc::AttributeValue>) -> Option<u32> {
-    let whole = match value? {
-        can_dbc::AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
-        can_dbc::AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
-        // Editors that export every number as a float write 100.0 as 100: read its digits.
-        can_dbc::AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
-        can_dbc::AttributeValue::String(ms) => ms.parse().ok(),
-    };
-    whole.filter(|ms| *ms > 0)
+fn plain_comment(dbc: &can_dbc::Dbc) -> Option<String> {
+    dbc.comments.iter().find_map(|comment| match comment {
+        can_dbc::Comment::Plain { comment } => Some(comment.clone()),
+        _ => None,
+    })
 }
 
 fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::Signal) -> Result<Signal, Misfit> {
@@ -330,6 +360,7 @@ fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::
         name: signal.name.clone(),
         layout,
         unit: signal.unit.clone(),
+        receivers: signal.receivers.clone(),
         multiplex: Multiplex { conditions: conditions(details, message, signal, 0).map_err(misfit)? },
         is_multiplexor: is_multiplexor(signal),
         values: values.iter().map(|value| (value.id, value.description.clone())).collect(),

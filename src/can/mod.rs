@@ -3,6 +3,7 @@
 
 pub mod dbc;
 pub mod decode;
+pub mod e2e;
 pub mod encode;
 pub mod frame;
 pub mod signal;

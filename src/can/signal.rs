@@ -135,7 +135,7 @@ fn low_64(code: i128) -> u64 {
 impl SignalLayout {
     /// Position of the first and last bit, counted in the order of the wire's bytes: within a byte from bit 0 up for
     /// little-endian signals, from bit 7 down for big-endian ones.
-    fn span(&self) -> (u32, u32) {
+    pub(crate) fn span(&self) -> (u32, u32) {
         let start = u32::from(self.start_bit);
         let first = match self.byte_order {
             ByteOrder::LittleEndian => start,

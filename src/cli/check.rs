@@ -125,6 +125,11 @@ fn output(output: &OutputUse) -> Vec<String> {
         output.id.clone(),
         output.interfaces.join(" "),
         format!("every {} ms", output.period_ms),
+        output.kind.to_owned(),
+        match output.protection.as_str() {
+            "none" => "no end-to-end protection".to_owned(),
+            protection => format!("end-to-end {protection}"),
+        },
     ]
 }
 

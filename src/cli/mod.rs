@@ -2,6 +2,7 @@
 #![expect(clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
 
 mod check;
+mod dbc;
 mod demo;
 #[cfg(feature = "lab")]
 mod fit;
@@ -38,6 +39,8 @@ enum Command {
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
+    /// Write the DBC of the frames as they are configured, for those who receive them
+    Dbc(dbc::Args),
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
@@ -76,6 +79,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Dbc(args) => dbc::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]

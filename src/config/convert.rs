@@ -3,9 +3,9 @@
 use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output, Pack,
-    PackVoltageInput, Recharge, ReportedSocInput, ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits,
-    Transition, Usable, VoltageLimits,
+    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output,
+    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, Recharge, ReportedSocInput, ReportedSohInput,
+    SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::can::decode::InputMap;
@@ -49,6 +49,9 @@ pub(crate) struct Raw {
     pub(crate) usable_written: bool,
     pub(crate) alarms: Vec<Alarm>,
     pub(crate) output: Option<Output>,
+    pub(crate) output_status: Option<OutputStatus>,
+    pub(crate) output_health: Option<OutputHealth>,
+    pub(crate) output_alarm: Option<OutputAlarm>,
     pub(crate) output_written: bool,
 }
 
@@ -85,6 +88,9 @@ impl Raw {
             alarms: walk.many(),
             output_written: walk.has::<Output>(),
             output: walk.one(),
+            output_status: walk.one(),
+            output_health: walk.one(),
+            output_alarm: walk.one(),
         }
     }
 }

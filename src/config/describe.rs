@@ -101,6 +101,10 @@ pub struct OutputUse {
     pub interfaces: Vec<String>,
     /// Period, ms.
     pub period_ms: f64,
+    /// `classic`, `FD`, `FD with bit rate switch`.
+    pub kind: &'static str,
+    /// End-to-end protection: `profile 1A, data id 0x123`, or `none`.
+    pub protection: String,
 }
 
 /// Describes a checked configuration and the signals found for it.

@@ -36,8 +36,22 @@ pub(crate) enum Method {
     Nominal,
 }
 
+/// End-to-end protection of a frame: off, or the AUTOSAR profile.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum E2e {
+    /// None.
+    Off,
+    /// Profile 1, variant A.
+    P01A,
+    /// Profile 1, variant C.
+    P01C,
+    /// Profile 5.
+    P05,
+}
+
 choice!(Positive { "charge" => Self::Charge, "discharge" => Self::Discharge });
 choice!(Method { "swing" => Self::Swing, "nominal" => Self::Nominal });
+choice!(E2e { "off" => Self::Off, "1A" => Self::P01A, "1C" => Self::P01C, "5" => Self::P05 });
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
 choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
@@ -410,29 +424,92 @@ section! {
 }
 
 section! {
-    /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent.
+    /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent. `packwatch dbc` writes the DBC of the frames as they are configured.
     Output at "output" {
         /// Whether anything is sent.
         enabled: bool, "", Any, Default("true");
         /// Interfaces to send on. Without it: all.
         interfaces: Option<Vec<String>>, "", NotEmpty, Optional;
-        /// DBC that lays the frames out, relative to this file. Without it: the built-in `packwatch.dbc`.
+        /// DBC that lays the frames out, relative to this file. Without it: the built-in `packwatch.dbc`, with steps of Ah that fit the cell.
         dbc: Option<String>, "", NotEmpty, Optional;
-        /// Identifier of the status frame. Without it: the DBC's.
-        status_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Identifier of the health frame. Without it: the DBC's.
-        health_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Identifier of the alarm frame. Without it: the DBC's.
-        alarm_id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
-        /// Whether the identifiers given here have 29 bits.
-        extended: bool, "", Any, Default("false");
-        /// Period of the status frame. Without it: the DBC's cycle time, or else 1000 ms.
-        status_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
-        /// Period of the health frame, all its pages. Without it: the DBC's cycle time, or else 1000 ms.
-        health_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
-        /// Period at which active alarms are repeated; a change is sent at once. Without it: the DBC's cycle time, or else 1000 ms.
-        alarm_period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
     }
+}
+
+/// What the table of a frame says.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct FrameKeys<'a> {
+    /// Where it stands.
+    pub(crate) place: &'a super::document::Place,
+    /// Identifier.
+    pub(crate) id: Option<u32>,
+    /// Whether it has 29 bits.
+    pub(crate) extended: bool,
+    /// Classic or FD.
+    pub(crate) fd: Option<bool>,
+    /// Bit rate switch.
+    pub(crate) brs: Option<bool>,
+    /// Period.
+    pub(crate) period_ms: Option<u32>,
+    /// Protection.
+    pub(crate) e2e: Option<E2e>,
+    /// Its data id.
+    pub(crate) data_id: Option<u16>,
+}
+
+/// Declares the table of a frame; every such table has these keys.
+macro_rules! frame_section {
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal) => {
+        section! {
+            $(#[doc = $about])+
+            $name at $path {
+                /// Identifier. Without it: the DBC's.
+                id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+                /// Whether `id` has 29 bits.
+                extended: bool, "", Any, Default("false");
+                /// Whether CAN FD frames carry it (the interface must have `fd = true` too). Without it: as the DBC says; the built-in one: classic frames.
+                fd: Option<bool>, "", Any, Optional;
+                /// Whether FD frames switch to the higher bit rate. Without it: as the DBC says; the built-in one: no.
+                brs: Option<bool>, "", Any, Optional;
+                /// Period. Without it: the DBC's cycle time, or else 1000 ms.
+                period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
+                /// AUTOSAR end-to-end protection: a checksum and a counter in the first bytes, profile 1 variant A or C (2 bytes) or profile 5 (3 bytes; the built-in layout then has 12 bytes and needs `fd = true`). Without it: as the DBC says; the built-in one: off.
+                e2e: Option<E2e>, "", Any, Optional;
+                /// Data id of the protection, which sender and receivers know; each protected frame has its own, with "1C" up to 0xFFF. Needed with `e2e`.
+                data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
+            }
+        }
+
+        impl $name {
+            /// What all tables of frames have in common.
+            pub(crate) fn frame(&self) -> FrameKeys<'_> {
+                FrameKeys {
+                    place: &self.place,
+                    id: self.id,
+                    extended: self.extended,
+                    fd: self.fd,
+                    brs: self.brs,
+                    period_ms: self.period_ms,
+                    e2e: self.e2e,
+                    data_id: self.data_id,
+                }
+            }
+        }
+    };
+}
+
+frame_section! {
+    /// The status frame: estimates.
+    OutputStatus at "output.status"
+}
+
+frame_section! {
+    /// The health frame: what was learned, all pages at once.
+    OutputHealth at "output.health"
+}
+
+frame_section! {
+    /// The alarm frame: at once on change, and one of the active alarms in each period.
+    OutputAlarm at "output.alarm"
 }
 
 /// Every table of the configuration, in the order of the reference page.
@@ -456,4 +533,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Usable>(),
     SectionInfo::many::<Alarm>(),
     SectionInfo::one::<Output>(),
+    SectionInfo::one::<OutputStatus>(),
+    SectionInfo::one::<OutputHealth>(),
+    SectionInfo::one::<OutputAlarm>(),
 ];

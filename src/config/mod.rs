@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::can::dbc::Database;
 use crate::monitor::MonitorConfig;
 
 mod alarm;
@@ -35,6 +36,8 @@ pub struct Config {
     pub interfaces: Vec<InterfaceConfig>,
     /// What the core needs.
     pub monitor: MonitorConfig,
+    /// Layout of what is sent, for consumers; `None` = nothing is sent.
+    pub output_layout: Option<Database>,
 }
 
 /// One CAN interface.
@@ -96,12 +99,12 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
     let databases = Databases::load(path, names, read, faults);
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
-    let output = output::output(&raw, path, &found, read, faults);
+    let (output, output_layout) = output::output(&raw, path, model.as_ref(), &found, read, faults).unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
     let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, output)?;
-    let config = Config { path: path.to_owned(), interfaces, monitor };
+    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
 }

@@ -1,94 +1,178 @@
-//! What is sent: layout, identifiers, interfaces, periods, and that nothing sent can be taken for an input.
+//! What is sent: layout, identifiers, interfaces, periods, protection, and that nothing sent can be taken for an input.
 
 use std::path::Path;
 
 use super::convert::Raw;
 use super::describe::OutputUse;
 use super::document::Faults;
-use super::keys::Output;
+use super::keys::{E2e, FrameKeys, Output};
 use super::resolve::{Resolved, read_dbc};
 use super::{ReadFile, beside};
 use crate::can::CanId;
-use crate::can::encode::{IdOverrides, OutputPlan, default_database};
+use crate::can::dbc::{Database, FrameFormat};
+use crate::can::e2e::{Profile, Protection};
+use crate::can::encode::{Base, E2eSetting, LaidOut, LayoutSettings, MessageSettings, OutputPlan, layout};
+use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
 
 /// Period of a frame for which neither configuration nor DBC says one, ms.
 const USUAL_PERIOD_MS: u32 = 1000;
 
-/// Frame and key of its identifier, in the order of the plan.
-const FRAMES: [(&str, &str); 3] = [("status", "status_id"), ("health", "health_id"), ("alarm", "alarm_id")];
+/// Names of the frames, in the order of the plan.
+const FRAMES: [&str; 3] = ["status", "health", "alarm"];
 
-/// What is sent; `None` = nothing (not configured, or faults noted).
+/// What is sent and its layout; `None` = nothing (not configured, or faults noted).
 pub(crate) fn output(
     raw: &Raw,
     config: &Path,
+    model: Option<&CellModel>,
     found: &[Resolved<'_>],
     read: ReadFile<'_>,
     faults: &mut Faults,
-) -> Option<OutputConfig> {
+) -> Option<(OutputConfig, Database)> {
     let keys = raw.output.as_ref().filter(|keys| raw.output_written && keys.enabled)?;
-    let id = |key, id: Option<u32>, faults: &mut Faults| configured_id(keys, key, id, faults);
-    let ids = IdOverrides {
-        status: id("status_id", keys.status_id, faults),
-        health: id("health_id", keys.health_id, faults),
-        alarm: id("alarm_id", keys.alarm_id, faults),
-    };
-    let plan = plan(keys, config, &ids, read, faults)?;
+    let frames =
+        [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
+    let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
+    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: None };
+    let database = database(raw, keys, config, model, &settings, &frames, read, faults)?;
+    let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
+    let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
     let buses = buses(raw, keys);
-    check_ids(keys, &plan.ids(), &buses, found, faults);
-    let [status, health, alarm] = plan.cycle_times_ms();
-    let period_s = |key: Option<u32>, dbc: Option<u32>| f64::from(key.or(dbc).unwrap_or(USUAL_PERIOD_MS)) / 1000.0;
-    Some(OutputConfig {
-        status_period_s: period_s(keys.status_period_ms, status),
-        health_period_s: period_s(keys.health_period_ms, health),
-        alarm_period_s: period_s(keys.alarm_period_ms, alarm),
-        plan,
-        buses,
-    })
+    check_ids(&frames, &plan, &buses, found, faults);
+    check_data_ids(&frames, &plan, faults);
+    check_interfaces(raw, &frames, &plan, &buses, faults);
+    let [status_period_s, health_period_s, alarm_period_s] =
+        plan.cycle_times_ms().map(|ms| f64::from(ms.unwrap_or(USUAL_PERIOD_MS)) / 1000.0);
+    Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
 }
 
-fn configured_id(keys: &Output, key: &str, id: Option<u32>, faults: &mut Faults) -> Option<CanId> {
-    let id = id?;
+/// The settings of a frame's message; `None` = faults noted.
+pub(crate) fn message_settings(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<MessageSettings> {
+    let id = match keys.id {
+        Some(id) => Some(configured_id(keys, id, faults)?),
+        None if keys.extended => {
+            keys.place.fault(faults, "extended", "must have an id beside it");
+            return None;
+        }
+        None => None,
+    };
+    let e2e = protection(keys, faults)?;
+    Some(MessageSettings { id, fd: keys.fd, brs: keys.brs, period_ms: keys.period_ms, e2e })
+}
+
+fn configured_id(keys: &FrameKeys<'_>, id: u32, faults: &mut Faults) -> Option<CanId> {
     let can_id = if keys.extended { CanId::extended(id) } else { CanId::standard(id) };
     if can_id.is_none() {
-        keys.place.fault(faults, key, "must be 0 to 0x7FF, or output.extended = true");
+        keys.place.fault(faults, "id", "must be 0 to 0x7FF, or extended = true");
     }
     can_id
 }
 
-fn plan(
+fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
+    let profile = match keys.e2e {
+        None if keys.data_id.is_some() => {
+            keys.place.fault(faults, "data_id", "must have e2e beside it");
+            return None;
+        }
+        None => return Some(E2eSetting::AsBase),
+        Some(E2e::Off) => return Some(E2eSetting::Off),
+        Some(E2e::P01A) => Profile::P01A,
+        Some(E2e::P01C) => Profile::P01C,
+        Some(E2e::P05) => Profile::P05,
+    };
+    let Some(data_id) = keys.data_id else {
+        let what = format!("must be given, 0 to {:#X}, with e2e = \"{}\"", profile.max_data_id(), profile.name());
+        keys.place.fault(faults, "data_id", &what);
+        return None;
+    };
+    Some(E2eSetting::On(Protection { profile, data_id }))
+}
+
+/// The layout; a setting that does not fit it is noted at its key.
+#[expect(clippy::too_many_arguments, reason = "one caller, which has all of them at hand")]
+fn database(
+    raw: &Raw,
     keys: &Output,
     config: &Path,
-    ids: &IdOverrides,
+    model: Option<&CellModel>,
+    settings: &LayoutSettings,
+    frames: &[FrameKeys<'_>; 3],
     read: ReadFile<'_>,
     faults: &mut Faults,
-) -> Option<OutputPlan> {
-    let database = match &keys.dbc {
-        Some(name) => read_dbc(&beside(config, name), read, faults)?,
-        None => default_database().map_err(|error| keys.place.fault(faults, "dbc", &error.to_string())).ok()?,
+) -> Option<Database> {
+    let own = match &keys.dbc {
+        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
+        None => None,
     };
-    match OutputPlan::new(&database, ids) {
-        Ok(plan) => Some(plan),
-        Err(missing) => {
-            for fault in missing.0 {
-                keys.place.fault(faults, "dbc", &fault);
-            }
-            None
+    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
+    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
+    let rated_capacity_ah = rated.unwrap_or(1.0);
+    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
+    let refused = match layout(base, settings) {
+        Ok(database) => return Some(database),
+        Err(refused) => refused,
+    };
+    for fault in refused {
+        let frame = LaidOut::ALL.iter().zip(frames).find(|(which, _)| **which == fault.message);
+        if let Some((_, frame)) = frame {
+            frame.place.fault(faults, fault.key, &fault.what);
+        }
+    }
+    None
+}
+
+/// No identifier twice, and none that an input has on the same interface.
+fn check_ids(
+    frames: &[FrameKeys<'_>; 3],
+    plan: &OutputPlan,
+    buses: &[BusIndex],
+    found: &[Resolved<'_>],
+    faults: &mut Faults,
+) {
+    let ids = plan.ids();
+    for (index, (id, frame)) in ids.iter().zip(frames).enumerate() {
+        if let Some(other) = ids[..index].iter().position(|other| other == id) {
+            let what = format!("{} and {} frame would both be {id}, must differ", FRAMES[index], FRAMES[other]);
+            frame.place.fault(faults, "id", &what);
+        }
+        if let Some(input) = found.iter().find(|f| buses.contains(&f.bus) && f.message.id == *id) {
+            let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
+            frame.place.fault(faults, "id", &what);
         }
     }
 }
 
-/// No identifier twice, and none that an input has on the same interface.
-fn check_ids(keys: &Output, ids: &[CanId; 3], buses: &[BusIndex], found: &[Resolved<'_>], faults: &mut Faults) {
-    for (index, (id, (frame, key))) in ids.iter().zip(FRAMES).enumerate() {
-        if let Some(other) = ids[..index].iter().position(|other| other == id) {
-            let what = format!("{frame} and {} frame would both be {id}, must differ", FRAMES[other].0);
-            keys.place.fault(faults, key, &what);
+/// No data id twice: one frame must not pass for another.
+fn check_data_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, faults: &mut Faults) {
+    let data_ids = plan.protections().map(|protection| protection.map(|protection| protection.data_id));
+    for (index, (data_id, frame)) in data_ids.iter().zip(frames).enumerate() {
+        let Some(data_id) = data_id else { continue };
+        if let Some(other) = data_ids[..index].iter().position(|other| other.as_ref() == Some(data_id)) {
+            let what =
+                format!("{} and {} frame would both have {data_id:#X}, must differ", FRAMES[index], FRAMES[other]);
+            frame.place.fault(faults, "data_id", &what);
         }
-        if let Some(input) = found.iter().find(|f| buses.contains(&f.bus) && f.message.id == *id) {
-            let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
-            keys.place.fault(faults, key, &what);
+    }
+}
+
+/// FD frames go only where FD is switched on.
+fn check_interfaces(
+    raw: &Raw,
+    frames: &[FrameKeys<'_>; 3],
+    plan: &OutputPlan,
+    buses: &[BusIndex],
+    faults: &mut Faults,
+) {
+    for (format, frame) in plan.formats().iter().zip(frames) {
+        if *format == FrameFormat::Classic {
+            continue;
+        }
+        let interfaces = buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
+        for interface in interfaces.filter(|interface| !interface.fd) {
+            let what = format!("must have fd = true on interface {} too", interface.name);
+            frame.place.fault(faults, "fd", &what);
         }
     }
 }
@@ -106,12 +190,21 @@ pub(crate) fn uses(raw: &Raw, output: Option<&OutputConfig>) -> Vec<OutputUse> {
     let names = output.buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
     let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();
     let periods_s = [output.status_period_s, output.health_period_s, output.alarm_period_s];
-    let frames = FRAMES.iter().zip(output.plan.ids()).zip(periods_s);
-    let used = frames.map(|(((frame, _), id), period_s)| OutputUse {
+    let plan = &output.plan;
+    let frames = FRAMES.into_iter().zip(plan.ids()).zip(periods_s).zip(plan.formats()).zip(plan.protections());
+    let used = frames.map(|((((frame, id), period_s), format), protection)| OutputUse {
         frame,
         id: id.to_string(),
         interfaces: names.clone(),
         period_ms: 1000.0 * period_s,
+        kind: match format {
+            FrameFormat::Classic => "classic",
+            FrameFormat::Fd { brs: false } => "FD",
+            FrameFormat::Fd { brs: true } => "FD with bit rate switch",
+        },
+        protection: protection.map_or("none".to_owned(), |Protection { profile, data_id }| {
+            format!("profile {}, data id {data_id:#X}", profile.name())
+        }),
     });
     used.collect()
 }

@@ -238,7 +238,7 @@ impl<'a> Walk<'a> {
             return self.read(S::PATH, 1, Some(root));
         }
         match self.find(S::PATH) {
-            None => self.read(S::PATH, 1, None),
+            None => self.read(S::PATH, self.line_above(S::PATH), None),
             Some(value) => match value.get_ref() {
                 DeValue::Table(table) => self.read(S::PATH, self.document.line(&value.span()), Some(table)),
                 _ => None, // noted by the check for unknown keys
@@ -283,6 +283,12 @@ impl<'a> Walk<'a> {
     /// The text at a full path, whatever else its table says.
     pub(crate) fn text(&self, path: &str) -> Option<String> {
         self.find(path)?.get_ref().as_str().map(str::to_owned)
+    }
+
+    /// Line of the table that the table at `path`, which is not written, would be in.
+    fn line_above(&self, path: &str) -> usize {
+        let above = path.rsplit_once('.').and_then(|(above, _)| self.find(above));
+        above.map_or(1, |value| self.document.line(&value.span()))
     }
 
     fn find(&self, path: &str) -> Option<&'a Spanned<DeValue<'a>>> {

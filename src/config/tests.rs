@@ -165,7 +165,7 @@ fn readings_have_our_sign_scale_and_cells() {
 #[test]
 fn nothing_is_sent_unless_configured() {
     assert!(good(PACK).monitor.output.is_none());
-    assert!(good(&format!("{PACK}[output]\nenabled = false\nstatus_id = 5\n")).monitor.output.is_none());
+    assert!(good(&format!("{PACK}[output]\nenabled = false\n[output.status]\nid = 5\n")).monitor.output.is_none());
 }
 
 #[test]
@@ -173,7 +173,7 @@ fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
     let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
     assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
     assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 0.1));
-    let text = "[output]\nextended = true\nstatus_id = 0x18FF_0001\nstatus_period_ms = 200\n";
+    let text = "[output.status]\nextended = true\nid = 0x18FF_0001\nperiod_ms = 200\n";
     let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
     assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
     assert_eq!((output.status_period_s, output.alarm_period_s), (0.2, 1.0));
@@ -189,7 +189,7 @@ fn an_output_dbc_must_have_the_daemons_messages() {
 #[test]
 fn numbers_may_be_hex_or_have_underscores() {
     let output =
-        "[output]\nstatus_id = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
+        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
     let config = good(&format!("{PACK}{output}"));
     assert_eq!(config.monitor.estimator.consistency_window_s, 1000.0);
     assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
@@ -390,20 +390,54 @@ fn single_faults_of_appended_tables() {
             "pack.toml:16: alarm[1].rule = \"bms_disagrees\", must have [input.reported_soc] or [input.reported_soh]",
         ),
         (
-            "[output]\nstatus_id = 0x800\n",
-            "pack.toml:16: output.status_id = 0x800, must be 0 to 0x7FF, or output.extended = true",
+            "[output.status]\nid = 0x800\n",
+            "pack.toml:16: output.status.id = 0x800, must be 0 to 0x7FF, or extended = true",
         ),
         (
-            "[output]\nstatus_id = 1\nalarm_id = 1\n",
-            "pack.toml:17: output.alarm_id = 1, alarm and status frame would both be 001, must differ",
+            "[output.status]\nid = 1\n[output.alarm]\nid = 1\n",
+            "pack.toml:18: output.alarm.id = 1, alarm and status frame would both be 001, must differ",
         ),
         (
-            "[output]\nstatus_id = 1\ninterfaces = [\"can7\"]\n",
+            "[output]\n[output.alarm]\nid = 0x6B0\n",
+            "pack.toml:17: output.alarm.id = 0x6B0, alarm and status frame would both be 6B0, must differ",
+        ),
+        ("[output.alarm]\nextended = true\n", "pack.toml:16: output.alarm.extended = true, must have an id beside it"),
+        ("[output.alarm]\nperiod_ms = 9\n", "pack.toml:16: output.alarm.period_ms = 9, must be 10 to 3600000"),
+        ("[output.alarm]\ne2e = \"2\"\n", "pack.toml:16: output.alarm.e2e = \"2\", must be off or 1A or 1C or 5"),
+        (
+            "[output.alarm]\ne2e = \"1A\"\n",
+            "pack.toml:15: output.alarm.data_id is not set, must be given, 0 to 0xFFFF, with e2e = \"1A\"",
+        ),
+        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, must have e2e beside it"),
+        (
+            "[output.alarm]\ne2e = \"1C\"\ndata_id = 0x1000\n",
+            "pack.toml:17: output.alarm.data_id = 0x1000, must be 0 to 0xFFF with profile 1C",
+        ),
+        (
+            "[output.status]\ne2e = \"1C\"\ndata_id = 7\n[output.alarm]\ne2e = \"1A\"\ndata_id = 7\n",
+            "pack.toml:20: output.alarm.data_id = 7, alarm and status frame would both have 0x7, must differ",
+        ),
+        (
+            "[output.health]\ne2e = \"5\"\ndata_id = 7\n",
+            "pack.toml:16: output.health.e2e = \"5\", must have fd = true here and on the interface: the header of \
+             profile 5 makes the message 12 bytes long; 1A and 1C fit classic frames",
+        ),
+        (
+            "[output.health]\nfd = true\n",
+            "pack.toml:16: output.health.fd = true, must have fd = true on interface can0 too",
+        ),
+        (
+            "[output.health]\nbrs = true\n",
+            "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",
+        ),
+        ("[output]\nstatus_id = 1\n", "pack.toml:16: output.status_id is not a known key, did you mean status"),
+        (
+            "[output]\nenabled = true\ninterfaces = [\"can7\"]\n",
             "pack.toml:17: output.interfaces = [\"can7\"], must be can0",
         ),
         (
-            "[output]\nhealth_id = 0x110\n",
-            "pack.toml:16: output.health_id = 0x110, must not be the identifier of an input, Cells has 110",
+            "[output.health]\nid = 0x110\n",
+            "pack.toml:16: output.health.id = 0x110, must not be the identifier of an input, Cells has 110",
         ),
         (
             "[[interface]]\nname = \"can0\"\n",
@@ -580,7 +614,7 @@ proptest! {
         const SCRAPS: [&str; 14] = [
             "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
         ];
-        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output]\nstatus_id = 1\n");
+        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n");
         let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
         for (file, place, length, scrap) in edits {
             let text = &mut texts[file];

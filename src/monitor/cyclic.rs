@@ -6,7 +6,7 @@ use super::alarms::HOUSEKEEPING_S;
 use super::{Event, EventKind, Monitor, Outputs, Transmit, Validity};
 use crate::alarm::{Alarm, Rule, State};
 use crate::can::Frame;
-use crate::can::encode::{AlarmFields, HealthFields, StatusFields};
+use crate::can::encode::{AlarmFields, HealthFields, SendCounters, StatusFields};
 use crate::quantity::Timestamp;
 
 /// Period of a test's frames, s: a consumer that looks once a second sees several.
@@ -31,6 +31,9 @@ pub(super) struct Schedule {
     alarm: Timestamp,
     /// Which of the raised alarms is next in the cycle.
     alarm_turn: usize,
+    /// Counters of the frames' end-to-end protection.
+    #[serde(default)]
+    counters: SendCounters,
 }
 
 impl Schedule {
@@ -117,10 +120,10 @@ impl Monitor {
         }
     }
 
-    fn status_frame(&self) -> Option<Frame> {
+    fn status_frame(&mut self) -> Option<Frame> {
         let output = self.config.output.as_ref()?;
         let pack = self.pack.as_ref();
-        Some(output.plan.status(&StatusFields {
+        let fields = StatusFields {
             soc: pack.map(|pack| pack.soc),
             soc_std: pack.map(|pack| pack.soc_std),
             mode: Some(self.detector.mode()),
@@ -129,7 +132,13 @@ impl Monitor {
             highest_severity: self.alarms.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-        }))
+            unknown_rules: Some(match self.alarms.unknown() {
+                (_, 0) => 0,
+                (all, unknown) if unknown < all => 1,
+                (_, _) => 2,
+            }),
+        };
+        Some(output.plan.status(&fields, &mut self.schedule.counters))
     }
 
     /// Health of the pack: its weakest cell's, once half-cycles have taught something about every cell.
@@ -153,11 +162,13 @@ impl Monitor {
         }
     }
 
-    fn send_health(&self, out: &mut Outputs) {
-        let Some(output) = &self.config.output else { return };
+    fn send_health(&mut self, out: &mut Outputs) {
         let fields = self.health_fields();
-        for page in 0..output.plan.health_pages() {
-            self.send(Some(output.plan.health(page, &fields)), out);
+        let pages = self.config.output.as_ref().map_or(0, |output| output.plan.health_pages());
+        for page in 0..pages {
+            let plan = self.config.output.as_ref().map(|output| &output.plan);
+            let frame = plan.map(|plan| plan.health(page, &fields, &mut self.schedule.counters));
+            self.send(frame, out);
         }
     }
 
@@ -179,7 +190,8 @@ impl Monitor {
     }
 
     fn send_alarm_fields(&mut self, fields: AlarmFields, out: &mut Outputs) {
-        let frame = self.config.output.as_ref().map(|output| output.plan.alarm(&fields));
+        let counters = &mut self.schedule.counters;
+        let frame = self.config.output.as_ref().map(|output| output.plan.alarm(&fields, counters));
         self.send(frame, out);
     }
 
@@ -220,6 +232,7 @@ fn alarm_fields(alarm: &Alarm) -> AlarmFields {
         state: Some(alarm.state.wire_code()),
         severity: Some(alarm.severity as u8),
         test: false,
+        acknowledged: alarm.is_acknowledged,
         cell: alarm.cell,
         value: alarm.value,
         threshold: Some(alarm.threshold),
@@ -229,5 +242,5 @@ fn alarm_fields(alarm: &Alarm) -> AlarmFields {
 /// No value and no threshold: nothing of it can be taken for a measurement.
 fn test_fields(rule: Rule, state: State) -> AlarmFields {
     let (rule, state) = (rule as u8, Some(state.wire_code()));
-    AlarmFields { rule, state, severity: None, test: true, cell: None, value: None, threshold: None }
+    AlarmFields { rule, state, test: true, ..AlarmFields::default() }
 }

@@ -1,12 +1,31 @@
 //! What goes out reads back with the same DBC, and unknown never reads as a number.
 
 use super::*;
+use crate::can::e2e::Profile;
+use crate::can::encode::{Base, E2eSetting, LayoutSettings, MessageSettings, default_database, layout};
 use crate::quantity::Fault;
 
 const TEXT: &str = include_str!("../../../../config/packwatch.dbc");
 
-fn plan() -> OutputPlan {
-    OutputPlan::new(&default_database().unwrap(), &IdOverrides::default()).unwrap()
+/// The plan, with counters nobody looks at.
+struct Unprotected(OutputPlan);
+
+impl Unprotected {
+    fn status(&self, fields: &StatusFields) -> Frame {
+        self.0.status(fields, &mut SendCounters::default())
+    }
+
+    fn health(&self, page: usize, fields: &HealthFields) -> Frame {
+        self.0.health(page, fields, &mut SendCounters::default())
+    }
+
+    fn alarm(&self, fields: &AlarmFields) -> Frame {
+        self.0.alarm(fields, &mut SendCounters::default())
+    }
+}
+
+fn plan() -> Unprotected {
+    Unprotected(OutputPlan::new(&default_database().unwrap()).unwrap())
 }
 
 /// Raw code and physical value of `Message.Signal` in a frame.
@@ -39,23 +58,15 @@ fn says_nothing(name: &str, frame: &Frame) {
 fn faults(from: &str, to: &str) -> Vec<String> {
     assert!(TEXT.contains(from), "{from}");
     let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();
-    OutputPlan::new(&dbc, &IdOverrides::default()).unwrap_err().0
+    OutputPlan::new(&dbc).unwrap_err().0
 }
 
 #[test]
 fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
-    let plan = plan();
+    let plan = plan().0;
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
     assert_eq!(plan.cycle_times_ms(), [Some(100), Some(1000), Some(1000)]);
     assert_eq!(plan.health_pages(), 3);
-}
-
-#[test]
-fn identifiers_can_be_others_than_the_dbc_s() {
-    let ids = IdOverrides { status: None, health: Some(CanId::Extended(5)), alarm: Some(CanId::Standard(7)) };
-    let plan = OutputPlan::new(&default_database().unwrap(), &ids).unwrap();
-    assert_eq!(plan.ids(), [CanId::Standard(0x6B0), CanId::Extended(5), CanId::Standard(7)]);
-    assert_eq!(plan.health(0, &HealthFields::default()).id(), CanId::Extended(5));
 }
 
 #[test]
@@ -68,6 +79,7 @@ fn status_reads_back_within_half_a_bit() {
         highest_severity: Some(3),
         active_alarms: Some(17),
         limiting_cell: Some(CellIndex(1023)),
+        unknown_rules: Some(2),
     };
     let frame = plan().status(&fields);
     for (name, wanted) in [
@@ -78,6 +90,7 @@ fn status_reads_back_within_half_a_bit() {
         ("HighestSeverity", 3.0),
         ("ActiveAlarms", 17.0),
         ("LimitingCell", 1023.0),
+        ("UnknownRules", 2.0),
     ] {
         says(&format!("Status.{name}"), &frame, wanted);
     }
@@ -191,10 +204,18 @@ fn extremes_saturate_at_the_range_and_never_say_not_available() {
         limiting_cell: Some(CellIndex(u16::MAX)),
         validity: u8::MAX,
         highest_severity: Some(u8::MAX),
+        unknown_rules: Some(u8::MAX),
         ..Default::default()
     };
     let frame = plan().status(&many);
-    for (name, end) in [("ActiveAlarms", 62.0), ("LimitingCell", 1023.0), ("Validity", 3.0), ("HighestSeverity", 3.0)] {
+    let ends = [
+        ("ActiveAlarms", 62.0),
+        ("LimitingCell", 1023.0),
+        ("Validity", 3.0),
+        ("HighestSeverity", 3.0),
+        ("UnknownRules", 2.0),
+    ];
+    for (name, end) in ends {
         says(&format!("Status.{name}"), &frame, end);
     }
 }
@@ -202,13 +223,29 @@ fn extremes_saturate_at_the_range_and_never_say_not_available() {
 #[test]
 fn every_rule_has_its_own_value_and_threshold() {
     // In the rule's inside unit and as read: the share of bad readings is a fraction inside and % on the wire.
-    let values = [(1.4, 1.4), (1.38, 1.38), (3600.0, 3600.0), (2.5, 2.5), (0.25, 25.0), (9.51, 9.51)];
+    let values = [
+        (1.4, 1.4),
+        (1.38, 1.38),
+        (3600.0, 3600.0),
+        (2.5, 2.5),
+        (0.25, 25.0),
+        (9.51, 9.51),
+        (1.83, 183.0),
+        (0.052, 5.2),
+        (55.3, 55.3),
+        (0.0312, 3.12),
+        (87.0, 87.0),
+        (0.11, 11.0),
+        (3600.0, 3600.0),
+        (12.0, 12.0),
+    ];
     for ((number, rule), (inside, wire)) in (1..).zip(RULES).zip(values) {
         let fields = AlarmFields {
             rule: number,
             state: Some(1),
             severity: Some(3),
             test: false,
+            acknowledged: true,
             cell: Some(CellIndex(96)),
             value: Some(inside),
             threshold: Some(inside * 1.1),
@@ -218,15 +255,17 @@ fn every_rule_has_its_own_value_and_threshold() {
         says("Alarm.State", &frame, 1.0);
         says("Alarm.Severity", &frame, 3.0);
         says("Alarm.Test", &frame, 0.0);
+        says("Alarm.Acknowledged", &frame, 1.0);
         says("Alarm.Cell", &frame, 96.0);
         says(&format!("Alarm.Value_{rule}"), &frame, wire);
         says(&format!("Alarm.Threshold_{rule}"), &frame, wire * 1.1);
         assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
-        let other = plan().alarm(&AlarmFields { value: None, cell: None, test: true, ..fields });
+        let other = plan().alarm(&AlarmFields { value: None, cell: None, test: true, acknowledged: false, ..fields });
         says_nothing(&format!("Alarm.Value_{rule}"), &other);
         says(&format!("Alarm.Threshold_{rule}"), &other, wire * 1.1);
         says_nothing("Alarm.Cell", &other);
         says("Alarm.Test", &other, 1.0);
+        says("Alarm.Acknowledged", &other, 0.0);
     }
 }
 
@@ -241,12 +280,12 @@ fn the_rules_numbers_and_names_are_those_of_the_value_table() {
 #[test]
 fn everything_missing_is_told_at_once() {
     let text = "VERSION \"\"\nBU_: X\nBO_ 1 PACKWATCH_Status: 8 X\n SG_ Soc : 0|8@1+ (1,0) [0|100] \"%\" X\n";
-    let found = OutputPlan::new(&Database::parse(text).unwrap(), &IdOverrides::default()).unwrap_err();
+    let found = OutputPlan::new(&Database::parse(text).unwrap()).unwrap_err();
     let mut wanted: Vec<_> =
         STATUS.iter().skip(1).map(|name| format!("signal PACKWATCH_Status.{name} is missing")).collect();
     wanted.extend(["Health", "Alarm"].map(|name| format!("message PACKWATCH_{name} is missing")));
     assert_eq!(found.0, wanted);
-    assert_eq!(found.to_string().lines().count(), 8);
+    assert_eq!(found.to_string().lines().count(), 9);
 }
 
 #[test]
@@ -263,11 +302,11 @@ fn every_signal_the_daemon_fills_is_required() {
         let position = message.signals.iter().position(|s| s.name == signal).unwrap();
         // Renamed and not removed: the others' conditions count positions.
         message.signals[position].name = "Other".to_owned();
-        let found = OutputPlan::new(&dbc, &IdOverrides::default()).unwrap_err();
+        let found = OutputPlan::new(&dbc).unwrap_err();
         assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);
         count += 1;
     }
-    assert_eq!(count, 31);
+    assert_eq!(count, 8 + 8 + 5 + 28);
 }
 
 #[test]
@@ -278,7 +317,9 @@ fn a_value_that_could_be_read_as_another_s_is_refused() {
     );
     assert_eq!(
         faults("Threshold_CapacityLow m1", "Threshold_CapacityLow "),
-        ["signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6], must be for 1 alone"]
+        [
+            "signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14], must be for 1 alone"
+        ]
     );
     assert_eq!(faults("Page M : 16|4@1+", "Page M : 16|1@1+").len(), 3, "three signals are on page 2");
 }
@@ -294,6 +335,10 @@ fn a_signal_past_its_message_or_without_layout_is_refused() {
         faults("PACKWATCH_Health: 8", "PACKWATCH_Health: 100"),
         ["message PACKWATCH_Health: 100 bytes, must be at most 64"]
     );
+    assert_eq!(
+        faults("PACKWATCH_Health: 8", "PACKWATCH_Health: 12"),
+        ["message PACKWATCH_Health: 12 bytes, must be at most 8 in classic frames"]
+    );
 }
 
 #[test]
@@ -302,7 +347,7 @@ fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() 
         .replace("Soc : 16|12@1+ (0.025,0) [0|102.35]", "Soc : 16|12@1- (1,0) [0|0]")
         .replace("SocStd : 28|8@1+ (0.1,0) [0|25.4]", "SocStd : 28|8@1+ (1,0) [0|0]")
         .replace("VAL_ 1712 Soc 4095 \"not available\" ;\n", "");
-    let plan = OutputPlan::new(&Database::parse(&text).unwrap(), &IdOverrides::default()).unwrap();
+    let plan = Unprotected(OutputPlan::new(&Database::parse(&text).unwrap()).unwrap());
     let codes = |value: Option<f64>| {
         let frame = plan.status(&StatusFields { soc: value, soc_std: value, ..Default::default() });
         (read("Status.Soc", &frame).0, read("Status.SocStd", &frame).0)
@@ -310,4 +355,48 @@ fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() 
     assert_eq!(codes(None), (0x800, 255));
     assert_eq!(codes(Some(1e9)), (0x7FF, 254));
     assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is taken: the next one up");
+}
+
+#[test]
+fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        let settings = |data_id| MessageSettings {
+            fd: Some(true),
+            e2e: E2eSetting::On(Protection { profile, data_id }),
+            ..Default::default()
+        };
+        let settings = LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: None };
+        let database = layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
+        let plan = OutputPlan::new(&database).unwrap();
+        let [status, health, alarm] = plan.protections().map(Option::unwrap);
+        let (mut counters, mut expected) = (SendCounters::default(), 0);
+        for round in 0..600_u16 {
+            let fields = StatusFields { active_alarms: Some(round % 60), ..Default::default() };
+            let frame = plan.status(&fields, &mut counters);
+            assert_eq!(status.verified_counter(frame.data()), Some(expected), "{profile:?} {round}");
+            assert_eq!(health.verified_counter(frame.data()), None, "another frame's data id");
+            expected = profile.next_counter(expected);
+        }
+        let frame = plan.health(1, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(0));
+        let frame = plan.health(2, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(1), "pages share the identifier and the counter");
+        let frame = plan.alarm(&AlarmFields::default(), &mut counters);
+        assert_eq!(alarm.verified_counter(frame.data()), Some(0));
+        assert_eq!(frame.kind(), FrameFormat::Fd { brs: false }.kind());
+        assert_eq!(frame.len(), if profile == Profile::P05 { 12 } else { 8 });
+    }
+}
+
+#[test]
+fn counters_survive_a_restart_and_a_change_of_the_profile() {
+    let protection = Protection { profile: Profile::P01A, data_id: 9 };
+    let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
+    let settings = LayoutSettings { status, ..Default::default() };
+    let plan = OutputPlan::new(&layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
+    let mut counters: SendCounters = serde_json::from_str(r#"{"status":200,"health":0,"alarm":3}"#).unwrap();
+    let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
+    assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
+    let stored = serde_json::to_string(&counters).unwrap();
+    assert_eq!(stored, r#"{"status":1,"health":0,"alarm":3}"#, "unprotected frames count nothing");
 }

@@ -1,0 +1,104 @@
+//! What a DBC says in attributes: cycle time, frame format, end-to-end protection.
+//!
+//! The names and the order of `VFrameFormat`'s words are those DBC editors use; the two about end-to-end protection
+//! are packwatch's own. An attribute that makes no sense counts as not written.
+
+use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
+
+use super::FrameFormat;
+use crate::can::e2e::{Profile, Protection};
+
+/// Cycle time, ms.
+pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
+/// Standard or extended, classic or FD.
+pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
+/// The words of [`FRAME_FORMAT`].
+pub(super) const FRAME_FORMATS: [&str; 16] = [
+    "StandardCAN",
+    "ExtendedCAN",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "reserved",
+    "StandardCAN_FD",
+    "ExtendedCAN_FD",
+];
+/// Bit rate switch.
+pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
+/// The words of [`BIT_RATE_SWITCH`].
+pub(super) const NO_YES: [&str; 2] = ["0", "1"];
+/// End-to-end protection: profile.
+pub(super) const E2E_PROFILE: &str = "E2EProfile";
+/// The words of [`E2E_PROFILE`].
+pub(super) const E2E_PROFILES: [&str; 4] = ["off", "1A", "1C", "5"];
+/// End-to-end protection: data id.
+pub(super) const E2E_DATA_ID: &str = "E2EDataId";
+
+/// The profile's place among the words of [`E2E_PROFILE`].
+pub(super) fn profile_index(profile: Profile) -> usize {
+    match profile {
+        Profile::P01A => 1,
+        Profile::P01C => 2,
+        Profile::P05 => 3,
+    }
+}
+
+/// The cycle time, when above 0.
+pub(super) fn cycle_time_ms(dbc: &Dbc, id: MessageId) -> Option<u32> {
+    let whole = match dbc.resolved_message_attribute(id, CYCLE_TIME)? {
+        AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
+        AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
+        // Editors that export every number as a float write 100.0 as 100: read its digits.
+        AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
+        AttributeValue::String(ms) => ms.parse().ok(),
+    };
+    whole.filter(|ms| *ms > 0)
+}
+
+/// Classic unless the attribute says FD.
+pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
+    match word(dbc, id, FRAME_FORMAT).as_deref() {
+        Some("StandardCAN_FD" | "ExtendedCAN_FD") => {
+            FrameFormat::Fd { brs: word(dbc, id, BIT_RATE_SWITCH).as_deref() == Some(NO_YES[1]) }
+        }
+        _ => FrameFormat::Classic,
+    }
+}
+
+/// The protection, when both attributes say one.
+pub(super) fn e2e(dbc: &Dbc, id: MessageId) -> Option<Protection> {
+    let profile = match word(dbc, id, E2E_PROFILE)?.as_str() {
+        "1A" => Profile::P01A,
+        "1C" => Profile::P01C,
+        "5" => Profile::P05,
+        _ => return None,
+    };
+    let data_id = match dbc.resolved_message_attribute(id, E2E_DATA_ID)? {
+        AttributeValue::Uint(id) => u16::try_from(*id).ok()?,
+        AttributeValue::Int(_) | AttributeValue::Double(_) | AttributeValue::String(_) => return None,
+    };
+    Some(Protection { profile, data_id })
+}
+
+/// The value of an attribute that is a choice between words: written as the word or as its place among them.
+fn word(dbc: &Dbc, id: MessageId, name: &str) -> Option<String> {
+    let place = match dbc.resolved_message_attribute(id, name)? {
+        AttributeValue::String(word) => return Some(word.clone()),
+        AttributeValue::Uint(place) => usize::try_from(*place).ok()?,
+        AttributeValue::Int(_) | AttributeValue::Double(_) => return None,
+    };
+    dbc.attribute_definitions.iter().find_map(|definition| match definition {
+        AttributeDefinition::Message(defined, AttributeValueType::Enum(words)) if defined == name => {
+            words.get(place).cloned()
+        }
+        _ => None,
+    })
+}

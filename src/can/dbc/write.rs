@@ -1,0 +1,236 @@
+//! Messages and signals to DBC text.
+//!
+//! In: a [`Database`]. Out: text that DBC tools load and that [`Database::parse`] reads back equal. Numbers are written
+//! with as many digits as they need and never with an exponent. Attributes are defined only when a message has them.
+
+use std::fmt::Write as _;
+
+use super::attributes::{
+    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FRAME_FORMAT, FRAME_FORMATS, NO_YES,
+    profile_index,
+};
+use super::{Database, FrameFormat, Message, MuxCondition, Signal};
+use crate::can::CanId;
+use crate::can::signal::{ByteOrder, ValueType};
+
+/// What stands for no node.
+const NOBODY: &str = "Vector__XXX";
+
+/// Longest cycle time an editor will accept, ms: an hour.
+const MAX_CYCLE_TIME_MS: u32 = 3_600_000;
+
+impl Database {
+    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as those that were read do.
+    pub fn to_dbc(&self) -> String {
+        let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_:");
+        for node in &self.nodes {
+            // Writing to a String cannot fail, here and below.
+            let _ = write!(text, " {node}");
+        }
+        text.push_str("\n\n");
+        for message in &self.messages {
+            write_message(message, &mut text);
+            text.push('\n');
+        }
+        self.comments(&mut text);
+        self.attributes(&mut text);
+        self.value_tables(&mut text);
+        self.floats(&mut text);
+        for message in self.messages.iter().filter(|message| needs_ranges(message)) {
+            write_ranges(message, &mut text);
+        }
+        text
+    }
+
+    /// The DBC as bytes: one per character, as DBC tools expect, unless a character or their sequence forbids it.
+    pub fn to_dbc_bytes(&self) -> Vec<u8> {
+        let text = self.to_dbc();
+        let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
+        // Bytes that happen to be good UTF-8 would be read as that.
+        latin
+            .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
+            .unwrap_or_else(|| text.into_bytes())
+    }
+
+    fn signals(&self) -> impl Iterator<Item = (&Message, &Signal)> {
+        self.messages.iter().flat_map(|message| message.signals.iter().map(move |signal| (message, signal)))
+    }
+
+    fn comments(&self, text: &mut String) {
+        if let Some(comment) = &self.comment {
+            let _ = writeln!(text, "CM_ \"{}\";", quoted(comment));
+        }
+        for message in &self.messages {
+            let id = number(message.id);
+            for signal in &message.signals {
+                if let Some(comment) = &signal.comment {
+                    let _ = writeln!(text, "CM_ SG_ {id} {} \"{}\";", signal.name, quoted(comment));
+                }
+            }
+            if let Some(comment) = &message.comment {
+                let _ = writeln!(text, "CM_ BO_ {id} \"{}\";", quoted(comment));
+            }
+        }
+    }
+
+    fn attributes(&self, text: &mut String) {
+        let is_fd = |message: &Message| message.format != FrameFormat::Classic;
+        let has_format = |message: &Message| is_fd(message) || matches!(message.id, CanId::Extended(_));
+        let mut list = Attributes { messages: &self.messages, text };
+        list.add(CYCLE_TIME, &format!("INT 0 {MAX_CYCLE_TIME_MS}"), "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()));
+        let formats = format!("ENUM {}", words(&FRAME_FORMATS));
+        list.add(FRAME_FORMAT, &formats, &words(&FRAME_FORMATS[..1]), |m| {
+            let (extended, fd) = (matches!(m.id, CanId::Extended(_)), is_fd(m));
+            has_format(m).then(|| (usize::from(extended) + if fd { 14 } else { 0 }).to_string())
+        });
+        list.add(BIT_RATE_SWITCH, &format!("ENUM {}", words(&NO_YES)), &words(&NO_YES[..1]), |m| match m.format {
+            FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
+            FrameFormat::Classic => None,
+        });
+        let profiles = format!("ENUM {}", words(&E2E_PROFILES));
+        list.add(E2E_PROFILE, &profiles, &words(&E2E_PROFILES[..1]), |m| {
+            m.e2e.map(|e2e| profile_index(e2e.profile).to_string())
+        });
+        list.add(E2E_DATA_ID, "INT 0 65535", "0", |m| m.e2e.map(|e2e| e2e.data_id.to_string()));
+        if self.messages.iter().any(is_fd) {
+            text.push_str(
+                "BA_DEF_ \"BusType\" STRING ;\nBA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_ \"BusType\" \"CAN FD\";\n",
+            );
+        }
+    }
+
+    fn value_tables(&self, text: &mut String) {
+        for (message, signal) in self.signals().filter(|(_, signal)| !signal.values.is_empty()) {
+            let _ = write!(text, "VAL_ {} {}", number(message.id), signal.name);
+            for (code, name) in &signal.values {
+                let _ = write!(text, " {code} \"{}\"", quoted(name));
+            }
+            text.push_str(" ;\n");
+        }
+    }
+
+    fn floats(&self, text: &mut String) {
+        for (message, signal) in self.signals() {
+            let kind = match signal.layout.value_type {
+                ValueType::Unsigned | ValueType::Signed => continue,
+                ValueType::Float32 => 1,
+                ValueType::Float64 => 2,
+            };
+            let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", number(message.id), signal.name);
+        }
+    }
+}
+
+/// Writes attributes that some message has.
+struct Attributes<'a> {
+    messages: &'a [Message],
+    text: &'a mut String,
+}
+
+impl Attributes<'_> {
+    fn add(&mut self, name: &str, kind: &str, default: &str, value: impl Fn(&Message) -> Option<String>) {
+        let values = self.messages.iter().filter_map(|message| Some((number(message.id), value(message)?)));
+        let values: Vec<_> = values.collect();
+        if values.is_empty() {
+            return;
+        }
+        let _ = writeln!(self.text, "BA_DEF_ BO_ \"{name}\" {kind};\nBA_DEF_DEF_ \"{name}\" {default};");
+        for (id, value) in values {
+            let _ = writeln!(self.text, "BA_ \"{name}\" BO_ {id} {value};");
+        }
+    }
+}
+
+fn words(words: &[&str]) -> String {
+    let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
+    quoted.join(",")
+}
+
+/// The identifier as a DBC writes it: bit 31 says extended.
+fn number(id: CanId) -> u32 {
+    match id {
+        CanId::Standard(id) => u32::from(id),
+        CanId::Extended(id) => id | 0x8000_0000,
+    }
+}
+
+/// A text that no quote ends too early. A text that was read has its quotes escaped already.
+fn quoted(text: &str) -> String {
+    let mut safe = String::with_capacity(text.len());
+    for c in text.chars() {
+        if c == '"' && !safe.ends_with('\\') {
+            safe.push('\\');
+        }
+        safe.push(c);
+    }
+    if safe.ends_with('\\') {
+        safe.push(' ');
+    }
+    safe
+}
+
+fn write_message(message: &Message, text: &mut String) {
+    let sender = message.sender.as_deref().unwrap_or(NOBODY);
+    let _ = writeln!(text, "BO_ {} {}: {} {sender}", number(message.id), message.name, message.len_bytes);
+    for signal in &message.signals {
+        let layout = &signal.layout;
+        let order = match layout.byte_order {
+            ByteOrder::LittleEndian => '1',
+            ByteOrder::BigEndian => '0',
+        };
+        let sign = match layout.value_type {
+            ValueType::Unsigned => '+',
+            ValueType::Signed | ValueType::Float32 | ValueType::Float64 => '-',
+        };
+        let receivers = if signal.receivers.is_empty() { NOBODY.to_owned() } else { signal.receivers.join(",") };
+        let _ = writeln!(
+            text,
+            " SG_ {}{} : {}|{}@{order}{sign} ({},{}) [{}|{}] \"{}\" {receivers}",
+            signal.name,
+            indicator(signal),
+            layout.start_bit,
+            layout.length_bits,
+            layout.factor,
+            layout.offset,
+            layout.minimum,
+            layout.maximum,
+            quoted(&signal.unit),
+        );
+    }
+}
+
+/// ` M`, ` m3`, ` m3M` or nothing.
+fn indicator(signal: &Signal) -> String {
+    let code = signal.multiplex.conditions.last().and_then(|condition| condition.ranges.first()).map(|range| range.0);
+    match (code, signal.is_multiplexor) {
+        (None, false) => String::new(),
+        (None, true) => " M".to_owned(),
+        (Some(code), false) => format!(" m{code}"),
+        (Some(code), true) => format!(" m{code}M"),
+    }
+}
+
+/// Whether `m3` does not say all: ranges, nested multiplexors, or several side by side.
+fn needs_ranges(message: &Message) -> bool {
+    let mut conditions = message.signals.iter().map(|signal| signal.multiplex.conditions.as_slice());
+    let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.multiplex.conditions.is_empty());
+    let is_simple = |chain: &[MuxCondition]| match chain {
+        [] => true,
+        [condition] => matches!(condition.ranges.as_slice(), [(low, high)] if low == high),
+        _ => false,
+    };
+    plain.count() > 1 && conditions.clone().any(|chain| !chain.is_empty()) || !conditions.all(is_simple)
+}
+
+fn write_ranges(message: &Message, text: &mut String) {
+    for signal in &message.signals {
+        let Some(condition) = signal.multiplex.conditions.last() else { continue };
+        let Some(selector) = message.signals.get(condition.selector) else { continue };
+        let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| format!("{low}-{high}")).collect();
+        let (id, ranges) = (number(message.id), ranges.join(", "));
+        let _ = writeln!(text, "SG_MUL_VAL_ {id} {} {} {ranges};", signal.name, selector.name);
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,253 @@
+//! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, the sender's and the receiver's half.
+//!
+//! A protected payload begins with a header: a CRC over an agreed data identifier and the rest of the payload, and a
+//! counter that moves by one from frame to frame. The receiver learns from it that a payload was damaged, repeated,
+//! lost, or is another message's. It finds faults; it does not stop an attacker, who can compute a CRC too.
+//!
+//! | profile | bytes of the header | CRC | counter |
+//! | --- | --- | --- | --- |
+//! | 1A | 0: CRC; 1, low nibble: counter | CRC-8 0x1D, from 0, of id low, id high, payload from byte 1 | 0 to 14 |
+//! | 1C | as 1A; 1, high nibble: low nibble of the id's high byte | CRC-8 0x1D, from 0, of id low, 0, payload from byte 1 | 0 to 14 |
+//! | 5 | 0, 1: CRC, low byte first; 2: counter | CRC-16 0x1021, from 0xFFFF, of payload from byte 2, id low, id high | 0 to 255 |
+//!
+//! In 1A the high nibble of byte 1 belongs to whoever lays out the message (a signal may lie there); `protect` leaves it.
+//! The CRC of profile 1 is the one of the AUTOSAR library with its start value and final XOR of 0xFF cancelled.
+//!
+//! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
+//! Library" as two peers and four open receivers have it; vectors in the tests.
+//!
+//! Deviation 1: profile 5 has no SYNC and INITIAL of its own in AUTOSAR (the state machine above it makes them). Here the
+//! receiver of profile 1 runs for it too, with the counter modulo 256: the same words and the same counts for both
+//! profiles; a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK.
+//! Deviation 2: what a receiver may be told about repetitions (`max_no_new_or_repeated_data`) ends at 14 for both
+//! profiles, where it means "any number".
+//! Deviation 3: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
+//! error). Here it is [`Status::WrongCrc`]: the payload is not one the sender can have made.
+
+mod receiver;
+
+use serde::{Deserialize, Serialize};
+
+pub use receiver::{CheckConfig, Receiver, Status, StatusCounts};
+
+/// Which layout, CRC and counter protect a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Profile {
+    /// Profile 1, variant A: the whole data identifier is in the CRC only.
+    #[serde(rename = "1A")]
+    P01A,
+    /// Profile 1, variant C: four bits of the data identifier are sent, its low byte is in the CRC.
+    #[serde(rename = "1C")]
+    P01C,
+    /// Profile 5.
+    #[serde(rename = "5")]
+    P05,
+}
+
+impl Profile {
+    /// The word for it in a configuration.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::P01A => "1A",
+            Self::P01C => "1C",
+            Self::P05 => "5",
+        }
+    }
+
+    /// Leading bits of the payload that the profile lays out; of 1A's the upper four (bits 12 to 15) are free for a signal.
+    pub const fn header_bits(self) -> usize {
+        self.header_bytes() * 8
+    }
+
+    /// Which bits of the first three bytes the protection writes, least significant bit of each byte = bit 0.
+    pub const fn header_mask(self) -> [u8; 3] {
+        match self {
+            Self::P01A => [0xFF, 0x0F, 0],
+            Self::P01C => [0xFF, 0xFF, 0],
+            Self::P05 => [0xFF, 0xFF, 0xFF],
+        }
+    }
+
+    /// Shortest payload that can be protected, bytes.
+    pub const fn header_bytes(self) -> usize {
+        match self {
+            Self::P01A | Self::P01C => 2,
+            Self::P05 => 3,
+        }
+    }
+
+    /// Longest payload the standard protects with this profile, bytes: 240 bits in profile 1; of profile 5 any frame.
+    pub const fn max_bytes(self) -> usize {
+        match self {
+            Self::P01A | Self::P01C => 30,
+            Self::P05 => crate::can::MAX_DATA,
+        }
+    }
+
+    /// Largest data identifier: variant 1C has room for 12 bits of it.
+    pub const fn max_data_id(self) -> u16 {
+        match self {
+            Self::P01C => 0x0FFF,
+            Self::P01A | Self::P05 => u16::MAX,
+        }
+    }
+
+    /// Largest counter.
+    pub const fn max_counter(self) -> u8 {
+        match self {
+            Self::P01A | Self::P01C => 14,
+            Self::P05 => u8::MAX,
+        }
+    }
+
+    /// The counter after `counter`; after the largest (and after anything beyond it) comes 0.
+    pub const fn next_counter(self, counter: u8) -> u8 {
+        if counter < self.max_counter() { counter + 1 } else { 0 }
+    }
+
+    /// By how many steps `to` is after `from`, both valid: 0 to the largest counter.
+    const fn counter_delta(self, from: u8, to: u8) -> u8 {
+        if to >= from { to - from } else { self.max_counter().wrapping_sub(from).wrapping_add(to).wrapping_add(1) }
+    }
+}
+
+/// Why a payload cannot be protected.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum ProtectError {
+    /// Shorter than the header.
+    #[error("payload has {found} bytes, this end-to-end profile needs {needed} or more")]
+    Short {
+        /// Bytes there are.
+        found: usize,
+        /// Bytes of the header.
+        needed: usize,
+    },
+    /// A counter the profile does not have.
+    #[error("end-to-end counter {found}, must be 0 to {max}")]
+    Counter {
+        /// The counter given.
+        found: u8,
+        /// The largest.
+        max: u8,
+    },
+}
+
+/// What sender and receiver of one message agree on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Protection {
+    /// Layout, CRC and counter.
+    pub profile: Profile,
+    /// Data identifier, unlike that of any other message; of it, 1C uses 12 bits.
+    pub data_id: u16,
+}
+
+impl Protection {
+    /// Writes counter, identifier nibble (1C) and CRC into a payload whose other bytes are final.
+    ///
+    /// # Errors
+    /// When the payload is shorter than the header or the counter beyond the profile's largest; nothing is written then.
+    pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
+        let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
+        if found < needed {
+            return Err(ProtectError::Short { found, needed });
+        }
+        if counter > max {
+            return Err(ProtectError::Counter { found: counter, max });
+        }
+        match self.profile {
+            Profile::P01A => payload[1] = payload[1] & 0xF0 | counter,
+            Profile::P01C => payload[1] = self.id_nibble() << 4 | counter,
+            Profile::P05 => payload[2] = counter,
+        }
+        match self.profile {
+            Profile::P01A | Profile::P01C => payload[0] = self.crc8(payload),
+            Profile::P05 => {
+                let crc = self.crc16(payload);
+                payload[..2].copy_from_slice(&crc.to_le_bytes());
+            }
+        }
+        Ok(())
+    }
+
+    /// The counter of a payload whose CRC, identifier and counter are valid.
+    pub fn verified_counter(&self, payload: &[u8]) -> Option<u8> {
+        let counter = self.counter(payload)?;
+        let intact = match self.profile {
+            Profile::P01A => payload[0] == self.crc8(payload),
+            Profile::P01C => payload[0] == self.crc8(payload) && payload[1] >> 4 == self.id_nibble(),
+            Profile::P05 => payload[..2] == self.crc16(payload).to_le_bytes(),
+        };
+        (intact && counter <= self.profile.max_counter()).then_some(counter)
+    }
+
+    /// The counter as it stands in the payload, whatever the CRC says; `None` = too short.
+    pub fn counter(&self, payload: &[u8]) -> Option<u8> {
+        match self.profile {
+            Profile::P01A | Profile::P01C => payload.get(1).map(|byte| byte & 0x0F),
+            Profile::P05 => payload.get(2).copied(),
+        }
+    }
+
+    /// Low nibble of the identifier's high byte, which 1C sends.
+    const fn id_nibble(&self) -> u8 {
+        self.data_id.to_be_bytes()[0] & 0x0F
+    }
+
+    /// CRC of profile 1 over everything but its own byte.
+    fn crc8(&self, payload: &[u8]) -> u8 {
+        let [high, low] = self.data_id.to_be_bytes();
+        let second = if self.profile == Profile::P01C { 0 } else { high };
+        crc8(crc8(0, &[low, second]), &payload[1..])
+    }
+
+    /// CRC of profile 5 over everything but its own bytes.
+    fn crc16(&self, payload: &[u8]) -> u16 {
+        crc16(crc16(0xFFFF, &payload[2..]), &self.data_id.to_le_bytes())
+    }
+}
+
+/// CRC-8 of each byte value, polynomial 0x1D.
+const CRC8: [u8; 256] = {
+    let mut table = [0; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let (mut crc, mut bit) = (byte as u8, 0);
+        while bit < 8 {
+            crc = if crc & 0x80 != 0 { crc << 1 ^ 0x1D } else { crc << 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
+    }
+    table
+};
+
+/// CRC-16 of each byte value, polynomial 0x1021.
+const CRC16: [u16; 256] = {
+    let mut table = [0; 256];
+    let mut byte = 0;
+    while byte < 256 {
+        let (mut crc, mut bit) = ((byte as u16) << 8, 0);
+        while bit < 8 {
+            crc = if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
+    }
+    table
+};
+
+fn crc8(start: u8, bytes: &[u8]) -> u8 {
+    bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)])
+}
+
+fn crc16(start: u16, bytes: &[u8]) -> u16 {
+    bytes.iter().fold(start, |crc, byte| {
+        let [high, low] = crc.to_be_bytes();
+        CRC16[usize::from(high ^ byte)] ^ u16::from(low) << 8
+    })
+}
+
+#[cfg(test)]
+mod tests;

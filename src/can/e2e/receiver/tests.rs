@@ -1,0 +1,199 @@
+//! Every pair of state and event, and runs of frames as a bus has them.
+
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+use super::*;
+
+const LAST: u8 = 7;
+
+/// Classes of state the receiver tells apart; LastValidCounter is 7 in all but the first.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum State {
+    /// WaitForFirstData.
+    Waiting,
+    /// Believed, nothing missed: the next call allows a step of 2.
+    Following,
+    /// The sequence broke and 2 more frames must show it.
+    Syncing,
+    /// More calls without a new frame than configured.
+    Silent,
+}
+
+/// What may come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum What {
+    NoFrame,
+    Short,
+    Damaged,
+    Invalid15,
+    Same,
+    Next,
+    OneLost,
+    TooFar,
+}
+
+const STATES: [State; 4] = [State::Waiting, State::Following, State::Syncing, State::Silent];
+const EVENTS: [What; 8] =
+    [What::NoFrame, What::Short, What::Damaged, What::Invalid15, What::Same, What::Next, What::OneLost, What::TooFar];
+
+fn config(profile: Profile, sync: u8) -> CheckConfig {
+    let protection = Protection { profile, data_id: 0x0123 };
+    CheckConfig { protection, max_delta_counter_init: 1, max_no_new_or_repeated_data: 3, sync_counter_init: sync }
+}
+
+fn in_state(state: State) -> Receiver {
+    let following = Receiver { last_valid: Some(LAST), max_delta: 1, ..Receiver::default() };
+    match state {
+        State::Waiting => Receiver::default(),
+        State::Following => following,
+        State::Syncing => Receiver { sync: 2, ..following },
+        State::Silent => Receiver { no_new_or_repeated: 4, max_delta: 5, ..following },
+    }
+}
+
+fn frame(config: &CheckConfig, counter: u8) -> [u8; 8] {
+    let mut payload = [0x55; 8];
+    config.protection.protect(&mut payload, counter).unwrap();
+    payload
+}
+
+fn happens(receiver: &mut Receiver, config: &CheckConfig, what: What) -> Status {
+    let counter = match what {
+        What::NoFrame => return receiver.no_new_data(config),
+        What::Short => return receiver.check(config, &[0]),
+        What::Damaged => {
+            let mut payload = frame(config, LAST + 1);
+            payload[5] ^= 1;
+            return receiver.check(config, &payload);
+        }
+        What::Invalid15 => return receiver.check(config, &counter_15(config)),
+        What::Same => LAST,
+        What::Next => LAST + 1,
+        What::OneLost => LAST + 2,
+        What::TooFar => LAST + 7,
+    };
+    receiver.check(config, &frame(config, counter))
+}
+
+/// In profile 1 the right CRC over an invalid counter (CRC found by trying); in profile 5, where 15 is a counter like
+/// any other, a frame of another message.
+fn counter_15(config: &CheckConfig) -> [u8; 8] {
+    let mut payload = frame(config, 14);
+    let other = Protection { data_id: 0x0456, ..config.protection };
+    match config.protection.profile {
+        Profile::P01A | Profile::P01C => {
+            payload[1] |= 0x0F;
+            payload[0] = config.protection.crc8(&payload);
+        }
+        Profile::P05 => other.protect(&mut payload, 15).unwrap(),
+    }
+    payload
+}
+
+/// What AUTOSAR's check says, `sync` = SyncCounterInit; and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated, Sync) after.
+fn wanted(state: State, what: What, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
+    use State::{Following, Silent, Syncing, Waiting};
+    use What::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
+    let before = in_state(state);
+    let (last, grown) = (before.last_valid, before.max_delta + 1);
+    let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
+    let at = |step: u8| Some(LAST + step);
+    // A silence too long asks for the synchronisation, and this frame is the first of it.
+    let left = sync.saturating_sub(1);
+    let after_silence = |otherwise| if sync > 0 { Status::Sync } else { otherwise };
+    match (state, what) {
+        (_, NoFrame) => (Status::NoNewData, (last, grown, repeated + 1, syncing)),
+        (_, Short | Damaged | Invalid15) => (Status::WrongCrc, (last, grown, repeated, syncing)),
+        (Waiting, Same) => (Status::Initial, (at(0), 1, 0, 0)),
+        (Waiting, Next) => (Status::Initial, (at(1), 1, 0, 0)),
+        (Waiting, OneLost) => (Status::Initial, (at(2), 1, 0, 0)),
+        (Waiting, TooFar) => (Status::Initial, (at(7), 1, 0, 0)),
+        (Following | Syncing | Silent, Same) => (Status::Repeated, (last, grown, repeated + 1, syncing)),
+        (Following, Next) => (Status::Ok, (at(1), 1, 0, 0)),
+        (Following, OneLost) => (Status::OkSomeLost, (at(2), 1, 0, 0)),
+        (Syncing, Next) => (Status::Sync, (at(1), 1, 0, 1)),
+        (Syncing, OneLost) => (Status::Sync, (at(2), 1, 0, 1)),
+        (Silent, Next) => (after_silence(Status::Ok), (at(1), 1, 0, left)),
+        (Silent, OneLost) => (after_silence(Status::OkSomeLost), (at(2), 1, 0, left)),
+        (Following | Syncing | Silent, TooFar) if sync > 0 => (Status::WrongSequence, (at(7), 1, 0, sync)),
+        (Following | Syncing | Silent, TooFar) => (Status::WrongSequence, (last, grown, 0, 0)),
+    }
+}
+
+#[test]
+fn every_pair_of_state_and_event_is_as_in_the_standard() {
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        for (sync, state, what) in [0, 2]
+            .into_iter()
+            .flat_map(|sync| STATES.map(|state| (sync, state)))
+            .flat_map(|(s, t)| EVENTS.map(|e| (s, t, e)))
+        {
+            let mut receiver = in_state(state);
+            let status = happens(&mut receiver, &config(profile, sync), what);
+            let after = (receiver.last_valid, receiver.max_delta, receiver.no_new_or_repeated, receiver.sync);
+            assert_eq!((status, after), wanted(state, what, sync), "{profile:?} {state:?} {what:?}, sync {sync}");
+            assert_eq!((receiver.counts().get(status), receiver.counts().total()), (1, 1));
+        }
+    }
+}
+
+#[test]
+fn lost_frames_are_counted_up_to_the_allowed_step() {
+    let config = CheckConfig { max_delta_counter_init: 3, ..config(Profile::P01A, 0) };
+    for (step, status, lost) in [(1, Status::Ok, 0), (4, Status::OkSomeLost, 3), (5, Status::WrongSequence, 0)] {
+        let mut receiver = Receiver { last_valid: Some(13), max_delta: 3, ..Receiver::default() };
+        let counter = (13 + step) % 15;
+        assert_eq!(receiver.check(&config, &frame(&config, counter)), status, "{step} steps, over the end");
+        assert_eq!(receiver.lost(), lost);
+    }
+}
+
+#[test]
+fn without_a_synchronisation_the_allowed_step_grows_to_the_sender() {
+    let config = config(Profile::P05, 0);
+    let mut receiver = Receiver { last_valid: Some(250), max_delta: 1, ..Receiver::default() };
+    // The sender is 8 ahead and goes on by 1 a frame, the allowed step by 1 too: it never catches up while frames
+    // come one by one, and does once the sender has gone round.
+    let statuses: Vec<_> = (0..256).map(|n| receiver.check(&config, &frame(&config, (258 + n) as u8))).collect();
+    let believed = statuses.iter().position(|status| status.is_usable()).unwrap();
+    assert!(statuses[..believed].iter().all(|status| matches!(status, Status::WrongSequence | Status::Repeated)));
+    assert_eq!(statuses[believed], Status::Ok, "one after the last believed counter, a whole turn later");
+    assert!(statuses[believed..].iter().all(|status| *status == Status::Ok));
+}
+
+#[test]
+fn with_a_synchronisation_a_jump_costs_as_many_frames_as_configured() {
+    let config = config(Profile::P01C, 2);
+    let mut receiver = in_state(State::Following);
+    let statuses = [14, 0, 1, 2].map(|counter| receiver.check(&config, &frame(&config, counter)));
+    assert_eq!(statuses, [Status::WrongSequence, Status::Sync, Status::Sync, Status::Ok]);
+}
+
+#[test]
+fn silence_without_end_stays_in_range() {
+    for profile in [Profile::P01A, Profile::P05] {
+        let config = CheckConfig::new(config(profile, 0).protection);
+        let mut receiver = in_state(State::Following);
+        (0..1000).for_each(|_| assert_eq!(receiver.no_new_data(&config), Status::NoNewData));
+        assert_eq!((receiver.no_new_or_repeated, receiver.max_delta), (14, profile.max_counter()));
+        assert_eq!(receiver.check(&config, &frame(&config, 3)), Status::OkSomeLost, "any counter but the last");
+    }
+}
+
+#[test]
+fn a_restart_waits_for_a_first_frame_and_keeps_the_counts() {
+    let config = config(Profile::P01A, 0);
+    let mut receiver = in_state(State::Following);
+    assert_eq!(receiver.check(&config, &frame(&config, 8)), Status::Ok);
+    receiver.restart();
+    assert_eq!(receiver.check(&config, &frame(&config, 9)), Status::Initial);
+    assert_eq!((receiver.counts().get(Status::Ok), receiver.counts().get(Status::Initial)), (1, 1));
+}
+
+#[test]
+fn statuses_are_numbered_and_named_as_they_are_written() {
+    for (number, status) in Status::ALL.into_iter().enumerate() {
+        assert_eq!(status as usize, number);
+        assert_eq!(serde_json::to_string(&status).unwrap(), format!("\"{}\"", status.name()));
+    }
+}

@@ -1,0 +1,160 @@
+//! Vectors, and what holds for any payload.
+
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+use proptest::prelude::*;
+
+use super::*;
+
+const PROFILES: [Profile; 3] = [Profile::P01A, Profile::P01C, Profile::P05];
+
+fn protected(profile: Profile, data_id: u16, payload: &[u8], counter: u8) -> Vec<u8> {
+    let mut payload = payload.to_vec();
+    Protection { profile, data_id }.protect(&mut payload, counter).unwrap();
+    payload
+}
+
+#[test]
+fn crcs_give_the_published_check_values() {
+    assert_eq!(crc8(0, b"123456789"), 0x37);
+    assert_eq!(crc16(0xFFFF, b"123456789"), 0x29B1);
+    // The library's CRC-8 SAE J1850 starts from 0xFF and inverts its result.
+    assert_eq!(crc8(0xFF, b"123456789") ^ 0xFF, 0x4B);
+}
+
+#[test]
+fn profile_1a_gives_the_vectors() {
+    assert_eq!(protected(Profile::P01A, 0x0123, &[0; 8], 0), [0xCC, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(protected(Profile::P01A, 0x0123, &[0; 8], 1), [0x91, 1, 0, 0, 0, 0, 0, 0]);
+    let upper_nibble_kept = protected(Profile::P01A, 0x0123, &[0xFF, 0xF5, 0, 0, 0, 0, 0, 0], 0);
+    assert_eq!(upper_nibble_kept, [0x65, 0xF0, 0, 0, 0, 0, 0, 0]);
+}
+
+#[test]
+fn profile_1c_gives_the_vectors() {
+    assert_eq!(protected(Profile::P01C, 0x0123, &[0; 8], 0), [0x2A, 0x10, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(protected(Profile::P01C, 0x0123, &[0xFF, 0xFF, 0, 0, 0, 0, 0, 0], 1), [0x77, 0x11, 0, 0, 0, 0, 0, 0]);
+}
+
+#[test]
+fn profile_5_gives_the_vector() {
+    assert_eq!(protected(Profile::P05, 0x1234, &[0; 8], 0), [0x1C, 0xCA, 0, 0, 0, 0, 0, 0]);
+}
+
+#[test]
+fn counters_run_over_where_the_profile_says() {
+    for (profile, last) in [(Profile::P01A, 14), (Profile::P01C, 14), (Profile::P05, 255)] {
+        assert_eq!((profile.next_counter(0), profile.next_counter(last - 1), profile.next_counter(last)), (1, last, 0));
+        assert_eq!(profile.counter_delta(last, 0), 1);
+        assert_eq!(profile.counter_delta(5, 4), last);
+    }
+    assert_eq!(Profile::P01A.next_counter(15), 0, "an invalid counter leads to a valid one");
+}
+
+#[test]
+fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
+    for profile in PROFILES {
+        let protection = Protection { profile, data_id: 1 };
+        let needed = profile.header_bytes();
+        for found in 0..needed {
+            let mut short = vec![0xAA; found];
+            assert_eq!(protection.protect(&mut short, 0), Err(ProtectError::Short { found, needed }));
+            assert_eq!(short, vec![0xAA; found]);
+            assert_eq!(protection.verified_counter(&short), None);
+        }
+        assert_eq!(protection.protect(&mut vec![0; needed], 0), Ok(()), "the header alone can be protected");
+    }
+    let mut payload = [0xAA; 8];
+    let protection = Protection { profile: Profile::P01A, data_id: 1 };
+    assert_eq!(protection.protect(&mut payload, 15), Err(ProtectError::Counter { found: 15, max: 14 }));
+    assert_eq!(payload, [0xAA; 8]);
+}
+
+#[test]
+fn counter_15_of_profile_1_is_refused_although_its_crc_is_right() {
+    let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
+    let mut payload = [0; 8];
+    payload[1] = 15;
+    payload[0] = protection.crc8(&payload);
+    assert_eq!((protection.counter(&payload), protection.verified_counter(&payload)), (Some(15), None));
+}
+
+#[test]
+fn the_nibble_of_the_identifier_sent_by_1c_is_compared() {
+    let (sender, receiver) = (0x0123, Protection { profile: Profile::P01C, data_id: 0x0223 });
+    assert_eq!(receiver.verified_counter(&protected(Profile::P01C, sender, &[0; 8], 3)), None, "the CRCs are equal");
+}
+
+#[test]
+fn profiles_are_written_as_in_a_configuration() {
+    for profile in PROFILES {
+        assert_eq!(serde_json::to_string(&profile).unwrap(), format!("\"{}\"", profile.name()));
+    }
+}
+
+#[test]
+fn the_mask_is_what_protect_writes() {
+    for profile in PROFILES {
+        let mut written = [0_u8; 64];
+        for (counter, data_id) in
+            (0..=profile.max_counter()).flat_map(|counter| (0..32).map(move |n| (counter, n * 2111)))
+        {
+            for fill in [0x00, 0xFF] {
+                let before = [fill; 64];
+                let after = protected(profile, data_id, &before, counter);
+                written.iter_mut().zip(before.iter().zip(&after)).for_each(|(w, (b, a))| *w |= b ^ a);
+            }
+        }
+        assert_eq!(written[..3], profile.header_mask());
+        assert!(written[3..].iter().all(|byte| *byte == 0));
+        assert_eq!(profile.header_bits(), 8 * profile.header_mask().iter().filter(|byte| **byte != 0).count());
+    }
+}
+
+fn any_protection() -> impl Strategy<Value = Protection> {
+    (prop::sample::select(PROFILES.to_vec()), any::<u16>())
+        .prop_map(|(profile, data_id)| Protection { profile, data_id })
+}
+
+proptest! {
+    #[test]
+    fn what_is_protected_is_verified_and_one_wrong_bit_is_not(
+        protection in any_protection(),
+        mut payload in prop::collection::vec(any::<u8>(), 3..=30),
+        counter: u8,
+        bit: prop::sample::Index,
+    ) {
+        let counter = counter % protection.profile.max_counter();
+        protection.protect(&mut payload, counter).unwrap();
+        prop_assert_eq!(protection.verified_counter(&payload), Some(counter));
+        let bit = bit.index(payload.len() * 8);
+        payload[bit / 8] ^= 1 << (bit % 8);
+        prop_assert_eq!(protection.verified_counter(&payload), None);
+    }
+
+    #[test]
+    fn another_messages_payload_is_not_accepted(
+        data_id: u16, bit in 0_u32..16, mut payload in prop::collection::vec(any::<u8>(), 3..=30),
+    ) {
+        for profile in PROFILES {
+            if profile == Profile::P01C && bit >= 12 {
+                continue; // 1C has no place for these
+            }
+            Protection { profile, data_id }.protect(&mut payload, 0).unwrap();
+            let other = Protection { profile, data_id: data_id ^ 1 << bit };
+            prop_assert_eq!(other.verified_counter(&payload), None);
+        }
+    }
+
+    #[test]
+    fn any_bytes_get_a_status(
+        protection in any_protection(),
+        payloads in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..=64), 0..40),
+    ) {
+        let (config, mut receiver) = (CheckConfig::new(protection), Receiver::default());
+        for payload in &payloads {
+            receiver.check(&config, payload);
+        }
+        prop_assert_eq!(receiver.counts().total(), payloads.len() as u64);
+    }
+}

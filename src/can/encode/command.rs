@@ -1,0 +1,236 @@
+//! The command frame, received: another ECU acknowledges or clears alarms, or says that the pack was replaced.
+//!
+//! In: a frame that the caller has checked against its end-to-end protection. Out: what is asked, "all" as `None`. A
+//! code that has no meaning is refused: a command that is understood in part is not carried out in part.
+
+use super::layout::LaidOut;
+use super::output::{PlanFaults, RULES};
+use crate::can::dbc::{Database, Message};
+use crate::can::e2e::Protection;
+use crate::can::signal::SignalPlan;
+use crate::can::{CanId, Frame, FrameKind};
+use crate::quantity::{CellIndex, MAX_CELLS};
+
+/// What is asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Command {
+    /// Note has been taken of alarms.
+    Acknowledge,
+    /// Latched alarms end, as far as their cause has.
+    Clear,
+    /// Another pack is in the vehicle.
+    PackReplaced,
+}
+
+/// A command, and the alarms it is about; `None` = all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CommandFields {
+    /// What to do.
+    pub command: Command,
+    /// Number of the rule.
+    pub rule: Option<u8>,
+    /// 1 info, 2 warning, 3 severe.
+    pub severity: Option<u8>,
+    /// The cell.
+    pub cell: Option<CellIndex>,
+}
+
+/// Why a frame is not a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum CommandFault {
+    /// Another message, or a remote request.
+    #[error("is not the command message")]
+    OtherMessage,
+    /// Too short.
+    #[error("has {found} bytes, must have {allowed}")]
+    Short {
+        /// Bytes it has.
+        found: usize,
+        /// Bytes it must have.
+        allowed: usize,
+    },
+    /// A code without meaning.
+    #[error("{signal} is {code}, which has no meaning")]
+    Meaningless {
+        /// Name of the signal.
+        signal: &'static str,
+        /// Its code.
+        code: u64,
+    },
+}
+
+/// How to read the command frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommandPlan {
+    id: CanId,
+    len: usize,
+    protection: Option<Protection>,
+    command: SignalPlan,
+    rule: Selector,
+    severity: Selector,
+    cell: Selector,
+}
+
+/// A signal that says which alarms.
+#[derive(Debug, Clone, PartialEq)]
+struct Selector {
+    name: &'static str,
+    plan: SignalPlan,
+    /// The code that says all of them.
+    all: Option<u64>,
+    /// Other codes that have a meaning.
+    codes: std::ops::RangeInclusive<u64>,
+}
+
+impl CommandPlan {
+    /// Finds the message and its signals.
+    ///
+    /// # Errors
+    /// All that is missing or cannot be read, by name.
+    pub fn new(database: &Database) -> Result<Self, PlanFaults> {
+        let name = LaidOut::Command.message();
+        let message = database.message(name).ok_or_else(|| PlanFaults(vec![format!("message {name} is missing")]))?;
+        let mut faults = Vec::new();
+        let command = signal(message, "Command", &mut faults).map(|(plan, _)| plan);
+        let most_cells = u64::try_from(MAX_CELLS).unwrap_or(u64::MAX);
+        let last_rule = u64::try_from(RULES.len()).unwrap_or(u64::MAX);
+        let rule = Selector::new(message, "Rule", 1..=last_rule, &mut faults);
+        let severity = Selector::new(message, "Severity", 1..=3, &mut faults);
+        let cell = Selector::new(message, "Cell", 0..=most_cells - 1, &mut faults);
+        match (command, rule, severity, cell) {
+            (Some(command), Some(rule), Some(severity), Some(cell)) => {
+                let (id, len) = (message.id, usize::from(message.len_bytes));
+                Ok(Self { id, len, protection: message.e2e, command, rule, severity, cell })
+            }
+            _ => Err(PlanFaults(faults)),
+        }
+    }
+
+    /// Identifier of the message.
+    pub fn id(&self) -> CanId {
+        self.id
+    }
+
+    /// End-to-end protection the frame must have.
+    pub fn protection(&self) -> Option<Protection> {
+        self.protection
+    }
+
+    /// What the frame asks. Its protection is not looked at.
+    ///
+    /// # Errors
+    /// When it is another message, too short, or has a code without meaning.
+    pub fn decode(&self, frame: &Frame) -> Result<CommandFields, CommandFault> {
+        if frame.id() != self.id || frame.kind() == FrameKind::Remote {
+            return Err(CommandFault::OtherMessage);
+        }
+        let payload = frame.data();
+        let short = CommandFault::Short { found: payload.len(), allowed: self.len };
+        if payload.len() < self.len {
+            return Err(short);
+        }
+        let command = match self.command.raw(payload).map_err(|_| short)? {
+            1 => Command::Acknowledge,
+            2 => Command::Clear,
+            3 => Command::PackReplaced,
+            code => return Err(CommandFault::Meaningless { signal: "Command", code }),
+        };
+        Ok(CommandFields {
+            command,
+            rule: self.rule.read(payload, short)?.and_then(|code| u8::try_from(code).ok()),
+            severity: self.severity.read(payload, short)?.and_then(|code| u8::try_from(code).ok()),
+            cell: self.cell.read(payload, short)?.and_then(|code| u16::try_from(code).ok()).map(CellIndex),
+        })
+    }
+}
+
+impl Selector {
+    fn new(
+        message: &Message,
+        name: &'static str,
+        codes: std::ops::RangeInclusive<u64>,
+        faults: &mut Vec<String>,
+    ) -> Option<Self> {
+        let (plan, all) = signal(message, name, faults)?;
+        Some(Self { name, plan, all, codes })
+    }
+
+    fn read(&self, payload: &[u8], short: CommandFault) -> Result<Option<u64>, CommandFault> {
+        let code = self.plan.raw(payload).map_err(|_| short)?;
+        match code {
+            code if Some(code) == self.all => Ok(None),
+            code if self.codes.contains(&code) => Ok(Some(code)),
+            code => Err(CommandFault::Meaningless { signal: self.name, code }),
+        }
+    }
+}
+
+/// A signal that is always there, and the code its value table calls "all".
+fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(SignalPlan, Option<u64>)> {
+    let mut fault = |what: String| faults.push(format!("signal {}.{name}{what}", message.name));
+    let Some(signal) = message.signal(name) else {
+        fault(" is missing".to_owned());
+        return None;
+    };
+    let all = signal.values.iter().find(|(_, word)| word == "all").and_then(|(code, _)| u64::try_from(*code).ok());
+    match signal.layout.plan() {
+        Ok(_) if !signal.multiplex.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
+        Ok(plan) if plan.bytes_needed() > usize::from(message.len_bytes) => {
+            fault(format!(": reaches past the message's {} bytes", message.len_bytes));
+        }
+        Ok(plan) => return Some((plan, all)),
+        Err(error) => fault(format!(": {error}")),
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::can::encode::{Base, LayoutSettings, MessageSettings, layout};
+
+    fn plan() -> CommandPlan {
+        let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
+        CommandPlan::new(&layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap()
+    }
+
+    /// Codes of command, rule, severity and cell in a frame.
+    fn frame(codes: [u64; 4]) -> Frame {
+        let bits = codes[0] << 16 | codes[1] << 20 | codes[2] << 25 | codes[3] << 27;
+        Frame::classic(CanId::Standard(1715), &bits.to_le_bytes()).unwrap()
+    }
+
+    #[test]
+    fn a_command_says_what_and_which_alarms() {
+        let fields = plan().decode(&frame([2, 14, 3, 95])).unwrap();
+        let wanted =
+            CommandFields { command: Command::Clear, rule: Some(14), severity: Some(3), cell: Some(CellIndex(95)) };
+        assert_eq!(fields, wanted);
+        let all = plan().decode(&frame([1, 31, 0, 2047])).unwrap();
+        let wanted = CommandFields { command: Command::Acknowledge, rule: None, severity: None, cell: None };
+        assert_eq!(all, wanted);
+        assert_eq!(plan().decode(&frame([3, 31, 0, 2047])).unwrap().command, Command::PackReplaced);
+    }
+
+    #[test]
+    fn a_code_without_meaning_is_refused() {
+        for (codes, signal, code) in [
+            ([0, 31, 0, 2047], "Command", 0),
+            ([4, 31, 0, 2047], "Command", 4),
+            ([1, 0, 0, 2047], "Rule", 0),
+            ([1, 15, 0, 2047], "Rule", 15),
+            ([1, 31, 0, 1024], "Cell", 1024),
+        ] {
+            assert_eq!(plan().decode(&frame(codes)), Err(CommandFault::Meaningless { signal, code }));
+        }
+    }
+
+    #[test]
+    fn another_message_and_a_short_one_are_refused() {
+        let other = Frame::classic(CanId::Standard(1714), &[0xFF; 8]).unwrap();
+        assert_eq!(plan().decode(&other), Err(CommandFault::OtherMessage));
+        assert_eq!(plan().decode(&Frame::remote(CanId::Standard(1715), 8).unwrap()), Err(CommandFault::OtherMessage));
+        let short = Frame::classic(CanId::Standard(1715), &[0; 7]).unwrap();
+        assert_eq!(plan().decode(&short), Err(CommandFault::Short { found: 7, allowed: 8 }));
+    }
+}

@@ -1,0 +1,201 @@
+//! A message of a layout, ready to be filled: signals, codes for "not available", pages, protection.
+
+use crate::can::dbc::{Database, FrameFormat, Message, Signal};
+use crate::can::e2e::Protection;
+use crate::can::signal::{SignalPlan, ValueType};
+use crate::can::{CanId, Frame, MAX_DATA};
+
+use super::layout::HEADER_SIGNALS;
+use super::{fd_frame, is_frame_length};
+
+/// How to make the frames of a message.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct MessagePlan {
+    pub(super) id: CanId,
+    pub(super) format: FrameFormat,
+    pub(super) protection: Option<Protection>,
+    pub(super) cycle_time_ms: Option<u32>,
+    len: usize,
+    fields: Vec<Field>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+struct Field {
+    name: String,
+    plan: SignalPlan,
+    not_available: u64,
+    /// 100 where the DBC's unit is %.
+    per_inside_unit: f64,
+    /// Codes of the message's multiplexor for which the signal is there; empty = always.
+    pages: Vec<(u64, u64)>,
+    is_multiplexor: bool,
+}
+
+impl MessagePlan {
+    /// The message of that name, with all `required` signals.
+    pub(super) fn new(database: &Database, name: &str, required: &[&str], faults: &mut Vec<String>) -> Option<Self> {
+        let Some(message) = database.message(name) else {
+            faults.push(format!("message {name} is missing"));
+            return None;
+        };
+        check_length(message, faults);
+        for signal in required.iter().filter(|signal| message.signal(signal).is_none()) {
+            faults.push(format!("signal {name}.{signal} is missing"));
+        }
+        let of_the_header = |signal: &&Signal| HEADER_SIGNALS.contains(&signal.name.as_str());
+        let fields = message.signals.iter().filter(|signal| !of_the_header(signal)).filter_map(|signal| {
+            Field::new(message, signal)
+                .map_err(|fault| faults.push(format!("signal {name}.{}: {fault}", signal.name)))
+                .ok()
+        });
+        let fields: Vec<_> = fields.collect();
+        check_pages(name, &fields, faults);
+        Some(Self {
+            id: message.id,
+            format: message.format,
+            protection: message.e2e,
+            cycle_time_ms: message.cycle_time_ms,
+            len: usize::from(message.len_bytes),
+            fields,
+        })
+    }
+
+    /// Every rule must have its value and its threshold, on its own page and on no other rule's.
+    pub(super) fn check_rules(&self, rules: &[&str], faults: &mut Vec<String>) {
+        if self.fields.iter().any(|field| field.name == "Rule" && !field.is_multiplexor) {
+            faults.push("signal PACKWATCH_Alarm.Rule must be the multiplexor (M)".to_owned());
+        }
+        for (number, rule) in (1..).zip(rules) {
+            for name in [format!("Value_{rule}"), format!("Threshold_{rule}")] {
+                let Some(field) = self.fields.iter().find(|field| field.name == name) else {
+                    faults.push(format!("signal PACKWATCH_Alarm.{name} is missing"));
+                    continue;
+                };
+                let found: Vec<_> = (1..).take(rules.len()).filter(|page| field.is_on(*page)).collect();
+                if found != [number] {
+                    faults.push(format!(
+                        "signal PACKWATCH_Alarm.{name} is there for the rules {found:?}, must be for {number} alone"
+                    ));
+                }
+            }
+        }
+    }
+
+    /// First selector code of every page; a message without pages has the one page 0.
+    pub(super) fn page_codes(&self) -> Vec<u64> {
+        let mut codes: Vec<_> = self.fields.iter().filter_map(|field| Some(field.pages.first()?.0)).collect();
+        codes.sort_unstable();
+        codes.dedup();
+        if codes.is_empty() { vec![0] } else { codes }
+    }
+
+    /// A frame of the page, with what `value` gives each signal. `counter` is the protection's next, and moves on.
+    pub(super) fn frame(&self, page: u64, counter: &mut u8, value: impl Fn(&str) -> Option<f64>) -> Frame {
+        let mut payload = [0; MAX_DATA];
+        for field in self.fields.iter().filter(|field| field.is_on(page)) {
+            let code =
+                if field.is_multiplexor { page.min(field.plan.all_ones()) } else { field.code(value(&field.name)) };
+            // Cannot fail: the plan was checked against the message's length, and the code fits the signal.
+            let _ = field.plan.encode_raw(&mut payload, code);
+        }
+        if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.len)) {
+            // Taken up from a snapshot of another profile it may be beyond this one's last.
+            let now = (*counter).min(protection.profile.max_counter());
+            // Cannot fail: length and data id were checked when the plan was made.
+            let _ = protection.protect(payload, now);
+            *counter = protection.profile.next_counter(now);
+        }
+        let frame = match self.format {
+            FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
+            FrameFormat::Fd { brs } => fd_frame(self.id, brs, self.len, &payload),
+        };
+        frame.unwrap_or_else(|| empty_frame(self.id))
+    }
+}
+
+/// The message must fit into its frames, and its protection into the message.
+fn check_length(message: &Message, faults: &mut Vec<String>) {
+    let (name, len) = (&message.name, usize::from(message.len_bytes));
+    if len > MAX_DATA {
+        faults.push(format!("message {name}: {len} bytes, must be at most {MAX_DATA}"));
+    } else if len > 8 && message.format == FrameFormat::Classic {
+        faults.push(format!("message {name}: {len} bytes, must be at most 8 in classic frames"));
+    }
+    let Some(Protection { profile, data_id }) = message.e2e else { return };
+    let (least, most) = (profile.header_bytes(), profile.max_bytes());
+    if !(least..=most).contains(&len) || !is_frame_length(len) || data_id > profile.max_data_id() {
+        let (word, largest) = (profile.name(), profile.max_data_id());
+        faults.push(format!(
+            "message {name}: {len} bytes and data id {data_id}, must be a frame's length of {least} to {most} and at most \
+             {largest} with protection {word}"
+        ));
+    }
+}
+
+/// The multiplexor must be able to say every page, or a page would go out under another one's number.
+fn check_pages(message: &str, fields: &[Field], faults: &mut Vec<String>) {
+    for selector in fields.iter().filter(|field| field.is_multiplexor) {
+        let highest = selector.plan.all_ones();
+        for field in fields.iter().filter(|field| field.pages.iter().any(|(first, _)| *first > highest)) {
+            let (name, selector) = (&field.name, &selector.name);
+            faults
+                .push(format!("signal {message}.{name} is on a page above {highest}, the highest {selector} can say"));
+        }
+    }
+}
+
+/// Never sent: lengths were checked when the plan was made.
+fn empty_frame(id: CanId) -> Frame {
+    Frame::classic(id, &[]).expect("a classic frame may be empty")
+}
+
+impl Field {
+    fn new(message: &Message, signal: &Signal) -> Result<Self, String> {
+        let plan = signal.layout.plan().map_err(|fault| fault.to_string())?;
+        if plan.bytes_needed() > usize::from(message.len_bytes) {
+            return Err(format!("reaches past the message's {} bytes", message.len_bytes));
+        }
+        let pages = match signal.multiplex.conditions.as_slice() {
+            [] => Vec::new(),
+            [condition] => condition.ranges.clone(),
+            _ => return Err("nested multiplexing, must be one multiplexor".to_owned()),
+        };
+        let customary = match plan.value_type() {
+            ValueType::Unsigned => plan.all_ones(),
+            ValueType::Signed => 1 << (plan.length_bits() - 1),
+            ValueType::Float32 => u64::from(f32::NAN.to_bits()),
+            ValueType::Float64 => f64::NAN.to_bits(),
+        };
+        Ok(Self {
+            name: signal.name.clone(),
+            plan,
+            not_available: signal.not_available_codes().first().copied().unwrap_or(customary),
+            per_inside_unit: if signal.unit == "%" { 100.0 } else { 1.0 },
+            pages,
+            is_multiplexor: signal.is_multiplexor,
+        })
+    }
+
+    fn is_on(&self, page: u64) -> bool {
+        self.pages.is_empty() || self.pages.iter().any(|(low, high)| (*low..=*high).contains(&page))
+    }
+
+    fn code(&self, value: Option<f64>) -> u64 {
+        let code = value.and_then(|value| self.plan.code(value * self.per_inside_unit));
+        match code {
+            None => self.not_available,
+            // One bit cannot spare a code.
+            Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.beside(code),
+            Some(code) => code,
+        }
+    }
+
+    /// The code next to one that is taken: one below, or above where there is none below.
+    fn beside(&self, taken: u64) -> u64 {
+        let lowest = match self.plan.value_type() {
+            ValueType::Signed => 1 << (self.plan.length_bits() - 1),
+            ValueType::Unsigned | ValueType::Float32 | ValueType::Float64 => 0,
+        };
+        if taken == lowest { taken + 1 } else { taken.wrapping_sub(1) & self.plan.all_ones() }
+    }
+}
