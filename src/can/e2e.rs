@@ -18,7 +18,9 @@
 //!
 //! Deviation 1: profile 5 has no SYNC and INITIAL of its own in AUTOSAR (the state machine above it makes them). Here the
 //! receiver of profile 1 runs for it too, with the counter modulo 256: the same words and the same counts for both
-//! profiles; a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK.
+//! profiles. Effect: a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK; and
+//! its allowed step grows while frames are missed. As in AUTOSAR's own check of profile 5, a counter that jumped too far
+//! is gone on from (a sender that restarted costs one frame, not a turn of 256).
 //! Deviation 2: what a receiver may be told about repetitions (`max_no_new_or_repeated_data`) ends at 14 for both
 //! profiles, where it means "any number".
 //! Deviation 3: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
