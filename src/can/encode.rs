@@ -6,9 +6,11 @@
 
 mod input;
 mod output;
+mod protector;
 
 pub use input::InputEncoder;
 pub use output::{AlarmFields, HealthFields, IdOverrides, OutputPlan, PlanFaults, StatusFields, default_database};
+pub use protector::InputProtector;
 
 use crate::can::{CanId, Frame, MAX_DATA};
 

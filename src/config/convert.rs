@@ -1,13 +1,18 @@
 //! Keys as written to the settings the other modules take. One line per key.
 
+use std::num::NonZeroU32;
+
 use super::document::{Document, Faults};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output, Pack,
-    PackVoltageInput, Recharge, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    PackVoltageInput, ProtectedInput, Recharge, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable,
+    VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::alarm::{Rule, RuleConfig};
 use crate::can::decode::InputMap;
+use crate::can::flood::FloodConfig;
+use crate::can::guard::GuardConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::monitor::{MonitorConfig, OutputConfig};
@@ -33,6 +38,7 @@ pub(crate) struct Raw {
     /// Whether `[input.cell_voltage]` and `[input.pack_voltage]` are written, faulty or not.
     pub(crate) voltages_written: (bool, bool),
     pub(crate) temperatures: Vec<TemperatureInput>,
+    pub(crate) protected: Vec<ProtectedInput>,
     pub(crate) current_limits: Option<CurrentLimits>,
     pub(crate) voltage_limits: Option<VoltageLimits>,
     pub(crate) temperature_limits: Option<TemperatureLimits>,
@@ -65,6 +71,7 @@ impl Raw {
             cell_voltage: walk.optional(),
             pack_voltage: walk.optional(),
             temperatures: walk.many(),
+            protected: walk.many(),
             current_limits: walk.one(),
             voltage_limits: walk.one(),
             temperature_limits: walk.one(),
@@ -87,6 +94,7 @@ pub(crate) fn monitor(
     mut model: CellModel,
     found: &Ranges,
     input: InputMap,
+    guards: Vec<GuardConfig>,
     output: Option<OutputConfig>,
 ) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
@@ -95,6 +103,8 @@ pub(crate) fn monitor(
     let rules: Option<Vec<_>> = raw.alarms.iter().map(|alarm| rule(alarm, rated_ah)).collect();
     Some(MonitorConfig {
         input,
+        guards,
+        flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
