@@ -22,7 +22,8 @@ pub(crate) fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faul
         let inputs: Vec<_> = inputs.collect();
         let Some(first) = inputs.first() else {
             if inputs_whole {
-                not_an_input(keys, found, faults);
+                let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
+                not_an_input(keys, there, faults);
             }
             continue;
         };
@@ -73,9 +74,9 @@ fn check_profile(keys: &ProtectedInput, faults: &mut Faults) {
     }
 }
 
-fn not_an_input(keys: &ProtectedInput, found: &[Resolved<'_>], faults: &mut Faults) {
+fn not_an_input<'n>(keys: &ProtectedInput, there: impl Iterator<Item = &'n str>, faults: &mut Faults) {
     let what = "must be the message of a configured input on its interface";
-    let hint = did_you_mean(&keys.message, found.iter().map(|input| input.message.name.as_str()));
+    let hint = did_you_mean(&keys.message, there);
     keys.place.fault(faults, "message", &format!("{what}{hint}"));
 }
 
@@ -159,3 +160,6 @@ pub(crate) fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
     }
     words
 }
+
+#[cfg(test)]
+mod tests;
