@@ -16,7 +16,7 @@ MODES = {"1A": E2E_P01_DATAID_BOTH, "1C": E2E_P01_DATAID_NIBBLE}
 
 
 def answer(profile, data_id, raw, ours, flipped):
-    peer = bytearray(raw)
+    peer = bytearray(raw)  # changed in place; the check of profile 1 wants what can be changed too
     if profile == "5":
         e2e_p05_protect(peer, data_id)
         accepted = [e2e_p05_check(payload, data_id) for payload in (ours, flipped)]
@@ -25,7 +25,7 @@ def answer(profile, data_id, raw, ours, flipped):
         accepted = [e2e_p01_check(payload, data_id, data_id_mode=MODES[profile]) for payload in (ours, flipped)]
     words = [peer.hex(), *("01"[a] for a in accepted)]
     if profile == "5" and len(raw) >= 4:
-        with_counter = bytes(raw[:2]) + ours[2:3] + bytes(raw[3:])
+        with_counter = raw[:2] + ours[2:3] + raw[3:]
         words.append(apply_profile5_crc(with_counter, data_id).hex())
         words += ["01"[check_profile5_crc(payload, data_id)] for payload in (ours, flipped)]
     return " ".join(words)
@@ -33,4 +33,4 @@ def answer(profile, data_id, raw, ours, flipped):
 
 for line in sys.stdin:
     profile, data_id, *payloads = line.split()
-    print(answer(profile, int(data_id), *(bytes.fromhex(payload) for payload in payloads)))
+    print(answer(profile, int(data_id), *(bytearray.fromhex(payload) for payload in payloads)))
