@@ -154,7 +154,8 @@ impl InputMap {
         }
     }
 
-    /// Every configured message, by interface and identifier, with the number of its multiplexer pages (1 without any).
+    /// Every configured message, by interface and identifier, with the number of its groups of signals that
+    /// come together: its multiplexer pages, or a few more; 1 without any.
     pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
         let first = |runs: &Range<usize>| &self.bindings[self.runs[runs.start].start];
         self.messages.iter().flatten().map(move |(id, runs)| (first(runs).bus, *id, runs.len()))
