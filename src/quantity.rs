@@ -123,6 +123,8 @@ pub enum Channel {
 pub enum Fault {
     /// The frame carries fewer bytes than the signal needs.
     ShortFrame,
+    /// Its frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
+    EndToEnd,
     /// The sender said "signal not available".
     NotAvailable,
     /// NaN or infinite on the wire (IEEE float signals).

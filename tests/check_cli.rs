@@ -92,7 +92,7 @@ fn all_faults_of_all_files_are_told_and_the_exit_code_is_78() {
     let at = |name: &str, line: usize| format!("{}:{line}: ", folder.path().join(name).display());
     let beginnings = [
         at("pack.toml", 1) + "interface is missing, must be at least one table [[interface]]",
-        at("pack.toml", 1) + "input.current.signal is missing",
+        at("pack.toml", 4) + "input.current.signal is missing",
         at("pack.toml", 2) + "pack.cells = 0, must be 1 to 1024",
         at("pack.toml", 6) + "input.speed is not a known key",
         at("cell.toml", 1) + "tables.soc is missing",

@@ -1,14 +1,18 @@
 //! Keys as written to the settings the other modules take. One line per key.
 
+use std::num::NonZeroU32;
+
 use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output,
-    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, Recharge, ReportedSocInput, ReportedSohInput,
-    SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge, ReportedSocInput,
+    ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::can::decode::InputMap;
+use crate::can::flood::FloodConfig;
+use crate::can::guard::GuardConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::monitor::{MonitorConfig, OutputConfig};
@@ -38,6 +42,7 @@ pub(crate) struct Raw {
     pub(crate) reported_soh: Option<ReportedSohInput>,
     /// Whether one of the two is written, faulty or not.
     pub(crate) reported_written: bool,
+    pub(crate) protected: Vec<ProtectedInput>,
     pub(crate) current_limits: Option<CurrentLimits>,
     pub(crate) voltage_limits: Option<VoltageLimits>,
     pub(crate) temperature_limits: Option<TemperatureLimits>,
@@ -76,6 +81,7 @@ impl Raw {
             reported_written: walk.has::<ReportedSocInput>() || walk.has::<ReportedSohInput>(),
             reported_soc: walk.optional(),
             reported_soh: walk.optional(),
+            protected: walk.many(),
             current_limits: walk.one(),
             voltage_limits: walk.one(),
             temperature_limits: walk.one(),
@@ -101,6 +107,7 @@ pub(crate) fn monitor(
     mut model: CellModel,
     found: &Ranges,
     input: InputMap,
+    guards: Vec<GuardConfig>,
     output: Option<OutputConfig>,
 ) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
@@ -110,6 +117,8 @@ pub(crate) fn monitor(
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
         input,
+        guards,
+        flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),

@@ -52,11 +52,14 @@ fn interfaces(raw: &Raw, faults: &mut Faults) {
     if !raw.interfaces_whole {
         return;
     }
-    for source in current.chain(cells).chain(pack).chain(temperatures).chain(reported) {
-        match source.interface {
-            Some(name) => known_interface(name, source.place, "interface", &raw.interfaces, faults),
+    let signals = current.chain(cells).chain(pack).chain(temperatures).chain(reported);
+    let signals = signals.map(|source| (source.interface, source.place));
+    let protected = raw.protected.iter().map(|protected| (protected.interface.as_deref(), &protected.place));
+    for (interface, place) in signals.chain(protected) {
+        match interface {
+            Some(name) => known_interface(name, place, "interface", &raw.interfaces, faults),
             None if raw.interfaces.len() > 1 => {
-                source.place.fault(faults, "interface", &format!("must be {}", names(&raw.interfaces)));
+                place.fault(faults, "interface", &format!("must be {}", names(&raw.interfaces)));
             }
             None => {}
         }

@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::convert::Raw;
 use super::keys::TemperatureInput;
 use super::resolve::{Resolved, channel_words};
-use super::{Config, InterfaceConfig};
+use super::{Config, InterfaceConfig, protect};
 use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
@@ -30,6 +30,8 @@ pub struct Description {
     pub signals: Vec<SignalUse>,
     /// What a plausible reading is.
     pub limits: Vec<String>,
+    /// What becomes of a frame before it is read: the bound on frames, end-to-end protection; in sentences.
+    pub intake: Vec<String>,
     /// Frames that are sent.
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
@@ -128,6 +130,7 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(bus, i, found)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
+        intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
     }

@@ -28,6 +28,11 @@ impl Faults {
         }
     }
 
+    /// How many faults there are.
+    pub(crate) fn len(&self) -> usize {
+        self.list.len()
+    }
+
     /// Whether nothing was found.
     pub(crate) fn is_empty(&self) -> bool {
         self.list.is_empty()

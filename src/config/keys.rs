@@ -9,6 +9,7 @@ use super::schema::{SectionInfo, section};
 use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
 use crate::alarm::{Rule, When};
+use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
@@ -55,6 +56,7 @@ choice!(E2e { "off" => Self::Off, "1A" => Self::P01A, "1C" => Self::P01C, "5" =>
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
 choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
+choice!(Profile { "1A" => Self::P01A, "1C" => Self::P01C, "5" => Self::P05 });
 choice!(Rule {
     "capacity_low" => Self::CapacityLow,
     "usable_capacity_low" => Self::UsableCapacityLow,
@@ -107,6 +109,28 @@ section! {
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file.
         dbc: Vec<String>, "", NotEmpty, Required;
+        /// Frames of one identifier on one interface that are taken in; a tenth of it may come at once. What comes beyond is dropped, counted and told, so that a sender gone wild does not take the time of the others. The default is twice the fastest honest sender (one frame a millisecond) and half of what a saturated bus of 500 kbit/s carries.
+        max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
+    }
+}
+
+section! {
+    /// An input message whose sender protects it end to end (AUTOSAR). The readings of a frame that fails its check (damaged, repeated, out of sequence, another message's, or the first after a start) are bad; each outcome is counted, and told when the message turns.
+    ProtectedInput at "input.protected" {
+        /// Name of the message in its DBC file; one of its signals must be an input.
+        message: String, "", NotEmpty, Required;
+        /// Interface the message comes on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// AUTOSAR profile: 1 with the whole data identifier in the CRC (variant A), 1 with four bits of it sent (variant C), or 5.
+        profile: Profile, "", Any, Required;
+        /// Data identifier agreed with the sender; up to 0xFFF in 1C.
+        data_id: u16, "", Between(0.0, 65535.0), Required;
+        /// Frames that may be lost between two; each further check without a good frame allows one more. Up to 14 in profile 1.
+        max_delta_counter: u16, "frames", Between(0.0, 255.0), Default("1");
+        /// Repeated or missing frames in a row after which the sequence is to be shown anew (`sync_counter`); 14 = any number.
+        max_repeated: u16, "frames", Between(0.0, 14.0), Default("14");
+        /// Frames in sequence that show it after a jump too far; they are used. 0 = none is asked for: then profile 1 keeps to its old counter after a jump (of a sender that restarted) until the sender has come round to it, 14 frames at most.
+        sync_counter: u16, "frames", Between(0.0, 14.0), Default("0");
     }
 }
 
@@ -523,6 +547,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::many::<TemperatureInput>(),
     SectionInfo::one::<ReportedSocInput>(),
     SectionInfo::one::<ReportedSohInput>(),
+    SectionInfo::many::<ProtectedInput>(),
     SectionInfo::one::<CurrentLimits>(),
     SectionInfo::one::<VoltageLimits>(),
     SectionInfo::one::<TemperatureLimits>(),

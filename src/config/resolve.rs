@@ -177,7 +177,7 @@ impl<'d> Search<'_, 'd> {
     }
 
     fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, (file, message, signal): Hit<'d>) {
-        let Some(bus) = self.bus(source) else {
+        let Some(bus) = bus_of(self.raw, source.interface) else {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = format!("{}.{}", message.name, signal.name);
@@ -210,15 +210,15 @@ impl<'d> Search<'_, 'd> {
         let (scale, offset) = (sign * usual_scale, sign * source.offset);
         self.found.push(Resolved { channel, bus, file, message, signal, scale, offset, not_available });
     }
+}
 
-    fn bus(&self, source: &SignalSource<'_>) -> Option<BusIndex> {
-        let interfaces = &self.raw.interfaces;
-        let index = match source.interface {
-            Some(name) => interfaces.iter().position(|interface| interface.name == name)?,
-            None => 0,
-        };
-        u8::try_from(index).ok().map(BusIndex)
-    }
+/// The interface a table names, the first when it names none; `None` = not there (noted by the cross checks).
+pub(crate) fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
+    let index = match interface {
+        Some(name) => raw.interfaces.iter().position(|interface| interface.name == name)?,
+        None => 0,
+    };
+    u8::try_from(index).ok().map(BusIndex)
 }
 
 fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {

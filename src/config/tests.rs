@@ -581,7 +581,7 @@ fn every_default_is_a_value_its_key_allows() {
                     key.about.contains("ithout it")
                         || info.path.is_empty()
                         || key.about.contains("Needed")
-                        || key.about.contains("threshold"),
+                        || key.about.contains("At least one of"),
                     "{}.{} says what holds without it",
                     info.path,
                     key.name

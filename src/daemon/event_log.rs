@@ -4,8 +4,10 @@
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
+use crate::can::CanId;
+use crate::can::e2e::Status;
 use crate::monitor::{BusEvent, Event, EventKind};
-use crate::quantity::{CellIndex, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// Error frames of one interface are summed up this often, s.
 const ERROR_SUMMARY_S: f64 = 10.0;
@@ -47,6 +49,15 @@ impl EventLog {
             }
             EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
             EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
+            EventKind::Protection { bus, id, status, usable, count } => {
+                self.log_protection(bus, id, status, usable, count);
+            }
+            EventKind::Flood { bus, id, active: true, .. } => {
+                tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
+            }
+            EventKind::Flood { bus, id, active: false, dropped } => {
+                tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
@@ -72,6 +83,19 @@ impl EventLog {
             EventKind::Store { works: true } => tracing::info!("files can be written"),
             EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
             EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
+        }
+    }
+
+    fn name(&self, bus: BusIndex) -> &str {
+        self.interfaces.get(bus.index()).map_or("?", String::as_str)
+    }
+
+    fn log_protection(&self, bus: BusIndex, id: CanId, status: Status, usable: bool, count: u64) {
+        let (interface, status) = (self.name(bus), status.name());
+        if usable {
+            tracing::info!(interface, %id, status, failed = count, "protected message usable again");
+        } else {
+            tracing::warn!(interface, %id, status, failed = count, "protected message fails its check");
         }
     }
 

@@ -93,6 +93,7 @@ impl Monitor {
 
     /// Staleness of the inputs, the mode's minimum duration, the alarms' debounce.
     fn keep_house(&mut self, out: &mut Outputs) {
+        self.intake.poll(self.now, out);
         self.sampler.poll(self.now, &mut self.scratch.signal_changes);
         self.report_signals(out);
         self.observe_current(self.sampler.pack_current_a(self.now), out);

@@ -8,6 +8,7 @@
 mod alarms;
 mod buses;
 mod cyclic;
+mod intake;
 mod learning;
 mod output;
 mod snapshot;
@@ -20,11 +21,14 @@ pub use types::*;
 use alarms::StoreState;
 use buses::Buses;
 use cyclic::{Schedule, Test};
+use intake::Intake;
 use snapshot::PendingRestore;
 
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::Frame;
 use crate::can::decode::InputMap;
+use crate::can::flood::{FloodConfig, FloodCount};
+use crate::can::guard::{GuardConfig, GuardCounts};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
 use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
@@ -39,6 +43,10 @@ const ASLEEP_S: f64 = 5.0;
 pub struct MonitorConfig {
     /// What input frames mean.
     pub input: InputMap,
+    /// Input messages with end-to-end protection.
+    pub guards: Vec<GuardConfig>,
+    /// How many frames of one identifier are taken in.
+    pub flood: FloodConfig,
     /// Sample stage.
     pub sample: SampleConfig,
     /// Cell model.
@@ -110,6 +118,7 @@ pub struct Monitor {
     now: Timestamp,
     /// Inputs that came with a time before `now`.
     time_backwards: u64,
+    intake: Intake,
     sampler: Sampler,
     cells: Vec<CellSlot>,
     detector: TransitionDetector,
@@ -145,6 +154,7 @@ impl Monitor {
         let cells = usize::from(config.sample.cells);
         let slot = CellSlot::new(&config.estimator);
         Self {
+            intake: Intake::new(&config),
             sampler: Sampler::new(config.sample.clone()),
             learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
@@ -244,6 +254,16 @@ impl Monitor {
         self.time_backwards
     }
 
+    /// Per protected input message: how often each status of its check was given.
+    pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
+        self.intake.protected()
+    }
+
+    /// Input messages of which frames were dropped, because more came than are taken in.
+    pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
+        self.intake.dropped()
+    }
+
     /// Alarms that are raised now.
     pub fn alarms(&self) -> &AlarmEngine {
         &self.alarms
@@ -292,6 +312,7 @@ impl Monitor {
     /// Nobody listened after `now`: the mode is unknown from there, nothing is timed over it, and the pack's values
     /// wait for a new reading of every cell.
     fn fall_asleep(&mut self, out: &mut Outputs) {
+        self.intake.restart(self.now, out);
         self.observe_current(None, out);
         self.alarms.handle_gap();
         self.recharge.interrupt();
@@ -323,8 +344,11 @@ impl Monitor {
 
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         self.buses.handle_frame(bus);
+        let Some(intact) = self.intake.judge(self.now, bus, frame, out) else { return };
         let mut readings = std::mem::take(&mut self.scratch.readings);
-        self.config.input.decode(bus, frame, |reading| readings.push(reading));
+        self.config.input.decode(bus, frame, |Reading { channel, value }| {
+            readings.push(Reading { channel, value: intact.and(value) });
+        });
         for reading in readings.drain(..) {
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
             self.report_signals(out);

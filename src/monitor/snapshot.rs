@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
+use super::intake::IntakeState;
 use super::{CellSlot, Consumed, Monitor};
 use crate::alarm::AlarmState;
 use crate::cell::{CellEstimator, CellState};
@@ -35,6 +36,8 @@ pub struct Snapshot {
     time_backwards: u64,
     alarms: AlarmState,
     schedule: Schedule,
+    #[serde(default)]
+    intake: IntakeState,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -98,6 +101,7 @@ impl Monitor {
             time_backwards: self.time_backwards,
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
+            intake: self.intake.snapshot(),
         }
     }
 
@@ -148,6 +152,7 @@ impl Monitor {
         self.time_backwards = snapshot.time_backwards;
         self.alarms.restore(&snapshot.alarms);
         self.schedule = snapshot.schedule;
+        self.intake.restore(&snapshot.intake);
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
         true

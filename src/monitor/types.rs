@@ -3,8 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use crate::alarm::{Change, Rule, Selector, Severity, State};
-use crate::can::Frame;
 use crate::can::decode::Channel;
+use crate::can::e2e::Status;
+use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// What an interface reports besides data frames.
@@ -289,6 +290,30 @@ pub enum EventKind {
         channel: Channel,
         /// Bad readings in between.
         bad_readings: u64,
+    },
+    /// A protected message turned from usable to failing, or back (told on change, then counted).
+    Protection {
+        /// Which interface.
+        bus: BusIndex,
+        /// Which message.
+        id: CanId,
+        /// The status of its check that turned it.
+        status: Status,
+        /// Whether it is usable from here on.
+        usable: bool,
+        /// Checks without a usable frame since it was last usable: so far, or when it is back, all of them.
+        count: u64,
+    },
+    /// More frames of one identifier come than are taken in; or no more.
+    Flood {
+        /// Which interface.
+        bus: BusIndex,
+        /// Which message.
+        id: CanId,
+        /// Whether it began.
+        active: bool,
+        /// Frames dropped in this flood: 1 when it begins, all of them when it ends.
+        dropped: u64,
     },
     /// An interface event.
     Bus {
