@@ -4,7 +4,8 @@
 //! ([`Guards::poll`]). Out: the [`Status`] of a frame, per-message counts, and a [`GuardChange`] when a message turns from
 //! usable to failing or back (what happens in between is counted). Where a message's cycle time is known, each period
 //! without a frame counts as one NONEWDATA: at one and a half periods after the last frame (half a period of jitter
-//! is no loss), and then once a period.
+//! is no loss), and then once a period. As many of them as the check allows to be lost turn nothing: the next frame will be
+//! good, and a sender with jitter would fill the log.
 //!
 //! What nobody listened to is no fault of the sender: after time asleep, a restart of the program or a step of the clock the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a snapshot keeps the counts and not
@@ -44,7 +45,7 @@ pub struct GuardChange {
     pub status: Status,
     /// Whether the message is usable from here on.
     pub usable: bool,
-    /// Checks without a usable frame since it was last usable: 1 when it turns, all of them when it is back.
+    /// Checks without a usable frame since it was last usable: so far when it turns, all of them when it is back.
     pub count: u64,
 }
 
@@ -69,6 +70,8 @@ struct Guard {
     receiver: Receiver,
     /// When the next frame is missed; `None` = the cycle time is not known, or not yet listening.
     missed_at: Option<Timestamp>,
+    /// Periods in a row without a frame.
+    missed: u64,
     /// Checks without a usable frame since the last usable one; 0 = usable, or nothing came yet.
     failed: u64,
 }
@@ -86,7 +89,7 @@ impl Guards {
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
-        let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, failed: 0 };
+        let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
         // A check makes one change, a poll one per message: the room is made here.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
@@ -100,6 +103,7 @@ impl Guards {
         let found = self.guards.binary_search_by_key(&key, |guard| (guard.config.bus, guard.config.id)).ok()?;
         let guard = &mut self.guards[found];
         guard.count_missed(now, &mut self.changes);
+        guard.missed = 0;
         let status = guard.receiver.check(&guard.config.check, frame.data());
         guard.missed_at = guard.config.cycle_time_s.map(|period_s| now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         guard.note(status, 1, &mut self.changes);
@@ -120,7 +124,7 @@ impl Guards {
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
             guard.receiver.restart();
-            guard.missed_at = None;
+            (guard.missed_at, guard.missed) = (None, 0);
         }
     }
 
@@ -164,13 +168,14 @@ impl Guard {
         let periods = now.nanos().saturating_sub(missed_at.nanos()) / period_ns + 1;
         self.missed_at = Some(missed_at.plus_nanos(periods.saturating_mul(period_ns)));
         let periods = u64::try_from(periods).unwrap_or(0);
+        self.missed = self.missed.saturating_add(periods);
         let status = self.receiver.miss(&self.config.check, periods);
         self.note(status, periods, changes);
     }
 
-    /// Tells a change. INITIAL is none: there is nothing yet to be wrong or right about, or no longer.
+    /// Tells a change.
     fn note(&mut self, status: Status, checks: u64, changes: &mut Vec<GuardChange>) {
-        let GuardConfig { bus, id, .. } = self.config;
+        let GuardConfig { bus, id, check, .. } = self.config;
         if status.is_usable() {
             let count = std::mem::take(&mut self.failed);
             if count > 0 {
@@ -178,13 +183,20 @@ impl Guard {
             }
             return;
         }
-        if self.failed == 0 && status == Status::Initial {
+        if self.failed > 0 {
+            self.failed = self.failed.saturating_add(checks);
             return;
         }
-        if self.failed == 0 {
-            changes.push(GuardChange { bus, id, status, usable: false, count: checks });
+        self.failed = match status {
+            // There is nothing yet to be wrong or right about, or no longer.
+            Status::Initial => 0,
+            Status::NoNewData if self.missed <= u64::from(check.max_delta_counter_init) => 0,
+            Status::NoNewData => self.missed,
+            _ => checks,
+        };
+        if self.failed > 0 {
+            changes.push(GuardChange { bus, id, status, usable: false, count: self.failed });
         }
-        self.failed += checks;
     }
 }
 

@@ -291,7 +291,8 @@ pub enum EventKind {
         /// Bad readings in between.
         bad_readings: u64,
     },
-    /// A protected message turned from usable to failing, or back (told on change, then counted).
+    /// A protected message turned from usable to failing, or back (told on change, then counted). A first frame, and as many
+    /// missing ones as its check allows to be lost, turn nothing.
     Protection {
         /// Which interface.
         bus: BusIndex,

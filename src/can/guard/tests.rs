@@ -78,10 +78,21 @@ fn each_period_without_a_frame_counts_once_however_often_one_looks() {
         guards.poll(at(tenths));
     }
     assert_eq!(count(&guards, Status::NoNewData), 3);
-    assert_eq!(changes(&mut guards), [(Status::NoNewData, false, 1)]);
+    assert_eq!(changes(&mut guards), [(Status::NoNewData, false, 2)], "one may be lost, by the configuration");
     assert_eq!(guards.check(at(57), BUS, &frame(6)), Some(Status::OkSomeLost), "the frames missed were counted");
     assert_eq!(changes(&mut guards), [(Status::OkSomeLost, true, 4)]);
     assert_eq!(count(&guards, Status::NoNewData), 4, "the one before this frame too");
+}
+
+#[test]
+fn as_many_frames_as_may_be_lost_turn_nothing() {
+    let mut guards = guards(Some(0.1));
+    guards.check(at(0), BUS, &frame(0));
+    for turn in 1..=100 {
+        let counter = u8::try_from(2 * turn % 15).unwrap();
+        assert_eq!(guards.check(at(20 * turn), BUS, &frame(counter)), Some(Status::OkSomeLost));
+    }
+    assert_eq!((count(&guards, Status::NoNewData), changes(&mut guards)), (100, vec![]));
 }
 
 #[test]
