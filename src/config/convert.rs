@@ -5,9 +5,10 @@ use std::num::NonZeroU32;
 use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output,
-    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge, ReportedSocInput,
-    ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method,
+    Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge,
+    ReportedSocInput, ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable,
+    VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::can::decode::InputMap;
@@ -15,7 +16,7 @@ use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
-use crate::monitor::{MonitorConfig, OutputConfig};
+use crate::monitor::{CommandConfig, MonitorConfig, OutputConfig};
 use crate::quantity::SensorIndex;
 use crate::sample::{Limits, SampleConfig, VoltageSource};
 
@@ -58,6 +59,7 @@ pub(crate) struct Raw {
     pub(crate) output_health: Option<OutputHealth>,
     pub(crate) output_alarm: Option<OutputAlarm>,
     pub(crate) output_written: bool,
+    pub(crate) commands: Option<Commands>,
 }
 
 impl Raw {
@@ -92,6 +94,7 @@ impl Raw {
             usable_written: walk.has::<Usable>(),
             usable: walk.optional(),
             alarms: walk.many(),
+            commands: walk.one(),
             output_written: walk.has::<Output>(),
             output: walk.one(),
             output_status: walk.one(),
@@ -109,6 +112,7 @@ pub(crate) fn monitor(
     input: InputMap,
     guards: Vec<GuardConfig>,
     output: Option<OutputConfig>,
+    commands: Option<CommandConfig>,
 ) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
@@ -120,6 +124,7 @@ pub(crate) fn monitor(
         guards,
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output,
+        commands,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
         health: HealthConfig {

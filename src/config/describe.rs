@@ -12,7 +12,7 @@ use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
-use crate::quantity::Channel;
+use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
 /// What a good configuration means.
@@ -127,7 +127,7 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         file: config.path.display().to_string(),
         cell,
         pack: pack(config),
-        interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(bus, i, found)).collect(),
+        interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
         intake: protect::describe(config, found),
@@ -165,11 +165,8 @@ fn pack(config: &Config) -> Vec<String> {
     words
 }
 
-fn interface(bus: u8, interface: &InterfaceConfig, found: &[Resolved<'_>]) -> InterfaceUse {
-    let mut ids: Vec<_> = found.iter().filter(|f| f.bus.0 == bus).map(|f| f.message.id).collect();
-    ids.sort_unstable();
-    ids.dedup();
-    let filter_ids = ids.iter().map(ToString::to_string).collect();
+fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> InterfaceUse {
+    let filter_ids = config.monitor.wanted_ids(bus).iter().map(ToString::to_string).collect();
     InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids }
 }
 

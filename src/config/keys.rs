@@ -536,6 +536,44 @@ frame_section! {
     OutputAlarm at "output.alarm"
 }
 
+section! {
+    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off unless switched on here, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not obeyed.
+    Commands at "commands" {
+        /// Whether commands from the bus are obeyed.
+        enabled: bool, "", Any, Default("false");
+        /// Interface the frame comes on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// Identifier. Without it: the DBC's.
+        id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+        /// Whether `id` has 29 bits.
+        extended: bool, "", Any, Default("false");
+        /// Whether CAN FD frames carry it. Without it: as the DBC says; the built-in one: classic frames.
+        fd: Option<bool>, "", Any, Optional;
+        /// Profile of the protection. Needed when commands are obeyed; "off" is refused then.
+        e2e: Option<E2e>, "", Any, Optional;
+        /// Data id of the protection. Needed with `e2e`.
+        data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
+        /// Frames that may be lost between two.
+        max_delta_counter: u16, "frames", Between(1.0, 14.0), Default("1");
+    }
+}
+
+impl Commands {
+    /// What all tables of frames have in common.
+    pub(crate) fn frame(&self) -> FrameKeys<'_> {
+        FrameKeys {
+            place: &self.place,
+            id: self.id,
+            extended: self.extended,
+            fd: self.fd,
+            brs: None,
+            period_ms: None,
+            e2e: self.e2e,
+            data_id: self.data_id,
+        }
+    }
+}
+
 /// Every table of the configuration, in the order of the reference page.
 pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Pack>(),
@@ -561,4 +599,5 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<OutputStatus>(),
     SectionInfo::one::<OutputHealth>(),
     SectionInfo::one::<OutputAlarm>(),
+    SectionInfo::one::<Commands>(),
 ];

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::convert::Raw;
 use super::describe::OutputUse;
 use super::document::Faults;
-use super::keys::{E2e, FrameKeys, Output};
+use super::keys::{Commands, E2e, FrameKeys, Output};
 use super::resolve::{Resolved, read_dbc};
 use super::{ReadFile, beside};
 use crate::can::CanId;
@@ -32,11 +32,17 @@ pub(crate) fn output(
     faults: &mut Faults,
 ) -> Option<(OutputConfig, Database)> {
     let keys = raw.output.as_ref().filter(|keys| raw.output_written && keys.enabled)?;
+    let command = raw.commands.as_ref().filter(|commands| commands.enabled);
     let frames =
         [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
     let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
-    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: None };
-    let database = database(raw, keys, config, model, &settings, &frames, read, faults)?;
+    let command_settings = match command {
+        Some(keys) => Some(message_settings(&keys.frame(), faults)?),
+        None => None,
+    };
+    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: command_settings };
+    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::frame)).collect();
+    let database = database(raw, keys, config, model, &settings, &laid_out, read, faults)?;
     let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
     let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
     let buses = buses(raw, keys);
@@ -98,7 +104,7 @@ fn database(
     config: &Path,
     model: Option<&CellModel>,
     settings: &LayoutSettings,
-    frames: &[FrameKeys<'_>; 3],
+    frames: &[FrameKeys<'_>],
     read: ReadFile<'_>,
     faults: &mut Faults,
 ) -> Option<Database> {

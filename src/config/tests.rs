@@ -430,6 +430,28 @@ fn single_faults_of_appended_tables() {
             "[output.health]\nbrs = true\n",
             "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",
         ),
+        (
+            "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
+            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: what became of a command \
+             is sent",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\n",
+            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\": commands are never taken unprotected",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\nid = 0x6B1\n",
+            "pack.toml:20: commands.id = 0x6B1, must not be that of a frame that is sent, 6B1",
+        ),
+        (
+            "[output.alarm]\ne2e = \"1A\"\ndata_id = 1\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
+            "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
+            "pack.toml:18: commands.e2e = \"5\", must have fd = true here and on the interface: the header of profile 5 \
+             makes the message 12 bytes long; 1A and 1C fit classic frames",
+        ),
         ("[output]\nstatus_id = 1\n", "pack.toml:16: output.status_id is not a known key, did you mean status"),
         (
             "[output]\nenabled = true\ninterfaces = [\"can7\"]\n",

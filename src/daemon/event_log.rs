@@ -70,6 +70,10 @@ impl EventLog {
             EventKind::Command { source, command, changed, refused } => {
                 tracing::info!(?source, ?command, changed, refused, "command");
             }
+            EventKind::BadCommand { bus, intact } => {
+                let interface = self.interfaces.get(bus.index()).map_or("?", String::as_str);
+                tracing::warn!(interface, intact, "command frame not obeyed");
+            }
             EventKind::Test { rule, running } => {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
             }

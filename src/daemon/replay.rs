@@ -466,6 +466,7 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::FilterReset { .. } => "filter_reset",
         EventKind::Trust { .. } => "trust",
         EventKind::Command { .. } => "command",
+        EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
         EventKind::Store { .. } => "store",

@@ -137,7 +137,7 @@ impl Service {
                 bus,
                 interface: interface.name.clone(),
                 fd: interface.fd,
-                ids: self.config.monitor.input.ids(bus),
+                ids: self.config.monitor.wanted_ids(bus),
                 receive_buffer_bytes: self.receive_buffer_bytes,
             };
             let (link, output) = Link::new(config, clock, inbox.clone());

@@ -4,10 +4,12 @@
 //! which is not known goes in as a bound: it can raise an alarm, but never say that all is well.
 
 use super::{Command, Event, EventKind, Monitor, MonitorConfig, Outputs, Source};
-use crate::alarm::{Alarm, AlarmChange, Observation, Rule};
+use crate::alarm::{Alarm, AlarmChange, Observation, Rule, Selector, Severity};
+use crate::can::Frame;
+use crate::can::encode::{self, CommandFields};
 use crate::filter::Belief;
 use crate::health::RechargeAlarm;
-use crate::quantity::{CellIndex, Channel, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
@@ -241,6 +243,17 @@ impl Monitor {
         self.scratch.alarm_changes = changes;
     }
 
+    /// A command from the bus; one that is not intact, or that has no meaning, is told and not obeyed.
+    pub(super) fn handle_command_frame(&mut self, bus: BusIndex, frame: &Frame, is_intact: bool, out: &mut Outputs) {
+        let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
+        match fields.and_then(|fields| command_of(&fields)) {
+            Some(command) if is_intact => self.handle_command(Source::Bus(bus), command, out),
+            Some(_) | None => {
+                out.events.push(Event { time: self.now, kind: EventKind::BadCommand { bus, intact: is_intact } })
+            }
+        }
+    }
+
     /// Does what somebody asks for.
     pub(super) fn handle_command(&mut self, source: Source, command: Command, out: &mut Outputs) {
         let mut changes = std::mem::take(&mut self.scratch.alarm_changes);
@@ -275,6 +288,25 @@ impl Monitor {
         self.forget_learned();
         self.alarms.forget_learned(changes);
     }
+}
+
+/// A frame's command; `None` = it names a rule or severity that there is not.
+fn command_of(fields: &CommandFields) -> Option<Command> {
+    let severities = [Severity::Info, Severity::Warning, Severity::Severe];
+    let which = Selector {
+        rule: fields.rule.map(|number| Rule::from_number(number).ok_or(())).transpose().ok()?,
+        severity: fields
+            .severity
+            .map(|code| severities.into_iter().find(|s| *s as u8 == code).ok_or(()))
+            .transpose()
+            .ok()?,
+        cell: fields.cell,
+    };
+    Some(match fields.command {
+        encode::Command::Acknowledge => Command::Acknowledge(which),
+        encode::Command::Clear => Command::Clear(which),
+        encode::Command::PackReplaced => Command::PackReplaced,
+    })
 }
 
 /// A value learned anew.

@@ -14,7 +14,7 @@ mod output;
 mod snapshot;
 mod types;
 
-pub use output::OutputConfig;
+pub use output::{CommandConfig, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
@@ -25,10 +25,10 @@ use intake::Intake;
 use snapshot::PendingRestore;
 
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
-use crate::can::Frame;
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
+use crate::can::{CanId, Frame};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
 use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
@@ -59,6 +59,8 @@ pub struct MonitorConfig {
     pub rules: Vec<RuleConfig>,
     /// What is sent, when and where; `None` = the daemon only listens.
     pub output: Option<OutputConfig>,
+    /// Commands taken from the bus; `None` = none.
+    pub commands: Option<CommandConfig>,
 }
 
 /// One cell's estimator and what it has consumed of the pack's totals.
@@ -146,6 +148,16 @@ struct Scratch {
     signal_changes: Vec<SignalChange>,
     alarm_changes: Vec<AlarmChange>,
     half_cycles: Vec<HalfCycle>,
+}
+
+impl MonitorConfig {
+    /// Identifiers to be received on an interface, ascending.
+    pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
+        let mut ids = self.input.ids(bus);
+        ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
+        ids.sort_unstable();
+        ids
+    }
 }
 
 impl Monitor {
@@ -345,6 +357,10 @@ impl Monitor {
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         self.buses.handle_frame(bus);
         let Some(intact) = self.intake.judge(self.now, bus, frame, out) else { return };
+        if self.config.commands.as_ref().is_some_and(|commands| commands.bus == bus && commands.plan.id() == frame.id())
+        {
+            return self.handle_command_frame(bus, frame, intact.is_ok(), out);
+        }
         let mut readings = std::mem::take(&mut self.scratch.readings);
         self.config.input.decode(bus, frame, |Reading { channel, value }| {
             readings.push(Reading { channel, value: intact.and(value) });

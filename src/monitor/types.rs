@@ -258,6 +258,13 @@ pub enum EventKind {
         /// What could not be done: alarms that are not healthy, a test without output.
         refused: u32,
     },
+    /// A command frame was not obeyed.
+    BadCommand {
+        /// Interface it came on.
+        bus: BusIndex,
+        /// Its protection was in order, what it asks has no meaning; otherwise it failed its check.
+        intact: bool,
+    },
     /// A test of a rule's alarm frame began or ended.
     Test {
         /// Which rule.
