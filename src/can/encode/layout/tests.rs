@@ -130,7 +130,8 @@ fn an_own_dbc_is_not_moved_and_must_leave_the_header_free() {
     let wanted = "signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 bits of the header of profile 5 free";
     assert_eq!((key, &*what), ("e2e", wanted));
     let (key, what) = own_fault("Soc : 16|12@1+", "Soc : 11|12@0+", on(Profile::P01C, 1));
-    let wanted = "signal PACKWATCH_Status.Soc begins at bit 11, must leave the 16 bits of the header of profile 1C free";
+    let wanted =
+        "signal PACKWATCH_Status.Soc begins at bit 11, must leave the 16 bits of the header of profile 1C free";
     assert_eq!((key, &*what), ("e2e", wanted));
 }
 
