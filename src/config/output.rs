@@ -36,7 +36,15 @@ pub(crate) fn output(
         [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
     let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
     let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: None };
-    let database = database(raw, keys, config, model, &settings, &frames, read, faults)?;
+    let own = match &keys.dbc {
+        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
+        None => None,
+    };
+    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
+    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
+    let rated_capacity_ah = rated.unwrap_or(1.0);
+    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
+    let database = database(base, &settings, &frames, faults)?;
     let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
     let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
     let buses = buses(raw, keys);
@@ -91,25 +99,12 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
 }
 
 /// The layout; a setting that does not fit it is noted at its key.
-#[expect(clippy::too_many_arguments, reason = "one caller, which has all of them at hand")]
 fn database(
-    raw: &Raw,
-    keys: &Output,
-    config: &Path,
-    model: Option<&CellModel>,
+    base: Base<'_>,
     settings: &LayoutSettings,
     frames: &[FrameKeys<'_>; 3],
-    read: ReadFile<'_>,
     faults: &mut Faults,
 ) -> Option<Database> {
-    let own = match &keys.dbc {
-        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
-        None => None,
-    };
-    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
-    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
-    let rated_capacity_ah = rated.unwrap_or(1.0);
-    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
     let refused = match layout(base, settings) {
         Ok(database) => return Some(database),
         Err(refused) => refused,
