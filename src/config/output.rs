@@ -16,9 +16,6 @@ use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
 
-/// Period of a frame for which neither configuration nor DBC says one, ms.
-const USUAL_PERIOD_MS: u32 = 1000;
-
 /// Names of the frames, in the order of the plan.
 const FRAMES: [&str; 3] = ["status", "health", "alarm"];
 
@@ -51,8 +48,7 @@ pub(crate) fn output(
     check_ids(&frames, &plan, &buses, found, faults);
     check_data_ids(&frames, &plan, faults);
     check_interfaces(raw, &frames, &plan, &buses, faults);
-    let [status_period_s, health_period_s, alarm_period_s] =
-        plan.cycle_times_ms().map(|ms| f64::from(ms.unwrap_or(USUAL_PERIOD_MS)) / 1000.0);
+    let [status_period_s, health_period_s, alarm_period_s] = plan.cycle_times_ms().map(|ms| f64::from(ms) / 1000.0);
     Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
 }
 
