@@ -7,7 +7,7 @@
 //! | --- | --- | --- |
 //! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
 //! | 1 | [`filter`] | unscented and linear Kalman filters: pure numbers |
-//! | 1 | [`can`] | frame, signal layout, decode, encode |
+//! | 1 | [`can`] | frame, signal layout, decode, encode, end-to-end protection, bound on frames |
 //! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
 //! | 2 | [`cell`] | equivalent circuit, thermal model, estimator |
 //! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity |

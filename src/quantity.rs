@@ -111,6 +111,10 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage, V.
     CellVoltage(CellIndex),
+    /// SOC as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoc,
+    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoh,
 }
 
 /// Why a reading cannot be used. A bad reading is data, not an error.
@@ -119,6 +123,8 @@ pub enum Channel {
 pub enum Fault {
     /// The frame carries fewer bytes than the signal needs.
     ShortFrame,
+    /// Its frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
+    EndToEnd,
     /// The sender said "signal not available".
     NotAvailable,
     /// NaN or infinite on the wire (IEEE float signals).

@@ -127,7 +127,7 @@ fn usable_errors(events: &[Value], discharges: &[Discharge]) -> Vec<Stated> {
 fn the_alarm_comes_at_the_end_of_life_and_not_before() {
     let Some(data) = data() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let lower = "\n[[alarm]]\nrule = \"usable_capacity_low\"\nthreshold = 1.2\nseverity = \"warning\"\n";
+    let lower = "\n[[alarm]]\nrule = \"usable_capacity_low\"\ninfo = 1.2\n";
     let config = configuration(folder.path(), "B0005", &[], lower);
     let path = folder.path().join("events.jsonl");
     replay(&config, &data, &["--events", path.to_str().unwrap()]);

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use packwatch::alarm::{Rule, RuleConfig, Severity};
+use packwatch::alarm::{Rule, RuleConfig, Severity, When};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::circuit;
@@ -158,7 +158,8 @@ struct Status {
 }
 
 fn rule(rule: Rule, threshold: f64, debounce_s: f64) -> RuleConfig {
-    RuleConfig { rule, threshold, hysteresis: 0.0, debounce_s, debounce_events: 1, severity: Severity::Warning }
+    let (clear, severity, when) = (threshold, Severity::Warning, When::Mean);
+    RuleConfig { rule, threshold, clear, severity, when, debounce_s, debounce_events: 1, is_latching: false }
 }
 fn alarm(kind: &EventKind, r: Rule, on: bool) -> bool {
     matches!(kind, EventKind::Alarm { rule, active, .. } if *rule == r && *active == on)

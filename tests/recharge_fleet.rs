@@ -8,7 +8,7 @@
 
 use std::path::Path;
 
-use packwatch::alarm::{Rule, RuleConfig, Severity};
+use packwatch::alarm::{Rule, RuleConfig, Severity, When};
 use packwatch::can::CanId;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
@@ -372,11 +372,13 @@ fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
     config.health.recharge.alarm_on = alarm_on;
     config.rules = vec![RuleConfig {
         rule: Rule::RechargePeriodLow,
+        severity: Severity::Warning,
         threshold: 3000.0,
-        hysteresis: 60.0,
+        clear: 3060.0,
+        when: When::Mean,
         debounce_s: 0.0,
         debounce_events: 1,
-        severity: Severity::Warning,
+        is_latching: false,
     }];
     let mut rig = Rig::new(&config, usage, 3);
     for _ in 0..3 {

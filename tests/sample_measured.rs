@@ -22,6 +22,8 @@ fn config() -> SampleConfig {
         current: limits(-10.0, 10.0),
         voltage: Limits { stuck_after_s: Some(120.0), ..limits(1.5, 4.5) },
         temperature: limits(-40.0, 85.0),
+        reported_soc: None,
+        reported_soh: None,
         sensor_of_cell: vec![Some(SensorIndex(0))],
         ambient_c: 24.0,
     }

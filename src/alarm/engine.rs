@@ -1,48 +1,54 @@
-//! One alarm machine per rule and cell, fed by rule; tells what was raised and cleared.
+//! One alarm machine per rule, severity and cell, fed by rule; tells what became of them.
 //!
-//! In: values in each rule's unit with the time of the look. Out: [`AlarmChange`]s and the list of raised
-//! alarms in the order rule, severity, cell (the pack first). One rule may be configured several times with
-//! different severities; each has alarms of its own. A value for a rule that is not configured, or for a cell
-//! a rule does not watch, concerns no alarm and is passed over.
+//! In: values in each rule's unit with the time of the look, and commands. Out: [`AlarmChange`]s and the list of raised
+//! alarms in the order rule, severity, cell (the pack first). One rule may have a threshold per severity; each has
+//! alarms of its own. A value for a rule that is not configured, or for a cell a rule does not watch, concerns no alarm
+//! and is passed over.
+
+use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::machine::{Machine, State};
-use super::{Rule, RuleConfig, Scope, Severity};
+use super::machine::{Change, Machine, Refusal, State};
+use super::{Observation, Outcome, Rule, RuleConfig, Scope, Selector, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// An alarm was raised or cleared.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct AlarmChange {
+/// An alarm as it stands.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Alarm {
     /// Which rule.
     pub rule: Rule,
-    /// Which cell; `None` = the pack.
-    pub cell: Option<CellIndex>,
-    /// Raised (true) or cleared.
-    pub active: bool,
     /// Its severity.
     pub severity: Severity,
-    /// The value that decided, in the rule's unit.
+    /// Which cell; `None` = the pack.
+    pub cell: Option<CellIndex>,
+    /// Where it is in its life.
+    pub state: State,
+    /// The latest value, in the rule's unit; `None` = not known (any more).
     pub value: Option<f64>,
+    /// Probability that the truth is beyond the threshold; `None` = the value has no standard deviation.
+    pub probability: Option<f64>,
     /// What it is compared with.
     pub threshold: f64,
+    /// Times it was raised.
+    pub occurrences: u32,
+    /// When it was raised for the first of these times; `None` = never.
+    pub first_raised: Option<Timestamp>,
+    /// When it was raised last.
+    pub last_raised: Option<Timestamp>,
+    /// The value that raised it last; `None` = never raised.
+    pub raised_value: Option<f64>,
+    /// Whether somebody has seen it since it was raised last.
+    pub is_acknowledged: bool,
 }
 
-/// A raised alarm.
+/// What became of an alarm, and how it stands now.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ActiveAlarm {
-    /// Which rule.
-    pub rule: Rule,
-    /// Which cell; `None` = the pack.
-    pub cell: Option<CellIndex>,
-    /// Its severity.
-    pub severity: Severity,
-    /// The latest value, in the rule's unit; `None` = not known any more, the alarm stays.
-    pub value: Option<f64>,
-    /// What it is compared with.
-    pub threshold: f64,
-    /// When it was raised.
-    pub raised: Timestamp,
+pub struct AlarmChange {
+    /// What.
+    pub change: Change,
+    /// The alarm after it.
+    pub alarm: Alarm,
 }
 
 /// One alarm of a stored state.
@@ -54,7 +60,7 @@ struct StoredAlarm {
     machine: Machine,
 }
 
-/// What an engine remembers: every alarm that is not inactive.
+/// What an engine remembers: every alarm that was raised or is about to be.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct AlarmState {
     alarms: Vec<StoredAlarm>,
@@ -69,27 +75,29 @@ impl AlarmState {
     }
 }
 
-/// The slots of one rule: the pack's first where it has one, then its cells in order.
+/// The slots of one threshold: the pack's first where it has one, then its cells in order.
 #[derive(Debug, Clone)]
 struct RuleSlots {
     config: RuleConfig,
     first: usize,
     pack_slots: usize,
     cell_slots: usize,
+    /// Alarms of it whose value is not known.
+    unknown: usize,
 }
 
 impl RuleSlots {
     fn new(config: RuleConfig, first: usize, cells: usize) -> Self {
-        let (pack_slots, cell_slots) = match config.rule.scope() {
+        let (pack_slots, cell_slots) = match config.rule.row().scope {
             Scope::Pack => (1, 0),
             Scope::Cell => (0, cells),
             Scope::Both => (1, cells),
         };
-        Self { config, first, pack_slots, cell_slots }
+        Self { config, first, pack_slots, cell_slots, unknown: pack_slots + cell_slots }
     }
 
-    fn end(&self) -> usize {
-        self.first + self.pack_slots + self.cell_slots
+    fn slots(&self) -> Range<usize> {
+        self.first..self.first + self.pack_slots + self.cell_slots
     }
 
     fn slot(&self, cell: Option<CellIndex>) -> Option<usize> {
@@ -108,67 +116,81 @@ impl RuleSlots {
 /// All alarms of a pack.
 #[derive(Debug, Clone)]
 pub struct AlarmEngine {
+    /// In the order of wire number, then severity.
     rules: Vec<RuleSlots>,
+    /// Where in `rules` each rule's thresholds are, by wire number.
+    by_rule: [Range<usize>; Rule::ALL.len() + 1],
     machines: Vec<Machine>,
-    /// Raised slots, rising: what `active` walks.
+    /// Raised slots, rising: what `raised` walks.
     raised: Vec<usize>,
     /// Slots whose debounce runs, rising: what `poll` walks.
     counting: Vec<usize>,
 }
 
 impl AlarmEngine {
-    /// An engine with every alarm inactive. Rules are put in the order of wire number, then severity.
+    /// An engine with every alarm unknown.
     pub fn new(mut rules: Vec<RuleConfig>, cells: u16) -> Self {
         rules.sort_by_key(|config| (config.rule, config.severity));
         let mut slots: Vec<RuleSlots> = Vec::with_capacity(rules.len());
         for config in rules {
-            let first = slots.last().map_or(0, RuleSlots::end);
+            let first = slots.last().map_or(0, |last| last.slots().end);
             slots.push(RuleSlots::new(config, first, usize::from(cells)));
         }
-        let total = slots.last().map_or(0, RuleSlots::end);
+        let number = |rule: &RuleSlots| usize::from(rule.config.rule as u8);
+        let by_rule = std::array::from_fn(|wanted| {
+            slots.partition_point(|rule| number(rule) < wanted)..slots.partition_point(|rule| number(rule) <= wanted)
+        });
+        let total = slots.last().map_or(0, |last| last.slots().end);
         Self {
             rules: slots,
+            by_rule,
             machines: vec![Machine::default(); total],
             raised: Vec::with_capacity(total),
             counting: Vec::with_capacity(total),
         }
     }
 
-    /// Takes the value of `rule` for `cell` (`None` = the pack) as it stands at `now`; `None` or a number that is
-    /// not finite = not known. `new_value` says that it was measured anew, and so counts for `debounce_events`.
+    /// Takes the value of `rule` for `cell` (`None` = the pack) as it stands at `now`.
     pub fn observe(
         &mut self,
         now: Timestamp,
         rule: Rule,
         cell: Option<CellIndex>,
-        value: Option<f64>,
-        new_value: bool,
+        seen: &Observation,
         changes: &mut Vec<AlarmChange>,
     ) {
-        for index in 0..self.rules.len() {
-            let slots = &self.rules[index];
-            if slots.config.rule != rule {
-                continue;
-            }
-            let Some(slot) = slots.slot(cell) else { continue };
-            let changed = self.machines[slot].observe(now, &slots.config, value, new_value);
-            self.file(slot);
-            if changed {
-                changes.push(self.change(index, slot));
-            }
+        self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, seen));
+    }
+
+    /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
+    /// renewed, and nothing is raised or cleared by it. For rules whose value is measured all the time it does nothing.
+    pub fn set_inputs_valid(
+        &mut self,
+        now: Timestamp,
+        rule: Rule,
+        cell: Option<CellIndex>,
+        valid: bool,
+        changes: &mut Vec<AlarmChange>,
+    ) {
+        if rule.row().is_learned {
+            self.each_threshold(rule, cell, changes, |machine, config| match valid {
+                true => machine.resume(now, config),
+                false => machine.suspend(now, config),
+            });
         }
     }
 
-    /// Lets time pass for the values that hold until the next one ([`Rule::holds_between_values`]).
+    /// Lets time pass for the values that hold until the next one ([`Row::is_learned`](super::rule::Row::is_learned)).
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
             let config = &self.rules[index].config;
-            if config.rule.holds_between_values() && self.machines[slot].poll(now, config) {
+            let change = if config.rule.row().is_learned { self.machines[slot].poll(now, config) } else { None };
+            if let Some(change) = change {
                 // The slot leaves `counting`, so the next one moves into its place.
-                self.file(slot);
-                changes.push(self.change(index, slot));
+                self.file(index, slot, self.machines[slot].is_known);
+                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             } else {
                 next += 1;
             }
@@ -178,33 +200,56 @@ impl AlarmEngine {
     /// Nobody looked until the next value (asleep, restarted, log with a hole): for values that do not hold
     /// between looks the time up to then does not count.
     pub fn handle_gap(&mut self) {
-        for position in 0..self.counting.len() {
-            let slot = self.counting[position];
-            if !self.rules[self.rule_of(slot)].config.rule.holds_between_values() {
-                self.machines[slot].handle_gap();
+        let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
+        for slot in measured {
+            self.machines[slot].handle_gap();
+            set_member(&mut self.counting, slot, false);
+        }
+    }
+
+    /// Somebody has seen the alarms.
+    pub fn acknowledge(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> Outcome {
+        self.command(which, changes, Machine::acknowledge)
+    }
+
+    /// Somebody clears the alarms: latched ones end, past ones are forgotten; those that are beyond their threshold, or
+    /// whose value is not known, stay and count as refused. No learned value is touched.
+    pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> Outcome {
+        self.command(which, changes, Machine::clear)
+    }
+
+    /// Another pack is connected: alarms about what was learned of the old one are over, and their past with them.
+    pub fn forget_learned(&mut self, changes: &mut Vec<AlarmChange>) {
+        for index in 0..self.rules.len() {
+            if !self.rules[index].config.rule.row().is_learned {
+                continue;
+            }
+            for slot in self.rules[index].slots() {
+                let old = std::mem::take(&mut self.machines[slot]);
+                self.file(index, slot, old.is_known);
+                if old.state.is_raised() {
+                    changes.push(AlarmChange { change: Change::Forgotten, alarm: self.alarm(index, slot) });
+                }
             }
         }
     }
 
     /// Raised alarms in stable order: rule, severity, cell (the pack first).
-    pub fn active(&self) -> impl Iterator<Item = ActiveAlarm> + '_ {
-        self.raised.iter().map(|&slot| {
-            let slots = &self.rules[self.rule_of(slot)];
-            let machine = &self.machines[slot];
-            ActiveAlarm {
-                rule: slots.config.rule,
-                cell: slots.cell(slot),
-                severity: slots.config.severity,
-                value: machine.value,
-                threshold: slots.config.threshold,
-                raised: machine.raised,
-            }
-        })
+    pub fn raised(&self) -> impl ExactSizeIterator<Item = Alarm> + '_ {
+        self.raised.iter().map(|&slot| self.alarm(self.rule_of(slot), slot))
+    }
+
+    /// Every alarm of every rule, in the same order.
+    pub fn all(&self) -> impl Iterator<Item = Alarm> + '_ {
+        self.rules
+            .iter()
+            .enumerate()
+            .flat_map(move |(index, rule)| rule.slots().map(move |slot| self.alarm(index, slot)))
     }
 
     /// The worst severity of the raised alarms; `None` = none is raised.
     pub fn highest_severity(&self) -> Option<Severity> {
-        self.active().map(|alarm| alarm.severity).max()
+        self.raised.iter().map(|&slot| self.rules[self.rule_of(slot)].config.severity).max()
     }
 
     /// Raised alarms.
@@ -212,74 +257,155 @@ impl AlarmEngine {
         self.raised.len()
     }
 
-    /// Where the alarm of a rule and cell is in its life (the worst severity's, when the rule is configured
-    /// several times); `None` = nothing watches it.
-    pub fn state(&self, rule: Rule, cell: Option<CellIndex>) -> Option<State> {
-        let slots = self.rules.iter().rfind(|slots| slots.config.rule == rule)?;
-        slots.slot(cell).map(|slot| self.machines[slot].state)
+    /// Thresholds, and those of them with an alarm whose value is not known.
+    pub fn unknown(&self) -> (usize, usize) {
+        (self.rules.len(), self.rules.iter().filter(|rule| rule.unknown > 0).count())
+    }
+
+    /// For the `turn`-th of the thresholds with unknown values, counted round and round, one such alarm that is not
+    /// raised; `None` = there is none.
+    pub fn unknown_alarm(&self, turn: usize) -> Option<Alarm> {
+        let (_, count) = self.unknown();
+        let mut waiting = self.rules.iter().enumerate().filter(|(_, rule)| rule.unknown > 0);
+        let (index, rule) = waiting.nth(turn.checked_rem(count)?)?;
+        let is_waiting = |slot: &usize| !self.machines[*slot].is_known && !self.machines[*slot].state.is_raised();
+        rule.slots().find(is_waiting).map(|slot| self.alarm(index, slot))
+    }
+
+    /// The alarm of a rule and cell as it stands (the worst severity's, when the rule has several thresholds); `None` =
+    /// nothing watches it.
+    pub fn get(&self, rule: Rule, cell: Option<CellIndex>) -> Option<Alarm> {
+        let index = self.by_rule[usize::from(rule as u8)].clone().next_back()?;
+        self.rules[index].slot(cell).map(|slot| self.alarm(index, slot))
     }
 
     /// What is to be stored.
     pub fn snapshot(&self) -> AlarmState {
-        let of_rule = |slots: &RuleSlots| {
-            let (rule, severity) = (slots.config.rule, slots.config.severity);
-            let stored = move |slots: &RuleSlots, slot| StoredAlarm {
-                rule,
-                severity,
-                cell: slots.cell(slot),
+        let of_rule = |rule: &RuleSlots| {
+            let kept = rule.slots().filter(|&slot| self.machines[slot].is_worth_storing());
+            let stored = |slot| StoredAlarm {
+                rule: rule.config.rule,
+                severity: rule.config.severity,
+                cell: rule.cell(slot),
                 machine: self.machines[slot],
             };
-            let kept = (slots.first..slots.end()).filter(|&slot| self.machines[slot].state != State::Inactive);
-            kept.map(|slot| stored(slots, slot)).collect::<Vec<_>>()
+            kept.map(stored).collect::<Vec<_>>()
         };
         AlarmState { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Takes up a stored state (rebased by the caller); returns how many of its alarms no configured rule
-    /// watches any more: they are gone, and the caller says so.
+    /// Takes up a stored state (rebased by the caller); returns how many of its alarms no configured threshold watches
+    /// any more: they are gone, and the caller says so.
     pub fn restore(&mut self, state: &AlarmState) -> usize {
-        self.machines.fill(Machine::default());
-        self.raised.clear();
-        self.counting.clear();
+        let cells = self.cells();
+        *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
         let mut orphans = 0;
         for alarm in &state.alarms {
-            match self.stored_slot(alarm) {
-                Some(slot) => {
-                    self.machines[slot] = alarm.machine;
-                    self.file(slot);
-                }
-                None => orphans += 1,
-            }
+            let same = |rule: &RuleSlots| (rule.config.rule, rule.config.severity) == (alarm.rule, alarm.severity);
+            let index = self.rules.iter().position(same);
+            let slot = index.and_then(|index| Some((index, self.rules[index].slot(alarm.cell)?)));
+            let Some((index, slot)) = slot else {
+                orphans += 1;
+                continue;
+            };
+            // Its value comes with the next look.
+            self.machines[slot] = alarm.machine.without_value();
+            self.file(index, slot, false);
         }
         orphans
     }
 
-    fn stored_slot(&self, alarm: &StoredAlarm) -> Option<usize> {
-        let same = |slots: &&RuleSlots| slots.config.rule == alarm.rule && slots.config.severity == alarm.severity;
-        self.rules.iter().find(same)?.slot(alarm.cell)
+    fn cells(&self) -> u16 {
+        let most = self.rules.iter().map(|rule| rule.cell_slots).max().unwrap_or(0);
+        u16::try_from(most).unwrap_or(u16::MAX)
     }
 
-    fn rule_of(&self, slot: usize) -> usize {
-        self.rules.partition_point(|slots| slots.end() <= slot)
-    }
-
-    fn change(&self, index: usize, slot: usize) -> AlarmChange {
-        let (slots, machine) = (&self.rules[index], &self.machines[slot]);
-        AlarmChange {
-            rule: slots.config.rule,
-            cell: slots.cell(slot),
-            active: machine.state.is_raised(),
-            severity: slots.config.severity,
-            value: machine.value,
-            threshold: slots.config.threshold,
+    fn each_threshold(
+        &mut self,
+        rule: Rule,
+        cell: Option<CellIndex>,
+        changes: &mut Vec<AlarmChange>,
+        mut act: impl FnMut(&mut Machine, &RuleConfig) -> Option<Change>,
+    ) {
+        for index in self.by_rule[usize::from(rule as u8)].clone() {
+            let Some(slot) = self.rules[index].slot(cell) else { continue };
+            let was_known = self.machines[slot].is_known;
+            let change = act(&mut self.machines[slot], &self.rules[index].config);
+            self.file(index, slot, was_known);
+            if let Some(change) = change {
+                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+            }
         }
     }
 
-    /// Keeps the two lists of slots in step with a machine's state.
-    fn file(&mut self, slot: usize) {
-        let state = self.machines[slot].state;
-        set_member(&mut self.raised, slot, state.is_raised());
-        set_member(&mut self.counting, slot, state.is_counting());
+    fn command(
+        &mut self,
+        which: &Selector,
+        changes: &mut Vec<AlarmChange>,
+        act: impl Fn(&mut Machine) -> Result<Change, Refusal>,
+    ) -> Outcome {
+        let mut outcome = Outcome::default();
+        for index in 0..self.rules.len() {
+            let (rule, severity) = (self.rules[index].config.rule, self.rules[index].config.severity);
+            for slot in self.rules[index].slots() {
+                if !which.matches(rule, severity, self.rules[index].cell(slot)) {
+                    continue;
+                }
+                let was_known = self.machines[slot].is_known;
+                let result = act(&mut self.machines[slot]);
+                self.file(index, slot, was_known);
+                match result {
+                    Ok(change) => {
+                        outcome.changed += 1;
+                        changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+                    }
+                    Err(Refusal::NotHealthy) => outcome.refused += 1,
+                    Err(Refusal::Nothing) => {}
+                }
+            }
+        }
+        outcome
+    }
+
+    fn rule_of(&self, slot: usize) -> usize {
+        self.rules.partition_point(|rule| rule.slots().end <= slot)
+    }
+
+    fn is_learned(&self, slot: usize) -> bool {
+        self.rules[self.rule_of(slot)].config.rule.row().is_learned
+    }
+
+    fn alarm(&self, index: usize, slot: usize) -> Alarm {
+        let (rule, machine) = (&self.rules[index], &self.machines[slot]);
+        let has_been = machine.occurrences > 0;
+        Alarm {
+            rule: rule.config.rule,
+            severity: rule.config.severity,
+            cell: rule.cell(slot),
+            state: machine.state,
+            value: machine.value(),
+            probability: machine.probability.filter(|_| machine.is_known),
+            threshold: rule.config.threshold,
+            occurrences: machine.occurrences,
+            first_raised: has_been.then_some(machine.first_raised),
+            last_raised: has_been.then_some(machine.last_raised),
+            raised_value: machine.raised_value.filter(|_| has_been),
+            is_acknowledged: machine.is_acknowledged,
+        }
+    }
+
+    /// Keeps the lists and counts in step with a machine.
+    fn file(&mut self, index: usize, slot: usize, was_known: bool) {
+        let machine = &self.machines[slot];
+        let (is_known, is_raised, is_counting) = (machine.is_known, machine.state.is_raised(), machine.is_counting());
+        let unknown = &mut self.rules[index].unknown;
+        match (was_known, is_known) {
+            (true, false) => *unknown += 1,
+            (false, true) => *unknown -= 1,
+            (true, true) | (false, false) => {}
+        }
+        set_member(&mut self.raised, slot, is_raised);
+        set_member(&mut self.counting, slot, is_counting);
     }
 }
 

@@ -1,27 +1,37 @@
-//! The life of one alarm: inactive, pending, active, clearing.
+//! The life of one alarm.
 //!
-//! | state | beyond | between | healthy | unknown |
-//! | --- | --- | --- | --- | --- |
-//! | inactive | count towards active | stay | stay | stay |
-//! | pending | count towards active | inactive | inactive | hold |
-//! | active | stay | stay | count towards inactive | stay |
-//! | clearing | active | active | count towards inactive | hold |
+//! | state | beyond | between | healthy | unknown | acknowledge | clear |
+//! | --- | --- | --- | --- | --- | --- | --- |
+//! | unknown | count towards active | rest | rest | stay | settle | forget |
+//! | inactive | count towards active | stay | stay | unknown | settle | forget |
+//! | pending | count towards active | rest | rest | hold | settle | forget |
+//! | active | stay | stay | count towards the end | suppressed | mark | refuse |
+//! | clearing | active | active | count towards the end | suppressed | mark | refuse |
+//! | suppressed | active | active | count towards the end | hold | mark | refuse |
+//! | latched | count towards active | stay | stay | hold | mark | rest |
+//! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
 //!
-//! Counting means time and new values; both must be reached. Time counts only between two looks at a known
-//! value on the same side: what lies beside an unknown value counts for nothing, and takes nothing away
-//! either, or a flickering input could keep an alarm from ever being raised.
+//! Rest is `cleared` when the alarm has been raised and nobody has acknowledged that, else `inactive`. The end is
+//! `latched` for a rule that latches, else rest. An alarm is raised while it is active, clearing, suppressed or latched.
+//!
+//! Counting means time and new values; both must be reached. Time counts only between two looks at a known value on the
+//! same side: what lies beside an unknown value counts for nothing, and takes nothing away either, or a flickering
+//! input could keep an alarm from ever being raised.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Direction, RuleConfig};
+use super::judge::Verdict;
+use super::{Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
 /// Where an alarm is in its life.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Nothing known to be wrong.
+    /// Its value is not known: nobody can say whether it should be raised.
     #[default]
+    Unknown,
+    /// Nothing wrong.
     Inactive,
     /// Beyond the threshold, not yet for long enough.
     Pending,
@@ -29,52 +39,73 @@ pub enum State {
     Active,
     /// Raised, healthy again, not yet for long enough.
     Clearing,
+    /// Raised, and its value is not known any more.
+    Suppressed,
+    /// Raised earlier, healthy again; stays until it is cleared by somebody.
+    Latched,
+    /// Raised earlier, healthy again; nobody has acknowledged it.
+    Cleared,
 }
 
 impl State {
     /// Whether the alarm is raised in this state.
     pub const fn is_raised(self) -> bool {
-        matches!(self, Self::Active | Self::Clearing)
+        matches!(self, Self::Active | Self::Clearing | Self::Suppressed | Self::Latched)
     }
 
-    /// Whether a debounce is running in this state.
-    pub const fn is_counting(self) -> bool {
-        matches!(self, Self::Pending | Self::Clearing)
-    }
-}
-
-/// What a value says about a rule.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
-    /// On the bad side of the threshold.
-    Beyond,
-    /// On the good side, but by less than the hysteresis.
-    Between,
-    /// On the good side by at least the hysteresis.
-    Healthy,
-    /// No usable value (none, or not finite).
-    Unknown,
-}
-
-impl Verdict {
-    pub(super) fn of(rule: &RuleConfig, value: Option<f64>) -> Self {
-        let Some(value) = value.filter(|value| value.is_finite()) else { return Self::Unknown };
-        let above_by = value - rule.threshold;
-        let good_by = match rule.rule.direction() {
-            Direction::Below => above_by,
-            Direction::Above => -above_by,
-        };
-        if good_by < 0.0 {
-            Self::Beyond
-        } else if good_by < rule.hysteresis {
-            Self::Between
-        } else {
-            Self::Healthy
+    /// The code on the wire (`State` of the alarm frame).
+    pub const fn wire_code(self) -> u8 {
+        match self {
+            Self::Inactive => 0,
+            Self::Active | Self::Clearing => 1,
+            Self::Cleared => 2,
+            Self::Pending => 3,
+            Self::Latched => 4,
+            Self::Suppressed => 5,
+            Self::Unknown => 6,
         }
     }
 }
 
-/// What to do in a state on a verdict.
+/// What an alarm is told.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Told {
+    Verdict(Verdict),
+    Acknowledge,
+    Clear,
+}
+
+/// What became of an alarm that others must hear of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Change {
+    /// Raised, or raised again while latched.
+    Raised,
+    /// Raised, but its value is not known any more.
+    Suppressed,
+    /// Raised, and its value is known again.
+    Resumed,
+    /// Healthy again, kept until somebody clears it.
+    Latched,
+    /// Over.
+    Cleared,
+    /// Somebody has seen it.
+    Acknowledged,
+    /// Its past was forgotten on request.
+    Forgotten,
+}
+
+/// Why a command changed nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Refusal {
+    /// Cleared by nobody but its value: the alarm is raised, and its value is not healthy (or not known).
+    NotHealthy,
+    /// There was nothing to do.
+    Nothing,
+}
+
+/// What to do in a state on what it is told.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Step {
     /// Nothing changes.
@@ -83,63 +114,107 @@ enum Step {
     Count,
     /// Keep what was counted, count nothing.
     Hold,
-    /// Forget what was counted.
-    Back,
+    /// Forget what was counted, go there.
+    Go(State),
+    /// Forget what was counted, go to rest.
+    Rest,
+    /// Raised without a value; what was counted towards the end is kept.
+    Suppress,
+    /// Somebody has seen the raised alarm.
+    Mark,
+    /// Somebody has seen that the alarm was raised.
+    Settle,
+    /// That the alarm was raised is forgotten.
+    Forget,
+    /// Not possible.
+    Refuse,
 }
 
-const fn step(state: State, verdict: Verdict) -> Step {
-    match (state, verdict) {
-        (State::Inactive, Verdict::Beyond) => Step::Count,
-        (State::Inactive, Verdict::Between | Verdict::Healthy | Verdict::Unknown) => Step::Stay,
-        (State::Pending, Verdict::Beyond) => Step::Count,
-        (State::Pending, Verdict::Between | Verdict::Healthy) => Step::Back,
-        (State::Pending, Verdict::Unknown) => Step::Hold,
-        (State::Active, Verdict::Healthy) => Step::Count,
-        (State::Active, Verdict::Beyond | Verdict::Between | Verdict::Unknown) => Step::Stay,
-        (State::Clearing, Verdict::Healthy) => Step::Count,
-        (State::Clearing, Verdict::Beyond | Verdict::Between) => Step::Back,
-        (State::Clearing, Verdict::Unknown) => Step::Hold,
+const fn step(state: State, told: Told) -> Step {
+    use State::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
+    match told {
+        Told::Verdict(verdict) => match (state, verdict) {
+            (Unknown | Inactive | Pending | Latched | Cleared, Verdict::Beyond) => Step::Count,
+            (Active, Verdict::Beyond | Verdict::Between) => Step::Stay,
+            (Clearing | Suppressed, Verdict::Beyond | Verdict::Between) => Step::Go(Active),
+            (Unknown | Pending, Verdict::Between | Verdict::Healthy) => Step::Rest,
+            (Inactive | Cleared, Verdict::Between | Verdict::Healthy) => Step::Stay,
+            (Latched, Verdict::Between | Verdict::Healthy) => Step::Go(Latched),
+            (Active | Clearing | Suppressed, Verdict::Healthy) => Step::Count,
+            (Unknown, Verdict::Unknown) => Step::Stay,
+            (Inactive | Cleared, Verdict::Unknown) => Step::Go(Unknown),
+            (Pending | Suppressed | Latched, Verdict::Unknown) => Step::Hold,
+            (Active | Clearing, Verdict::Unknown) => Step::Suppress,
+        },
+        Told::Acknowledge => match state {
+            Unknown | Inactive | Pending | Cleared => Step::Settle,
+            Active | Clearing | Suppressed | Latched => Step::Mark,
+        },
+        Told::Clear => match state {
+            Unknown | Inactive | Pending | Cleared => Step::Forget,
+            Active | Clearing | Suppressed => Step::Refuse,
+            Latched => Step::Rest,
+        },
     }
 }
 
-/// One alarm: its state and what its debounce has counted.
+/// One alarm: its state, its past, and what its debounce has counted.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Machine {
     pub(super) state: State,
-    /// The latest value; `None` = not known (any more).
-    pub(super) value: Option<f64>,
-    /// When it was raised; meaningful while raised.
-    pub(super) raised: Timestamp,
+    /// Whether the latest look could be judged.
+    #[serde(skip)]
+    pub(super) is_known: bool,
+    /// The latest value, standard deviation and probability; the value of a learned rule outlives its input.
+    #[serde(skip)]
+    pub(super) seen: Observation,
+    #[serde(skip)]
+    pub(super) probability: Option<f64>,
+    /// Times it was raised since its past was last forgotten.
+    pub(super) occurrences: u32,
+    /// When it was raised for the first and the last of these times, and the value that raised it last.
+    pub(super) first_raised: Timestamp,
+    pub(super) last_raised: Timestamp,
+    pub(super) raised_value: Option<f64>,
+    /// Whether somebody has seen the last of them.
+    pub(super) is_acknowledged: bool,
     /// Time counted by the running debounce, ns.
     held_nanos: i64,
     /// New values counted by it.
     events: u32,
     /// From when on time counts; `None` = not counting.
     counted_to: Option<Timestamp>,
+    /// The inputs a learned value came from are not valid now.
+    is_suspended: bool,
 }
 
 impl Machine {
-    /// Takes a value; true when the alarm was raised or cleared by it.
-    pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, value: Option<f64>, new_value: bool) -> bool {
-        let verdict = Verdict::of(rule, value);
-        self.value = value.filter(|value| value.is_finite());
-        match step(self.state, verdict) {
-            Step::Stay => false,
-            Step::Count => self.count(now, rule, new_value),
-            Step::Hold => {
-                self.counted_to = None;
-                false
-            }
-            Step::Back => {
-                self.enter(if self.state.is_raised() { State::Active } else { State::Inactive });
-                false
-            }
-        }
+    /// Takes a value.
+    pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, seen: &Observation) -> Option<Change> {
+        (self.seen, self.is_suspended) = (*seen, false);
+        self.judge(now, rule, seen.is_new)
     }
 
-    /// Lets time pass over a value that still holds; true when the alarm was raised or cleared by it.
-    pub(super) fn poll(&mut self, now: Timestamp, rule: &RuleConfig) -> bool {
-        self.state.is_counting() && self.counted_to.is_some() && self.count(now, rule, false)
+    /// Lets time pass over a value that still holds.
+    pub(super) fn poll(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
+        if self.counted_to.is_some() { self.count(now, rule, false) } else { None }
+    }
+
+    /// What the value was learned from is not valid now: the value cannot be renewed.
+    pub(super) fn suspend(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
+        if self.is_suspended {
+            return None;
+        }
+        self.is_suspended = true;
+        self.tell(now, rule, Verdict::Unknown, false)
+    }
+
+    /// It is valid again: the value stands as it was.
+    pub(super) fn resume(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
+        if !std::mem::take(&mut self.is_suspended) {
+            return None;
+        }
+        self.judge(now, rule, false)
     }
 
     /// The time up to the next look is not known or nobody looked: it does not count.
@@ -147,26 +222,137 @@ impl Machine {
         self.counted_to = None;
     }
 
+    /// Somebody has seen the alarm.
+    pub(super) fn acknowledge(&mut self) -> Result<Change, Refusal> {
+        match step(self.state, Told::Acknowledge) {
+            Step::Mark | Step::Settle if self.occurrences == 0 || self.is_acknowledged => Err(Refusal::Nothing),
+            _ => {
+                self.is_acknowledged = true;
+                if self.state == State::Cleared {
+                    self.enter(State::Inactive);
+                }
+                Ok(Change::Acknowledged)
+            }
+        }
+    }
+
+    /// Somebody clears it: a latched alarm ends, a past one is forgotten, one that is beyond or not known stays.
+    pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
+        match step(self.state, Told::Clear) {
+            Step::Refuse => Err(Refusal::NotHealthy),
+            Step::Rest => {
+                self.is_acknowledged = true;
+                self.enter(if self.is_known { State::Inactive } else { State::Unknown });
+                Ok(Change::Cleared)
+            }
+            _ if self.occurrences == 0 => Err(Refusal::Nothing),
+            _ => {
+                (self.occurrences, self.is_acknowledged) = (0, true);
+                if self.state == State::Cleared {
+                    self.enter(State::Inactive);
+                }
+                Ok(Change::Forgotten)
+            }
+        }
+    }
+
+    /// The latest value, unless it is not known (any more).
+    pub(super) fn value(&self) -> Option<f64> {
+        self.seen.value.filter(|value| self.is_known && value.is_finite())
+    }
+
+    /// Whether time is being counted.
+    pub(super) fn is_counting(&self) -> bool {
+        self.counted_to.is_some()
+    }
+
+    /// Whether a restart must not forget it.
+    pub(super) fn is_worth_storing(&self) -> bool {
+        self.occurrences > 0 || self.state == State::Pending
+    }
+
+    /// As it is stored: its value is not known before the next look.
+    pub(super) fn without_value(self) -> Self {
+        Self { is_known: false, seen: Observation::default(), probability: None, ..self }
+    }
+
     /// Moves the stamps onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
-        self.raised = self.raised.plus_nanos(by_nanos);
+        self.first_raised = self.first_raised.plus_nanos(by_nanos);
+        self.last_raised = self.last_raised.plus_nanos(by_nanos);
         self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
     }
 
-    fn count(&mut self, now: Timestamp, rule: &RuleConfig, new_value: bool) -> bool {
+    fn judge(&mut self, now: Timestamp, rule: &RuleConfig, is_new: bool) -> Option<Change> {
+        let (verdict, probability) = Verdict::of(rule, &self.seen);
+        self.probability = probability;
+        self.tell(now, rule, verdict, is_new)
+    }
+
+    fn tell(&mut self, now: Timestamp, rule: &RuleConfig, verdict: Verdict, is_new: bool) -> Option<Change> {
+        self.is_known = verdict != Verdict::Unknown;
+        match step(self.state, Told::Verdict(verdict)) {
+            Step::Count => return self.count(now, rule, is_new),
+            Step::Hold => self.counted_to = None,
+            Step::Suppress => {
+                (self.state, self.counted_to) = (State::Suppressed, None);
+                return Some(Change::Suppressed);
+            }
+            Step::Go(state) => {
+                let was_suppressed = self.state == State::Suppressed;
+                self.enter(state);
+                return was_suppressed.then_some(Change::Resumed);
+            }
+            Step::Rest => self.enter(self.rest()),
+            Step::Stay | Step::Mark | Step::Settle | Step::Forget | Step::Refuse => {}
+        }
+        None
+    }
+
+    /// Where an alarm is that is not raised and whose value is known.
+    fn rest(&self) -> State {
+        if self.occurrences > 0 && !self.is_acknowledged { State::Cleared } else { State::Inactive }
+    }
+
+    fn count(&mut self, now: Timestamp, rule: &RuleConfig, is_new: bool) -> Option<Change> {
         let passed = self.counted_to.map_or(0, |from| now.nanos().saturating_sub(from.nanos()).max(0));
         self.held_nanos = self.held_nanos.saturating_add(passed);
-        self.events = self.events.saturating_add(u32::from(new_value));
+        self.events = self.events.saturating_add(u32::from(is_new));
         self.counted_to = Some(now);
-        let raised = self.state.is_raised();
         let held_long_enough = self.held_nanos >= Timestamp::from_secs(rule.debounce_s).nanos();
-        if !(held_long_enough && self.events >= rule.debounce_events) {
-            self.state = if raised { State::Clearing } else { State::Pending };
-            return false;
+        let is_over = held_long_enough && self.events >= rule.debounce_events;
+        match (self.state, is_over) {
+            (State::Unknown | State::Inactive | State::Pending | State::Cleared, false) => {
+                self.state = State::Pending;
+                None
+            }
+            (State::Latched, false) => None,
+            (State::Active | State::Clearing, false) => {
+                self.state = State::Clearing;
+                None
+            }
+            (State::Suppressed, false) => {
+                self.state = State::Clearing;
+                Some(Change::Resumed)
+            }
+            (State::Unknown | State::Inactive | State::Pending | State::Cleared | State::Latched, true) => {
+                self.raise(now);
+                Some(Change::Raised)
+            }
+            (State::Active | State::Clearing | State::Suppressed, true) => {
+                self.enter(if rule.is_latching { State::Latched } else { self.rest() });
+                Some(if rule.is_latching { Change::Latched } else { Change::Cleared })
+            }
         }
-        self.enter(if raised { State::Inactive } else { State::Active });
-        self.raised = now;
-        true
+    }
+
+    fn raise(&mut self, now: Timestamp) {
+        self.enter(State::Active);
+        if self.occurrences == 0 {
+            self.first_raised = now;
+        }
+        self.occurrences = self.occurrences.saturating_add(1);
+        (self.last_raised, self.raised_value, self.is_acknowledged) = (now, self.value(), false);
     }
 
     fn enter(&mut self, state: State) {
@@ -178,138 +364,4 @@ impl Machine {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::{Rule, Severity};
-    use super::*;
-
-    const STATES: [State; 4] = [State::Inactive, State::Pending, State::Active, State::Clearing];
-    const VERDICTS: [Verdict; 4] = [Verdict::Beyond, Verdict::Between, Verdict::Healthy, Verdict::Unknown];
-
-    fn rule() -> RuleConfig {
-        RuleConfig {
-            rule: Rule::CapacityLow,
-            threshold: 1.4,
-            hysteresis: 0.1,
-            debounce_s: 10.0,
-            debounce_events: 2,
-            severity: Severity::Warning,
-        }
-    }
-
-    fn value(verdict: Verdict) -> Option<f64> {
-        match verdict {
-            Verdict::Beyond => Some(1.3),
-            Verdict::Between => Some(1.45),
-            Verdict::Healthy => Some(1.6),
-            Verdict::Unknown => None,
-        }
-    }
-
-    fn machine_in(state: State) -> Machine {
-        let mut machine = Machine::default();
-        let looks: &[(f64, f64)] = match state {
-            State::Inactive => &[],
-            State::Pending => &[(0.0, 1.3)],
-            State::Active => &[(0.0, 1.3), (10.0, 1.3)],
-            State::Clearing => &[(0.0, 1.3), (10.0, 1.3), (20.0, 1.6)],
-        };
-        for &(time, v) in looks {
-            machine.observe(Timestamp::from_secs(time), &rule(), Some(v), true);
-        }
-        assert_eq!(machine.state, state);
-        machine
-    }
-
-    /// State after one more look, before and after the debounce has run out.
-    fn expected(state: State, verdict: Verdict) -> (State, State) {
-        match (state, verdict) {
-            (State::Inactive, Verdict::Beyond) => (State::Pending, State::Pending),
-            (State::Inactive, Verdict::Between) => (State::Inactive, State::Inactive),
-            (State::Inactive, Verdict::Healthy) => (State::Inactive, State::Inactive),
-            (State::Inactive, Verdict::Unknown) => (State::Inactive, State::Inactive),
-            (State::Pending, Verdict::Beyond) => (State::Pending, State::Active),
-            (State::Pending, Verdict::Between) => (State::Inactive, State::Inactive),
-            (State::Pending, Verdict::Healthy) => (State::Inactive, State::Inactive),
-            (State::Pending, Verdict::Unknown) => (State::Pending, State::Pending),
-            (State::Active, Verdict::Beyond) => (State::Active, State::Active),
-            (State::Active, Verdict::Between) => (State::Active, State::Active),
-            (State::Active, Verdict::Healthy) => (State::Clearing, State::Clearing),
-            (State::Active, Verdict::Unknown) => (State::Active, State::Active),
-            (State::Clearing, Verdict::Beyond) => (State::Active, State::Active),
-            (State::Clearing, Verdict::Between) => (State::Active, State::Active),
-            (State::Clearing, Verdict::Healthy) => (State::Clearing, State::Inactive),
-            (State::Clearing, Verdict::Unknown) => (State::Clearing, State::Clearing),
-        }
-    }
-
-    #[test]
-    fn every_state_and_verdict_leads_where_the_table_says() {
-        for state in STATES {
-            for verdict in VERDICTS {
-                let (early, late) = expected(state, verdict);
-                for (time, want) in [(21.0, early), (40.0, late)] {
-                    // Pending began at 0, clearing at 20: look 1 s or 20 s later.
-                    let time = if state == State::Pending { time - 20.0 } else { time };
-                    let mut machine = machine_in(state);
-                    let changed = machine.observe(Timestamp::from_secs(time), &rule(), value(verdict), true);
-                    assert_eq!(machine.state, want, "{state:?} {verdict:?} at {time}");
-                    assert_eq!(changed, state.is_raised() != want.is_raised(), "{state:?} {verdict:?} at {time}");
-                    assert_eq!(machine.value, value(verdict));
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn time_alone_or_values_alone_do_not_raise() {
-        let mut by_time = machine_in(State::Pending);
-        assert!(!by_time.poll(Timestamp::from_secs(1e6), &rule()), "one value, endless time");
-        let mut by_values = machine_in(State::Pending);
-        for _ in 0..1000 {
-            assert!(!by_values.observe(Timestamp::from_secs(9.9), &rule(), Some(1.0), true), "many values, 9.9 s");
-        }
-        assert!(by_values.poll(Timestamp::from_secs(10.0), &rule()), "and 0.1 s later both hold");
-    }
-
-    #[test]
-    fn time_beside_an_unknown_value_does_not_count() {
-        let mut machine = machine_in(State::Pending);
-        machine.observe(Timestamp::from_secs(4.0), &rule(), None, true);
-        assert!(!machine.poll(Timestamp::from_secs(100.0), &rule()));
-        assert!(!machine.observe(Timestamp::from_secs(200.0), &rule(), Some(1.3), true));
-        assert!(!machine.poll(Timestamp::from_secs(209.0), &rule()), "the time before the unknown value is not known");
-        assert!(machine.poll(Timestamp::from_secs(210.0), &rule()));
-    }
-
-    #[test]
-    fn time_in_a_gap_does_not_count() {
-        let mut machine = machine_in(State::Pending);
-        machine.handle_gap();
-        assert!(!machine.observe(Timestamp::from_secs(500.0), &rule(), Some(1.3), true));
-        assert!(machine.observe(Timestamp::from_secs(510.0), &rule(), Some(1.3), true));
-    }
-
-    #[test]
-    fn a_clock_that_goes_back_takes_nothing_away() {
-        let mut machine = machine_in(State::Pending);
-        assert!(!machine.observe(Timestamp::from_secs(-50.0), &rule(), Some(1.3), true));
-        assert!(machine.observe(Timestamp::from_secs(-40.0), &rule(), Some(1.3), true));
-    }
-
-    #[test]
-    fn the_threshold_itself_is_not_beyond_in_either_direction() {
-        let low = RuleConfig { hysteresis: 0.0, ..rule() };
-        assert_eq!(Verdict::of(&low, Some(1.4)), Verdict::Healthy);
-        let high = RuleConfig { rule: Rule::InputMissing, threshold: 5.0, hysteresis: 1.0, ..rule() };
-        assert_eq!(Verdict::of(&high, Some(5.1)), Verdict::Beyond);
-        assert_eq!(Verdict::of(&high, Some(5.0)), Verdict::Between);
-        assert_eq!(Verdict::of(&high, Some(4.0)), Verdict::Healthy);
-    }
-
-    #[test]
-    fn values_that_are_not_finite_are_unknown() {
-        for odd in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
-            assert_eq!(Verdict::of(&rule(), Some(odd)), Verdict::Unknown);
-        }
-    }
-}
+mod tests;

@@ -154,6 +154,13 @@ impl InputMap {
         }
     }
 
+    /// Every configured message, by interface and identifier, with the number of its groups of signals that
+    /// come together: its multiplexer pages, or a few more; 1 without any.
+    pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
+        let first = |runs: &Range<usize>| &self.bindings[self.runs[runs.start].start];
+        self.messages.iter().flatten().map(move |(id, runs)| (first(runs).bus, *id, runs.len()))
+    }
+
     /// Identifiers configured on an interface, ascending, for kernel filters.
     pub fn ids(&self, bus: BusIndex) -> Vec<CanId> {
         self.messages.get(bus.index()).map(|ids| ids.iter().map(|(id, _)| *id).collect()).unwrap_or_default()

@@ -18,10 +18,14 @@
 //!
 //! Deviation 1: profile 5 has no SYNC and INITIAL of its own in AUTOSAR (the state machine above it makes them). Here the
 //! receiver of profile 1 runs for it too, with the counter modulo 256: the same words and the same counts for both
-//! profiles; a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK.
+//! profiles. Effect: a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK; and
+//! its allowed step grows while frames are missed. As in AUTOSAR's own check of profile 5, a counter that jumped too far
+//! is gone on from (a sender that restarted costs one frame, not a turn of 256).
 //! Deviation 2: what a receiver may be told about repetitions (`max_no_new_or_repeated_data`) ends at 14 for both
 //! profiles, where it means "any number".
-//! Deviation 3: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
+//! Deviation 3: AUTOSAR calls its check once a period, frame or no frame. Here it is called once per frame, and once for each
+//! period without one where the period is known; where it is not, the allowed step grows with bad frames only.
+//! Deviation 4: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
 //! error). Here it is [`Status::WrongCrc`]: the payload is not one the sender can have made.
 
 mod receiver;
@@ -206,8 +210,8 @@ impl Protection {
     }
 }
 
-/// CRC-8 of each byte value, polynomial 0x1D.
-const CRC8: [u8; 256] = {
+/// CRC-8 of each byte value, polynomial 0x1D. Static, so that there is one of it.
+static CRC8: [u8; 256] = {
     let mut table = [0; 256];
     let mut byte = 0;
     while byte < 256 {
@@ -223,7 +227,7 @@ const CRC8: [u8; 256] = {
 };
 
 /// CRC-16 of each byte value, polynomial 0x1021.
-const CRC16: [u16; 256] = {
+static CRC16: [u16; 256] = {
     let mut table = [0; 256];
     let mut byte = 0;
     while byte < 256 {
@@ -243,10 +247,7 @@ fn crc8(start: u8, bytes: &[u8]) -> u8 {
 }
 
 fn crc16(start: u16, bytes: &[u8]) -> u16 {
-    bytes.iter().fold(start, |crc, byte| {
-        let [high, low] = crc.to_be_bytes();
-        CRC16[usize::from(high ^ byte)] ^ u16::from(low) << 8
-    })
+    bytes.iter().fold(start, |crc, byte| CRC16[usize::from(crc >> 8 ^ u16::from(*byte))] ^ crc << 8)
 }
 
 #[cfg(test)]

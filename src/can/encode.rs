@@ -9,11 +9,13 @@ mod input;
 mod layout;
 mod message;
 mod output;
+mod protector;
 
 pub use command::{Command, CommandFault, CommandFields, CommandPlan};
 pub use input::InputEncoder;
 pub use layout::{Base, E2eSetting, LaidOut, LayoutSettings, MessageSettings, SettingFault, default_database, layout};
 pub use output::{AlarmFields, HealthFields, OutputPlan, PlanFaults, SendCounters, StatusFields};
+pub use protector::InputProtector;
 
 use crate::can::{CanId, Frame, MAX_DATA};
 

@@ -112,6 +112,14 @@ impl Frame {
         }
     }
 
+    /// The payload, to be changed in place.
+    pub(crate) fn data_mut(&mut self) -> &mut [u8] {
+        match self.kind {
+            FrameKind::Remote => &mut [],
+            FrameKind::Classic | FrameKind::Fd { .. } => &mut self.data[..usize::from(self.len)],
+        }
+    }
+
     /// Payload length, or for a remote request the length asked for.
     pub const fn len(&self) -> usize {
         self.len as usize

@@ -5,7 +5,9 @@ pub mod dbc;
 pub mod decode;
 pub mod e2e;
 pub mod encode;
+pub mod flood;
 pub mod frame;
+pub mod guard;
 pub mod signal;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

@@ -66,6 +66,7 @@ fn show(description: &Description, page: &mut String) {
     page.push_str("\nsignals\n");
     table(&description.signals.iter().map(signal).collect::<Vec<_>>(), page);
     list("plausible readings", &description.limits, page);
+    list("taken in", &description.intake, page);
     page.push_str("\noutputs\n");
     if description.outputs.is_empty() {
         page.push_str("  nothing is sent\n");

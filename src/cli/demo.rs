@@ -11,7 +11,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use super::Failure;
-use crate::alarm::Rule;
+use crate::alarm::{Change, Rule};
 use crate::can::Frame;
 use crate::can::encode::InputEncoder;
 use crate::config::{self, Config};
@@ -173,7 +173,7 @@ impl Demo {
             self.consumer.receive(&sent.frame);
         }
         for event in &self.out.events {
-            let EventKind::Alarm { rule, active: true, .. } = event.kind else { continue };
+            let EventKind::Alarm { rule, change: Change::Raised, .. } = event.kind else { continue };
             let frame = self.out.frames.iter().find(|sent| self.consumer.is_alarm(&sent.frame, rule));
             if let Some(sent) = frame {
                 let (time, bus, frame) = (sent.time, sent.bus, sent.frame);

@@ -10,7 +10,7 @@ pub(crate) use args::Args;
 use report::Bar;
 
 use super::Failure;
-use crate::can::encode::InputEncoder;
+use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::daemon::replay::{self, ReplayError, Settings, Sinks, Summary};
 use crate::daemon::snapshot_file;
@@ -69,6 +69,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &Settings, interface: &st
 fn log_options(args: &Args, config: &Config) -> LogOptions {
     let sample = &config.monitor.sample;
     let encoder = InputEncoder::new(&config.monitor.input);
+    let mut protector = InputProtector::new(&config.monitor.guards);
     LogOptions {
         interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
         strict: args.strict,
@@ -79,7 +80,12 @@ fn log_options(args: &Args, config: &Config) -> LogOptions {
             cells: sample.cells,
             pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
         },
-        encode_row: Box::new(move |values, frames| encoder.encode(values, frames)),
+        // A row has no frames: they are made as their senders would have made them, protection and all.
+        encode_row: Box::new(move |values, frames| {
+            let uncarried = encoder.encode(values, frames);
+            protector.protect(frames);
+            uncarried
+        }),
     }
 }
 

@@ -11,9 +11,10 @@ mod settings;
 use std::path::PathBuf;
 
 use super::Failure;
-use crate::can::encode::InputEncoder;
+use crate::can::encode::{InputEncoder, InputProtector};
 use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
+use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
 use crate::sim::{Moment, Settings, Simulation, Wiring};
@@ -73,7 +74,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => None,
     };
     let start = Timestamp::from_nanos(i64::from(args.start) * 1_000_000_000);
-    let mut frames = Frames::new(InputEncoder::new(&monitor.input), &settings, start);
+    let mut frames = Frames::new(monitor, &settings, start);
     let mut tally = Tally::default();
     while let Some(moment) = sim.advance() {
         for (time, bus, frame) in frames.of(&sim, &moment) {
@@ -163,6 +164,7 @@ fn wiring(sample: &SampleConfig) -> Wiring {
 /// Makes the frames of a moment, those with the current first: the voltages have its drop in them.
 struct Frames {
     encoder: InputEncoder,
+    protector: InputProtector,
     with_current: Vec<(BusIndex, CanId)>,
     made: Vec<(BusIndex, Frame)>,
     start: Timestamp,
@@ -170,17 +172,20 @@ struct Frames {
 }
 
 impl Frames {
-    fn new(encoder: InputEncoder, settings: &Settings, start: Timestamp) -> Self {
+    fn new(monitor: &MonitorConfig, settings: &Settings, start: Timestamp) -> Self {
+        let encoder = InputEncoder::new(&monitor.input);
         let mut made = Vec::new();
         encoder.encode(&[(Channel::Current, Some(0.0))], &mut made);
         let with_current = made.iter().map(|(bus, frame)| (*bus, frame.id())).collect();
-        Self { encoder, with_current, made, start, period_ns: settings.current_period_ns }
+        let protector = InputProtector::new(&monitor.guards);
+        Self { encoder, protector, with_current, made, start, period_ns: settings.current_period_ns }
     }
 
     fn of(&mut self, sim: &Simulation, moment: &Moment) -> impl Iterator<Item = (Timestamp, BusIndex, &Frame)> {
         self.made.clear();
         self.encoder.encode(sim.readings(), &mut self.made);
         self.made.sort_by_key(|(bus, frame)| !self.with_current.contains(&(*bus, frame.id())));
+        self.protector.protect(&mut self.made);
         let count = i64::try_from(self.made.len()).unwrap_or(i64::MAX - 1);
         let spacing_ns = FRAME_SPACING_NS.min(self.period_ns / (count + 1));
         let first = self.start.plus_nanos(moment.time.nanos());

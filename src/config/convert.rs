@@ -1,14 +1,18 @@
 //! Keys as written to the settings the other modules take. One line per key.
 
+use std::num::NonZeroU32;
+
+use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output,
-    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, Recharge, SECTIONS, TemperatureInput,
-    TemperatureLimits, Transition, Usable, VoltageLimits,
+    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge, ReportedSocInput,
+    ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
-use crate::alarm::{Rule, RuleConfig};
 use crate::can::decode::InputMap;
+use crate::can::flood::FloodConfig;
+use crate::can::guard::GuardConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
 use crate::monitor::{MonitorConfig, OutputConfig};
@@ -34,6 +38,11 @@ pub(crate) struct Raw {
     /// Whether `[input.cell_voltage]` and `[input.pack_voltage]` are written, faulty or not.
     pub(crate) voltages_written: (bool, bool),
     pub(crate) temperatures: Vec<TemperatureInput>,
+    pub(crate) reported_soc: Option<ReportedSocInput>,
+    pub(crate) reported_soh: Option<ReportedSohInput>,
+    /// Whether one of the two is written, faulty or not.
+    pub(crate) reported_written: bool,
+    pub(crate) protected: Vec<ProtectedInput>,
     pub(crate) current_limits: Option<CurrentLimits>,
     pub(crate) voltage_limits: Option<VoltageLimits>,
     pub(crate) temperature_limits: Option<TemperatureLimits>,
@@ -69,6 +78,10 @@ impl Raw {
             cell_voltage: walk.optional(),
             pack_voltage: walk.optional(),
             temperatures: walk.many(),
+            reported_written: walk.has::<ReportedSocInput>() || walk.has::<ReportedSohInput>(),
+            reported_soc: walk.optional(),
+            reported_soh: walk.optional(),
+            protected: walk.many(),
             current_limits: walk.one(),
             voltage_limits: walk.one(),
             temperature_limits: walk.one(),
@@ -94,14 +107,18 @@ pub(crate) fn monitor(
     mut model: CellModel,
     found: &Ranges,
     input: InputMap,
+    guards: Vec<GuardConfig>,
     output: Option<OutputConfig>,
 ) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
-    let rules: Option<Vec<_>> = raw.alarms.iter().map(|alarm| rule(alarm, rated_ah)).collect();
+    let rated = Rated::new(rated_ah, raw.recharge.as_ref()?);
+    let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
         input,
+        guards,
+        flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
@@ -111,7 +128,7 @@ pub(crate) fn monitor(
             recharge: recharge(raw.recharge.as_ref()?, rated_ah),
             usable: raw.usable.as_ref().map(|keys| usable(keys, rated_ah)),
         },
-        rules: rules?,
+        rules,
         model,
     })
 }
@@ -143,6 +160,8 @@ fn sample(raw: &Raw, pack: &Pack, model: &CellModel, found: &Ranges) -> Option<S
         current: current_limits(current, found.current_a),
         voltage: voltage_limits(voltage, model, found.voltage_v),
         temperature: temperature_limits(raw.temperature_limits.as_ref()?, found.temperature_c),
+        reported_soc: raw.reported_soc.as_ref().map(|keys| reported_limits(keys.max_age_s)),
+        reported_soh: raw.reported_soh.as_ref().map(|keys| reported_limits(keys.max_age_s)),
         sensor_of_cell: sensors(&raw.temperatures, cells),
         ambient_c: pack.ambient_c,
     })
@@ -176,6 +195,11 @@ fn temperature_limits(keys: &TemperatureLimits, found: (f64, f64)) -> Limits {
         stuck_after_s: keys.stuck_after_s,
         max_age_s: keys.max_age_s,
     }
+}
+
+/// A fraction; packs that count above 100 % exist.
+fn reported_limits(max_age_s: f64) -> Limits {
+    Limits { min: -0.1, max: 1.5, max_rate_per_s: None, stuck_after_s: None, max_age_s }
 }
 
 /// The sensor of each cell; a sensor without `cells` serves all.
@@ -275,24 +299,4 @@ fn usable(keys: &Usable, rated_ah: f64) -> UsableConfig {
         cutoff_v: keys.cutoff_v,
         taper_current_a: keys.taper_current_a.unwrap_or(rated_ah / 20.0),
     }
-}
-
-/// Whether a rule compares Ah, so that its threshold may be a part of the rated capacity.
-pub(crate) fn in_ampere_hours(rule: Rule) -> bool {
-    match rule {
-        Rule::CapacityLow | Rule::UsableCapacityLow => true,
-        Rule::RechargePeriodLow | Rule::InputMissing | Rule::InputImplausible | Rule::EstimateUntrusted => false,
-    }
-}
-
-fn rule(keys: &Alarm, rated_ah: f64) -> Option<RuleConfig> {
-    let threshold = keys.threshold.or_else(|| keys.threshold_of_rated.map(|part| part * rated_ah))?;
-    Some(RuleConfig {
-        rule: keys.rule,
-        threshold,
-        hysteresis: keys.hysteresis.unwrap_or(0.02 * threshold),
-        debounce_s: keys.debounce_s,
-        debounce_events: keys.debounce_events,
-        severity: keys.severity,
-    })
 }

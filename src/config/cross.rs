@@ -1,9 +1,9 @@
 //! Checks that concern several keys, or a key and the cell model. Nothing here stops at the first fault.
 
-use super::convert::{Raw, in_ampere_hours};
+use super::alarm::{self, Rated};
+use super::convert::Raw;
 use super::document::{Faults, Place};
-use super::keys::{Alarm, Interface, Method, Pack, TemperatureInput};
-use crate::alarm::Rule;
+use super::keys::{Interface, Method, Pack, TemperatureInput};
 use crate::cell::{CapacityState, CellModel};
 
 /// Interfaces one daemon may watch: more than any vehicle computer has, few enough for one byte in journals.
@@ -20,9 +20,9 @@ pub(crate) fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     }
     limits(raw, faults);
     health(raw, model, faults);
-    for (index, alarm) in raw.alarms.iter().enumerate() {
-        check_alarm(alarm, &raw.alarms[..index], raw.usable_written, faults);
-    }
+    let rated_ah = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
+    let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| Rated::new(rated_ah, recharge));
+    alarm::check(raw, rated.as_ref(), faults);
     output(raw, faults);
 }
 
@@ -48,14 +48,18 @@ fn interfaces(raw: &Raw, faults: &mut Faults) {
     let cells = raw.cell_voltage.iter().map(|s| s.source());
     let pack = raw.pack_voltage.iter().map(|s| s.source());
     let temperatures = raw.temperatures.iter().map(|s| s.source());
+    let reported = raw.reported_soc.iter().map(|s| s.source()).chain(raw.reported_soh.iter().map(|s| s.source()));
     if !raw.interfaces_whole {
         return;
     }
-    for source in current.chain(cells).chain(pack).chain(temperatures) {
-        match source.interface {
-            Some(name) => known_interface(name, source.place, "interface", &raw.interfaces, faults),
+    let signals = current.chain(cells).chain(pack).chain(temperatures).chain(reported);
+    let signals = signals.map(|source| (source.interface, source.place));
+    let protected = raw.protected.iter().map(|protected| (protected.interface.as_deref(), &protected.place));
+    for (interface, place) in signals.chain(protected) {
+        match interface {
+            Some(name) => known_interface(name, place, "interface", &raw.interfaces, faults),
             None if raw.interfaces.len() > 1 => {
-                source.place.fault(faults, "interface", &format!("must be {}", names(&raw.interfaces)));
+                place.fault(faults, "interface", &format!("must be {}", names(&raw.interfaces)));
             }
             None => {}
         }
@@ -166,25 +170,6 @@ fn health(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     {
         let what = format!("must be below the cell model's voltage_max_v = {}", model.voltage_max_v);
         usable.place.fault(faults, "cutoff_v", &what);
-    }
-}
-
-fn check_alarm(alarm: &Alarm, earlier: &[Alarm], usable_written: bool, faults: &mut Faults) {
-    let place = &alarm.place;
-    match (alarm.threshold, alarm.threshold_of_rated) {
-        (None, None) => place.fault(faults, "threshold", "must be given, in the rule's unit"),
-        (Some(_), Some(_)) => place.fault(faults, "threshold_of_rated", "must not stand beside threshold"),
-        (None, Some(_)) if !in_ampere_hours(alarm.rule) => {
-            place.fault(faults, "threshold_of_rated", "must be threshold: this rule does not compare a capacity");
-        }
-        (Some(_), None) | (None, Some(_)) => {}
-    }
-    if alarm.rule == Rule::UsableCapacityLow && !usable_written {
-        place.fault(faults, "rule", "must have a table [usable] that states the load");
-    }
-    if let Some(twin) = earlier.iter().find(|other| other.rule == alarm.rule && other.severity == alarm.severity) {
-        let what = format!("must differ in severity from the same rule in line {}", twin.place.line);
-        place.fault(faults, "rule", &what);
     }
 }
 

@@ -4,11 +4,11 @@ use std::ops::RangeInclusive;
 
 use serde::Serialize;
 
-use super::convert::{Raw, in_ampere_hours};
+use super::convert::Raw;
 use super::keys::TemperatureInput;
 use super::resolve::{Resolved, channel_words};
-use super::{Config, InterfaceConfig};
-use crate::alarm::{Rule, RuleConfig, Severity};
+use super::{Config, InterfaceConfig, protect};
+use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
@@ -30,6 +30,8 @@ pub struct Description {
     pub signals: Vec<SignalUse>,
     /// What a plausible reading is.
     pub limits: Vec<String>,
+    /// What becomes of a frame before it is read: the bound on frames, end-to-end protection; in sentences.
+    pub intake: Vec<String>,
     /// Frames that are sent.
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
@@ -128,6 +130,7 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(bus, i, found)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
+        intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
     }
@@ -203,7 +206,11 @@ fn signal(raw: &Raw, config: &Config, resolved: &Resolved<'_>) -> SignalUse {
         not_available: resolved.not_available.iter().map(|code| format!("{code:X}")).collect(),
         serves: match resolved.channel {
             Channel::Temperature(sensor) => raw.temperatures.get(usize::from(sensor.0)).map(serves),
-            Channel::Current | Channel::PackVoltage | Channel::CellVoltage(_) => None,
+            Channel::Current
+            | Channel::PackVoltage
+            | Channel::CellVoltage(_)
+            | Channel::ReportedSoc
+            | Channel::ReportedSoh => None,
         },
     }
 }
@@ -274,37 +281,56 @@ fn alarms(config: &Config) -> Vec<String> {
 }
 
 fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String {
-    let (what, unit, below) = match rule.rule {
-        Rule::CapacityLow => ("a cell's capacity", " Ah", true),
-        Rule::UsableCapacityLow => ("a cell's usable capacity", " Ah", true),
-        Rule::RechargePeriodLow => match recharge.alarm_on {
-            RechargeAlarm::Raw => ("the recharge period", " s", true),
-            RechargeAlarm::Normalised => ("the normalised recharge period", " s", true),
-        },
-        Rule::InputMissing => ("the age of an input", " s", false),
-        Rule::InputImplausible => ("the share of bad readings of an input", "", false),
-        Rule::EstimateUntrusted => ("a cell's mean normalised innovation squared", "", false),
+    let row = rule.rule.row();
+    let what = match (rule.rule, recharge.alarm_on) {
+        (Rule::RechargePeriodLow, RechargeAlarm::Normalised) => "the normalised recharge period",
+        _ => row.about,
     };
-    let (side, clear) =
-        if below { ("below", rule.threshold + rule.hysteresis) } else { ("above", rule.threshold - rule.hysteresis) };
+    let side = match row.direction {
+        Direction::Below => "below",
+        Direction::Above => "above",
+    };
     let severity = match rule.severity {
         Severity::Info => "info",
         Severity::Warning => "warning",
         Severity::Severe => "severe",
     };
-    let of_rated = match in_ampere_hours(rule.rule) {
-        true => format!(" ({} % of rated)", round(100.0 * rule.threshold / rated_ah)),
-        false => String::new(),
+    let of_rated = match row.unit {
+        Unit::AmpereHours => format!(" ({} % of rated)", round(100.0 * rule.threshold / rated_ah)),
+        _ => String::new(),
     };
-    let mut words = format!("{severity} when {what} is {side} {}{unit}{of_rated}", round(rule.threshold));
+    let (set, clear) = (amount(rule.threshold, row.unit), amount(rule.clear, row.unit));
+    let mut words = match rule.when {
+        When::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
+        When::Probability(level) => {
+            format!(
+                "{severity} when {what} is {side} {set}{of_rated} with a probability above {} %",
+                round(100.0 * level)
+            )
+        }
+    };
     if rule.debounce_s > 0.0 {
         words.push_str(&format!(" for {} s", rule.debounce_s));
     }
     if rule.debounce_events > 1 {
         words.push_str(&format!(" in {} values one after the other", rule.debounce_events));
     }
-    words.push_str(&format!(", cleared at {}{unit}", round(clear)));
+    words.push_str(&format!(", cleared at {clear}"));
+    if rule.is_latching {
+        words.push_str(" and on command");
+    }
     words
+}
+
+/// A value of a rule with its unit, fractions as percent.
+fn amount(value: f64, unit: Unit) -> String {
+    match unit {
+        Unit::Fraction => format!("{} %", round(100.0 * value)),
+        Unit::Ratio => round(value).to_string(),
+        Unit::AmpereHours | Unit::Seconds | Unit::Celsius | Unit::Cycles => {
+            format!("{} {}", round(value), unit.symbol())
+        }
+    }
 }
 
 /// Without the digits a float adds to a decimal number.

@@ -28,6 +28,11 @@ impl Faults {
         }
     }
 
+    /// How many faults there are.
+    pub(crate) fn len(&self) -> usize {
+        self.list.len()
+    }
+
     /// Whether nothing was found.
     pub(crate) fn is_empty(&self) -> bool {
         self.list.is_empty()
@@ -97,12 +102,17 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
+    /// Whether the table at `span` is written `{ ... }`.
+    pub(crate) fn is_inline(&self, span: &Range<usize>) -> bool {
+        self.text.get(span.clone()).is_some_and(|text| text.starts_with('{'))
+    }
+
     /// The place of a table: its path for people, its line, and where its keys stand.
     pub(crate) fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> Place {
         let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
             let key: &Spanned<std::borrow::Cow<'_, str>> = key;
             let found = match value.get_ref() {
-                DeValue::Table(_) => "a table".to_owned(),
+                DeValue::Table(_) if !self.is_inline(&value.span()) => "a table".to_owned(),
                 _ => self.quote(&value.span()),
             };
             (key.get_ref().to_string(), Spot { line: self.line(&key.span()), found })

@@ -3,11 +3,13 @@
 //! A new key is one line here and one where `convert` turns it into a setting. The reference page
 //! (`config/REFERENCE.md`) and every fault's "must be" come from these lines.
 
+use super::alarm::Threshold;
 use super::schema::Presence::{Default, Optional, Required};
 use super::schema::{SectionInfo, section};
 use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
-use crate::alarm::{Rule, Severity};
+use crate::alarm::{Rule, When};
+use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
@@ -54,7 +56,7 @@ choice!(E2e { "off" => Self::Off, "1A" => Self::P01A, "1C" => Self::P01C, "5" =>
 choice!(Discretisation { "exact" => Self::Exact, "euler" => Self::Euler });
 choice!(CapacityState { "joint" => Self::Joint, "held" => Self::Held });
 choice!(RechargeAlarm { "raw" => Self::Raw, "normalised" => Self::Normalised });
-choice!(Severity { "info" => Self::Info, "warning" => Self::Warning, "severe" => Self::Severe });
+choice!(Profile { "1A" => Self::P01A, "1C" => Self::P01C, "5" => Self::P05 });
 choice!(Rule {
     "capacity_low" => Self::CapacityLow,
     "usable_capacity_low" => Self::UsableCapacityLow,
@@ -62,6 +64,14 @@ choice!(Rule {
     "input_missing" => Self::InputMissing,
     "input_implausible" => Self::InputImplausible,
     "estimate_untrusted" => Self::EstimateUntrusted,
+    "resistance_high" => Self::ResistanceHigh,
+    "soc_low" => Self::SocLow,
+    "temperature_high" => Self::TemperatureHigh,
+    "cell_imbalance" => Self::CellImbalance,
+    "remaining_life_low" => Self::RemainingLifeLow,
+    "bms_disagrees" => Self::BmsDisagrees,
+    "store_failed" => Self::StoreFailed,
+    "bus_fault" => Self::BusFault,
 });
 
 section! {
@@ -99,6 +109,28 @@ section! {
     Input at "input" {
         /// DBC files that describe the signals named below, relative to this file.
         dbc: Vec<String>, "", NotEmpty, Required;
+        /// Frames of one identifier on one interface that are taken in; a tenth of it may come at once. What comes beyond is dropped, counted and told, so that a sender gone wild does not take the time of the others. The default is twice the fastest honest sender (one frame a millisecond) and half of what a saturated bus of 500 kbit/s carries.
+        max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
+    }
+}
+
+section! {
+    /// An input message whose sender protects it end to end (AUTOSAR). The readings of a frame that fails its check (damaged, repeated, out of sequence, another message's, or the first after a start) are bad; each outcome is counted, and told when the message turns.
+    ProtectedInput at "input.protected" {
+        /// Name of the message in its DBC file; one of its signals must be an input.
+        message: String, "", NotEmpty, Required;
+        /// Interface the message comes on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// AUTOSAR profile: 1 with the whole data identifier in the CRC (variant A), 1 with four bits of it sent (variant C), or 5.
+        profile: Profile, "", Any, Required;
+        /// Data identifier agreed with the sender; up to 0xFFF in 1C.
+        data_id: u16, "", Between(0.0, 65535.0), Required;
+        /// Frames that may be lost between two; each further check without a good frame allows one more. Up to 14 in profile 1.
+        max_delta_counter: u16, "frames", Between(0.0, 255.0), Default("1");
+        /// Repeated or missing frames in a row after which the sequence is to be shown anew (`sync_counter`); 14 = any number.
+        max_repeated: u16, "frames", Between(0.0, 14.0), Default("14");
+        /// Frames in sequence that show it after a jump too far; they are used. 0 = none is asked for: then profile 1 keeps to its old counter after a jump (of a sender that restarted) until the sender has come round to it, 14 frames at most.
+        sync_counter: u16, "frames", Between(0.0, 14.0), Default("0");
     }
 }
 
@@ -182,6 +214,22 @@ signal_section! {
     TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
         /// Cells this sensor serves. Without it: all cells.
         cells: Option<CellRanges>, "", Any, Optional;
+    }
+}
+
+signal_section! {
+    /// State of charge as the pack itself reports it, for the rule `bms_disagrees`; no estimate is made of it. A DBC in % is taken as such where `scale` is not given.
+    ReportedSocInput at "input.reported_soc", "fraction per unit of the DBC" {
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0");
+    }
+}
+
+signal_section! {
+    /// State of health (capacity over rated capacity) as the pack itself reports it, likewise.
+    ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0");
     }
 }
 
@@ -368,23 +416,34 @@ section! {
 }
 
 section! {
-    /// An alarm. `capacity_low` and `usable_capacity_low` compare Ah per cell, `recharge_period_low` s, `input_missing` the age in s,
-    /// `input_implausible` the share of bad readings, `estimate_untrusted` the mean normalised innovation squared.
+    /// The alarms of a rule. What each rule compares, and the unit of its thresholds:
+    /// `capacity_low`, `usable_capacity_low` Ah per cell; `recharge_period_low` s; `resistance_high` times that of a new cell;
+    /// `soc_low` (the emptiest cell), `cell_imbalance` (SOC between the fullest and the emptiest cell), `bms_disagrees` (SOC or SOH as the pack reports it less ours), `input_implausible` (share of bad readings) fractions;
+    /// `temperature_high` (the hottest sensor) degrees C; `remaining_life_low` equivalent full cycles;
+    /// `input_missing` (silence), `store_failed` and `bus_fault` (for how long) s; `estimate_untrusted` the mean normalised innovation squared.
     Alarm at "alarm" {
         /// What it is about.
         rule: Rule, "", Any, Required;
-        /// Raised when the value is below this (`*_low`) or above it (the others), in the rule's unit. Required, except where `threshold_of_rated` says it.
-        threshold: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
-        /// The threshold as a part of the rated capacity, for `capacity_low` and `usable_capacity_low`.
-        threshold_of_rated: Option<f64>, "fraction", Above(0.0, 2.0), Optional;
-        /// Cleared when the value is back on the healthy side by this much. Without it: 2 % of the threshold.
+        /// Threshold of the alarm of severity "info": raised when the value is below it (`*_low`) or above it (the others). A number in the rule's unit, or a text like "80 %": of the rated capacity, of the period the reference charger needs for it, of a new cell's resistance, of a fraction's 1. With `{ set = ..., clear = ... }` it is cleared at `clear`. At least one of `info`, `warning` and `severe` is needed, and each at most once per rule.
+        info: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional;
+        /// The same for severity "warning". Without it: no such alarm.
+        warning: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional;
+        /// The same for severity "severe". Without it: no such alarm.
+        severe: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional;
+        /// Cleared when the value is back on the healthy side by this much, where the threshold does not say `clear`. Without it: 2 % of the threshold.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
+        /// What is compared: "mean" the value itself; `{ probability = 0.95 }` raises when the probability that the truth is beyond the threshold passes that level (and clears when the probability that it is beyond the clear threshold does not). A level above one half raises later and seldom wrongly, one below it earlier.
+        when: When, "", Any, Default("\"mean\"");
         /// Must hold this long before it is raised, and be healthy this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
         /// Must hold for this many new values before it is raised or cleared.
         debounce_events: u32, "", Between(1.0, 1e6), Default("1");
-        /// How bad it is.
-        severity: Severity, "", Any, Default("\"warning\"");
+        /// Whether it stays raised when the value is healthy again, until somebody clears it.
+        latched: bool, "", Any, Default("false");
+        /// J1939: suspect parameter number. Without it: 520192 (maker-assignable) plus the rule's number.
+        spn: Option<u32>, "", Between(1.0, 524_287.0), Optional;
+        /// J1939: failure mode identifier. Without it: by rule and severity (17, 18, 1 for a value too low, 15, 16, 0 for one too high; 9 for a missing input, 19 for a bad one or a bus, 2 for an estimate not to be trusted, 31 for a store).
+        fmi: Option<u16>, "", Between(0.0, 31.0), Optional;
     }
 }
 
@@ -486,6 +545,9 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<CellVoltageInput>(),
     SectionInfo::one::<PackVoltageInput>(),
     SectionInfo::many::<TemperatureInput>(),
+    SectionInfo::one::<ReportedSocInput>(),
+    SectionInfo::one::<ReportedSohInput>(),
+    SectionInfo::many::<ProtectedInput>(),
     SectionInfo::one::<CurrentLimits>(),
     SectionInfo::one::<VoltageLimits>(),
     SectionInfo::one::<TemperatureLimits>(),

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use crate::can::dbc::Database;
 use crate::monitor::MonitorConfig;
 
+mod alarm;
 pub mod cell_model;
 mod convert;
 mod cross;
@@ -16,6 +17,7 @@ mod document;
 mod keys;
 mod output;
 mod pattern;
+mod protect;
 mod reference;
 mod resolve;
 mod schema;
@@ -97,12 +99,15 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     cross::check(&raw, model.as_ref(), faults);
     let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
     let databases = Databases::load(path, names, read, faults);
+    let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
+    let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
+    let guards = protect::guards(&raw, &found, inputs_whole, faults);
     let (output, output_layout) = output::output(&raw, path, model.as_ref(), &found, read, faults).unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, output)?;
+    let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, guards, output)?;
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))

@@ -93,6 +93,12 @@ pub(crate) fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faul
     if let Some(voltage) = &raw.pack_voltage {
         search.one(Channel::PackVoltage, &voltage.source(), 1.0);
     }
+    if let Some(soc) = &raw.reported_soc {
+        search.one(Channel::ReportedSoc, &soc.source(), 1.0);
+    }
+    if let Some(soh) = &raw.reported_soh {
+        search.one(Channel::ReportedSoh, &soh.source(), 1.0);
+    }
     if let (Some(voltage), Some(pack)) = (&raw.cell_voltage, &raw.pack) {
         search.cells(voltage, pack.cells);
     }
@@ -171,7 +177,7 @@ impl<'d> Search<'_, 'd> {
     }
 
     fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, (file, message, signal): Hit<'d>) {
-        let Some(bus) = self.bus(source) else {
+        let Some(bus) = bus_of(self.raw, source.interface) else {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = format!("{}.{}", message.name, signal.name);
@@ -199,18 +205,20 @@ impl<'d> Search<'_, 'd> {
         not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
         not_available.sort_unstable();
         not_available.dedup();
-        let (scale, offset) = (sign * source.scale, sign * source.offset);
+        let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
+        let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
+        let (scale, offset) = (sign * usual_scale, sign * source.offset);
         self.found.push(Resolved { channel, bus, file, message, signal, scale, offset, not_available });
     }
+}
 
-    fn bus(&self, source: &SignalSource<'_>) -> Option<BusIndex> {
-        let interfaces = &self.raw.interfaces;
-        let index = match source.interface {
-            Some(name) => interfaces.iter().position(|interface| interface.name == name)?,
-            None => 0,
-        };
-        u8::try_from(index).ok().map(BusIndex)
-    }
+/// The interface a table names, the first when it names none; `None` = not there (noted by the cross checks).
+pub(crate) fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
+    let index = match interface {
+        Some(name) => raw.interfaces.iter().position(|interface| interface.name == name)?,
+        None => 0,
+    };
+    u8::try_from(index).ok().map(BusIndex)
 }
 
 fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
@@ -224,6 +232,8 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
         Channel::PackVoltage => "pack voltage".to_owned(),
         Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
+        Channel::ReportedSoc => "reported SOC".to_owned(),
+        Channel::ReportedSoh => "reported SOH".to_owned(),
     }
 }
 

@@ -187,7 +187,7 @@ impl TableReader<'_> {
                 };
                 let (Wrong::Type(span) | Wrong::Range(span)) = wrong;
                 let found = match value.get_ref() {
-                    DeValue::Table(_) => "a table".to_owned(),
+                    DeValue::Table(_) if !self.document.is_inline(&value.span()) => "a table".to_owned(),
                     _ => self.document.quote(&span),
                 };
                 let text = format!("{} = {found}, {what}", self.place.key(key.name));

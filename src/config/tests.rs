@@ -135,7 +135,7 @@ fn a_total_voltage_means_one_cell_of_a_series() {
 
 #[test]
 fn a_relative_threshold_is_of_the_rated_capacity() {
-    let alarm = "[[alarm]]\nrule = \"capacity_low\"\nthreshold_of_rated = 0.75\n";
+    let alarm = "[[alarm]]\nrule = \"capacity_low\"\nwarning = \"75 %\"\n";
     assert_eq!(good(&format!("{PACK}{alarm}")).monitor.rules[0].threshold, 1.5);
     let rated = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 4");
     let config = good(&format!("{rated}{alarm}"));
@@ -369,19 +369,61 @@ fn single_faults_of_appended_tables() {
         ),
         (
             "[[alarm]]\nrule = \"capacity_low\"\n",
-            "pack.toml:15: alarm[1].threshold is not set, must be given, in the rule's unit",
+            "pack.toml:15: alarm[1] has no threshold, must have info, warning or severe",
         ),
         (
-            "[[alarm]]\nrule = \"usable_capacity_low\"\nthreshold = 1\n",
+            "[[alarm]]\nrule = \"usable_capacity_low\"\nwarning = 1\n",
             "pack.toml:16: alarm[1].rule = \"usable_capacity_low\", must have a table [usable] that states the load",
         ),
         (
-            "[[alarm]]\nrule = \"input_missing\"\nthreshold_of_rated = 1\n",
-            "pack.toml:17: alarm[1].threshold_of_rated = 1, must be threshold: this rule does not compare a capacity",
+            "[[alarm]]\nrule = \"input_missing\"\nwarning = \"80 %\"\n",
+            "pack.toml:17: alarm[1].warning = \"80 %\", must be a number: nothing is 100 % for this rule",
         ),
         (
-            "[[alarm]]\nrule = \"input_missing\"\nthreshold = 1\n[[alarm]]\nrule = \"input_missing\"\nthreshold = 2\n",
-            "pack.toml:19: alarm[2].rule = \"input_missing\", must differ in severity from the same rule in line 15",
+            "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\n[[alarm]]\nrule = \"input_missing\"\nwarning = 2\n",
+            "pack.toml:20: alarm[2].warning = 2, must be one per rule, alarm[1] in line 15 has one",
+        ),
+        (
+            "[[alarm]]\nrule = \"capacity_low\"\nwarning = { set = 1.5, clear = \"74 %\" }\n",
+            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 or above it, on the \
+             healthy side, not at 1.48",
+        ),
+        (
+            "[[alarm]]\nrule = \"temperature_high\"\nsevere = { set = 60, clear = 61 }\n",
+            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 or below it, on the healthy \
+             side, not at 61",
+        ),
+        (
+            "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1.4\nsevere = 1.5\n",
+            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4: it is the graver one",
+        ),
+        (
+            "[[alarm]]\nrule = \"soc_low\"\nwarning = 10\n",
+            "pack.toml:17: alarm[1].warning = 10, must be 0 to 1, or a text like \"20 %\"",
+        ),
+        (
+            "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clera = 0.2 }\n",
+            "pack.toml:17: alarm[1].warning = { set = 0.1, clera = 0.2 }, must be a number, a text like \"80 %\", or { set \
+             = ..., clear = ... } of these, -1000000000 to 1000000000 (the rule's)",
+        ),
+        (
+            "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
+            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\": the value of this rule has no standard \
+             deviation",
+        ),
+        (
+            "[[alarm]]\nrule = \"recharge_period_low\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
+            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\" with recharge.alarm_on = \"raw\": that \
+             period has no standard deviation",
+        ),
+        (
+            "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\nwhen = { probability = 1.5 }\n",
+            "pack.toml:18: alarm[1].when = { probability = 1.5 }, must be \"mean\", or { probability = ... } above 0 and \
+             below 1",
+        ),
+        (
+            "[[alarm]]\nrule = \"bms_disagrees\"\nwarning = 0.1\n",
+            "pack.toml:16: alarm[1].rule = \"bms_disagrees\", must have [input.reported_soc] or [input.reported_soh]",
         ),
         (
             "[output.status]\nid = 0x800\n",
@@ -575,7 +617,7 @@ fn every_default_is_a_value_its_key_allows() {
                     key.about.contains("ithout it")
                         || info.path.is_empty()
                         || key.about.contains("Needed")
-                        || key.about.contains("threshold"),
+                        || key.about.contains("At least one of"),
                     "{}.{} says what holds without it",
                     info.path,
                     key.name
@@ -608,7 +650,7 @@ proptest! {
         const SCRAPS: [&str; 14] = [
             "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
         ];
-        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nthreshold = 1\n[output.status]\nid = 1\n");
+        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n");
         let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
         for (file, place, length, scrap) in edits {
             let text = &mut texts[file];

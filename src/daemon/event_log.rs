@@ -3,9 +3,11 @@
 
 use std::io::{self, Write};
 
-use crate::alarm::Severity;
+use crate::alarm::{Change, Severity};
+use crate::can::CanId;
+use crate::can::e2e::Status;
 use crate::monitor::{BusEvent, Event, EventKind};
-use crate::quantity::{CellIndex, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 /// Error frames of one interface are summed up this often, s.
 const ERROR_SUMMARY_S: f64 = 10.0;
@@ -41,12 +43,21 @@ impl EventLog {
     pub(crate) fn log(&mut self, event: &Event) {
         match event.kind {
             EventKind::Bus { bus, what } => self.log_bus(event.time, bus.index(), what),
-            EventKind::Alarm { severity, active, .. } => log_alarm(&event.kind, active && severity != Severity::Info),
+            EventKind::Alarm { .. } => log_alarm(&event.kind),
             EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::RechargePeriod { .. } => {
                 log_learned(&event.kind);
             }
             EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
             EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
+            EventKind::Protection { bus, id, status, usable, count } => {
+                self.log_protection(bus, id, status, usable, count);
+            }
+            EventKind::Flood { bus, id, active: true, .. } => {
+                tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
+            }
+            EventKind::Flood { bus, id, active: false, dropped } => {
+                tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
             EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
@@ -56,7 +67,35 @@ impl EventLog {
                 tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
             }
             EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
+            EventKind::Command { source, command, changed, refused } => {
+                tracing::info!(?source, ?command, changed, refused, "command");
+            }
+            EventKind::Test { rule, running } => {
+                tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
+            }
+            EventKind::PackReplaced { capacity_ah, capacity_std_ah } => {
+                tracing::warn!(
+                    capacity_ah,
+                    capacity_std_ah,
+                    "another pack: what was learned of the old one is forgotten"
+                );
+            }
+            EventKind::Store { works: true } => tracing::info!("files can be written"),
+            EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
             EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
+        }
+    }
+
+    fn name(&self, bus: BusIndex) -> &str {
+        self.interfaces.get(bus.index()).map_or("?", String::as_str)
+    }
+
+    fn log_protection(&self, bus: BusIndex, id: CanId, status: Status, usable: bool, count: u64) {
+        let (interface, status) = (self.name(bus), status.name());
+        if usable {
+            tracing::info!(interface, %id, status, failed = count, "protected message usable again");
+        } else {
+            tracing::warn!(interface, %id, status, failed = count, "protected message fails its check");
         }
     }
 
@@ -86,14 +125,25 @@ fn number(cell: CellIndex) -> u32 {
     u32::from(cell.0) + 1
 }
 
-fn log_alarm(kind: &EventKind, loud: bool) {
-    let EventKind::Alarm { rule, cell, active, severity, value, threshold } = *kind else { return };
+fn log_alarm(kind: &EventKind) {
+    let EventKind::Alarm { rule, cell, change, severity, value, probability, threshold, occurrences, .. } = *kind
+    else {
+        return;
+    };
     let cell = cell.map(number);
-    if loud {
-        tracing::warn!(?rule, cell, ?severity, value, threshold, "alarm raised");
+    let what = match change {
+        Change::Raised => "alarm raised",
+        Change::Suppressed => "alarm raised earlier, its value is not known now",
+        Change::Resumed => "alarm raised earlier, its value is known again",
+        Change::Latched => "alarm latched",
+        Change::Cleared => "alarm cleared",
+        Change::Acknowledged => "alarm acknowledged",
+        Change::Forgotten => "alarm forgotten",
+    };
+    if change == Change::Raised && severity != Severity::Info {
+        tracing::warn!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
     } else {
-        let what = if active { "alarm raised" } else { "alarm cleared" };
-        tracing::info!(?rule, cell, ?severity, value, threshold, "{what}");
+        tracing::info!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
     }
 }
 

@@ -11,17 +11,20 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+mod intake;
+mod rows;
+
 use super::event_log;
+use crate::alarm::Change;
 use crate::can::Frame;
-use crate::cell::MAX_BRANCHES;
-use crate::io::candump::{self, StampDigits};
 use crate::io::log::{LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{
-    Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS, Transmit,
-};
+use crate::monitor::{Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
+
+pub use intake::{DroppedSummary, ProtectedSummary};
+use rows::{write_estimate, write_estimates_header, write_frame};
 
 /// Records between two looks at the clock for the progress report.
 const REPORT_EVERY: u64 = 4096;
@@ -148,6 +151,10 @@ pub struct Summary {
     pub frames_out: u64,
     /// Bad readings of signals that came back to good.
     pub bad_readings: u64,
+    /// Protected input messages.
+    pub protected: Vec<ProtectedSummary>,
+    /// Messages that came too often.
+    pub dropped: Vec<DroppedSummary>,
     /// Events by kind.
     pub events: BTreeMap<&'static str, u64>,
     /// The first 1,000 alarms raised.
@@ -378,6 +385,7 @@ impl Replay {
         let (span, mut summary) = (self.span, self.summary);
         summary.log = counts.clone();
         summary.cells = cell_summaries(&self.monitor, &self.usable);
+        (summary.protected, summary.dropped) = intake::summaries(&self.monitor, &self.settings.interfaces);
         summary.first_s = span.first.map(Timestamp::secs);
         summary.last_s = span.latest.map(Timestamp::secs);
         summary.awake_s = span.awake_s();
@@ -427,64 +435,54 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             "capacity"
         }
         EventKind::RechargePeriod { .. } => "recharge_period",
-        EventKind::Alarm { active, .. } => {
-            if active && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
+        EventKind::Alarm { change, .. } => {
+            if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
                 summary.alarms_raised.push(*event);
             }
-            if active { "alarm_raised" } else { "alarm_cleared" }
+            alarm_change_name(change)
         }
         EventKind::SignalBad { .. } => "signal_bad",
         EventKind::SignalGood { bad_readings, .. } => {
             summary.bad_readings += bad_readings;
             "signal_good"
         }
+        EventKind::Protection { usable, .. } => {
+            if usable {
+                "protection_usable"
+            } else {
+                "protection_failed"
+            }
+        }
+        EventKind::Flood { active, .. } => {
+            if active {
+                "flood_begun"
+            } else {
+                "flood_over"
+            }
+        }
         EventKind::Bus { .. } => "bus",
         EventKind::Gap { .. } => "gap",
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",
         EventKind::Trust { .. } => "trust",
+        EventKind::Command { .. } => "command",
+        EventKind::Test { .. } => "test",
+        EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::Store { .. } => "store",
     };
     *summary.events.entry(name).or_default() += 1;
 }
 
-fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
-    write!(out, "time_s,cell,soc,soc_std")?;
-    (1..=MAX_BRANCHES).try_for_each(|n| write!(out, ",u{n}_v"))?;
-    writeln!(
-        out,
-        ",capacity_ah,capacity_std_ah,resistance_ratio,resistance_ratio_std,innovation_v,innovation_std_v,accepted,\
-         voltage_v,current_a,temperature_c"
-    )
-}
-
-/// One row; floats in the shortest form that reads back the same, nothing for NaN.
-fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::Result<()> {
-    let e = estimate;
-    let nanos = e.time.nanos();
-    let (sign, nanos) = (if nanos < 0 { "-" } else { "" }, nanos.unsigned_abs());
-    write!(out, "{sign}{}.{:09},{}", nanos / 1_000_000_000, nanos % 1_000_000_000, e.cell.0)?;
-    [e.soc, e.soc_std].into_iter().chain(e.branch_v).try_for_each(|value| write_value(out, value))?;
-    let filter = [
-        e.capacity_ah,
-        e.capacity_std_ah,
-        e.resistance_ratio,
-        e.resistance_ratio_std,
-        e.innovation_v,
-        e.innovation_std_v,
-    ];
-    filter.into_iter().try_for_each(|value| write_value(out, value))?;
-    write!(out, ",{}", e.accepted)?;
-    [e.voltage_v, e.current_a, e.temperature_c].into_iter().try_for_each(|value| write_value(out, value))?;
-    out.write_all(b"\n")
-}
-
-fn write_value(out: &mut impl Write, value: f64) -> io::Result<()> {
-    if value.is_nan() { out.write_all(b",") } else { write!(out, ",{value:?}") }
-}
-
-fn write_frame(out: &mut impl Write, interfaces: &[String], transmit: &Transmit) -> io::Result<()> {
-    let interface = interfaces.get(transmit.bus.index()).map_or("unknown", String::as_str);
-    candump::write_line(out, transmit.time, StampDigits::Nanos, interface, &transmit.frame)
+fn alarm_change_name(change: Change) -> &'static str {
+    match change {
+        Change::Raised => "alarm_raised",
+        Change::Suppressed => "alarm_suppressed",
+        Change::Resumed => "alarm_resumed",
+        Change::Latched => "alarm_latched",
+        Change::Cleared => "alarm_cleared",
+        Change::Acknowledged => "alarm_acknowledged",
+        Change::Forgotten => "alarm_forgotten",
+    }
 }
 
 /// Which records are wanted.

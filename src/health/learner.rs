@@ -222,6 +222,11 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(config, cell) }
     }
 
+    /// Whether a cell's capacity is more than what it was configured to start from.
+    pub fn has_learned(&self, cell: usize) -> bool {
+        self.learned.get(cell).copied().unwrap_or(false)
+    }
+
     /// Whether every cell's capacity is more than what it was configured to start from.
     pub fn has_learned_all(&self) -> bool {
         self.learned.iter().all(|&learned| learned)

@@ -9,6 +9,8 @@
 //! BUS (1700000000.200000000) can0 up|down|missing|dropped N|error_frame CLASS|send_failed N
 //! GAP (1700000000.300000000)
 //! RESTORE (1700000000.000000000) AWAY_SECONDS|-
+//! COMMAND (1700000000.400000000) {"command":"acknowledge",...}
+//! STORE (1700000000.500000000) works|fails
 //! ```
 //!
 //! `RESTORE` stands first in the journal of a run that took up a stored state, and says how long it was away.
@@ -17,7 +19,7 @@
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use crate::monitor::{BusEvent, Input};
+use crate::monitor::{BusEvent, Command, Input};
 use crate::quantity::Timestamp;
 
 /// First line of every journal.
@@ -30,6 +32,8 @@ pub(crate) enum Mark<'a> {
     Bus { time: Timestamp, interface: &'a [u8], event: BusEvent },
     Gap { time: Timestamp },
     Restore { time: Timestamp, away_s: Option<f64> },
+    Command { time: Timestamp, command: Command },
+    Store { time: Timestamp, works: bool },
 }
 
 /// Reads a journal line that does not begin with `(`; `None` = none of the journal's.
@@ -40,7 +44,7 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
     let Some(space) = memchr::memchr(b' ', line) else { return Ok(None) };
     let keyword = &line[..space];
-    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE"].contains(&keyword) {
+    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE"].contains(&keyword) {
         return Ok(None);
     }
     let shifted = |e: LineError| LineError { column: e.column + space + 1, ..e };
@@ -54,6 +58,15 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
         b"RESTORE" => match parse_away(rest_text) {
             Some(away_s) => Ok(Some(Mark::Restore { time, away_s })),
             None => fail("seconds away, or -"),
+        },
+        b"COMMAND" => match serde_json::from_slice(rest_text) {
+            Ok(command) => Ok(Some(Mark::Command { time, command })),
+            Err(_) => fail("a command as JSON"),
+        },
+        b"STORE" => match rest_text {
+            b"works" => Ok(Some(Mark::Store { time, works: true })),
+            b"fails" => Ok(Some(Mark::Store { time, works: false })),
+            _ => fail("works or fails"),
         },
         _ => match parse_bus(rest_text) {
             Some((interface, event)) => Ok(Some(Mark::Bus { time, interface, event })),
@@ -133,6 +146,14 @@ impl<W: Write> JournalWriter<W> {
             Input::UnknownGap { time } => {
                 self.mark("GAP", time)?;
                 self.out.write_all(b"\n")
+            }
+            Input::Command { time, command } => {
+                self.mark("COMMAND", time)?;
+                writeln!(self.out, " {}", serde_json::to_string(&command)?)
+            }
+            Input::Store { time, works } => {
+                self.mark("STORE", time)?;
+                writeln!(self.out, " {}", if works { "works" } else { "fails" })
             }
             Input::Bus { time, bus, event } => {
                 self.mark("BUS", time)?;

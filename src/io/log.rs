@@ -17,7 +17,7 @@ use super::journal::{self, Mark};
 use super::lines::{self, Lines, RawLine};
 use crate::can::Frame;
 use crate::can::decode::Channel;
-use crate::monitor::{BusEvent, Input};
+use crate::monitor::{BusEvent, Command, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Where a part with an unknown gap before it is put: this long after the record so far.
@@ -82,6 +82,20 @@ pub enum Record {
         /// The stamp from which the record goes on.
         time: Timestamp,
     },
+    /// Somebody asked for something.
+    Command {
+        /// When.
+        time: Timestamp,
+        /// What.
+        command: Command,
+    },
+    /// Whether files could be written changed.
+    Store {
+        /// When.
+        time: Timestamp,
+        /// They could.
+        works: bool,
+    },
     /// The recorded run took up a stored state here.
     Restore {
         /// When.
@@ -99,6 +113,8 @@ impl Record {
             Self::Tick { time } => Input::Tick { time: *time },
             Self::Bus { time, bus, event } => Input::Bus { time: *time, bus: *bus, event: *event },
             Self::UnknownGap { time } => Input::UnknownGap { time: *time },
+            Self::Command { time, command } => Input::Command { time: *time, command: *command },
+            Self::Store { time, works } => Input::Store { time: *time, works: *works },
             Self::Restore { .. } => return None,
         })
     }
@@ -110,6 +126,8 @@ impl Record {
             | Self::Tick { time }
             | Self::Bus { time, .. }
             | Self::UnknownGap { time }
+            | Self::Command { time, .. }
+            | Self::Store { time, .. }
             | Self::Restore { time, .. } => time,
         }
     }
@@ -120,6 +138,8 @@ impl Record {
             | Self::Tick { time }
             | Self::Bus { time, .. }
             | Self::UnknownGap { time }
+            | Self::Command { time, .. }
+            | Self::Store { time, .. }
             | Self::Restore { time, .. } => *time = placed,
         }
         self
@@ -391,6 +411,8 @@ impl State {
             Some(Mark::Tick { time }) => Some(Record::Tick { time }),
             Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
             Some(Mark::Restore { time, away_s }) => Some(Record::Restore { time, away_s }),
+            Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
+            Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
             Some(Mark::Bus { time, interface, event }) => {
                 let bus = self.bus(interface)?;
                 Some(Record::Bus { time, bus, event })

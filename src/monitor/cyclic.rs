@@ -2,14 +2,25 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Event, EventKind, Monitor, MonitorConfig, Outputs, Transmit, Validity};
-use crate::alarm::{ActiveAlarm, AlarmChange, Rule};
+use super::alarms::HOUSEKEEPING_S;
+use super::{Event, EventKind, Monitor, Outputs, Transmit, Validity};
+use crate::alarm::{Alarm, Rule, State};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, SendCounters, StatusFields};
-use crate::quantity::{CellIndex, Channel, Timestamp};
+use crate::quantity::Timestamp;
 
-/// Period of the work that only watches the clock (staleness, debounce), s.
-const HOUSEKEEPING_S: f64 = 0.1;
+/// Period of a test's frames, s: a consumer that looks once a second sees several.
+const TEST_PERIOD_S: f64 = 0.1;
+/// Longest test, s: one that is forgotten ends by itself.
+const MAX_TEST_S: f64 = 600.0;
+
+/// A test of an alarm frame that is running.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Test {
+    rule: Rule,
+    next: Timestamp,
+    end: Timestamp,
+}
 
 /// When each cyclic piece of work is due next.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -49,34 +60,6 @@ fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
     true
 }
 
-/// What the rules about inputs look at; `None` = not known.
-#[derive(Debug, Clone, Copy, Default)]
-struct InputState {
-    silence_s: Option<f64>,
-    bad_share: Option<f64>,
-    /// Whether a reading has come since the last look.
-    is_new: bool,
-}
-
-impl InputState {
-    fn worst(self, other: Self) -> Self {
-        let max = |a: Option<f64>, b: Option<f64>| a.map_or(b, |a| Some(b.map_or(a, |b| a.max(b))));
-        Self {
-            silence_s: max(self.silence_s, other.silence_s),
-            bad_share: max(self.bad_share, other.bad_share),
-            is_new: self.is_new || other.is_new,
-        }
-    }
-}
-
-impl MonitorConfig {
-    /// Silence that the strictest rule calls missing, s.
-    fn missing_after_s(&self) -> Option<f64> {
-        let rules = self.rules.iter().filter(|rule| rule.rule == Rule::InputMissing);
-        rules.map(|rule| rule.threshold).min_by(f64::total_cmp)
-    }
-}
-
 impl Monitor {
     /// When a tick will next do something: a driver may leave out earlier ticks, the result is the same.
     pub fn next_due(&self) -> Option<Timestamp> {
@@ -85,7 +68,8 @@ impl Monitor {
         }
         let schedule = &self.schedule;
         let sending = self.config.output.as_ref().map(|_| schedule.status.min(schedule.health).min(schedule.alarm));
-        Some(sending.map_or(schedule.housekeeping, |due| due.min(schedule.housekeeping)))
+        let test = self.test.map(|test| test.next.min(test.end));
+        [sending, test].into_iter().flatten().chain([schedule.housekeeping]).min()
     }
 
     pub(super) fn handle_tick(&mut self, out: &mut Outputs) {
@@ -104,10 +88,12 @@ impl Monitor {
         if take_due(&mut self.schedule.alarm, self.now, alarm_s) {
             self.send_next_alarm(out);
         }
+        self.continue_test(out);
     }
 
     /// Staleness of the inputs, the mode's minimum duration, the alarms' debounce.
     fn keep_house(&mut self, out: &mut Outputs) {
+        self.intake.poll(self.now, out);
         self.sampler.poll(self.now, &mut self.scratch.signal_changes);
         self.report_signals(out);
         self.observe_current(self.sampler.pack_current_a(self.now), out);
@@ -115,73 +101,7 @@ impl Monitor {
             // A cell nobody measures any more may be the weakest.
             self.forget_pack();
         }
-        self.watch_inputs(out);
-        self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
-        self.report_alarms(out);
-    }
-
-    /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
-    /// what belongs to no cell under the pack.
-    fn watch_inputs(&mut self, out: &mut Outputs) {
-        let mut pack = InputState::default();
-        for index in 0..self.sampler.channel_count() {
-            let channel = self.sampler.channel(index);
-            let state = self.input_state(channel);
-            if let Channel::CellVoltage(cell) = channel {
-                self.observe_input(Some(cell), state, out);
-            } else {
-                pack = pack.worst(state);
-            }
-        }
-        self.observe_input(None, pack, out);
-    }
-
-    fn input_state(&self, channel: Channel) -> InputState {
-        let silence_s = self.sampler.silence_s(channel, self.now);
-        // Since waking nothing may have come yet: that is neither silence nor its end.
-        let heard = self.sampler.heard_since_waking(channel);
-        let beyond = |silence: &f64| heard || self.config.missing_after_s().is_some_and(|limit| *silence > limit);
-        InputState {
-            silence_s: silence_s.filter(beyond),
-            bad_share: self.sampler.bad_share(channel),
-            is_new: silence_s.is_some_and(|silence_s| heard && silence_s <= HOUSEKEEPING_S),
-        }
-    }
-
-    fn observe_input(&mut self, cell: Option<CellIndex>, state: InputState, out: &mut Outputs) {
-        self.observe_alarm(Rule::InputMissing, cell, state.silence_s, true, out);
-        self.observe_alarm(Rule::InputImplausible, cell, state.bad_share, state.is_new, out);
-    }
-
-    /// Takes a value into the rules; what changes goes out at once.
-    pub(super) fn observe_alarm(
-        &mut self,
-        rule: Rule,
-        cell: Option<CellIndex>,
-        value: Option<f64>,
-        new_value: bool,
-        out: &mut Outputs,
-    ) {
-        self.alarms.observe(self.now, rule, cell, value, new_value, &mut self.scratch.alarm_changes);
-        self.report_alarms(out);
-    }
-
-    fn report_alarms(&mut self, out: &mut Outputs) {
-        let mut changes = std::mem::take(&mut self.scratch.alarm_changes);
-        for change in changes.drain(..) {
-            let kind = EventKind::Alarm {
-                rule: change.rule,
-                cell: change.cell,
-                active: change.active,
-                severity: change.severity,
-                value: change.value,
-                threshold: change.threshold,
-            };
-            out.events.push(Event { time: self.now, kind });
-            let frame = self.alarm_frame(&change);
-            self.send(frame, out);
-        }
-        self.scratch.alarm_changes = changes;
+        self.watch(out);
     }
 
     fn send(&self, frame: Option<Frame>, out: &mut Outputs) {
@@ -213,7 +133,11 @@ impl Monitor {
             highest_severity: self.alarms.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
             active_alarms: Some(u16::try_from(self.alarms.count()).unwrap_or(u16::MAX)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
-            unknown_rules: None,
+            unknown_rules: Some(match self.alarms.unknown() {
+                (_, 0) => 0,
+                (all, unknown) if unknown < all => 1,
+                (_, _) => 2,
+            }),
         };
         Some(output.plan.status(&fields, &mut self.schedule.counters))
     }
@@ -224,10 +148,7 @@ impl Monitor {
         if !self.learner.has_learned_all() {
             return HealthFields { recharge_period_s, ..HealthFields::default() };
         }
-        let cells = 0..self.cells.len();
-        let capacity = cells
-            .map(|index| self.learner.capacity(&self.config.health.capacity, index))
-            .min_by(|a, b| a.mean.total_cmp(&b.mean));
+        let capacity = self.weakest_capacity();
         let usable = self.cells.iter().filter_map(|slot| slot.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
         let log_resistance = self.cells.iter().map(|slot| slot.estimator.log_resistance().mean).max_by(f64::total_cmp);
         HealthFields {
@@ -252,41 +173,75 @@ impl Monitor {
         }
     }
 
+    /// One of the raised alarms in turn, and one of those whose value is not known: the first are not slowed by the
+    /// second.
     fn send_next_alarm(&mut self, out: &mut Outputs) {
-        let count = self.alarms.count();
-        if count == 0 {
-            return;
+        let turn = self.schedule.alarm_turn;
+        self.schedule.alarm_turn = turn.wrapping_add(1);
+        let raised = turn.checked_rem(self.alarms.count()).and_then(|turn| self.alarms.raised().nth(turn));
+        let unknown = self.alarms.unknown_alarm(turn);
+        for alarm in raised.into_iter().chain(unknown) {
+            self.send_alarm(&alarm, out);
         }
-        let turn = self.schedule.alarm_turn % count;
-        self.schedule.alarm_turn = turn + 1;
-        let alarm = self.alarms.active().nth(turn);
-        let frame = alarm.and_then(|alarm| self.alarm_frame(&raised(&alarm)));
+    }
+
+    /// Sends an alarm as it stands.
+    pub(super) fn send_alarm(&mut self, alarm: &Alarm, out: &mut Outputs) {
+        self.send_alarm_fields(alarm_fields(alarm), out);
+    }
+
+    fn send_alarm_fields(&mut self, fields: AlarmFields, out: &mut Outputs) {
+        let counters = &mut self.schedule.counters;
+        let frame = self.config.output.as_ref().map(|output| output.plan.alarm(&fields, counters));
         self.send(frame, out);
     }
 
-    fn alarm_frame(&mut self, alarm: &AlarmChange) -> Option<Frame> {
-        let output = self.config.output.as_ref()?;
-        let fields = AlarmFields {
-            rule: alarm.rule as u8,
-            state: Some(if alarm.active { 1 } else { 2 }),
-            severity: Some(alarm.severity as u8),
-            test: false,
-            acknowledged: false,
-            cell: alarm.cell,
-            value: alarm.value,
-            threshold: Some(alarm.threshold),
-        };
-        Some(output.plan.alarm(&fields, &mut self.schedule.counters))
+    /// Begins to send a rule's alarm frame marked as a test; `false` = there is no output to send it on.
+    pub(super) fn start_test(&mut self, rule: Rule, seconds: f64, out: &mut Outputs) -> bool {
+        if self.config.output.is_none() {
+            return false;
+        }
+        self.end_test(out);
+        let seconds = seconds.clamp(0.0, MAX_TEST_S);
+        self.test = Some(Test { rule, next: self.now, end: self.now.plus_secs(seconds) });
+        out.events.push(Event { time: self.now, kind: EventKind::Test { rule, running: true } });
+        self.continue_test(out);
+        true
+    }
+
+    /// The test's frame when it is due, and its end.
+    fn continue_test(&mut self, out: &mut Outputs) {
+        let Some(mut test) = self.test else { return };
+        if self.now >= test.end {
+            self.end_test(out);
+        } else if take_due(&mut test.next, self.now, TEST_PERIOD_S) {
+            self.test = Some(test);
+            self.send_alarm_fields(test_fields(test.rule, State::Active), out);
+        }
+    }
+
+    fn end_test(&mut self, out: &mut Outputs) {
+        let Some(test) = self.test.take() else { return };
+        self.send_alarm_fields(test_fields(test.rule, State::Inactive), out);
+        out.events.push(Event { time: self.now, kind: EventKind::Test { rule: test.rule, running: false } });
     }
 }
 
-fn raised(alarm: &ActiveAlarm) -> AlarmChange {
-    AlarmChange {
-        rule: alarm.rule,
+fn alarm_fields(alarm: &Alarm) -> AlarmFields {
+    AlarmFields {
+        rule: alarm.rule as u8,
+        state: Some(alarm.state.wire_code()),
+        severity: Some(alarm.severity as u8),
+        test: false,
+        acknowledged: alarm.is_acknowledged,
         cell: alarm.cell,
-        active: true,
-        severity: alarm.severity,
         value: alarm.value,
-        threshold: alarm.threshold,
+        threshold: Some(alarm.threshold),
     }
+}
+
+/// No value and no threshold: nothing of it can be taken for a measurement.
+fn test_fields(rule: Rule, state: State) -> AlarmFields {
+    let (rule, state) = (rule as u8, Some(state.wire_code()));
+    AlarmFields { rule, state, test: true, ..AlarmFields::default() }
 }

@@ -1,8 +1,9 @@
 //! Transitions and what follows from them: half-cycles, capacities, usable capacities, recharge periods, and the
 //! pack's values.
 
+use super::alarms::learned;
 use super::{CellSlot, Event, EventKind, Monitor, Outputs};
-use crate::alarm::Rule;
+use crate::alarm::{Observation, Rule};
 use crate::filter::Belief;
 use crate::health::recharge::normalised_period;
 use crate::health::usable::usable_capacity;
@@ -70,13 +71,18 @@ impl Monitor {
             let capacity = update.capacity;
             slot.usable = Some(usable_capacity(&self.config.model, config, &slot.estimator, capacity, slot.full_soc));
         }
-        let usable_ah = slot.usable.map(|usable| usable.mean);
+        let (usable, resistance) = (slot.usable, slot.resistance());
         out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
         out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
         if update.measurement.is_some() {
-            self.observe_alarm(Rule::CapacityLow, Some(cell), Some(update.capacity.mean), true, out);
+            self.observe_alarm(Rule::CapacityLow, Some(cell), learned(update.capacity), out);
         }
-        self.observe_alarm(Rule::UsableCapacityLow, Some(cell), usable_ah, restate, out);
+        if let Some(usable) = usable.filter(|_| restate) {
+            self.observe_alarm(Rule::UsableCapacityLow, Some(cell), learned(usable), out);
+        }
+        if half_cycle.mode == Mode::Discharge {
+            self.observe_alarm(Rule::ResistanceHigh, Some(cell), learned(resistance), out);
+        }
     }
 
     /// Notes that a charge has tapered off at the highest voltage: what it leaves is "full".
@@ -97,7 +103,7 @@ impl Monitor {
         if let Some(seconds) = self.recharge.observe(config, self.now, self.detector.mode(), pack.soc) {
             self.recharge_period_s = Some(seconds);
             if config.alarm_on == RechargeAlarm::Raw {
-                self.observe_alarm(Rule::RechargePeriodLow, None, Some(seconds), true, out);
+                self.observe_alarm(Rule::RechargePeriodLow, None, Observation::new(Some(seconds)), out);
             }
         }
     }
@@ -120,10 +126,10 @@ impl Monitor {
     }
 
     /// A charge is over, and its cells have `learned` from it or not: its recharge period, raw and normalised.
-    fn finish_charge(&mut self, learned: bool, out: &mut Outputs) {
+    fn finish_charge(&mut self, has_learned: bool, out: &mut Outputs) {
         let config = &self.config.health.recharge;
         let charged = self.recharge.finish(config);
-        let told = charged.coverage >= config.min_coverage && learned && self.learner.has_learned_all();
+        let told = charged.coverage >= config.min_coverage && has_learned && self.learner.has_learned_all();
         let pack = if told { self.combined() } else { None };
         let normalised = pack.map(|pack| {
             let capacity = Belief::from_std(pack.capacity_ah, pack.capacity_std_ah);
@@ -141,7 +147,7 @@ impl Monitor {
         let Some(period) = normalised else { return };
         self.normalised_recharge = Some(period);
         if self.config.health.recharge.alarm_on == RechargeAlarm::Normalised {
-            self.observe_alarm(Rule::RechargePeriodLow, None, Some(period.mean), true, out);
+            self.observe_alarm(Rule::RechargePeriodLow, None, learned(period), out);
         }
     }
 }
@@ -160,8 +166,7 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
 }
 
 fn capacity_event(cell: CellIndex, slot: &CellSlot, update: &CapacityUpdate) -> EventKind {
-    let log_resistance = slot.estimator.log_resistance();
-    let resistance_ratio = libm::exp(log_resistance.mean);
+    let resistance = slot.resistance();
     EventKind::Capacity {
         cell,
         measured_ah: update.measurement.map(|z| z.value),
@@ -170,7 +175,7 @@ fn capacity_event(cell: CellIndex, slot: &CellSlot, update: &CapacityUpdate) -> 
         capacity_std_ah: update.capacity.std(),
         usable_capacity_ah: slot.usable.map(|usable| usable.mean),
         usable_capacity_std_ah: slot.usable.as_ref().map(Belief::std),
-        resistance_ratio,
-        resistance_ratio_std: resistance_ratio * log_resistance.std(),
+        resistance_ratio: resistance.mean,
+        resistance_ratio_std: resistance.std(),
     }
 }

@@ -5,7 +5,10 @@
 //! charge/discharge transition runs the capacity filters; values go to the alarm rules; ticks send the cyclic
 //! frames. Bad input is an event and a count, never a panic.
 
+mod alarms;
+mod buses;
 mod cyclic;
+mod intake;
 mod learning;
 mod output;
 mod snapshot;
@@ -15,12 +18,17 @@ pub use output::OutputConfig;
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
-use cyclic::Schedule;
+use alarms::StoreState;
+use buses::Buses;
+use cyclic::{Schedule, Test};
+use intake::Intake;
 use snapshot::PendingRestore;
 
-use crate::alarm::{AlarmChange, AlarmEngine, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::Frame;
 use crate::can::decode::InputMap;
+use crate::can::flood::{FloodConfig, FloodCount};
+use crate::can::guard::{GuardConfig, GuardCounts};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
 use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
@@ -35,6 +43,10 @@ const ASLEEP_S: f64 = 5.0;
 pub struct MonitorConfig {
     /// What input frames mean.
     pub input: InputMap,
+    /// Input messages with end-to-end protection.
+    pub guards: Vec<GuardConfig>,
+    /// How many frames of one identifier are taken in.
+    pub flood: FloodConfig,
     /// Sample stage.
     pub sample: SampleConfig,
     /// Cell model.
@@ -65,6 +77,29 @@ struct CellSlot {
     updated_in_round: bool,
 }
 
+impl CellSlot {
+    /// A cell of which nothing is known.
+    fn new(config: &EstimatorConfig) -> Self {
+        Self {
+            estimator: CellEstimator::new(config),
+            consumed: None,
+            latest: None,
+            trusted: true,
+            full_soc: 1.0,
+            tapered: false,
+            usable: None,
+            updated_in_round: false,
+        }
+    }
+
+    /// Resistance relative to new.
+    fn resistance(&self) -> Belief {
+        let log_resistance = self.estimator.log_resistance();
+        let ratio = libm::exp(log_resistance.mean);
+        Belief::from_std(ratio, ratio * log_resistance.std())
+    }
+}
+
 /// Totals of the sampler a cell has already taken in.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 struct Consumed {
@@ -83,6 +118,7 @@ pub struct Monitor {
     now: Timestamp,
     /// Inputs that came with a time before `now`.
     time_backwards: u64,
+    intake: Intake,
     sampler: Sampler,
     cells: Vec<CellSlot>,
     detector: TransitionDetector,
@@ -94,6 +130,10 @@ pub struct Monitor {
     /// Cells with a new estimate since the pack's values were last combined.
     updated_cells: usize,
     alarms: AlarmEngine,
+    buses: Buses,
+    store: StoreState,
+    /// A test of an alarm frame that is running; it ends with the process.
+    test: Option<Test>,
     schedule: Schedule,
     pending: Option<PendingRestore>,
     scratch: Scratch,
@@ -112,17 +152,9 @@ impl Monitor {
     /// A monitor that knows nothing yet.
     pub fn new(config: MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
-        let slot = CellSlot {
-            estimator: CellEstimator::new(&config.estimator),
-            consumed: None,
-            latest: None,
-            trusted: true,
-            full_soc: 1.0,
-            tapered: false,
-            usable: None,
-            updated_in_round: false,
-        };
+        let slot = CellSlot::new(&config.estimator);
         Self {
+            intake: Intake::new(&config),
             sampler: Sampler::new(config.sample.clone()),
             learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
@@ -136,6 +168,9 @@ impl Monitor {
             normalised_recharge: None,
             pack: None,
             updated_cells: 0,
+            buses: Buses::default(),
+            store: StoreState::default(),
+            test: None,
             schedule: Schedule::default(),
             pending: None,
             scratch: Scratch::default(),
@@ -148,7 +183,7 @@ impl Monitor {
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
         let time = input.time();
         if !self.started {
-            self.start(time);
+            self.start(time, out);
         }
         match input {
             Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => {}
@@ -161,8 +196,19 @@ impl Monitor {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
             }
+            Input::Command { command, .. } => {
+                self.advance(time, out);
+                self.handle_command(Source::Local, command, out);
+            }
+            Input::Store { works, .. } => {
+                self.advance(time, out);
+                if self.store.note(self.now, works) {
+                    out.events.push(Event { time: self.now, kind: EventKind::Store { works } });
+                }
+            }
             Input::Bus { bus, event, .. } => {
                 self.advance(time, out);
+                self.buses.handle_event(self.now, bus, event);
                 out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
             }
         }
@@ -208,16 +254,39 @@ impl Monitor {
         self.time_backwards
     }
 
+    /// Per protected input message: how often each status of its check was given.
+    pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
+        self.intake.protected()
+    }
+
+    /// Input messages of which frames were dropped, because more came than are taken in.
+    pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
+        self.intake.dropped()
+    }
+
     /// Alarms that are raised now.
     pub fn alarms(&self) -> &AlarmEngine {
         &self.alarms
     }
 
     /// The first input: its time is now; a stored state that waits is taken up and says when it was "now".
-    fn start(&mut self, time: Timestamp) {
+    fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        self.apply_pending(time);
+        if self.apply_pending(time) {
+            self.restate_learned(out);
+        }
+    }
+
+    /// Nothing is known of the cells any more; what comes in is judged as before.
+    fn forget_learned(&mut self) {
+        let slot = CellSlot::new(&self.config.estimator);
+        self.learner = Learner::new(&self.config.health.capacity, self.cells.len(), slot.estimator.capacity());
+        self.cells.fill(slot);
+        self.detector = TransitionDetector::default();
+        self.recharge = RechargeTimer::default();
+        (self.recharge_period_s, self.normalised_recharge) = (None, None);
+        self.forget_pack();
     }
 
     /// Moves the clock to an input's time: never back, and with an eye on time asleep (or away, after a restart).
@@ -243,6 +312,7 @@ impl Monitor {
     /// Nobody listened after `now`: the mode is unknown from there, nothing is timed over it, and the pack's values
     /// wait for a new reading of every cell.
     fn fall_asleep(&mut self, out: &mut Outputs) {
+        self.intake.restart(self.now, out);
         self.observe_current(None, out);
         self.alarms.handle_gap();
         self.recharge.interrupt();
@@ -273,8 +343,12 @@ impl Monitor {
     }
 
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        self.buses.handle_frame(bus);
+        let Some(intact) = self.intake.judge(self.now, bus, frame, out) else { return };
         let mut readings = std::mem::take(&mut self.scratch.readings);
-        self.config.input.decode(bus, frame, |reading| readings.push(reading));
+        self.config.input.decode(bus, frame, |Reading { channel, value }| {
+            readings.push(Reading { channel, value: intact.and(value) });
+        });
         for reading in readings.drain(..) {
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
             self.report_signals(out);
@@ -357,7 +431,7 @@ impl Monitor {
             slot.trusted = trusted;
             out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
         }
-        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Some(mean_nis), true, out);
+        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
     }
 
     /// Once every cell has a new estimate, or one has its second: the pack's values.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
+use super::intake::IntakeState;
 use super::{CellSlot, Consumed, Monitor};
 use crate::alarm::AlarmState;
 use crate::cell::{CellEstimator, CellState};
@@ -35,6 +36,8 @@ pub struct Snapshot {
     time_backwards: u64,
     alarms: AlarmState,
     schedule: Schedule,
+    #[serde(default)]
+    intake: IntakeState,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -98,6 +101,7 @@ impl Monitor {
             time_backwards: self.time_backwards,
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
+            intake: self.intake.snapshot(),
         }
     }
 
@@ -126,9 +130,9 @@ impl Monitor {
         Ok(())
     }
 
-    /// Takes the waiting snapshot up; `now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp) {
-        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return };
+    /// Takes the waiting snapshot up, if there is one; `now` becomes when it was taken, on the present clock.
+    pub(super) fn apply_pending(&mut self, now: Timestamp) -> bool {
+        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return false };
         let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
         let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
         snapshot.rebase(by_nanos);
@@ -148,8 +152,10 @@ impl Monitor {
         self.time_backwards = snapshot.time_backwards;
         self.alarms.restore(&snapshot.alarms);
         self.schedule = snapshot.schedule;
+        self.intake.restore(&snapshot.intake);
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
+        true
     }
 }
 

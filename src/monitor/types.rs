@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::alarm::{Rule, Severity};
-use crate::can::Frame;
+use crate::alarm::{Change, Rule, Selector, Severity, State};
 use crate::can::decode::Channel;
+use crate::can::e2e::Status;
+use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
 /// What an interface reports besides data frames.
@@ -67,15 +68,61 @@ pub enum Input<'a> {
         /// The stamp from which the record goes on.
         time: Timestamp,
     },
+    /// Somebody on this computer asks for something. Commands of the bus are frames.
+    Command {
+        /// When.
+        time: Timestamp,
+        /// What.
+        command: Command,
+    },
+    /// Whether the files that keep what is learned and recorded can be written.
+    Store {
+        /// When.
+        time: Timestamp,
+        /// They can.
+        works: bool,
+    },
+}
+
+/// What people may ask of the daemon.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "command")]
+pub enum Command {
+    /// The alarms were seen.
+    Acknowledge(Selector),
+    /// Latched alarms end, past ones are forgotten; nothing learned is.
+    Clear(Selector),
+    /// Another pack is connected: what was learned of the old one does not hold for it.
+    PackReplaced,
+    /// Send a rule's alarm frame, marked as a test, for a while.
+    Test {
+        /// Which rule.
+        rule: Rule,
+        /// How long, s.
+        seconds: f64,
+    },
+}
+
+/// Who asked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Source {
+    /// Somebody on this computer.
+    Local,
+    /// A frame.
+    Bus(BusIndex),
 }
 
 impl Input<'_> {
     /// The driver's time of this input.
     pub fn time(&self) -> Timestamp {
         match *self {
-            Input::Frame { time, .. } | Input::Tick { time } | Input::Bus { time, .. } | Input::UnknownGap { time } => {
-                time
-            }
+            Input::Frame { time, .. }
+            | Input::Tick { time }
+            | Input::Bus { time, .. }
+            | Input::UnknownGap { time }
+            | Input::Command { time, .. }
+            | Input::Store { time, .. } => time,
         }
     }
 }
@@ -174,20 +221,61 @@ pub enum EventKind {
         /// Its standard deviation, s.
         normalised_std_s: Option<f64>,
     },
-    /// An alarm was raised, changed severity or cleared.
+    /// Something became of an alarm.
     Alarm {
         /// Which rule.
         rule: Rule,
         /// Which cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// Active after the change.
+        /// What.
+        change: Change,
+        /// Where it is in its life now.
+        state: State,
+        /// Whether it is raised now.
         active: bool,
         /// Its severity.
         severity: Severity,
         /// The value that decided; `None` = unknown.
         value: Option<f64>,
+        /// Probability that the truth is beyond the threshold; `None` = the value has no standard deviation.
+        probability: Option<f64>,
         /// The threshold it is compared with.
         threshold: f64,
+        /// Times it was raised.
+        occurrences: u32,
+        /// Whether somebody has seen it since.
+        acknowledged: bool,
+    },
+    /// Somebody asked for something.
+    Command {
+        /// Who.
+        source: Source,
+        /// What.
+        #[serde(rename = "request")]
+        command: Command,
+        /// Alarms changed.
+        changed: u32,
+        /// What could not be done: alarms that are not healthy, a test without output.
+        refused: u32,
+    },
+    /// A test of a rule's alarm frame began or ended.
+    Test {
+        /// Which rule.
+        rule: Rule,
+        /// It began.
+        running: bool,
+    },
+    /// Another pack is connected. What was learned of the old one, for the records.
+    PackReplaced {
+        /// Capacity of its weakest cell, Ah; `None` = nothing was learned.
+        capacity_ah: Option<f64>,
+        /// Its standard deviation, Ah.
+        capacity_std_ah: Option<f64>,
+    },
+    /// Whether files can be written has changed.
+    Store {
+        /// They can.
+        works: bool,
     },
     /// A signal turned bad (told once per change, then counted).
     SignalBad {
@@ -202,6 +290,31 @@ pub enum EventKind {
         channel: Channel,
         /// Bad readings in between.
         bad_readings: u64,
+    },
+    /// A protected message turned from usable to failing, or back (told on change, then counted). A first frame, and as many
+    /// missing ones as its check allows to be lost, turn nothing.
+    Protection {
+        /// Which interface.
+        bus: BusIndex,
+        /// Which message.
+        id: CanId,
+        /// The status of its check that turned it.
+        status: Status,
+        /// Whether it is usable from here on.
+        usable: bool,
+        /// Checks without a usable frame since it was last usable: so far, or when it is back, all of them.
+        count: u64,
+    },
+    /// More frames of one identifier come than are taken in; or no more.
+    Flood {
+        /// Which interface.
+        bus: BusIndex,
+        /// Which message.
+        id: CanId,
+        /// Whether it began.
+        active: bool,
+        /// Frames dropped in this flood: 1 when it begins, all of them when it ends.
+        dropped: u64,
     },
     /// An interface event.
     Bus {

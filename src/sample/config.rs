@@ -44,6 +44,10 @@ pub struct SampleConfig {
     pub voltage: Limits,
     /// Limits of a temperature, degrees C.
     pub temperature: Limits,
+    /// Limits of the SOC the pack reports; `None` = it reports none.
+    pub reported_soc: Option<Limits>,
+    /// Limits of the SOH the pack reports; `None` = it reports none.
+    pub reported_soh: Option<Limits>,
     /// For each cell the sensor that serves it; `None` = no sensor, the thermal model alone.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
     /// Temperature assumed for surroundings when no sensor says otherwise, degrees C.

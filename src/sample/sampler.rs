@@ -81,8 +81,12 @@ pub struct SamplerShape {
 #[derive(Debug, Clone)]
 pub struct Sampler {
     config: SampleConfig,
+    /// Channels in the order of their signals: current, sensors, voltages, what the pack reports.
+    channels: Vec<Channel>,
     /// Temperature sensors that serve a cell.
     sensors: usize,
+    /// Channels with a voltage.
+    voltages: usize,
     flow_a: f64,
     state: SamplerState,
     /// Before this no signal can become stale; `None` = not known.
@@ -97,15 +101,16 @@ impl Sampler {
             VoltageSource::Cells => usize::from(config.cells),
             VoltageSource::PackTotal { .. } => 1,
         };
+        let channels = channels(&config, sensors);
         let state = SamplerState {
-            signals: vec![Signal::default(); 1 + sensors + voltages],
+            signals: vec![Signal::default(); channels.len()],
             charge: ChargeCounter::default(),
             began: None,
             latest: Timestamp::ZERO,
             unused_readings: 0,
         };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
-        Self { config, sensors, flow_a, state, next_stale: None }
+        Self { config, channels, sensors, voltages, flow_a, state, next_stale: None }
     }
 
     /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
@@ -135,7 +140,7 @@ impl Sampler {
                 self.state.charge.handle_current(time, value, limits.max_age_s, self.flow_a);
                 None
             }
-            Channel::Temperature(_) => None,
+            Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh => None,
             Channel::PackVoltage => Some(self.sample(time, CellIndex(0), value, totals)),
             Channel::CellVoltage(cell) => Some(self.sample(time, cell, value, totals)),
         }
@@ -150,7 +155,7 @@ impl Sampler {
         let began = self.state.began.unwrap_or(now);
         let mut next = Timestamp::from_nanos(i64::MAX);
         for slot in 0..self.state.signals.len() {
-            let channel = self.channel(slot);
+            let channel = self.channels[slot];
             let limits = self.limits(channel);
             let signal = &mut self.state.signals[slot];
             if let Some(state) = signal.poll(now, began, &limits) {
@@ -218,9 +223,29 @@ impl Sampler {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
     }
 
-    /// The channels that feed something: current, sensors, voltages.
-    pub fn channels(&self) -> impl Iterator<Item = Channel> + '_ {
-        (0..self.state.signals.len()).map(|slot| self.channel(slot))
+    /// The channels that feed something: current, sensors, voltages, what the pack reports.
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// The highest temperature of the sensors whose last good reading is fresh, degrees C, and whether that is all of
+    /// them; `None` = no sensor is.
+    pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
+        let sensors = &self.state.signals[1..=self.sensors];
+        let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
+        let hottest = fresh.clone().flatten().reduce(f64::max)?;
+        Some((hottest, fresh.clone().all(|value| value.is_some())))
+    }
+
+    /// What the pack reports of itself, when it is fresh.
+    pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        let limits = self.limits(channel);
+        self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, &limits))
+    }
+
+    /// Whether a channel's value cannot be used now; `false` for one from which nothing came yet, as long as it may.
+    pub fn is_bad(&self, channel: Channel) -> bool {
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad())
     }
 
     /// Whether anything has come on the channel since the start or the last waking.
@@ -230,18 +255,14 @@ impl Sampler {
 
     /// Whether every voltage has a good reading that is young enough.
     pub fn voltages_fresh(&self, now: Timestamp) -> bool {
-        let voltages = &self.state.signals[1 + self.sensors..];
+        let first = 1 + self.sensors;
+        let voltages = &self.state.signals[first..first + self.voltages];
         voltages.iter().all(|signal| signal.fresh(now, &self.config.voltage).is_some())
     }
 
-    /// How many channels feed something.
-    pub fn channel_count(&self) -> usize {
-        self.state.signals.len()
-    }
-
-    /// Whether any signal is bad or stale.
+    /// Whether any signal the estimates are made of is bad or stale.
     pub fn any_bad(&self) -> bool {
-        self.state.signals.iter().any(Signal::is_bad)
+        self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
     }
 
     /// Whether a stored state is of this many signals.
@@ -310,7 +331,14 @@ impl Sampler {
         match (channel, self.config.voltage_source) {
             (Channel::PackVoltage, VoltageSource::PackTotal { series }) => f64::from(series.max(1)),
             (Channel::PackVoltage, VoltageSource::Cells)
-            | (Channel::Current | Channel::Temperature(_) | Channel::CellVoltage(_), _) => 1.0,
+            | (
+                Channel::Current
+                | Channel::Temperature(_)
+                | Channel::CellVoltage(_)
+                | Channel::ReportedSoc
+                | Channel::ReportedSoh,
+                _,
+            ) => 1.0,
         }
     }
 
@@ -319,6 +347,8 @@ impl Sampler {
             Channel::Current => self.config.current,
             Channel::Temperature(_) => self.config.temperature,
             Channel::PackVoltage | Channel::CellVoltage(_) => self.config.voltage,
+            Channel::ReportedSoc => self.config.reported_soc.unwrap_or(self.config.voltage),
+            Channel::ReportedSoh => self.config.reported_soh.unwrap_or(self.config.voltage),
         }
     }
 
@@ -333,19 +363,27 @@ impl Sampler {
             }
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. }) => None,
+            (Channel::ReportedSoc | Channel::ReportedSoh, _) => {
+                let first = voltage + self.voltages;
+                let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
+                Some(first + found)
+            }
         }
     }
+}
 
-    /// The channel in a place of [`Sampler::channels`].
-    pub fn channel(&self, slot: usize) -> Channel {
-        let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
-        match (slot, self.config.voltage_source) {
-            (0, _) => Channel::Current,
-            (slot, _) if slot <= self.sensors => Channel::Temperature(SensorIndex(narrow(slot - 1))),
-            (_, VoltageSource::PackTotal { .. }) => Channel::PackVoltage,
-            (slot, VoltageSource::Cells) => Channel::CellVoltage(CellIndex(narrow(slot - 1 - self.sensors))),
-        }
+/// Every channel that feeds something, in the order of the signals.
+fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
+    let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
+    let mut channels = vec![Channel::Current];
+    channels.extend((0..sensors).map(|sensor| Channel::Temperature(SensorIndex(narrow(sensor)))));
+    match config.voltage_source {
+        VoltageSource::Cells => channels.extend((0..config.cells).map(|cell| Channel::CellVoltage(CellIndex(cell)))),
+        VoltageSource::PackTotal { .. } => channels.push(Channel::PackVoltage),
     }
+    channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
+    channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
+    channels
 }
 
 /// The clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
@@ -354,6 +392,8 @@ fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
+        // Nothing is known of how they should move.
+        Channel::ReportedSoc | Channel::ReportedSoh => 0.0,
     }
 }
 

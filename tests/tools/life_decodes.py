@@ -18,6 +18,7 @@ import cantools
 
 MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
 SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
+STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
 MAX_TOLD = 20
 
 
@@ -68,7 +69,7 @@ class Life:
         self.pack = None
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
-        self.alarms = {}  # (rule, cell, severity): threshold
+        self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
         self.recharge = None  # the last told
         self.normalised = None
 
@@ -113,7 +114,7 @@ class Life:
         elif kind == "alarm":
             key = event["rule"], event["cell"], event["severity"]
             if event["active"]:
-                self.alarms[key] = event["threshold"]
+                self.alarms[key] = event
             else:
                 self.alarms.pop(key, None)
 
@@ -249,7 +250,7 @@ def compare(reader, life, estimates, events, frame_list):
 
 
 def compare_alarm(result, life, time, values, told):
-    """A frame at an alarm event's own time is that event's, until it has one; the others repeat what is active."""
+    """A frame at an alarm event's own time is that event's, until it has one; the others repeat what is raised or unknown."""
     rule, cell = result.rules[values["Rule"]], values["Cell"]
     severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
     name = next(signal for signal in values if signal.startswith("Value_"))
@@ -258,19 +259,23 @@ def compare_alarm(result, life, time, values, told):
     key = rule, cell, severity
     at_once = next((e for e in told.get(time, []) if (e["rule"], e["cell"], e["severity"]) == key), None)
     result.value(time, "Alarm", "Test", values["Test"], 0)
+    event = at_once or life.alarms.get(key)
     if at_once:
         told[time].remove(at_once)
-        result.value(time, "Alarm", "State", values["State"], 1 if at_once["active"] else 2)
         result.value(time, "Alarm", name, values[name], scaled(at_once["value"], factor))
-        result.value(time, "Alarm", threshold, values[threshold], factor * at_once["threshold"])
         result.frames["Alarm at once"] += 1
-    elif key not in life.alarms:
-        result.fault(time, "Alarm", f"{key} is sent and is not active")
+    elif event and rule == "capacity_low" and values["State"] == STATES["active"]:
+        result.value(time, "Alarm", name, values[name], life.capacity[cell][0])
+    if event:
+        result.value(time, "Alarm", "State", values["State"], STATES[event["state"]])
+        result.value(time, "Alarm", "Acknowledged", values["Acknowledged"], event["acknowledged"])
+        result.value(time, "Alarm", threshold, values[threshold], factor * event["threshold"])
+    elif values["State"] == STATES["unknown"]:
+        # Not raised, and nobody can say whether it should be.
+        result.value(time, "Alarm", name, values[name], None)
+        result.frames["Alarm unknown"] += 1
     else:
-        result.value(time, "Alarm", "State", values["State"], 1)
-        result.value(time, "Alarm", threshold, values[threshold], factor * life.alarms[key])
-        if rule == "capacity_low":
-            result.value(time, "Alarm", name, values[name], life.capacity[cell][0])
+        result.fault(time, "Alarm", f"{key} is sent and is not raised")
 
 
 def main():

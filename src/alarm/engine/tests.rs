@@ -3,10 +3,28 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::super::{Direction, When};
 use super::*;
 
 fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_events: u32) -> RuleConfig {
-    RuleConfig { rule, threshold, hysteresis, debounce_s, debounce_events, severity: Severity::Warning }
+    let clear = match rule.row().direction {
+        Direction::Below => threshold + hysteresis,
+        Direction::Above => threshold - hysteresis,
+    };
+    let (severity, when) = (Severity::Warning, When::Mean);
+    RuleConfig { rule, severity, threshold, clear, when, debounce_s, debounce_events, is_latching: false }
+}
+
+/// A new value.
+fn see(
+    engine: &mut AlarmEngine,
+    now: Timestamp,
+    rule: Rule,
+    cell: Option<CellIndex>,
+    value: Option<f64>,
+    changes: &mut Vec<AlarmChange>,
+) {
+    engine.observe(now, rule, cell, &Observation::new(value), changes);
 }
 
 fn at(seconds: f64) -> Timestamp {
@@ -28,10 +46,10 @@ fn noise_around_the_threshold_for_24_hours_gives_one_raise_and_one_clear() {
         let value = mean + rng.random_range(-0.4..0.4);
         crossings += u32::from((value > 3.0) != was_beyond);
         was_beyond = value > 3.0;
-        engine.observe(at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), true, &mut changes);
+        see(&mut engine, at(f64::from(second)), Rule::EstimateUntrusted, CELL, Some(value), &mut changes);
     }
     assert!(crossings > 10_000, "the noise must cross the threshold all the time, it did {crossings} times");
-    assert_eq!(changes.iter().map(|change| change.active).collect::<Vec<_>>(), [true, false]);
+    assert_eq!(changes.iter().map(|change| change.change).collect::<Vec<_>>(), [Change::Raised, Change::Cleared]);
     assert_eq!(engine.count(), 0);
 }
 
@@ -39,13 +57,15 @@ fn noise_around_the_threshold_for_24_hours_gives_one_raise_and_one_clear() {
 fn input_lost_while_active_keeps_the_alarm_without_a_value() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.05, 0.0, 1)], 2);
     let mut changes = Vec::new();
-    engine.observe(at(0.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     assert_eq!(changes.len(), 1);
-    engine.observe(at(10.0), Rule::CapacityLow, CELL, None, true, &mut changes);
+    see(&mut engine, at(10.0), Rule::CapacityLow, CELL, None, &mut changes);
     engine.poll(at(1e6), &mut changes);
-    assert_eq!(changes.len(), 1, "neither cleared nor raised again");
-    let alarms: Vec<_> = engine.active().collect();
-    assert_eq!((alarms.len(), alarms[0].value, alarms[0].raised), (1, None, at(0.0)));
+    let heard: Vec<_> = changes.iter().map(|change| change.change).collect();
+    assert_eq!(heard, [Change::Raised, Change::Suppressed], "neither cleared nor raised again");
+    let alarms: Vec<_> = engine.raised().collect();
+    assert_eq!((alarms.len(), alarms[0].value, alarms[0].last_raised), (1, None, Some(at(0.0))));
+    assert_eq!((alarms[0].state, alarms[0].raised_value), (State::Suppressed, Some(1.3)));
 }
 
 #[test]
@@ -54,8 +74,8 @@ fn unknown_values_alone_raise_nothing() {
     let mut changes = Vec::new();
     for r in Rule::ALL {
         for cell in [None, CELL] {
-            engine.observe(at(0.0), r, cell, None, true, &mut changes);
-            engine.observe(at(1.0), r, cell, Some(f64::NAN), true, &mut changes);
+            see(&mut engine, at(0.0), r, cell, None, &mut changes);
+            see(&mut engine, at(1.0), r, cell, Some(f64::NAN), &mut changes);
         }
     }
     engine.poll(at(100.0), &mut changes);
@@ -67,24 +87,24 @@ fn a_learned_value_holds_while_time_debounce_runs_out_and_a_measured_one_does_no
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 30.0, 1), rule(Rule::EstimateUntrusted, 3.0, 0.0, 30.0, 1)];
     let mut engine = AlarmEngine::new(rules, 1);
     let mut changes = Vec::new();
-    engine.observe(at(0.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
-    engine.observe(at(0.0), Rule::EstimateUntrusted, CELL, Some(9.0), true, &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
+    see(&mut engine, at(0.0), Rule::EstimateUntrusted, CELL, Some(9.0), &mut changes);
     engine.poll(at(29.9), &mut changes);
     assert_eq!(changes, []);
     engine.poll(at(30.0), &mut changes);
     engine.poll(at(99.0), &mut changes);
-    assert_eq!(changes.iter().map(|change| change.rule).collect::<Vec<_>>(), [Rule::CapacityLow]);
+    assert_eq!(changes.iter().map(|change| change.alarm.rule).collect::<Vec<_>>(), [Rule::CapacityLow]);
 }
 
 #[test]
 fn a_gap_does_not_count_for_measured_values() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::InputMissing, 5.0, 0.0, 10.0, 1)], 1);
     let mut changes = Vec::new();
-    engine.observe(at(0.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    see(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     engine.handle_gap();
-    engine.observe(at(1000.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    see(&mut engine, at(1000.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(changes, []);
-    engine.observe(at(1010.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    see(&mut engine, at(1010.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(changes.len(), 1);
 }
 
@@ -93,10 +113,10 @@ fn poll_raises_every_alarm_that_is_due_in_one_call() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 1.0, 1)], 5);
     let mut changes = Vec::new();
     for cell in 0..5 {
-        engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), true, &mut changes);
+        see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut changes);
     }
     engine.poll(at(1.0), &mut changes);
-    let cells: Vec<_> = changes.iter().map(|change| change.cell.map(|cell| cell.0)).collect();
+    let cells: Vec<_> = changes.iter().map(|change| change.alarm.cell.map(|cell| cell.0)).collect();
     assert_eq!(cells, [Some(0), Some(1), Some(2), Some(3), Some(4)]);
 }
 
@@ -111,12 +131,12 @@ fn active_alarms_are_listed_by_rule_then_cell_whatever_the_order_of_raising() {
         3,
     );
     let mut changes = Vec::new();
-    engine.observe(at(0.0), Rule::InputMissing, Some(CellIndex(1)), Some(6.0), true, &mut changes);
-    engine.observe(at(0.0), Rule::InputMissing, None, Some(6.0), true, &mut changes);
+    see(&mut engine, at(0.0), Rule::InputMissing, Some(CellIndex(1)), Some(6.0), &mut changes);
+    see(&mut engine, at(0.0), Rule::InputMissing, None, Some(6.0), &mut changes);
     assert_eq!(engine.highest_severity(), Some(Severity::Warning));
-    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(1.3), true, &mut changes);
-    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(0)), Some(1.1), true, &mut changes);
-    let listed: Vec<_> = engine.active().map(|a| (a.rule, a.severity, a.cell.map(|cell| cell.0))).collect();
+    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(1.3), &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(0)), Some(1.1), &mut changes);
+    let listed: Vec<_> = engine.raised().map(|a| (a.rule, a.severity, a.cell.map(|cell| cell.0))).collect();
     assert_eq!(
         listed,
         [
@@ -134,12 +154,12 @@ fn active_alarms_are_listed_by_rule_then_cell_whatever_the_order_of_raising() {
 fn values_of_rules_and_cells_not_watched_are_passed_over() {
     let mut engine = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 2);
     let mut changes = Vec::new();
-    engine.observe(at(0.0), Rule::CapacityLow, None, Some(0.0), true, &mut changes);
-    engine.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), true, &mut changes);
-    engine.observe(at(0.0), Rule::RechargePeriodLow, None, Some(0.0), true, &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, None, Some(0.0), &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), &mut changes);
+    see(&mut engine, at(0.0), Rule::RechargePeriodLow, None, Some(0.0), &mut changes);
     assert_eq!(changes, []);
-    assert_eq!(engine.state(Rule::CapacityLow, Some(CellIndex(1))), Some(State::Inactive));
-    assert_eq!(engine.state(Rule::RechargePeriodLow, None), None);
+    assert_eq!(engine.get(Rule::CapacityLow, Some(CellIndex(1))).map(|alarm| alarm.state), Some(State::Unknown));
+    assert_eq!(engine.get(Rule::RechargePeriodLow, None), None);
 }
 
 #[test]
@@ -147,17 +167,17 @@ fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
     let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 10.0, 2), rule(Rule::RechargePeriodLow, 900.0, 0.0, 0.0, 1)];
     let mut first = AlarmEngine::new(rules.clone(), 2);
     let mut changes = Vec::new();
-    first.observe(at(0.0), Rule::RechargePeriodLow, None, Some(800.0), true, &mut changes);
-    first.observe(at(5.0), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    see(&mut first, at(0.0), Rule::RechargePeriodLow, None, Some(800.0), &mut changes);
+    see(&mut first, at(5.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     let text = serde_json::to_string(&first.snapshot()).expect("serialises");
     let mut state: AlarmState = serde_json::from_str(&text).expect("reads back");
-    assert_eq!(state, first.snapshot());
+    assert_eq!(text, serde_json::to_string(&state).expect("serialises"));
     state.rebase(1_000_000_000_000);
     let mut second = AlarmEngine::new(rules, 2);
     assert_eq!(second.restore(&state), 0);
-    assert_eq!(second.active().next().map(|a| a.raised), Some(at(1000.0)));
+    assert_eq!(second.raised().next().and_then(|a| a.last_raised), Some(at(1000.0)));
     changes.clear();
-    second.observe(at(1014.9), Rule::CapacityLow, CELL, Some(1.3), true, &mut changes);
+    see(&mut second, at(1014.9), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     assert_eq!(changes, []);
     second.poll(at(1015.0), &mut changes);
     assert_eq!(changes.len(), 1);
@@ -167,9 +187,58 @@ fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
 fn alarms_of_rules_no_longer_configured_are_counted_on_restore() {
     let mut first = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 4);
     for cell in 0..4 {
-        first.observe(at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), true, &mut Vec::new());
+        see(&mut first, at(0.0), Rule::CapacityLow, Some(CellIndex(cell)), Some(1.0), &mut Vec::new());
     }
     let mut fewer_cells = AlarmEngine::new(vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1)], 3);
     assert_eq!(fewer_cells.restore(&first.snapshot()), 1);
     assert_eq!(fewer_cells.count(), 3);
+}
+
+#[test]
+fn thresholds_with_an_unknown_value_are_counted_and_named_in_turn() {
+    let rules = vec![rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1), rule(Rule::SocLow, 0.1, 0.0, 0.0, 1)];
+    let mut engine = AlarmEngine::new(rules, 2);
+    let mut changes = Vec::new();
+    assert_eq!(engine.unknown(), (2, 2));
+    let named = |engine: &AlarmEngine, turn| engine.unknown_alarm(turn).map(|alarm| (alarm.rule, alarm.cell));
+    assert_eq!(named(&engine, 0), Some((Rule::CapacityLow, CELL)));
+    assert_eq!(named(&engine, 1), Some((Rule::SocLow, None)));
+    assert_eq!(named(&engine, 2), named(&engine, 0));
+    see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.5), &mut changes);
+    see(&mut engine, at(0.0), Rule::CapacityLow, CELL, Some(1.6), &mut changes);
+    assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 1), Some((Rule::CapacityLow, Some(CellIndex(1))))));
+    see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(1)), Some(1.6), &mut changes);
+    assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 0), None));
+    engine.set_inputs_valid(at(1.0), Rule::CapacityLow, CELL, false, &mut changes);
+    engine.set_inputs_valid(at(1.0), Rule::SocLow, None, false, &mut changes);
+    assert_eq!(engine.unknown(), (2, 1), "only a learned value outlives its inputs and waits for them");
+    assert_eq!(changes, []);
+}
+
+#[test]
+fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
+    let mut latching = rule(Rule::CapacityLow, 1.4, 0.0, 0.0, 1);
+    latching.is_latching = true;
+    let mut engine = AlarmEngine::new(vec![latching, rule(Rule::SocLow, 0.1, 0.0, 0.0, 1)], 3);
+    let mut changes = Vec::new();
+    for (cell, last) in [(0, 1.6), (1, 1.3)] {
+        let cell = Some(CellIndex(cell));
+        see(&mut engine, at(0.0), Rule::CapacityLow, cell, Some(1.3), &mut changes);
+        see(&mut engine, at(1.0), Rule::CapacityLow, cell, Some(last), &mut changes);
+    }
+    see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.05), &mut changes);
+    changes.clear();
+    let cell_1 = Selector { cell: Some(CellIndex(1)), ..Selector::default() };
+    assert_eq!(engine.acknowledge(&cell_1, &mut changes), Outcome { changed: 1, refused: 0 });
+    assert_eq!(engine.acknowledge(&cell_1, &mut changes), Outcome::default());
+    let capacity = Selector { rule: Some(Rule::CapacityLow), ..Selector::default() };
+    assert_eq!(engine.clear(&capacity, &mut changes), Outcome { changed: 1, refused: 1 });
+    let heard: Vec<_> = changes.iter().map(|c| (c.change, c.alarm.cell, c.alarm.state)).collect();
+    assert_eq!(
+        heard,
+        [(Change::Acknowledged, Some(CellIndex(1)), State::Active), (Change::Cleared, CELL, State::Inactive),]
+    );
+    assert_eq!(engine.clear(&Selector::default(), &mut changes), Outcome { changed: 1, refused: 2 });
+    assert_eq!(engine.get(Rule::CapacityLow, CELL).map(|alarm| alarm.occurrences), Some(0), "forgotten");
+    assert_eq!(engine.count(), 2);
 }

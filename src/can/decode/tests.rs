@@ -71,6 +71,13 @@ pub(crate) fn nested() -> InputMap {
     ])
 }
 
+#[test]
+fn every_message_is_told_with_no_fewer_groups_than_pages() {
+    let both = InputMap::new([map().bindings(), nested().bindings()].concat());
+    let told: Vec<_> = both.messages().map(|(bus, id, groups)| (bus.0, id.to_string(), groups)).collect();
+    assert_eq!(told, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
+}
+
 /// All readings of one frame.
 pub(crate) fn readings(map: &InputMap, bus: u8, frame: &Frame) -> Vec<(Channel, Result<f64, Fault>)> {
     let mut found = Vec::new();

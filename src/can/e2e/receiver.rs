@@ -109,11 +109,12 @@ impl StatusCounts {
 
     /// Every status given so far, whichever.
     pub fn total(&self) -> u64 {
-        self.0.iter().sum()
+        self.0.iter().fold(0, |sum, count| sum.saturating_add(*count))
     }
 
-    fn add(&mut self, status: Status) {
-        self.0[status as usize] += 1;
+    fn add(&mut self, status: Status, times: u64) {
+        let count = &mut self.0[status as usize];
+        *count = count.saturating_add(times);
     }
 }
 
@@ -137,26 +138,36 @@ pub struct Receiver {
 impl Receiver {
     /// Checks one frame's payload.
     pub fn check(&mut self, config: &CheckConfig, payload: &[u8]) -> Status {
-        self.grow(config.protection.profile);
+        self.grow(config.protection.profile, 1);
         let status = match config.protection.verified_counter(payload) {
             None => Status::WrongCrc,
             Some(counter) => self.take(config, counter),
         };
-        self.counts.add(status);
+        self.counts.add(status, 1);
         status
     }
 
     /// A period went by without a frame.
     pub fn no_new_data(&mut self, config: &CheckConfig) -> Status {
-        self.grow(config.protection.profile);
-        self.count_repeated();
-        self.counts.add(Status::NoNewData);
+        self.miss(config, 1)
+    }
+
+    /// So many periods went by without a frame.
+    pub(crate) fn miss(&mut self, config: &CheckConfig, periods: u64) -> Status {
+        self.grow(config.protection.profile, periods);
+        self.count_repeated(periods);
+        self.counts.add(Status::NoNewData, periods);
         Status::NoNewData
+    }
+
+    /// A receiver that waits for its first frame and has these counts.
+    pub(crate) fn with_counts(counts: StatusCounts) -> Self {
+        Self { counts, ..Self::default() }
     }
 
     /// Waits for a first frame again and keeps the counts.
     pub fn restart(&mut self) {
-        *self = Self { counts: self.counts, ..Self::default() };
+        *self = Self::with_counts(self.counts);
     }
 
     /// How often each status was given.
@@ -170,12 +181,12 @@ impl Receiver {
     }
 
     /// Each call may stand for a frame of the sender's that was lost.
-    fn grow(&mut self, profile: Profile) {
-        self.max_delta = self.max_delta.saturating_add(1).min(profile.max_counter());
+    fn grow(&mut self, profile: Profile, calls: u64) {
+        self.max_delta = grown(self.max_delta, calls, profile.max_counter());
     }
 
-    fn count_repeated(&mut self) {
-        self.no_new_or_repeated = self.no_new_or_repeated.saturating_add(1).min(MAX_REPEATED);
+    fn count_repeated(&mut self, calls: u64) {
+        self.no_new_or_repeated = grown(self.no_new_or_repeated, calls, MAX_REPEATED);
     }
 
     /// An intact frame with this counter.
@@ -186,15 +197,15 @@ impl Receiver {
         };
         let delta = config.protection.profile.counter_delta(last, counter);
         if delta == 0 {
-            self.count_repeated();
+            self.count_repeated(1);
             return Status::Repeated;
         }
         if delta > self.max_delta {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
-            // With a synchronisation to come, the new counter is where it starts; without one, the allowed step
-            // grows until it reaches the sender.
-            if self.sync > 0 {
+            // Profile 5 goes on from any intact frame, and so does a synchronisation that is to come. Profile 1 without one
+            // keeps the last counter it believed, until the sender comes round to it or the allowed step reaches that far.
+            if self.sync > 0 || config.protection.profile == Profile::P05 {
                 self.believe(config, counter);
             }
             return Status::WrongSequence;
@@ -223,6 +234,11 @@ impl Receiver {
         self.sync = self.sync.saturating_sub(1);
         wanted
     }
+}
+
+/// `from` and `by` more, at most `limit`.
+fn grown(from: u8, by: u64, limit: u8) -> u8 {
+    from.saturating_add(u8::try_from(by).unwrap_or(u8::MAX)).min(limit)
 }
 
 #[cfg(test)]

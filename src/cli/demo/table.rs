@@ -88,7 +88,7 @@ fn text(row: &Row) -> String {
         Mode::Rest => "rest",
         Mode::Discharge => "discharge",
     };
-    let alarms: Vec<&str> = row.alarms.iter().map(|rule| rule_name(*rule)).collect();
+    let alarms: Vec<String> = row.alarms.iter().map(|rule| rule.name().replace('_', " ")).collect();
     format!(
         "{:5} {:5.1} h | {soc} {:6.1} | {:8.3} +-{:6.3} {:6.3} | {:4.0} | {recharge:>8} | {mode:10} {}",
         row.cycle,
@@ -100,15 +100,4 @@ fn text(row: &Row) -> String {
         100.0 * row.soh,
         alarms.join(", "),
     )
-}
-
-fn rule_name(rule: Rule) -> &'static str {
-    match rule {
-        Rule::CapacityLow => "capacity low",
-        Rule::UsableCapacityLow => "usable capacity low",
-        Rule::RechargePeriodLow => "recharge period low",
-        Rule::InputMissing => "input missing",
-        Rule::InputImplausible => "input implausible",
-        Rule::EstimateUntrusted => "estimate untrusted",
-    }
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::daemon::replay::{Progress, Summary};
+use crate::daemon::replay::{Progress, ProtectedSummary, Summary};
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 
@@ -107,6 +107,10 @@ fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
     rows.push(("frames to send", s.frames_out.to_string()));
     let events: Vec<_> = s.events.iter().map(|(name, count)| format!("{name} {count}")).collect();
     rows.push(("events", if events.is_empty() { "none".to_owned() } else { events.join(", ") }));
+    rows.extend(s.protected.iter().map(|of| ("protected", statuses(of))));
+    rows.extend(
+        s.dropped.iter().map(|of| ("too many frames", format!("{} {}: {} dropped", of.interface, of.id, of.dropped))),
+    );
     rows.extend(s.notes.iter().map(|note| ("note", note.clone())));
     write_rows(out, &rows)?;
     write_cells(out, summary)?;
@@ -118,6 +122,14 @@ fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
         writeln!(out, "... and {more} more alarms")?;
     }
     Ok(())
+}
+
+/// A protected message and the statuses that were given.
+fn statuses(of: &ProtectedSummary) -> String {
+    let given = of.counts.iter().filter(|(_, count)| **count > 0);
+    let given: Vec<_> = given.map(|(status, count)| format!("{status} {count}")).collect();
+    let given = if given.is_empty() { "never came".to_owned() } else { given.join(", ") };
+    format!("{} {}: {given}", of.interface, of.id)
 }
 
 fn write_rows(out: &mut impl Write, rows: &[(&str, String)]) -> io::Result<()> {
@@ -156,5 +168,5 @@ fn write_alarm(out: &mut impl Write, event: &Event) -> io::Result<()> {
     let place = cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell.0 + 1));
     let value = value.map_or_else(|| "unknown".to_owned(), |value| format!("{value:.4}"));
     let seconds = event.time.secs();
-    writeln!(out, "alarm {rule:?} ({severity:?}) at {seconds:.3} s, {place}: {value}, threshold {threshold:.4}")
+    writeln!(out, "alarm {} ({severity:?}) at {seconds:.3} s, {place}: {value}, threshold {threshold:.4}", rule.name())
 }

@@ -2,7 +2,7 @@
 
 use crate::can::Frame;
 use crate::can::decode::SensorIndex;
-use crate::can::encode::InputEncoder;
+use crate::can::encode::{InputEncoder, InputProtector};
 use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
@@ -11,6 +11,7 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 pub(super) struct Feeder {
     monitor: Monitor,
     encoder: InputEncoder,
+    protector: InputProtector,
     ticks: Ticks,
     frames: Vec<(BusIndex, Frame)>,
     /// What came out since the caller last emptied it.
@@ -23,6 +24,7 @@ impl Feeder {
     pub(super) fn new(config: MonitorConfig, sleep_gap_s: f64) -> Self {
         Self {
             encoder: InputEncoder::new(&config.input),
+            protector: InputProtector::new(&config.guards),
             monitor: Monitor::new(config),
             ticks: Ticks::new(TICK_PERIOD_MS, sleep_gap_s),
             frames: Vec::new(),
@@ -42,6 +44,7 @@ impl Feeder {
         ];
         let mut frames = std::mem::take(&mut self.frames);
         self.uncarried += self.encoder.encode(&values, &mut frames);
+        self.protector.protect(&mut frames);
         for (bus, frame) in frames.drain(..) {
             self.monitor.handle(Input::Frame { time, bus, frame: &frame }, &mut self.out);
         }

@@ -18,6 +18,8 @@ fn config() -> SampleConfig {
         current: limits(-10.0, 10.0, 2.0),
         voltage: limits(2.0, 4.5, 5.0),
         temperature: limits(-40.0, 85.0, 30.0),
+        reported_soc: None,
+        reported_soh: None,
         sensor_of_cell: vec![Some(SensorIndex(0)), None],
         ambient_c: 20.0,
     }
@@ -284,7 +286,7 @@ fn every_slot_is_found_again_through_its_channel() {
     config.cells = 1024;
     config.sensor_of_cell = (0..1024).map(|cell| Some(SensorIndex(cell / 12))).collect();
     let sampler = Sampler::new(config);
-    let slots: Vec<_> = sampler.channels().map(|channel| sampler.slot(channel)).collect();
+    let slots: Vec<_> = sampler.channels().iter().map(|&channel| sampler.slot(channel)).collect();
     assert_eq!(slots.len(), 1 + 86 + 1024);
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }

@@ -101,5 +101,6 @@ fn a_reading_is_as_good_as_sensor_model_drop_and_load_leave_it() {
     assert_eq!(at(5.0, 2.0, 10.0).gate_variance, at(0.0, 0.0, 1.0).gate_variance);
     // The model's own error is an average over 100 s: 20 mV there are 0.2 V over one second.
     model.voltage_error_v = Some(Table { values: vec![vec![0.01, 0.02, 0.03]; 2] });
-    assert!(near(of(&model, 0.0, 2.0, 1.0).variance, 0.2 * 0.2 + drop));
+    let variance = of(&model, 0.0, 2.0, 1.0).variance;
+    assert!(near(variance, 0.2 * 0.2 + drop), "{variance} {}", 0.2 * 0.2 + drop);
 }

@@ -1,0 +1,78 @@
+//! Protection of input frames that were made here (CSV replay, simulator): what the sender of a protected message adds.
+//!
+//! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC;
+//! every other frame stays as it is, and so does one too short for the header (its reader sees the fault).
+
+use crate::can::e2e::Protection;
+use crate::can::guard::GuardConfig;
+use crate::can::{CanId, Frame};
+use crate::quantity::BusIndex;
+
+/// The sending half of every protected input message.
+#[derive(Debug, Clone, Default)]
+pub struct InputProtector {
+    senders: Vec<Sender>,
+}
+
+#[derive(Debug, Clone)]
+struct Sender {
+    bus: BusIndex,
+    id: CanId,
+    protection: Protection,
+    counter: u8,
+}
+
+impl InputProtector {
+    /// For the messages that `guards` check; every counter begins at 0.
+    pub fn new(guards: &[GuardConfig]) -> Self {
+        let sender = |guard: &GuardConfig| Sender {
+            bus: guard.bus,
+            id: guard.id,
+            protection: guard.check.protection,
+            counter: 0,
+        };
+        Self { senders: guards.iter().map(sender).collect() }
+    }
+
+    /// Protects the frames of protected messages.
+    pub fn protect(&mut self, frames: &mut [(BusIndex, Frame)]) {
+        if self.senders.is_empty() {
+            return;
+        }
+        for (bus, frame) in frames {
+            let key = (*bus, frame.id());
+            if let Some(sender) = self.senders.iter_mut().find(|sender| (sender.bus, sender.id) == key)
+                && sender.protection.protect(frame.data_mut(), sender.counter).is_ok()
+            {
+                sender.counter = sender.protection.profile.next_counter(sender.counter);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+    use super::*;
+    use crate::can::e2e::{CheckConfig, Profile, Status};
+    use crate::can::guard::Guards;
+    use crate::quantity::Timestamp;
+
+    #[test]
+    fn protected_frames_pass_their_own_guard_and_others_stay_as_they_are() {
+        let protection = Protection { profile: Profile::P01C, data_id: 0x0456 };
+        let (bus, id) = (BusIndex(0), CanId::Standard(0x123));
+        let guard = GuardConfig { bus, id, check: CheckConfig::new(protection), cycle_time_s: None };
+        let (mut guards, mut protector) = (Guards::new(vec![guard]), InputProtector::new(&[guard]));
+        let other = Frame::classic(CanId::Standard(0x124), &[9; 8]).unwrap();
+        let short = Frame::classic(id, &[9]).unwrap();
+        for n in 0..100 {
+            let mut frames = vec![(bus, Frame::classic(id, &[n; 8]).unwrap()), (bus, other), (bus, short)];
+            protector.protect(&mut frames);
+            let wanted = if n == 0 { Status::Initial } else { Status::Ok };
+            assert_eq!(guards.check(Timestamp::ZERO, bus, &frames[0].1), Some(wanted));
+            assert_eq!((frames[1].1, frames[2].1), (other, short));
+        }
+    }
+}

@@ -1,0 +1,250 @@
+//! A bound on how many frames of one identifier are taken in: a sender gone wild must not take the time of the others.
+//!
+//! In: the time and identifier of each frame that came. Out: whether it is taken in; what was not is counted, and a
+//! [`FloodChange`] says when dropping began and ended. Per message it is a leaky bucket in one number (the time up to which
+//! the allowed rate is spent): a burst of one tenth of a second's frames passes at once, and in the long run the rate.
+//! Deterministic from the stamps; nothing is allocated after the start. Messages nobody configured pass: they cost next to
+//! nothing and nobody reads them.
+
+use std::num::NonZeroU32;
+
+use serde::{Deserialize, Serialize};
+
+use crate::can::CanId;
+use crate::quantity::{BusIndex, Timestamp};
+
+/// Length of the burst that passes at once, ns: a tenth of a second's frames.
+const BURST_NS: i64 = 100_000_000;
+/// Without a dropped frame for this long the flood is over, s: dropping that comes and goes is one flood.
+const OVER_AFTER_S: f64 = 1.0;
+
+/// How many frames of one identifier are taken in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FloodConfig {
+    /// Frames per second of one identifier on one interface.
+    pub max_frames_per_s: NonZeroU32,
+}
+
+impl Default for FloodConfig {
+    /// 2,000: a saturated bus of 500 kbit/s carries about 4,000 frames a second in all, and no battery message is sent
+    /// more often than once a millisecond. Twice the fastest honest sender, half of what one wild sender can do.
+    fn default() -> Self {
+        Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
+    }
+}
+
+/// Dropping began or ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FloodChange {
+    /// Interface.
+    pub bus: BusIndex,
+    /// Message.
+    pub id: CanId,
+    /// Whether it began.
+    pub active: bool,
+    /// Frames dropped in this flood so far: 1 when it begins, all of them when it ends.
+    pub dropped: u64,
+}
+
+/// Frames of one message dropped so far.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FloodCount {
+    /// Interface.
+    pub bus: BusIndex,
+    /// Message.
+    pub id: CanId,
+    /// Frames.
+    pub dropped: u64,
+}
+
+#[derive(Debug, Clone)]
+struct Bucket {
+    bus: BusIndex,
+    id: CanId,
+    /// Burst that passes at once, ns of the allowed rate.
+    burst_ns: i64,
+    /// Up to when the allowed rate is spent.
+    spent_until: Option<Timestamp>,
+    dropped: u64,
+    /// The present flood: frames dropped in it, and when the last one was.
+    flood: Option<(u64, Timestamp)>,
+}
+
+/// The bound for every configured message.
+#[derive(Debug, Clone)]
+pub struct FloodGate {
+    /// Time one frame takes of the allowed rate, ns.
+    frame_ns: i64,
+    /// Sorted by interface and identifier.
+    buckets: Vec<Bucket>,
+    changes: Vec<FloodChange>,
+}
+
+impl FloodGate {
+    /// For these messages, each with the number of frames that make it up: a multiplexed message may send all its pages at
+    /// once, twice over.
+    pub fn new(config: &FloodConfig, messages: impl IntoIterator<Item = (BusIndex, CanId, usize)>) -> Self {
+        let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
+        let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
+            let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
+            let burst_ns = BURST_NS.max(pages_ns).max(frame_ns);
+            Bucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
+        };
+        let mut buckets: Vec<_> = messages.into_iter().map(bucket).collect();
+        buckets.sort_by_key(|bucket| (bucket.bus, bucket.id));
+        buckets.dedup_by_key(|bucket| (bucket.bus, bucket.id));
+        Self { frame_ns, changes: Vec::with_capacity(buckets.len() + 1), buckets }
+    }
+
+    /// Whether a frame is taken in; time never runs backwards except after [`Self::restart`].
+    pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
+        let Ok(found) = self.buckets.binary_search_by_key(&(bus, id), |bucket| (bucket.bus, bucket.id)) else {
+            return true;
+        };
+        let bucket = &mut self.buckets[found];
+        let spent = bucket.spent_until.map_or(now, |spent| spent.max(now)).plus_nanos(self.frame_ns);
+        if spent <= now.plus_nanos(bucket.burst_ns) {
+            bucket.spent_until = Some(spent);
+            return true;
+        }
+        bucket.dropped += 1;
+        let (frames, _) = bucket.flood.unwrap_or((0, now));
+        if frames == 0 {
+            self.changes.push(FloodChange { bus, id, active: true, dropped: 1 });
+        }
+        bucket.flood = Some((frames + 1, now));
+        false
+    }
+
+    /// Ends the floods that are over.
+    pub fn poll(&mut self, now: Timestamp) {
+        self.end(|last| now.since(last) >= OVER_AFTER_S);
+    }
+
+    /// Time asleep, or the clock was set: the budget is whole again, and every flood is over.
+    pub fn restart(&mut self) {
+        self.end(|_| true);
+        self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
+    }
+
+    /// What began or ended since the last call.
+    pub fn take_changes(&mut self) -> impl Iterator<Item = FloodChange> + '_ {
+        self.changes.drain(..)
+    }
+
+    /// Messages of which frames were dropped, and how many.
+    pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
+        let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
+        dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
+    }
+
+    /// Takes up stored counts; those of messages that are no longer configured are left out.
+    pub fn restore(&mut self, counts: &[FloodCount]) {
+        for bucket in &mut self.buckets {
+            let stored = counts.iter().find(|count| (count.bus, count.id) == (bucket.bus, bucket.id));
+            bucket.dropped = stored.map_or(0, |count| count.dropped);
+        }
+    }
+
+    fn end(&mut self, is_over: impl Fn(Timestamp) -> bool) {
+        for bucket in &mut self.buckets {
+            if let Some((dropped, last)) = bucket.flood
+                && is_over(last)
+            {
+                bucket.flood = None;
+                let (bus, id) = (bucket.bus, bucket.id);
+                self.changes.push(FloodChange { bus, id, active: false, dropped });
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BUS: BusIndex = BusIndex(0);
+    const ID: CanId = CanId::Standard(0x100);
+
+    fn gate(rate: u32, pages: usize) -> FloodGate {
+        let max_frames_per_s = NonZeroU32::new(rate).expect("not 0");
+        FloodGate::new(&FloodConfig { max_frames_per_s }, [(BUS, ID, pages), (BUS, CanId::Standard(0x101), 1)])
+    }
+
+    /// Frames `gap_ns` apart from `from_ns` on; how many are taken in.
+    fn taken(gate: &mut FloodGate, from_ns: i64, gap_ns: i64, frames: i64) -> usize {
+        let at = |n: i64| Timestamp::from_nanos(from_ns + n * gap_ns);
+        (0..frames).filter(|&n| gate.admit(at(n), BUS, ID)).count()
+    }
+
+    #[test]
+    fn the_allowed_rate_passes_for_ever() {
+        let mut gate = gate(2000, 1);
+        assert_eq!(taken(&mut gate, 0, 500_000, 100_000), 100_000);
+        assert_eq!((gate.counts().count(), gate.take_changes().count()), (0, 0));
+    }
+
+    #[test]
+    fn a_burst_of_a_tenth_of_the_rate_passes_and_the_rest_does_not() {
+        let mut gate = gate(2000, 1);
+        assert_eq!(taken(&mut gate, 0, 0, 1000), 200);
+        assert_eq!(gate.counts().next(), Some(FloodCount { bus: BUS, id: ID, dropped: 800 }));
+        assert_eq!(taken(&mut gate, 50_000_000, 0, 1000), 100, "half the budget is back after 50 ms");
+    }
+
+    #[test]
+    fn ten_times_the_rate_is_cut_to_the_rate() {
+        let mut gate = gate(2000, 1);
+        let taken = taken(&mut gate, 0, 50_000, 200_000);
+        assert_eq!(taken, 20_199, "10 s of the rate and the first burst");
+    }
+
+    #[test]
+    fn other_messages_pass_meanwhile() {
+        let mut gate = gate(10, 1);
+        taken(&mut gate, 0, 0, 1000);
+        assert!(!gate.admit(Timestamp::ZERO, BUS, ID));
+        assert!(gate.admit(Timestamp::ZERO, BUS, CanId::Standard(0x101)), "another identifier");
+        assert!(gate.admit(Timestamp::ZERO, BusIndex(1), ID), "another interface");
+        assert!(gate.admit(Timestamp::ZERO, BUS, CanId::Extended(0x100)), "nobody's message");
+    }
+
+    #[test]
+    fn a_message_of_many_pages_may_send_them_all_at_once() {
+        assert_eq!(taken(&mut gate(2000, 256), 0, 0, 1000), 512);
+    }
+
+    #[test]
+    fn a_flood_is_told_when_it_begins_and_with_its_count_when_it_ends() {
+        let mut gate = gate(100, 1);
+        assert_eq!(taken(&mut gate, 0, 0, 15), 10);
+        gate.poll(Timestamp::from_secs(0.9));
+        assert_eq!(taken(&mut gate, 900_000_000, 0, 12), 10, "it goes on");
+        gate.poll(Timestamp::from_secs(1.8));
+        let begun = FloodChange { bus: BUS, id: ID, active: true, dropped: 1 };
+        assert_eq!(gate.take_changes().collect::<Vec<_>>(), [begun]);
+        gate.poll(Timestamp::from_secs(1.9));
+        assert_eq!(gate.take_changes().collect::<Vec<_>>(), [FloodChange { active: false, dropped: 7, ..begun }]);
+        gate.poll(Timestamp::from_secs(9.0));
+        assert_eq!(gate.take_changes().count(), 0);
+    }
+
+    #[test]
+    fn a_clock_set_back_does_not_close_the_gate() {
+        let mut gate = gate(100, 1);
+        assert_eq!(taken(&mut gate, 1_000_000_000_000, 0, 15), 10);
+        gate.restart();
+        assert_eq!(gate.take_changes().map(|change| change.active).collect::<Vec<_>>(), [true, false]);
+        assert_eq!(taken(&mut gate, 0, 0, 5), 5);
+    }
+
+    #[test]
+    fn counts_outlive_a_restart() {
+        let mut before = gate(100, 1);
+        taken(&mut before, 0, 0, 15);
+        let mut after = gate(100, 1);
+        after.restore(&before.counts().collect::<Vec<_>>());
+        assert_eq!(after.counts().next().map(|count| count.dropped), Some(5));
+    }
+}

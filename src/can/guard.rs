@@ -1,0 +1,204 @@
+//! The protected input messages: who checks a frame, what became of each message, and when to tell somebody.
+//!
+//! In: frames with their time and interface, in the order of their arrival, and now and then the time alone
+//! ([`Guards::poll`]). Out: the [`Status`] of a frame, per-message counts, and a [`GuardChange`] when a message turns from
+//! usable to failing or back (what happens in between is counted). Where a message's cycle time is known, each period
+//! without a frame counts as one NONEWDATA: at one and a half periods after the last frame (half a period of jitter
+//! is no loss), and then once a period. As many of them as the check allows to be lost turn nothing: the next frame will be
+//! good, and a sender with jitter would fill the log.
+//!
+//! What nobody listened to is no fault of the sender: after time asleep, a restart of the program or a step of the clock the
+//! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a snapshot keeps the counts and not
+//! the counters. A stored counter says nothing about a sender that went on in the meantime: it would refuse good frames, or
+//! take for fresh an old one that happens to follow it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
+use crate::can::{CanId, Frame, FrameKind};
+use crate::quantity::{BusIndex, Timestamp};
+
+/// A frame is missed this many periods after the last one; then one more each period.
+const MISSED_AFTER_PERIODS: f64 = 1.5;
+
+/// One protected message.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GuardConfig {
+    /// Interface it comes on.
+    pub bus: BusIndex,
+    /// Its identifier.
+    pub id: CanId,
+    /// How it is checked.
+    pub check: CheckConfig,
+    /// Its period, s, above 0; `None` = not known, then frames that do not come are not counted.
+    pub cycle_time_s: Option<f64>,
+}
+
+/// A message turned from usable to failing, or back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct GuardChange {
+    /// Interface.
+    pub bus: BusIndex,
+    /// Message.
+    pub id: CanId,
+    /// The status that turned it.
+    pub status: Status,
+    /// Whether the message is usable from here on.
+    pub usable: bool,
+    /// Checks without a usable frame since it was last usable: so far when it turns, all of them when it is back.
+    pub count: u64,
+}
+
+/// Counts of one message, for reports and snapshots.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GuardCounts {
+    /// Interface.
+    pub bus: BusIndex,
+    /// Message.
+    pub id: CanId,
+    /// How often each status was given.
+    pub counts: StatusCounts,
+}
+
+/// What is kept over a restart: counts, and no counters.
+pub type GuardsState = Vec<GuardCounts>;
+
+#[derive(Debug, Clone)]
+struct Guard {
+    config: GuardConfig,
+    receiver: Receiver,
+    /// When the next frame is missed; `None` = the cycle time is not known, or not yet listening.
+    missed_at: Option<Timestamp>,
+    /// Periods in a row without a frame.
+    missed: u64,
+    /// Checks without a usable frame since the last usable one; 0 = usable, or nothing came yet.
+    failed: u64,
+}
+
+/// All protected input messages.
+#[derive(Debug, Clone, Default)]
+pub struct Guards {
+    /// Sorted by interface and identifier.
+    guards: Vec<Guard>,
+    changes: Vec<GuardChange>,
+}
+
+impl Guards {
+    /// For these messages; of two entries for one message the first counts.
+    pub fn new(mut configs: Vec<GuardConfig>) -> Self {
+        configs.sort_by_key(|config| (config.bus, config.id));
+        configs.dedup_by_key(|config| (config.bus, config.id));
+        let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
+        // A check makes one change, a poll one per message: the room is made here.
+        Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
+    }
+
+    /// Checks a frame; `None` = its message is not protected, or it is a remote request, which carries no data.
+    pub fn check(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
+        if self.guards.is_empty() || frame.kind() == FrameKind::Remote {
+            return None;
+        }
+        let key = (bus, frame.id());
+        let found = self.guards.binary_search_by_key(&key, |guard| (guard.config.bus, guard.config.id)).ok()?;
+        let guard = &mut self.guards[found];
+        guard.count_missed(now, &mut self.changes);
+        guard.missed = 0;
+        let status = guard.receiver.check(&guard.config.check, frame.data());
+        guard.missed_at = guard.config.cycle_time_s.map(|period_s| now.plus_secs(MISSED_AFTER_PERIODS * period_s));
+        guard.note(status, 1, &mut self.changes);
+        Some(status)
+    }
+
+    /// Counts the frames that should have come by now.
+    pub fn poll(&mut self, now: Timestamp) {
+        self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
+    }
+
+    /// What turned since the last call, in the order in which it did.
+    pub fn take_changes(&mut self) -> impl Iterator<Item = GuardChange> + '_ {
+        self.changes.drain(..)
+    }
+
+    /// Nobody listened, or the clock was set: every receiver waits for a first frame again; the counts stay.
+    pub fn restart(&mut self) {
+        for guard in &mut self.guards {
+            guard.receiver.restart();
+            (guard.missed_at, guard.missed) = (None, 0);
+        }
+    }
+
+    /// Per message, by interface and identifier: how often each status was given.
+    pub fn counts(&self) -> impl Iterator<Item = GuardCounts> + '_ {
+        self.guards.iter().map(|guard| GuardCounts {
+            bus: guard.config.bus,
+            id: guard.config.id,
+            counts: *guard.receiver.counts(),
+        })
+    }
+
+    /// The counts, to be stored.
+    pub fn snapshot(&self) -> GuardsState {
+        self.counts().collect()
+    }
+
+    /// Takes up stored counts; those of a message that is no longer protected are dropped. The receivers start anew.
+    pub fn restore(&mut self, state: &GuardsState) {
+        self.restart();
+        for guard in &mut self.guards {
+            let key = (guard.config.bus, guard.config.id);
+            if let Some(stored) = state.iter().find(|stored| (stored.bus, stored.id) == key) {
+                guard.receiver = Receiver::with_counts(stored.counts);
+            }
+        }
+    }
+}
+
+impl Guard {
+    /// One NONEWDATA for each period that went by without a frame.
+    fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
+        let Some(period_s) = self.config.cycle_time_s else { return };
+        // Counting begins when listening does.
+        let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
+        if now < missed_at {
+            return;
+        }
+        // At least one nanosecond, so that the division is one.
+        let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
+        let periods = now.nanos().saturating_sub(missed_at.nanos()) / period_ns + 1;
+        self.missed_at = Some(missed_at.plus_nanos(periods.saturating_mul(period_ns)));
+        let periods = u64::try_from(periods).unwrap_or(0);
+        self.missed = self.missed.saturating_add(periods);
+        let status = self.receiver.miss(&self.config.check, periods);
+        self.note(status, periods, changes);
+    }
+
+    /// Tells a change.
+    fn note(&mut self, status: Status, checks: u64, changes: &mut Vec<GuardChange>) {
+        let GuardConfig { bus, id, check, .. } = self.config;
+        if status.is_usable() {
+            let count = std::mem::take(&mut self.failed);
+            if count > 0 {
+                changes.push(GuardChange { bus, id, status, usable: true, count });
+            }
+            return;
+        }
+        if self.failed > 0 {
+            self.failed = self.failed.saturating_add(checks);
+            return;
+        }
+        self.failed = match status {
+            // There is nothing yet to be wrong or right about, or no longer.
+            Status::Initial => 0,
+            Status::NoNewData if self.missed <= u64::from(check.max_delta_counter_init) => 0,
+            Status::NoNewData => self.missed,
+            _ => checks,
+        };
+        if self.failed > 0 {
+            changes.push(GuardChange { bus, id, status, usable: false, count: self.failed });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,225 @@
+//! Protected inputs, good and bad, compared word for word.
+
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+use std::path::Path;
+
+use crate::can::CanId;
+use crate::can::e2e::{CheckConfig, Profile, Protection};
+use crate::can::guard::GuardConfig;
+use crate::config::{Description, read_all};
+use crate::quantity::BusIndex;
+
+const DBC: &str = r#"VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 256 Status: 8 A
+ SG_ Current : 16|16@1- (0.1,0) [-300|500] "A" A
+ SG_ Low : 12|4@1+ (1,0) [0|0] "" A
+ SG_ Temperature : 32|8@1+ (1,-40) [-40|100] "degC" A
+BO_ 272 Cells: 8 A
+ SG_ Page M : 8|8@1+ (1,0) [0|1] "" A
+ SG_ Voltage1 m0 : 31|16@0+ (0.001,0) [0|0] "V" A
+ SG_ Voltage2 m1 : 31|16@0+ (0.001,0) [0|0] "V" A
+BO_ 288 Short: 2 A
+ SG_ Temperature : 12|4@1+ (1,0) [0|0] "degC" A
+BO_ 289 Long: 48 A
+ SG_ Current : 100|16@1- (0.1,0) [0|0] "A" A
+BA_DEF_ BO_ "GenMsgCycleTime" INT 0 60000;
+BA_DEF_DEF_ "GenMsgCycleTime" 0;
+BA_ "GenMsgCycleTime" BO_ 256 100;
+"#;
+
+const CELL: &str = r#"format = 1
+name = "test"
+rated_capacity_ah = 2.0
+capacity_ah = 1.9
+voltage_min_v = 2.5
+voltage_max_v = 4.2
+[tables]
+soc = [0, 0.5, 1]
+temperature_c = [10, 30]
+ocv_v = [[3.0, 3.6, 4.1], [3.0, 3.6, 4.2]]
+r0_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+[[tables.branches]]
+r_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+c_farad = [[100, 100, 100], [100, 100, 100]]
+"#;
+
+/// 15 lines.
+const PACK: &str = r#"[pack]
+cells = 2
+cell_model = "cell.toml"
+[[interface]]
+name = "can0"
+fd = true
+[input]
+dbc = ["pack.dbc"]
+[input.current]
+signal = "Status.Current"
+positive = "charge"
+[input.cell_voltage]
+signal = "Cells.Voltage{n}"
+[[input.temperature]]
+signal = "Status.Temperature"
+"#;
+
+fn read(pack: &str) -> Result<(crate::config::Config, Description), Vec<String>> {
+    let read = |path: &Path| match path.to_str() {
+        Some("pack.toml") => Ok(pack.as_bytes().to_vec()),
+        Some("pack.dbc") => Ok(DBC.as_bytes().to_vec()),
+        Some("cell.toml") => Ok(CELL.as_bytes().to_vec()),
+        _ => Err(std::io::ErrorKind::NotFound.into()),
+    };
+    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
+}
+
+fn protected(table: &str) -> String {
+    format!("{PACK}[[input.protected]]\n{table}")
+}
+
+fn faults(pack: &str) -> Vec<String> {
+    read(pack).unwrap_err()
+}
+
+#[test]
+fn a_table_becomes_a_guard_with_the_cycle_time_of_the_dbc() {
+    let (config, _) = read(&protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 0x0123\n")).unwrap();
+    let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
+    let guard = GuardConfig {
+        bus: BusIndex(0),
+        id: CanId::Standard(0x100),
+        check: CheckConfig::new(protection),
+        cycle_time_s: Some(0.1),
+    };
+    assert_eq!(config.monitor.guards, [guard], "the defaults are those of the check");
+    assert_eq!(config.monitor.flood, crate::can::flood::FloodConfig::default(), "and so is the bound on frames");
+    let keys = "max_delta_counter = 3\nmax_repeated = 2\nsync_counter = 4\n";
+    let (config, _) =
+        read(&protected(&format!("message = \"Status\"\nprofile = \"1C\"\ndata_id = 7\n{keys}"))).unwrap();
+    let check = config.monitor.guards[0].check;
+    let counters = (check.max_delta_counter_init, check.max_no_new_or_repeated_data, check.sync_counter_init);
+    assert_eq!((check.protection.profile, counters), (Profile::P01C, (3, 2, 4)));
+}
+
+#[test]
+fn check_says_what_is_protected() {
+    let (_, description) = read(&protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 0x0123\n")).unwrap();
+    assert_eq!(
+        description.intake,
+        [
+            "at most 2000 frames a second of one identifier, a tenth of them at once",
+            "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, 1 lost in a row allowed, \
+             one missing is counted each 100 ms"
+        ]
+    );
+    let (_, description) = read(PACK).unwrap();
+    assert!(description.intake[1].starts_with("no end-to-end protection"), "{:?}", description.intake);
+}
+
+#[test]
+fn faults_name_file_line_key_found_and_allowed() {
+    let table: &[(&str, &str)] = &[
+        (
+            "message = \"Stats\"\nprofile = \"1A\"\ndata_id = 1\n",
+            "pack.toml:17: input.protected[1].message = \"Stats\", must be the message of a configured input on its interface, did you mean Status",
+        ),
+        (
+            "message = \"Short\"\nprofile = \"1A\"\ndata_id = 1\n",
+            "pack.toml:17: input.protected[1].message = \"Short\", must be the message of a configured input on its interface",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"2\"\ndata_id = 1\n",
+            "pack.toml:18: input.protected[1].profile = \"2\", must be 1A or 1C or 5",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1A\"\ndata_id = 65536\n",
+            "pack.toml:19: input.protected[1].data_id = 65536, must be 0 to 65535",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1C\"\ndata_id = 0x1000\n",
+            "pack.toml:19: input.protected[1].data_id = 0x1000, must be 0 to 0xFFF with profile \"1C\"",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1C\"\ndata_id = 1\nmax_delta_counter = 15\n",
+            "pack.toml:20: input.protected[1].max_delta_counter = 15, must be 0 to 14 with profile \"1C\"",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1C\"\n",
+            "pack.toml:16: input.protected[1].data_id is missing, must be a whole number, 0 to 65535",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\ninterface = \"can1\"\n",
+            "pack.toml:20: input.protected[1].interface = \"can1\", must be can0",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"5\"\ndata_id = 1\n",
+            "pack.toml:18: input.protected[1].profile = \"5\", inputs must not lie in bytes 0 to 2, which profile \"5\" writes: Status.Current does",
+        ),
+        (
+            "message = \"Cells\"\nprofile = \"1C\"\ndata_id = 1\n",
+            "pack.toml:18: input.protected[1].profile = \"1C\", inputs must not lie in bytes 0 and 1, which profile \"1C\" writes: Cells.Page does",
+        ),
+        (
+            "message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n[[input.protected]]\nmessage = \"Status\"\nprofile = \"1A\"\ndata_id = 2\n",
+            "pack.toml:21: input.protected[2].message = \"Status\", must be protected once, is also in line 17",
+        ),
+    ];
+    for (text, fault) in table {
+        assert_eq!(faults(&protected(text)), [*fault]);
+    }
+    let rate = PACK.replace("[\"pack.dbc\"]", "[\"pack.dbc\"]\nmax_frames_per_s = 5");
+    assert_eq!(faults(&rate), ["pack.toml:9: input.max_frames_per_s = 5, must be 10 to 1000000"]);
+}
+
+#[test]
+fn the_upper_half_of_byte_1_is_free_for_an_input_in_1a_only() {
+    let pack =
+        protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n").replace("Status.Temp", "Status.Low\" #");
+    assert!(read(&pack).is_ok(), "{:?}", read(&pack).err());
+    let fault = &faults(&pack.replace("\"1A\"", "\"1C\""))[0];
+    assert!(fault.ends_with("which profile \"1C\" writes: Status.Low does"), "{fault}");
+}
+
+#[test]
+fn a_message_too_short_or_too_long_for_the_profile_is_refused() {
+    let pack = protected("message = \"Short\"\nprofile = \"5\"\ndata_id = 1\n");
+    let all = faults(&pack.replace("Status.Temperature", "Short.Temperature"));
+    assert_eq!(
+        all[0],
+        "pack.toml:17: input.protected[1].message = \"Short\", must have 3 to 64 bytes with profile \"5\", has 2 in pack.dbc"
+    );
+    let pack = protected("message = \"Long\"\nprofile = \"1A\"\ndata_id = 1\n");
+    assert_eq!(
+        faults(&pack.replace("Status.Current", "Long.Current")),
+        [
+            "pack.toml:17: input.protected[1].message = \"Long\", must have 2 to 30 bytes with profile \"1A\", has 48 in pack.dbc"
+        ]
+    );
+}
+
+#[test]
+fn with_several_interfaces_the_table_must_say_which() {
+    let pack = protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")
+        .replace("[input]", "[[interface]]\nname = \"can1\"\n[input]");
+    let pack = pack.replace("positive = \"charge\"", "positive = \"charge\"\ninterface = \"can0\"");
+    let pack = pack.replace("Voltage{n}\"", "Voltage{n}\"\ninterface = \"can0\"");
+    let pack = pack.replace("Status.Temperature\"", "Status.Temperature\"\ninterface = \"can0\"");
+    assert_eq!(faults(&pack), ["pack.toml:21: input.protected[1].interface is not set, must be can0 or can1"]);
+    let on_the_other = format!("{pack}interface = \"can1\"\n");
+    assert_eq!(
+        faults(&on_the_other),
+        [
+            "pack.toml:22: input.protected[1].message = \"Status\", must be the message of a configured input on its interface"
+        ]
+    );
+    assert_eq!(read(&format!("{pack}interface = \"can0\"\n")).unwrap().0.monitor.guards.len(), 1);
+}
+
+#[test]
+fn a_signal_that_is_not_found_does_not_make_its_protected_message_a_fault_too() {
+    let pack = protected("message = \"Status\"\nprofile = \"1A\"\ndata_id = 1\n")
+        .replace("signal = \"Status.", "signal = \"Stats.");
+    assert!(faults(&pack).iter().all(|fault| !fault.contains("protected")), "{:?}", faults(&pack));
+}

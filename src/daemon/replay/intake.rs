@@ -1,0 +1,46 @@
+//! What became of frames before they were read: end-to-end checks and dropped frames, for the summary of a replay.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use crate::monitor::Monitor;
+use crate::quantity::BusIndex;
+
+/// A protected message and how often each status of its check was given.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct ProtectedSummary {
+    /// Interface.
+    pub interface: String,
+    /// Identifier as candump writes it.
+    pub id: String,
+    /// Every status, zeros too.
+    pub counts: BTreeMap<&'static str, u64>,
+}
+
+/// A message of which frames were dropped because more came than are taken in.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct DroppedSummary {
+    /// Interface.
+    pub interface: String,
+    /// Identifier as candump writes it.
+    pub id: String,
+    /// Frames.
+    pub dropped: u64,
+}
+
+/// Both, of a monitor at its end.
+pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> (Vec<ProtectedSummary>, Vec<DroppedSummary>) {
+    let name = |bus: BusIndex| interfaces.get(bus.index()).map_or("unknown", String::as_str).to_owned();
+    let protected = monitor.protected().map(|of| ProtectedSummary {
+        interface: name(of.bus),
+        id: of.id.to_string(),
+        counts: of.counts.iter().map(|(status, count)| (status.name(), count)).collect(),
+    });
+    let dropped = monitor.dropped().map(|of| DroppedSummary {
+        interface: name(of.bus),
+        id: of.id.to_string(),
+        dropped: of.dropped,
+    });
+    (protected.collect(), dropped.collect())
+}

@@ -1,0 +1,49 @@
+//! Rows of a replay's result files: estimates as CSV, frames as candump lines.
+
+use std::io::{self, Write};
+
+use crate::cell::MAX_BRANCHES;
+use crate::io::candump::{self, StampDigits};
+use crate::monitor::{Estimate, Transmit};
+
+/// The column names.
+pub(super) fn write_estimates_header(out: &mut impl Write) -> io::Result<()> {
+    write!(out, "time_s,cell,soc,soc_std")?;
+    (1..=MAX_BRANCHES).try_for_each(|n| write!(out, ",u{n}_v"))?;
+    writeln!(
+        out,
+        ",capacity_ah,capacity_std_ah,resistance_ratio,resistance_ratio_std,innovation_v,innovation_std_v,accepted,\
+         voltage_v,current_a,temperature_c"
+    )
+}
+
+/// One row; floats in the shortest form that reads back the same, nothing for NaN.
+pub(super) fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::Result<()> {
+    let e = estimate;
+    let nanos = e.time.nanos();
+    let (sign, nanos) = (if nanos < 0 { "-" } else { "" }, nanos.unsigned_abs());
+    write!(out, "{sign}{}.{:09},{}", nanos / 1_000_000_000, nanos % 1_000_000_000, e.cell.0)?;
+    [e.soc, e.soc_std].into_iter().chain(e.branch_v).try_for_each(|value| write_value(out, value))?;
+    let filter = [
+        e.capacity_ah,
+        e.capacity_std_ah,
+        e.resistance_ratio,
+        e.resistance_ratio_std,
+        e.innovation_v,
+        e.innovation_std_v,
+    ];
+    filter.into_iter().try_for_each(|value| write_value(out, value))?;
+    write!(out, ",{}", e.accepted)?;
+    [e.voltage_v, e.current_a, e.temperature_c].into_iter().try_for_each(|value| write_value(out, value))?;
+    out.write_all(b"\n")
+}
+
+fn write_value(out: &mut impl Write, value: f64) -> io::Result<()> {
+    if value.is_nan() { out.write_all(b",") } else { write!(out, ",{value:?}") }
+}
+
+/// One candump line.
+pub(super) fn write_frame(out: &mut impl Write, interfaces: &[String], transmit: &Transmit) -> io::Result<()> {
+    let interface = interfaces.get(transmit.bus.index()).map_or("unknown", String::as_str);
+    candump::write_line(out, transmit.time, StampDigits::Nanos, interface, &transmit.frame)
+}

@@ -1,0 +1,324 @@
+//! Values for the alarm rules, what becomes of the alarms, and what people ask of them.
+//!
+//! Learned values go to the rules when they are learned; everything else is looked at every 0.1 s. A value some part of
+//! which is not known goes in as a bound: it can raise an alarm, but never say that all is well.
+
+use super::{Command, Event, EventKind, Monitor, MonitorConfig, Outputs, Source};
+use crate::alarm::{Alarm, AlarmChange, Observation, Rule};
+use crate::filter::Belief;
+use crate::health::RechargeAlarm;
+use crate::quantity::{CellIndex, Channel, Timestamp};
+
+/// Period of the work that only watches the clock (staleness, debounce), s.
+pub(super) const HOUSEKEEPING_S: f64 = 0.1;
+
+/// What the rules about inputs look at; `None` = not known.
+#[derive(Debug, Clone, Copy, Default)]
+struct InputState {
+    silence_s: Option<f64>,
+    bad_share: Option<f64>,
+    /// Whether a reading has come since the last look.
+    is_new: bool,
+}
+
+impl InputState {
+    fn worst(self, other: Self) -> Self {
+        let max = |a: Option<f64>, b: Option<f64>| a.map_or(b, |a| Some(b.map_or(a, |b| a.max(b))));
+        Self {
+            silence_s: max(self.silence_s, other.silence_s),
+            bad_share: max(self.bad_share, other.bad_share),
+            is_new: self.is_new || other.is_new,
+        }
+    }
+}
+
+/// The SOC of the emptiest and the fullest cell.
+#[derive(Debug, Clone, Copy)]
+struct Spread {
+    lowest: Belief,
+    highest: Belief,
+    /// Whether every cell is among them.
+    is_whole: bool,
+}
+
+impl MonitorConfig {
+    /// Silence that the strictest threshold calls missing, s.
+    fn missing_after_s(&self) -> Option<f64> {
+        let rules = self.rules.iter().filter(|rule| rule.rule == Rule::InputMissing);
+        rules.map(|rule| rule.threshold).min_by(f64::total_cmp)
+    }
+}
+
+impl Monitor {
+    /// Everything the rules compare that is not learned at a transition.
+    pub(super) fn watch(&mut self, out: &mut Outputs) {
+        self.watch_inputs(out);
+        self.watch_learned(out);
+        self.watch_pack(out);
+        let (bus, store) = (self.buses.worst_s(self.now), self.store.failing_s(self.now));
+        self.observe_alarm(Rule::BusFault, None, Observation::new(bus), out);
+        self.observe_alarm(Rule::StoreFailed, None, Observation::new(store), out);
+        self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
+        self.report_alarms(out);
+    }
+
+    /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
+    /// what belongs to no cell under the pack.
+    fn watch_inputs(&mut self, out: &mut Outputs) {
+        let mut pack = InputState::default();
+        for index in 0..self.sampler.channels().len() {
+            let channel = self.sampler.channels()[index];
+            let state = self.input_state(channel);
+            if let Channel::CellVoltage(cell) = channel {
+                self.observe_input(Some(cell), state, out);
+            } else {
+                pack = pack.worst(state);
+            }
+        }
+        self.observe_input(None, pack, out);
+    }
+
+    fn input_state(&self, channel: Channel) -> InputState {
+        let silence_s = self.sampler.silence_s(channel, self.now);
+        // Since waking nothing may have come yet: that is neither silence nor its end.
+        let heard = self.sampler.heard_since_waking(channel);
+        let beyond = |silence: &f64| heard || self.config.missing_after_s().is_some_and(|limit| *silence > limit);
+        InputState {
+            silence_s: silence_s.filter(beyond),
+            bad_share: self.sampler.bad_share(channel),
+            is_new: silence_s.is_some_and(|silence_s| heard && silence_s <= HOUSEKEEPING_S),
+        }
+    }
+
+    fn observe_input(&mut self, cell: Option<CellIndex>, state: InputState, out: &mut Outputs) {
+        self.observe_alarm(Rule::InputMissing, cell, Observation::new(state.silence_s), out);
+        let bad = Observation { is_new: state.is_new, ..Observation::new(state.bad_share) };
+        self.observe_alarm(Rule::InputImplausible, cell, bad, out);
+    }
+
+    /// What was learned of a cell stands only while its inputs can renew it.
+    fn watch_learned(&mut self, out: &mut Outputs) {
+        let current_bad = self.sampler.is_bad(Channel::Current);
+        let mut all_valid = !current_bad;
+        for (index, cell) in (0..self.config.sample.cells).map(CellIndex).enumerate() {
+            let valid = !current_bad && !self.sampler.is_bad(self.voltage_channel(cell));
+            all_valid &= valid;
+            for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
+                self.alarms.set_inputs_valid(self.now, rule, Some(cell), valid, &mut self.scratch.alarm_changes);
+            }
+            if !valid || self.cells[index].estimator.soc().is_none() {
+                self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::default(), out);
+            }
+        }
+        for rule in [Rule::RechargePeriodLow, Rule::RemainingLifeLow] {
+            self.alarms.set_inputs_valid(self.now, rule, None, all_valid, &mut self.scratch.alarm_changes);
+        }
+        self.report_alarms(out);
+    }
+
+    /// The channel a cell's voltage comes on.
+    fn voltage_channel(&self, cell: CellIndex) -> Channel {
+        match self.config.sample.voltage_source {
+            crate::sample::VoltageSource::Cells => Channel::CellVoltage(cell),
+            crate::sample::VoltageSource::PackTotal { .. } => Channel::PackVoltage,
+        }
+    }
+
+    fn watch_pack(&mut self, out: &mut Outputs) {
+        let spread = self.spread();
+        let soc_low = spread.map_or(Observation::default(), |spread| Observation {
+            is_bound: !spread.is_whole,
+            ..Observation::new(Some(spread.lowest.mean)).with_std(spread.lowest.std())
+        });
+        self.observe_alarm(Rule::SocLow, None, soc_low, out);
+        let imbalance = spread.filter(|_| self.cells.len() > 1).map_or(Observation::default(), |spread| Observation {
+            is_bound: !spread.is_whole,
+            ..Observation::new(Some(spread.highest.mean - spread.lowest.mean))
+                .with_std((spread.highest.variance + spread.lowest.variance).sqrt())
+        });
+        self.observe_alarm(Rule::CellImbalance, None, imbalance, out);
+        let hottest = self.sampler.hottest_c(self.now).map_or(Observation::default(), |(hottest_c, is_whole)| {
+            Observation { is_bound: !is_whole, ..Observation::new(Some(hottest_c)) }
+        });
+        self.observe_alarm(Rule::TemperatureHigh, None, hottest, out);
+        let disagreement = self.disagreement();
+        self.observe_alarm(Rule::BmsDisagrees, None, disagreement, out);
+    }
+
+    /// SOC of the emptiest and the fullest of the cells whose voltage is fresh; `None` = of no cell.
+    fn spread(&self) -> Option<Spread> {
+        let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
+        for (slot, cell) in self.cells.iter().zip((0..).map(CellIndex)) {
+            let fresh = slot.consumed.is_some() && !self.sampler.is_bad(self.voltage_channel(cell));
+            let Some(soc) = slot.estimator.soc().filter(|_| fresh) else { continue };
+            known += 1;
+            spread = Some(match spread {
+                None => Spread { lowest: soc, highest: soc, is_whole: false },
+                Some(so_far) => Spread {
+                    lowest: if soc.mean < so_far.lowest.mean { soc } else { so_far.lowest },
+                    highest: if soc.mean > so_far.highest.mean { soc } else { so_far.highest },
+                    is_whole: false,
+                },
+            });
+        }
+        spread.map(|spread| Spread { is_whole: known == self.cells.len(), ..spread })
+    }
+
+    /// The larger of the differences between what the pack reports of itself and what we estimate.
+    fn disagreement(&self) -> Observation {
+        let config = &self.config.sample;
+        let soc = self.pack.map(|pack| Belief::from_std(pack.soc, pack.soc_std));
+        let rated_ah = self.config.model.rated_capacity_ah;
+        let soh = self.weakest_capacity().map(|c| Belief::from_std(c.mean / rated_ah, c.std() / rated_ah));
+        let pairs = [
+            (config.reported_soc.is_some(), Channel::ReportedSoc, soc),
+            (config.reported_soh.is_some(), Channel::ReportedSoh, soh),
+        ];
+        let mut worst = Observation::default();
+        for (_, channel, ours) in pairs.into_iter().filter(|(configured, ..)| *configured) {
+            let reported = self.sampler.reported(channel, self.now);
+            let Some((reported, ours)) = reported.zip(ours) else {
+                worst.is_bound = true;
+                continue;
+            };
+            let difference = (reported - ours.mean).abs();
+            if worst.value.is_none_or(|value| difference > value) {
+                worst.value = Some(difference);
+                worst.std = Some(ours.std());
+            }
+        }
+        Observation { is_new: true, ..worst }
+    }
+
+    /// Capacity of the cell with the lowest; `None` until half-cycles have taught something about every cell.
+    pub(super) fn weakest_capacity(&self) -> Option<Belief> {
+        let cells = 0..self.cells.len();
+        let capacities = cells.map(|index| self.learner.capacity(&self.config.health.capacity, index));
+        capacities.min_by(|a, b| a.mean.total_cmp(&b.mean)).filter(|_| self.learner.has_learned_all())
+    }
+
+    /// After a restart: what was learned stands, though it is not learned anew.
+    pub(super) fn restate_learned(&mut self, out: &mut Outputs) {
+        let old = |belief: Belief| Observation { is_new: false, ..learned(belief) };
+        for index in 0..self.cells.len() {
+            let cell = Some(CellIndex(u16::try_from(index).unwrap_or(u16::MAX)));
+            if self.learner.has_learned(index) {
+                let capacity = self.learner.capacity(&self.config.health.capacity, index);
+                self.observe_alarm(Rule::CapacityLow, cell, old(capacity), out);
+                let resistance = self.cells[index].resistance();
+                self.observe_alarm(Rule::ResistanceHigh, cell, old(resistance), out);
+            }
+            if let Some(usable) = self.cells[index].usable {
+                self.observe_alarm(Rule::UsableCapacityLow, cell, old(usable), out);
+            }
+        }
+        let period = match self.config.health.recharge.alarm_on {
+            RechargeAlarm::Raw => self.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
+            RechargeAlarm::Normalised => self.normalised_recharge.map(learned),
+        };
+        if let Some(period) = period {
+            let period = Observation { is_new: false, ..period };
+            self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
+        }
+    }
+
+    /// Takes a value into the rules; what becomes of it goes out at once.
+    pub(super) fn observe_alarm(&mut self, rule: Rule, cell: Option<CellIndex>, seen: Observation, out: &mut Outputs) {
+        self.alarms.observe(self.now, rule, cell, &seen, &mut self.scratch.alarm_changes);
+        self.report_alarms(out);
+    }
+
+    /// Tells what became of alarms, and sends each as it stands now.
+    pub(super) fn report_alarms(&mut self, out: &mut Outputs) {
+        if self.scratch.alarm_changes.is_empty() {
+            return;
+        }
+        let mut changes = std::mem::take(&mut self.scratch.alarm_changes);
+        for change in changes.drain(..) {
+            out.events.push(Event { time: self.now, kind: alarm_event(&change) });
+            self.send_alarm(&change.alarm, out);
+        }
+        self.scratch.alarm_changes = changes;
+    }
+
+    /// Does what somebody asks for.
+    pub(super) fn handle_command(&mut self, source: Source, command: Command, out: &mut Outputs) {
+        let mut changes = std::mem::take(&mut self.scratch.alarm_changes);
+        let (changed, refused) = match command {
+            Command::Acknowledge(which) => {
+                let outcome = self.alarms.acknowledge(&which, &mut changes);
+                (outcome.changed, outcome.refused)
+            }
+            Command::Clear(which) => {
+                let outcome = self.alarms.clear(&which, &mut changes);
+                (outcome.changed, outcome.refused)
+            }
+            Command::PackReplaced => {
+                self.replace_pack(&mut changes, out);
+                (u32::try_from(changes.len()).unwrap_or(u32::MAX), 0)
+            }
+            Command::Test { rule, seconds } => (0, u32::from(!self.start_test(rule, seconds, out))),
+        };
+        self.scratch.alarm_changes = changes;
+        out.events.push(Event { time: self.now, kind: EventKind::Command { source, command, changed, refused } });
+        self.report_alarms(out);
+    }
+
+    /// What was learned of the old pack is told once more and does not hold for the new one.
+    fn replace_pack(&mut self, changes: &mut Vec<AlarmChange>, out: &mut Outputs) {
+        let capacity = self.weakest_capacity();
+        let kind = EventKind::PackReplaced {
+            capacity_ah: capacity.map(|capacity| capacity.mean),
+            capacity_std_ah: capacity.as_ref().map(Belief::std),
+        };
+        out.events.push(Event { time: self.now, kind });
+        self.forget_learned();
+        self.alarms.forget_learned(changes);
+    }
+}
+
+/// A value learned anew.
+pub(super) fn learned(belief: Belief) -> Observation {
+    Observation::new(Some(belief.mean)).with_std(belief.std())
+}
+
+fn alarm_event(change: &AlarmChange) -> EventKind {
+    let Alarm { rule, cell, state, severity, value, probability, threshold, occurrences, is_acknowledged, .. } =
+        change.alarm;
+    EventKind::Alarm {
+        rule,
+        cell,
+        change: change.change,
+        state,
+        active: state.is_raised(),
+        severity,
+        value,
+        probability,
+        threshold,
+        occurrences,
+        acknowledged: is_acknowledged,
+    }
+}
+
+/// Since when files cannot be written; not known before the driver has said.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct StoreState {
+    is_known: bool,
+    failing_since: Option<Timestamp>,
+}
+
+impl StoreState {
+    /// Notes what the driver says; true when it is news.
+    pub(super) fn note(&mut self, now: Timestamp, works: bool) -> bool {
+        let was_failing = self.failing_since.is_some();
+        let is_news = !self.is_known || was_failing == works;
+        self.is_known = true;
+        self.failing_since = if works { None } else { self.failing_since.or(Some(now)) };
+        is_news
+    }
+
+    /// For how long they cannot be written, s; 0 while they can.
+    fn failing_s(&self, now: Timestamp) -> Option<f64> {
+        self.is_known.then(|| self.failing_since.map_or(0.0, |since| now.since(since).max(0.0)))
+    }
+}

@@ -1,0 +1,36 @@
+"""What autosar-e2e, and for profile 5 cantools, make of end-to-end protected payloads.
+
+usage: e2e_oracle.py   reads lines `profile data_id raw ours flipped`, payloads in hex: `raw` as the sender had it, with
+                       its previous counter; `ours` as our side protected it with the next; `flipped` with one bit wrong.
+                       Answers one line each: `peer ours? flipped? [peer ours? flipped?]`: `raw` as the peer protects it,
+                       its counter moved on by itself; whether it accepts `ours` and `flipped` (1, 0); the same by cantools
+                       in profile 5, from 4 bytes on (`raw` then with our counter: cantools moves none).
+"""
+import sys
+
+from cantools.autosar import apply_profile5_crc, check_profile5_crc
+from e2e.p01 import E2E_P01_DATAID_BOTH, E2E_P01_DATAID_NIBBLE, e2e_p01_check, e2e_p01_protect
+from e2e.p05 import e2e_p05_check, e2e_p05_protect
+
+MODES = {"1A": E2E_P01_DATAID_BOTH, "1C": E2E_P01_DATAID_NIBBLE}
+
+
+def answer(profile, data_id, raw, ours, flipped):
+    peer = bytearray(raw)  # changed in place; the check of profile 1 wants what can be changed too
+    if profile == "5":
+        e2e_p05_protect(peer, data_id)
+        accepted = [e2e_p05_check(payload, data_id) for payload in (ours, flipped)]
+    else:
+        e2e_p01_protect(peer, data_id, data_id_mode=MODES[profile])
+        accepted = [e2e_p01_check(payload, data_id, data_id_mode=MODES[profile]) for payload in (ours, flipped)]
+    words = [peer.hex(), *("01"[a] for a in accepted)]
+    if profile == "5" and len(raw) >= 4:
+        with_counter = raw[:2] + ours[2:3] + raw[3:]
+        words.append(apply_profile5_crc(with_counter, data_id).hex())
+        words += ["01"[check_profile5_crc(payload, data_id)] for payload in (ours, flipped)]
+    return " ".join(words)
+
+
+for line in sys.stdin:
+    profile, data_id, *payloads = line.split()
+    print(answer(profile, int(data_id), *(bytearray.fromhex(payload) for payload in payloads)))
