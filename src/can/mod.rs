@@ -5,6 +5,7 @@ pub mod dbc;
 pub mod decode;
 pub mod encode;
 pub mod frame;
+pub mod j1939;
 pub mod signal;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};
