@@ -2,8 +2,8 @@
 
 use super::document::{Document, Faults};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output, Pack,
-    PackVoltageInput, Recharge, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939, Method, Output,
+    Pack, PackVoltageInput, Recharge, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::alarm::{Rule, RuleConfig};
@@ -43,6 +43,8 @@ pub(crate) struct Raw {
     pub(crate) usable: Option<Usable>,
     pub(crate) usable_written: bool,
     pub(crate) alarms: Vec<Alarm>,
+    pub(crate) j1939: Option<J1939>,
+    pub(crate) j1939_written: bool,
     pub(crate) output: Option<Output>,
     pub(crate) output_written: bool,
 }
@@ -75,6 +77,8 @@ impl Raw {
             usable_written: walk.has::<Usable>(),
             usable: walk.optional(),
             alarms: walk.many(),
+            j1939_written: walk.has::<J1939>(),
+            j1939: walk.optional(),
             output_written: walk.has::<Output>(),
             output: walk.one(),
         }

@@ -34,6 +34,8 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
+    /// The J1939 node and its codes, in sentences; empty = there is none.
+    pub j1939: Vec<String>,
 }
 
 /// An interface and what is read from it.
@@ -126,6 +128,7 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         limits: limits(config),
         outputs,
         alarms: alarms(config),
+        j1939: super::j1939::words(config),
     }
 }
 

@@ -5,6 +5,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::can::j1939::J1939Config;
 use crate::monitor::MonitorConfig;
 
 pub mod cell_model;
@@ -12,6 +13,7 @@ mod convert;
 mod cross;
 mod describe;
 mod document;
+mod j1939;
 mod keys;
 mod output;
 mod pattern;
@@ -34,6 +36,8 @@ pub struct Config {
     pub interfaces: Vec<InterfaceConfig>,
     /// What the core needs.
     pub monitor: MonitorConfig,
+    /// The J1939 node; `None` = there is none.
+    pub j1939: Option<J1939Config>,
 }
 
 /// One CAN interface.
@@ -96,11 +100,12 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let databases = Databases::load(path, names, read, faults);
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let output = output::output(&raw, path, &found, read, faults);
+    let j1939 = j1939::node(&raw, &found, output.as_ref(), faults);
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
     let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, output)?;
-    let config = Config { path: path.to_owned(), interfaces, monitor };
+    let config = Config { path: path.to_owned(), interfaces, monitor, j1939 };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
 }

@@ -14,13 +14,13 @@ use serde::{Deserialize, Serialize};
 use super::address::{AddressClaim, State};
 use super::codes::{ActiveCode, Codes};
 use super::id::{
-    GLOBAL_ADDRESS, Header, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST, PRIORITY, can_id,
-    filter, pgn_bytes, pgn_of,
+    GLOBAL_ADDRESS, Header, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
+    PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, PRIORITY, TRANSPORT_PRIORITY, can_id, filter, pgn_bytes, pgn_of,
 };
 use super::name::Name;
 use super::transport::Transfer;
 use super::trouble_code::{DmPayload, TroubleCode, dm_payload};
-use crate::can::{Frame, FrameKind};
+use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::Timestamp;
 
 /// Time between two cyclic DM1, ns (J1939-73).
@@ -41,6 +41,22 @@ pub struct NodeConfig {
     pub name: Name,
     /// The address it claims, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
     pub address: u8,
+}
+
+impl NodeConfig {
+    /// Every identifier the node sends with.
+    pub fn sent_ids(&self) -> [CanId; 7] {
+        let id = |priority, pgn, source| can_id(priority, pgn, GLOBAL_ADDRESS, source);
+        [
+            id(PRIORITY, PGN_DM1, self.address),
+            id(PRIORITY, PGN_DM2, self.address),
+            id(PRIORITY, PGN_ADDRESS_CLAIMED, self.address),
+            id(PRIORITY, PGN_ADDRESS_CLAIMED, NULL_ADDRESS),
+            id(PRIORITY, PGN_ACKNOWLEDGEMENT, self.address),
+            id(TRANSPORT_PRIORITY, PGN_TRANSPORT_CONTROL, self.address),
+            id(TRANSPORT_PRIORITY, PGN_TRANSPORT_DATA, self.address),
+        ]
+    }
 }
 
 /// Something worth a line in a log.
