@@ -353,7 +353,8 @@ impl Node {
         }
     }
 
-    /// When [`poll`](Self::poll) has something to do; `None` = only a frame or [`start`](Self::start) can change that.
+    /// When [`poll`](Self::poll) has something to do, in the past = now; `None` = only a frame or [`start`](Self::start)
+    /// can change that. A poll before this time does nothing.
     pub fn next_due(&self) -> Option<Timestamp> {
         let claim = self.claim.next_due();
         if self.is_silent() {
