@@ -151,7 +151,7 @@ impl Node {
         }
     }
 
-    /// Claims the address. Codes are told after 250 ms without objection.
+    /// Claims the address. Codes are told after 300 ms without objection (`address` says why not 250).
     pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.fall_silent();
         self.codes.restart();

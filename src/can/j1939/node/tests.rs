@@ -73,11 +73,17 @@ impl Bench {
         }
     }
 
+    /// Starts at -50 ms, so that the address is claimed at 250 ms.
+    fn start(&mut self) {
+        self.now_ms = -50;
+        self.node.start(at(-50), &mut self.out);
+    }
+
     /// Claimed, everything known, nothing active; the first DM1 is out at 250 ms.
     fn claimed() -> Self {
         let mut bench = Self::new();
         bench.set(&[]);
-        bench.node.start(at(0), &mut bench.out);
+        bench.start();
         bench.run_to(250);
         assert_eq!(bench.events, [NodeEvent::Claimed { address: OURS }]);
         bench
@@ -163,18 +169,18 @@ fn nothing_is_sent_before_the_start() {
 }
 
 #[test]
-fn the_first_dm1_comes_250_ms_after_the_claim_and_then_one_a_second_without_any_code() {
+fn the_first_dm1_comes_300_ms_after_the_claim_and_then_one_a_second_without_any_code() {
     let mut bench = Bench::claimed();
     bench.run_to(3500);
     let dm1 = 0x18FE_CA00 | u32::from(OURS);
-    assert_eq!(bench.ids(), [(0, 0x18EE_FFF9), (250, dm1), (1250, dm1), (2250, dm1), (3250, dm1)]);
+    assert_eq!(bench.ids(), [(-50, 0x18EE_FFF9), (250, dm1), (1250, dm1), (2250, dm1), (3250, dm1)]);
     assert_eq!(bench.frames[1].1.data(), [0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
 }
 
 #[test]
 fn without_any_word_about_the_alarms_every_lamp_is_unknown() {
     let mut bench = Bench::new();
-    bench.node.start(at(0), &mut bench.out);
+    bench.start();
     bench.run_to(250);
     assert_eq!(bench.frames[1].1.data(), [0x3F, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
 }
@@ -420,13 +426,13 @@ fn after_a_gap_the_address_is_claimed_again_and_the_codes_told_again() {
     bench.node.handle_gap(at(5000), &mut bench.out);
     bench.run_to(5300);
     assert_eq!(bench.events[2..], [NodeEvent::Claimed { address: OURS }]);
-    assert_eq!(bench.told(PGN_DM1).last(), Some(&(5250, vec![1])));
+    assert_eq!(bench.told(PGN_DM1).last(), Some(&(5300, vec![1])));
 }
 
 #[test]
 fn what_was_active_while_the_address_was_being_claimed_is_told() {
     let mut bench = Bench::new();
-    bench.node.start(at(0), &mut bench.out);
+    bench.start();
     bench.set(&[active(1, Lamp::Red)]);
     bench.run_to(100);
     bench.set(&[]);
