@@ -8,7 +8,7 @@ use super::convert::Raw;
 use super::keys::TemperatureInput;
 use super::resolve::{Resolved, channel_words};
 use super::{Config, InterfaceConfig, protect};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
+use crate::alarm::{Direction, Rule, RuleConfig, Unit, When};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
@@ -36,6 +36,8 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
+    /// The J1939 node and its codes, in sentences; empty = there is none.
+    pub j1939: Vec<String>,
 }
 
 /// An interface and what is read from it.
@@ -133,6 +135,7 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
+        j1939: super::j1939::words(config),
     }
 }
 
@@ -287,11 +290,7 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
         Direction::Below => "below",
         Direction::Above => "above",
     };
-    let severity = match rule.severity {
-        Severity::Info => "info",
-        Severity::Warning => "warning",
-        Severity::Severe => "severe",
-    };
+    let severity = rule.severity.name();
     let of_rated = match row.unit {
         Unit::AmpereHours => format!(" ({} % of rated)", round(100.0 * rule.threshold / rated_ah)),
         _ => String::new(),

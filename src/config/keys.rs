@@ -448,6 +448,36 @@ section! {
 }
 
 section! {
+    /// A J1939 node beside the frames of `[output]`: it claims an address and tells alarms as trouble codes, in DM1 once a second and on every change, in DM2 when asked for.
+    /// Of a rule the code of its gravest raised alarm is told. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
+    /// The NAME says who the node is: in a contest for the address the smaller one wins, and a node that loses falls silent.
+    J1939 at "j1939" {
+        /// Interface the node is on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// Address it claims, and keeps or loses: it never takes another one.
+        address: u16, "", Between(0.0, 253.0), Required;
+        /// Serial number in the NAME, unique among the maker's nodes.
+        identity_number: u32, "", Between(0.0, 2_097_151.0), Required;
+        /// The maker's number in the NAME, which SAE assigns.
+        manufacturer_code: u16, "", Between(0.0, 2047.0), Required;
+        /// What the node does, as SAE numbers it; 255 = not available.
+        function: u16, "", Between(0.0, 255.0), Default("255");
+        /// Which one of several nodes of this function.
+        function_instance: u16, "", Between(0.0, 31.0), Default("0");
+        /// Which one of several computers that share the function.
+        ecu_instance: u16, "", Between(0.0, 7.0), Default("0");
+        /// Vehicle system within the industry group; 127 = not available.
+        vehicle_system: u16, "", Between(0.0, 127.0), Default("127");
+        /// Which one of several equal vehicle systems.
+        vehicle_system_instance: u16, "", Between(0.0, 15.0), Default("0");
+        /// 0 global, 1 on-highway, 2 agriculture and forestry, 3 construction, 4 marine, 5 industrial.
+        industry_group: u16, "", Between(0.0, 7.0), Default("0");
+        /// Suspect parameter number that is told, with FMI 31 and no lamp, while `packwatch test-alarm` runs: a trouble code has no mark of a test of its own.
+        test_spn: u32, "", Between(1.0, 524_287.0), Default("524286");
+    }
+}
+
+section! {
     /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent. `packwatch dbc` writes the DBC of the frames as they are configured.
     Output at "output" {
         /// Whether anything is sent.
@@ -595,6 +625,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Recharge>(),
     SectionInfo::one::<Usable>(),
     SectionInfo::many::<Alarm>(),
+    SectionInfo::one::<J1939>(),
     SectionInfo::one::<Output>(),
     SectionInfo::one::<OutputStatus>(),
     SectionInfo::one::<OutputHealth>(),

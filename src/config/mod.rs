@@ -15,6 +15,7 @@ mod convert;
 mod cross;
 mod describe;
 mod document;
+mod j1939;
 mod keys;
 mod output;
 mod pattern;
@@ -107,11 +108,13 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let laid_out = output::output(&raw, path, model.as_ref(), &found, read, faults);
     let (commands, guard) = commands::commands(&raw, laid_out.as_ref(), &found, faults).unzip();
     guards.extend(guard);
+    let j1939 = j1939::node(&raw, &found, laid_out.as_ref().map(|(output, _)| output), faults);
     let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, guards, output, commands)?;
+    let traffic = convert::Traffic { input: resolve::input_map(&found)?, guards, output, commands, j1939 };
+    let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))

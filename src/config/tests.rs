@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 
+mod j1939;
+
 use super::*;
 use crate::can::dbc::FrameFormat;
 use crate::can::e2e::{Profile, Protection};
@@ -672,7 +674,10 @@ proptest! {
         const SCRAPS: [&str; 14] = [
             "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
         ];
-        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n");
+        let full = format!(
+            "{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n{}",
+            j1939::TABLE
+        );
         let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
         for (file, place, length, scrap) in edits {
             let text = &mut texts[file];

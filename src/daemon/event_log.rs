@@ -66,6 +66,7 @@ impl EventLog {
             EventKind::Trust { cell, trusted: true, mean_nis } => {
                 tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
             }
+            EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
             EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
             EventKind::Command { source, command, changed, refused } => {
                 tracing::info!(?source, ?command, changed, refused, "command");

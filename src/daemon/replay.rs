@@ -461,6 +461,7 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             }
         }
         EventKind::Bus { .. } => "bus",
+        EventKind::J1939 { .. } => "j1939",
         EventKind::Gap { .. } => "gap",
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",

@@ -138,6 +138,7 @@ impl Service {
                 interface: interface.name.clone(),
                 fd: interface.fd,
                 ids: self.config.monitor.wanted_ids(bus),
+                patterns: self.config.monitor.wanted_patterns(bus),
                 receive_buffer_bytes: self.receive_buffer_bytes,
             };
             let (link, output) = Link::new(config, clock, inbox.clone());

@@ -62,6 +62,8 @@ impl Monitor {
         self.observe_alarm(Rule::StoreFailed, None, Observation::new(store), out);
         self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
+        // Whether every value is known may have changed without an alarm.
+        self.tell_j1939();
     }
 
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
@@ -241,6 +243,8 @@ impl Monitor {
             self.send_alarm(&change.alarm, out);
         }
         self.scratch.alarm_changes = changes;
+        self.tell_j1939();
+        self.poll_j1939(out);
     }
 
     /// A command from the bus; one that is not intact, or that has no meaning, is told and not obeyed.
@@ -292,12 +296,11 @@ impl Monitor {
 
 /// A frame's command; `None` = it names a rule or severity that there is not.
 fn command_of(fields: &CommandFields) -> Option<Command> {
-    let severities = [Severity::Info, Severity::Warning, Severity::Severe];
     let which = Selector {
         rule: fields.rule.map(|number| Rule::from_number(number).ok_or(())).transpose().ok()?,
         severity: fields
             .severity
-            .map(|code| severities.into_iter().find(|s| *s as u8 == code).ok_or(()))
+            .map(|code| Severity::ALL.into_iter().find(|s| *s as u8 == code).ok_or(()))
             .transpose()
             .ok()?,
         cell: fields.cell,

@@ -9,11 +9,13 @@ mod alarms;
 mod buses;
 mod cyclic;
 mod intake;
+mod j1939;
 mod learning;
 mod output;
 mod snapshot;
 mod types;
 
+pub use j1939::{AlarmCode, J1939Config};
 pub use output::{CommandConfig, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
@@ -28,6 +30,7 @@ use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
+use crate::can::j1939::Node;
 use crate::can::{CanId, Frame};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
@@ -61,6 +64,8 @@ pub struct MonitorConfig {
     pub output: Option<OutputConfig>,
     /// Commands taken from the bus; `None` = none.
     pub commands: Option<CommandConfig>,
+    /// The J1939 node; `None` = there is none.
+    pub j1939: Option<J1939Config>,
 }
 
 /// One cell's estimator and what it has consumed of the pack's totals.
@@ -137,6 +142,7 @@ pub struct Monitor {
     /// A test of an alarm frame that is running; it ends with the process.
     test: Option<Test>,
     schedule: Schedule,
+    j1939: Option<j1939::J1939>,
     pending: Option<PendingRestore>,
     scratch: Scratch,
 }
@@ -157,6 +163,12 @@ impl MonitorConfig {
         ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
         ids.sort_unstable();
         ids
+    }
+
+    /// Extended identifiers to be received besides, as identifier and mask.
+    pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
+        let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
+        node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
     }
 }
 
@@ -184,6 +196,7 @@ impl Monitor {
             store: StoreState::default(),
             test: None,
             schedule: Schedule::default(),
+            j1939: config.j1939.clone().map(j1939::J1939::new),
             pending: None,
             scratch: Scratch::default(),
             config,
@@ -207,6 +220,7 @@ impl Monitor {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
+                self.handle_j1939_frame(bus, frame, out);
             }
             Input::Command { command, .. } => {
                 self.advance(time, out);
@@ -222,6 +236,9 @@ impl Monitor {
                 self.advance(time, out);
                 self.buses.handle_event(self.now, bus, event);
                 out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
+                if event == BusEvent::Up && self.config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
+                    self.start_j1939(out);
+                }
             }
         }
     }
@@ -288,6 +305,7 @@ impl Monitor {
         if self.apply_pending(time) {
             self.restate_learned(out);
         }
+        self.start_j1939(out);
     }
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
@@ -317,6 +335,8 @@ impl Monitor {
             out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(elapsed_s) } });
             self.sampler.wake(time);
             self.schedule.restart(time);
+            self.now = time;
+            self.start_j1939(out);
         }
         self.now = time;
     }
@@ -348,6 +368,7 @@ impl Monitor {
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
         self.sampler.handle_gap(time);
         self.schedule.restart(time);
+        self.start_j1939(out);
         for cell in &mut self.cells {
             cell.estimator.handle_unknown_gap();
             cell.consumed = None;
