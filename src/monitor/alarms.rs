@@ -201,15 +201,21 @@ impl Monitor {
         capacities.min_by(|a, b| a.mean.total_cmp(&b.mean)).filter(|_| self.learner.has_learned_all())
     }
 
-    /// After a restart: what was learned stands, though it is not learned anew.
-    pub(super) fn restate_learned(&mut self, out: &mut Outputs) {
+    /// After a restart: what was known stands, though it is not known anew.
+    pub(super) fn restate_known(&mut self, out: &mut Outputs) {
         let old = |belief: Belief| Observation { is_new: false, ..learned(belief) };
         for index in 0..self.cells.len() {
             let cell = Some(CellIndex(u16::try_from(index).unwrap_or(u16::MAX)));
             if self.learner.has_learned(index) {
                 let capacity = self.learner.capacity(&self.config.health.capacity, index);
                 self.observe_alarm(Rule::CapacityLow, cell, old(capacity), out);
-                let resistance = self.cells[index].resistance();
+            }
+            if self.cells[index].estimator.soc().is_some() {
+                let mean_nis =
+                    Observation { value: Some(self.cells[index].estimator.mean_nis()), ..Observation::default() };
+                self.observe_alarm(Rule::EstimateUntrusted, cell, mean_nis, out);
+            }
+            if let Some(resistance) = self.cells[index].discharge_resistance {
                 self.observe_alarm(Rule::ResistanceHigh, cell, old(resistance), out);
             }
             if let Some(usable) = self.cells[index].usable {

@@ -81,6 +81,8 @@ struct CellSlot {
     /// Whether the present charge has tapered off at the highest voltage.
     tapered: bool,
     usable: Option<Belief>,
+    /// Resistance relative to new as the last discharge left it.
+    discharge_resistance: Option<Belief>,
     updated_in_round: bool,
 }
 
@@ -95,6 +97,7 @@ impl CellSlot {
             full_soc: 1.0,
             tapered: false,
             usable: None,
+            discharge_resistance: None,
             updated_in_round: false,
         }
     }
@@ -303,7 +306,7 @@ impl Monitor {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
         if self.apply_pending(time) {
-            self.restate_learned(out);
+            self.restate_known(out);
         }
         self.start_j1939(out);
     }
