@@ -124,9 +124,9 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
     match rule {
         // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.
         Rule::InputMissing => 9,
-        Rule::InputImplausible | Rule::BusFault => 19,
-        Rule::EstimateUntrusted | Rule::BmsDisagrees => 2,
-        Rule::StoreFailed => 31,
+        Rule::BusFault => 19,
+        Rule::InputImplausible | Rule::BmsDisagrees => 2,
+        Rule::EstimateUntrusted | Rule::StoreFailed => 31,
         Rule::CapacityLow
         | Rule::UsableCapacityLow
         | Rule::RechargePeriodLow

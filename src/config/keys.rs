@@ -442,14 +442,14 @@ section! {
         latched: bool, "", Any, Default("false");
         /// J1939: suspect parameter number. Without it: 520192 (maker-assignable) plus the rule's number.
         spn: Option<u32>, "", Between(1.0, 524_287.0), Optional;
-        /// J1939: failure mode identifier. Without it: by rule and severity (17, 18, 1 for a value too low, 15, 16, 0 for one too high; 9 for a missing input, 19 for a bad one or a bus, 2 for an estimate not to be trusted, 31 for a store).
+        /// J1939: failure mode identifier. Without it: by rule and severity (17, 18, 1 for a value too low, 15, 16, 0 for one too high; 9 for a missing input, 2 for an implausible one and a pack that disagrees, 19 for a bus, 31 for an estimate not to be trusted and a store).
         fmi: Option<u16>, "", Between(0.0, 31.0), Optional;
     }
 }
 
 section! {
     /// A J1939 node beside the frames of `[output]`: it claims an address and tells alarms as trouble codes, in DM1 once a second and on every change, in DM2 when asked for.
-    /// Of a rule the code of its gravest raised alarm is told. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
+    /// Of a rule's alarms that share a parameter number the gravest is told. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
     /// The NAME says who the node is: in a contest for the address the smaller one wins, and a node that loses falls silent.
     J1939 at "j1939" {
         /// Interface the node is on. Needed when there are several.

@@ -1,8 +1,8 @@
 //! The J1939 node beside the frames of `[output]`: alarms as trouble codes.
 //!
-//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. A rule's thresholds share a
-//! parameter number: of those that are raised for any cell, the gravest is told. Its occurrence count is that of its
-//! alarms together.
+//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. Of the thresholds
+//! of a rule that share a parameter number and are raised for any cell, the gravest is told. The occurrence count is
+//! that of a threshold's alarms together.
 
 use super::{Event, EventKind, Monitor, Outputs, Transmit};
 use crate::alarm::{Rule, Severity};
@@ -94,17 +94,15 @@ impl Monitor {
         let Some(j1939) = &mut self.j1939 else { return };
         j1939.active.clear();
         j1939.previously_active.clear();
-        let mut told: Option<Rule> = None;
         // Within a rule the gravest threshold comes last.
         for threshold in self.alarms.thresholds().rev() {
             let same = |code: &&AlarmCode| (code.rule, code.severity) == (threshold.rule, threshold.severity);
             let Some(own) = j1939.config.alarms.iter().find(same) else { continue };
             let code = own.code.with_occurrences(threshold.occurrences);
             if threshold.is_raised {
-                if told != Some(threshold.rule) {
+                if j1939.active.iter().all(|graver| graver.code.spn() != code.spn()) {
                     j1939.active.push(ActiveCode { code, lamp: own.lamp });
                 }
-                told = Some(threshold.rule);
             } else if threshold.occurrences > 0 {
                 j1939.previously_active.push(code);
             }
