@@ -14,6 +14,7 @@ mod output;
 mod snapshot;
 mod types;
 
+pub use cyclic::MAX_TEST_S;
 pub use output::OutputConfig;
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
