@@ -14,6 +14,7 @@ mod run;
 #[cfg(feature = "lab")]
 mod score;
 mod simulate;
+mod test_alarm;
 
 use std::process::ExitCode;
 
@@ -42,6 +43,8 @@ enum Command {
     Clear(command::AlarmArgs),
     /// Tell the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
+    /// Send a rule's alarm frame, marked as a test, and see what goes out on every interface
+    TestAlarm(test_alarm::Args),
     /// Replay journals, candump logs or CSV files through the same core
     Replay(Box<replay::Args>),
     /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
@@ -90,6 +93,7 @@ pub fn main() -> ExitCode {
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
         Command::PackReplaced(args) => command::pack_replaced(&args),
+        Command::TestAlarm(args) => test_alarm::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),

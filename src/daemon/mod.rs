@@ -1,5 +1,6 @@
 //! The loops round the core: the live service and the replay of records.
 
+pub(crate) mod alarm_test;
 mod background_file;
 pub mod control;
 mod event_log;

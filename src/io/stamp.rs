@@ -85,6 +85,13 @@ pub fn format_utc(time: Timestamp) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
 }
 
+/// The same to the microsecond: `2008-04-02T13:08:17.921000Z`.
+pub fn format_utc_micros(time: Timestamp) -> String {
+    let whole = format_utc(time);
+    let micros = time.nanos().rem_euclid(1_000_000_000) / 1000;
+    format!("{}.{micros:06}Z", whole.trim_end_matches('Z'))
+}
+
 /// Year, month and day of a number of days from 1970-01-01; the reverse of `days_from_epoch`.
 fn date_of(days: i64) -> (i64, i64, i64) {
     let days = days + 719_468;

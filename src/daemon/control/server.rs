@@ -46,7 +46,9 @@ impl ControlServer {
         };
         let shown = path.display();
         match bind(&path).await {
-            Ok(bound) => Ok(Some(Self::serve(bound, requests).map_err(|error| format!("{shown}: {error}"))?)),
+            Ok(bound) => {
+                Ok(Some(Self::serve(bound, requests, MAX_SILENCE).map_err(|error| format!("{shown}: {error}"))?))
+            }
             Err(BindError::Taken(owner)) => Err(format!(
                 "{shown}: {owner} listens there already; stop it, or start this one with --control and another path"
             )),
@@ -58,12 +60,12 @@ impl ControlServer {
         }
     }
 
-    fn serve(bound: Bound, requests: mpsc::Sender<Asked>) -> std::io::Result<Self> {
+    fn serve(bound: Bound, requests: mpsc::Sender<Asked>, max_silence: Duration) -> std::io::Result<Self> {
         // The kernel's own word for who we are, in the same terms as for a peer.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");
         let mut tasks = JoinSet::new();
-        tasks.spawn(accept(bound.listener, Desk { requests, own_uid }));
+        tasks.spawn(accept(bound.listener, Desk { requests, own_uid, max_silence }));
         Ok(Self { _tasks: tasks, _file: bound.file })
     }
 }
@@ -73,6 +75,7 @@ impl ControlServer {
 struct Desk {
     requests: mpsc::Sender<Asked>,
     own_uid: u32,
+    max_silence: Duration,
 }
 
 async fn accept(listener: UnixListener, desk: Desk) {
@@ -121,18 +124,18 @@ async fn serve_connection(stream: UnixStream, desk: &Desk) {
         line.clear();
         // One byte more than allowed tells a line that is too long.
         let mut limited = (&mut reader).take(MAX_REQUEST_BYTES as u64 + 1);
-        match timeout(MAX_SILENCE, limited.read_until(b'\n', &mut line)).await {
+        match timeout(desk.max_silence, limited.read_until(b'\n', &mut line)).await {
             Ok(Ok(0) | Err(_)) => return,
             Ok(Ok(_)) => {}
             Err(_) => {
-                let limit = MAX_SILENCE.as_secs();
+                let limit = desk.max_silence.as_secs_f64();
                 let silent = Answer::Error(format!("no request within {limit} s, the connection is closed"));
-                return drop(send(&mut write, &silent).await);
+                return drop(send(&mut write, &silent, desk).await);
             }
         }
         if line.len() > MAX_REQUEST_BYTES {
             let long = format!("a request of more than {MAX_REQUEST_BYTES} bytes, must be a line of at most that many");
-            return drop(send(&mut write, &Answer::Error(long)).await);
+            return drop(send(&mut write, &Answer::Error(long), desk).await);
         }
         let answer = match Request::parse(&line) {
             Err(fault) => Answer::Error(fault),
@@ -148,7 +151,7 @@ async fn serve_connection(stream: UnixStream, desk: &Desk) {
                 ask(desk, request).await
             }
         };
-        if send(&mut write, &answer).await.is_err() {
+        if send(&mut write, &answer, desk).await.is_err() {
             return;
         }
     }
@@ -164,9 +167,9 @@ async fn ask(desk: &Desk, request: Request) -> Answer {
 }
 
 /// Writes an answer; one that is not taken in time ends the connection.
-async fn send(write: &mut OwnedWriteHalf, answer: &Answer) -> std::io::Result<()> {
+async fn send(write: &mut OwnedWriteHalf, answer: &Answer, desk: &Desk) -> std::io::Result<()> {
     let line = answer.to_line();
-    timeout(MAX_SILENCE, write.write_all(&line)).await.unwrap_or_else(|late| Err(late.into()))
+    timeout(desk.max_silence, write.write_all(&line)).await.unwrap_or_else(|late| Err(late.into()))
 }
 
 #[cfg(test)]
