@@ -87,7 +87,7 @@ fn row(alarm: &Alarm) -> [String; HEAD.len()] {
         alarm.rule.name().to_owned(),
         severity(alarm.severity).to_owned(),
         cell(alarm.cell),
-        state(alarm.state).to_owned(),
+        state_name(alarm.state).to_owned(),
         alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
         with_unit(alarm.rule, alarm.threshold),
         alarm.probability.map_or_else(|| "-".to_owned(), |probability| format!("{:.1} %", 100.0 * probability)),
@@ -119,6 +119,7 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
     }
 }
 
+/// A severity as people write it.
 pub(super) fn severity(severity: Severity) -> &'static str {
     match severity {
         Severity::Info => "info",
@@ -127,7 +128,8 @@ pub(super) fn severity(severity: Severity) -> &'static str {
     }
 }
 
-fn state(state: State) -> &'static str {
+/// Where an alarm is, in a word.
+pub(super) fn state_name(state: State) -> &'static str {
     match state {
         State::Unknown => "unknown",
         State::Inactive => "inactive",

@@ -7,8 +7,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
+use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
-use crate::alarm::Rule;
+use crate::alarm::{Rule, State};
 use crate::config;
 use crate::daemon::alarm_test::{self, ChannelReport};
 use crate::io::stamp;
@@ -91,12 +92,19 @@ fn protection(report: &ChannelReport) -> String {
     format!("BROKEN: {}", found.collect::<Vec<_>>().join(", "))
 }
 
+/// States with a code of their own on the wire.
+const ON_THE_WIRE: [State; 7] =
+    [State::Inactive, State::Active, State::Cleared, State::Pending, State::Latched, State::Suppressed, State::Unknown];
+
 /// What else was on the channel.
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let seen = &report.seen;
     for ((rule, state), count) in &seen.real {
         let name = Rule::from_number(*rule).map_or("unknown rule", Rule::name);
-        let _ = writeln!(text, "  meanwhile REAL, without the marker: {name}, state {state}, {count} frames");
+        let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == *state);
+        let kind = if found.is_some_and(State::is_raised) { "REAL, " } else { "" };
+        let word = found.map_or("in an unknown state", state_name);
+        let _ = writeln!(text, "  meanwhile {kind}without the marker: {name} {word}, {count} frames");
     }
     let others = [
         (seen.foreign, "test frames of other rules"),

@@ -111,7 +111,7 @@ mod tests {
 
     #[test]
     fn dates_are_written_as_they_are_read() {
-        for days in (-200_000..200_000).step_by(17).chain([-1, 0, 11_016, 11_017]) {
+        for days in (-100_000..100_000).step_by(17).chain([-1, 0, 11_016, 11_017]) {
             let time = Timestamp::from_nanos((days * 86_400 + 47_297) * 1_000_000_000);
             let text = format_utc(time);
             assert_eq!(parse_stamp(&text), Some(time), "{text}");
