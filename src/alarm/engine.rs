@@ -51,6 +51,19 @@ pub struct AlarmChange {
     pub alarm: Alarm,
 }
 
+/// What became of all alarms of one threshold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ThresholdState {
+    /// Which rule.
+    pub rule: Rule,
+    /// Its severity.
+    pub severity: Severity,
+    /// Whether one of its alarms is raised.
+    pub is_raised: bool,
+    /// Times they were raised, together.
+    pub occurrences: u32,
+}
+
 /// One alarm of a stored state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct StoredAlarm {
@@ -245,6 +258,19 @@ impl AlarmEngine {
             .iter()
             .enumerate()
             .flat_map(move |(index, rule)| rule.slots().map(move |slot| self.alarm(index, slot)))
+    }
+
+    /// Every threshold, in the order of rule and severity.
+    pub fn thresholds(&self) -> impl DoubleEndedIterator<Item = ThresholdState> + '_ {
+        self.rules.iter().map(|rule| {
+            let machines = &self.machines[rule.slots()];
+            ThresholdState {
+                rule: rule.config.rule,
+                severity: rule.config.severity,
+                is_raised: machines.iter().any(|machine| machine.state.is_raised()),
+                occurrences: machines.iter().fold(0, |sum: u32, machine| sum.saturating_add(machine.occurrences)),
+            }
+        })
     }
 
     /// The worst severity of the raised alarms; `None` = none is raised.

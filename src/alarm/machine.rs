@@ -191,7 +191,7 @@ pub(super) struct Machine {
 impl Machine {
     /// Takes a value.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, seen: &Observation) -> Option<Change> {
-        (self.seen, self.is_suspended) = (*seen, false);
+        (self.seen, self.is_suspended) = (Observation { is_new: false, ..*seen }, false);
         self.judge(now, rule, seen.is_new)
     }
 

@@ -198,6 +198,20 @@ pub enum Severity {
     Severe = 3,
 }
 
+impl Severity {
+    /// All of them, mildest first.
+    pub const ALL: [Self; 3] = [Self::Info, Self::Warning, Self::Severe];
+
+    /// As written in configurations, events and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Info => "info",
+            Self::Warning => "warning",
+            Self::Severe => "severe",
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

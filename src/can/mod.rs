@@ -8,6 +8,7 @@ pub mod encode;
 pub mod flood;
 pub mod frame;
 pub mod guard;
+pub mod j1939;
 pub mod signal;
 
 pub use frame::{CanId, Frame, FrameKind, MAX_DATA};

@@ -77,6 +77,9 @@ fn show(description: &Description, page: &mut String) {
     } else {
         list("alarms", &description.alarms, page);
     }
+    if !description.j1939.is_empty() {
+        list("j1939", &description.j1939, page);
+    }
 }
 
 fn list(heading: &str, lines: &[String], page: &mut String) {

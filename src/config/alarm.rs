@@ -114,7 +114,7 @@ impl Rated {
 
 impl Alarm {
     /// The thresholds that are written, by severity, with their keys.
-    fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
+    pub(crate) fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
         let all = [
             ("info", Severity::Info, self.info),
             ("warning", Severity::Warning, self.warning),

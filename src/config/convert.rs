@@ -5,9 +5,10 @@ use std::num::NonZeroU32;
 use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
-    Alarm, Capacity, CellVoltageInput, CurrentInput, CurrentLimits, Estimator, Input, Interface, Method, Output,
-    OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge, ReportedSocInput,
-    ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable, VoltageLimits,
+    Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
+    Method, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge,
+    ReportedSocInput, ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable,
+    VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::can::decode::InputMap;
@@ -15,7 +16,7 @@ use crate::can::flood::FloodConfig;
 use crate::can::guard::GuardConfig;
 use crate::cell::{CellModel, EstimatorConfig};
 use crate::health::{CapacityConfig, CapacityMethod, HealthConfig, RechargeConfig, TransitionConfig, UsableConfig};
-use crate::monitor::{MonitorConfig, OutputConfig};
+use crate::monitor::{CommandConfig, J1939Config, MonitorConfig, OutputConfig};
 use crate::quantity::SensorIndex;
 use crate::sample::{Limits, SampleConfig, VoltageSource};
 
@@ -53,11 +54,14 @@ pub(crate) struct Raw {
     pub(crate) usable: Option<Usable>,
     pub(crate) usable_written: bool,
     pub(crate) alarms: Vec<Alarm>,
+    pub(crate) j1939: Option<J1939>,
+    pub(crate) j1939_written: bool,
     pub(crate) output: Option<Output>,
     pub(crate) output_status: Option<OutputStatus>,
     pub(crate) output_health: Option<OutputHealth>,
     pub(crate) output_alarm: Option<OutputAlarm>,
     pub(crate) output_written: bool,
+    pub(crate) commands: Option<Commands>,
 }
 
 impl Raw {
@@ -92,6 +96,9 @@ impl Raw {
             usable_written: walk.has::<Usable>(),
             usable: walk.optional(),
             alarms: walk.many(),
+            commands: walk.one(),
+            j1939_written: walk.has::<J1939>(),
+            j1939: walk.optional(),
             output_written: walk.has::<Output>(),
             output: walk.one(),
             output_status: walk.one(),
@@ -101,25 +108,30 @@ impl Raw {
     }
 }
 
+/// What the frames of the buses mean, both ways.
+#[derive(Debug)]
+pub(crate) struct Traffic {
+    pub(crate) input: InputMap,
+    pub(crate) guards: Vec<GuardConfig>,
+    pub(crate) output: Option<OutputConfig>,
+    pub(crate) commands: Option<CommandConfig>,
+    pub(crate) j1939: Option<J1939Config>,
+}
+
 /// Everything the core must know; `None` when a table is missing or faulty (and noted).
-pub(crate) fn monitor(
-    raw: &Raw,
-    mut model: CellModel,
-    found: &Ranges,
-    input: InputMap,
-    guards: Vec<GuardConfig>,
-    output: Option<OutputConfig>,
-) -> Option<MonitorConfig> {
+pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: Traffic) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
     let rated = Rated::new(rated_ah, raw.recharge.as_ref()?);
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
-        input,
-        guards,
+        input: traffic.input,
+        guards: traffic.guards,
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
-        output,
+        output: traffic.output,
+        commands: traffic.commands,
+        j1939: traffic.j1939,
         sample: sample(raw, pack, &model, found)?,
         estimator: estimator(raw.estimator.as_ref()?, pack, &model),
         health: HealthConfig {

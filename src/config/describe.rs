@@ -8,11 +8,11 @@ use super::convert::Raw;
 use super::keys::TemperatureInput;
 use super::resolve::{Resolved, channel_words};
 use super::{Config, InterfaceConfig, protect};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
+use crate::alarm::{Direction, Rule, RuleConfig, Unit, When};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
-use crate::quantity::Channel;
+use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
 /// What a good configuration means.
@@ -36,6 +36,8 @@ pub struct Description {
     pub outputs: Vec<OutputUse>,
     /// Alarms, in sentences.
     pub alarms: Vec<String>,
+    /// The J1939 node and its codes, in sentences; empty = there is none.
+    pub j1939: Vec<String>,
 }
 
 /// An interface and what is read from it.
@@ -127,12 +129,13 @@ pub(crate) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outpu
         file: config.path.display().to_string(),
         cell,
         pack: pack(config),
-        interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(bus, i, found)).collect(),
+        interfaces: (0..).zip(&config.interfaces).map(|(bus, i)| interface(BusIndex(bus), i, config)).collect(),
         signals: found.iter().map(|resolved| signal(raw, config, resolved)).collect(),
         limits: limits(config),
         intake: protect::describe(config, found),
         outputs,
         alarms: alarms(config),
+        j1939: super::j1939::words(config),
     }
 }
 
@@ -165,11 +168,8 @@ fn pack(config: &Config) -> Vec<String> {
     words
 }
 
-fn interface(bus: u8, interface: &InterfaceConfig, found: &[Resolved<'_>]) -> InterfaceUse {
-    let mut ids: Vec<_> = found.iter().filter(|f| f.bus.0 == bus).map(|f| f.message.id).collect();
-    ids.sort_unstable();
-    ids.dedup();
-    let filter_ids = ids.iter().map(ToString::to_string).collect();
+fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> InterfaceUse {
+    let filter_ids = config.monitor.wanted_ids(bus).iter().map(ToString::to_string).collect();
     InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids }
 }
 
@@ -290,11 +290,7 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
         Direction::Below => "below",
         Direction::Above => "above",
     };
-    let severity = match rule.severity {
-        Severity::Info => "info",
-        Severity::Warning => "warning",
-        Severity::Severe => "severe",
-    };
+    let severity = rule.severity.name();
     let of_rated = match row.unit {
         Unit::AmpereHours => format!(" ({} % of rated)", round(100.0 * rule.threshold / rated_ah)),
         _ => String::new(),

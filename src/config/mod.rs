@@ -10,10 +10,12 @@ use crate::monitor::MonitorConfig;
 
 mod alarm;
 pub mod cell_model;
+mod commands;
 mod convert;
 mod cross;
 mod describe;
 mod document;
+mod j1939;
 mod keys;
 mod output;
 mod pattern;
@@ -102,12 +104,17 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
-    let guards = protect::guards(&raw, &found, inputs_whole, faults);
-    let (output, output_layout) = output::output(&raw, path, model.as_ref(), &found, read, faults).unzip();
+    let mut guards = protect::guards(&raw, &found, inputs_whole, faults);
+    let laid_out = output::output(&raw, path, model.as_ref(), &found, read, faults);
+    let (commands, guard) = commands::commands(&raw, laid_out.as_ref(), &found, faults).unzip();
+    guards.extend(guard);
+    let j1939 = j1939::node(&raw, &found, laid_out.as_ref().map(|(output, _)| output), faults);
+    let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let monitor = convert::monitor(&raw, model?, &ranges, resolve::input_map(&found)?, guards, output)?;
+    let traffic = convert::Traffic { input: resolve::input_map(&found)?, guards, output, commands, j1939 };
+    let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))

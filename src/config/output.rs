@@ -5,7 +5,7 @@ use std::path::Path;
 use super::convert::Raw;
 use super::describe::OutputUse;
 use super::document::Faults;
-use super::keys::{E2e, FrameKeys, Output};
+use super::keys::{Commands, E2e, FrameKeys, Output};
 use super::resolve::{Resolved, read_dbc};
 use super::{ReadFile, beside};
 use crate::can::CanId;
@@ -15,9 +15,6 @@ use crate::can::encode::{Base, E2eSetting, LaidOut, LayoutSettings, MessageSetti
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
-
-/// Period of a frame for which neither configuration nor DBC says one, ms.
-const USUAL_PERIOD_MS: u32 = 1000;
 
 /// Names of the frames, in the order of the plan.
 const FRAMES: [&str; 3] = ["status", "health", "alarm"];
@@ -32,19 +29,32 @@ pub(crate) fn output(
     faults: &mut Faults,
 ) -> Option<(OutputConfig, Database)> {
     let keys = raw.output.as_ref().filter(|keys| raw.output_written && keys.enabled)?;
+    let command = raw.commands.as_ref().filter(|commands| commands.enabled);
     let frames =
         [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
     let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
-    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: None };
-    let database = database(raw, keys, config, model, &settings, &frames, read, faults)?;
+    let command_settings = match command {
+        Some(keys) => Some(message_settings(&keys.frame(), faults)?),
+        None => None,
+    };
+    let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: command_settings };
+    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::frame)).collect();
+    let own = match &keys.dbc {
+        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
+        None => None,
+    };
+    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
+    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
+    let rated_capacity_ah = rated.unwrap_or(1.0);
+    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
+    let database = database(base, &settings, &laid_out, faults)?;
     let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
     let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
     let buses = buses(raw, keys);
     check_ids(&frames, &plan, &buses, found, faults);
     check_data_ids(&frames, &plan, faults);
     check_interfaces(raw, &frames, &plan, &buses, faults);
-    let [status_period_s, health_period_s, alarm_period_s] =
-        plan.cycle_times_ms().map(|ms| f64::from(ms.unwrap_or(USUAL_PERIOD_MS)) / 1000.0);
+    let [status_period_s, health_period_s, alarm_period_s] = plan.cycle_times_ms().map(|ms| f64::from(ms) / 1000.0);
     Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
 }
 
@@ -91,25 +101,12 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
 }
 
 /// The layout; a setting that does not fit it is noted at its key.
-#[expect(clippy::too_many_arguments, reason = "one caller, which has all of them at hand")]
 fn database(
-    raw: &Raw,
-    keys: &Output,
-    config: &Path,
-    model: Option<&CellModel>,
+    base: Base<'_>,
     settings: &LayoutSettings,
-    frames: &[FrameKeys<'_>; 3],
-    read: ReadFile<'_>,
+    frames: &[FrameKeys<'_>],
     faults: &mut Faults,
 ) -> Option<Database> {
-    let own = match &keys.dbc {
-        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
-        None => None,
-    };
-    let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
-    // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
-    let rated_capacity_ah = rated.unwrap_or(1.0);
-    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
     let refused = match layout(base, settings) {
         Ok(database) => return Some(database),
         Err(refused) => refused,

@@ -142,9 +142,12 @@ pub(crate) fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
             "no end-to-end protection: a damaged, repeated or old frame cannot be told from a good one".to_owned(),
         );
     }
+    if monitor.commands.is_none() {
+        words.push("commands of other ECUs are not taken".to_owned());
+    }
     for guard in &monitor.guards {
         let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));
-        let name = input.map_or("", |input| input.message.name.as_str());
+        let name = input.map_or("commands", |input| input.message.name.as_str());
         let interface = config.interfaces.get(guard.bus.index()).map_or("", |interface| interface.name.as_str());
         let Protection { profile, data_id } = guard.check.protection;
         let missed = match guard.cycle_time_s {

@@ -7,7 +7,12 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 
+mod j1939;
+
 use super::*;
+use crate::can::dbc::FrameFormat;
+use crate::can::e2e::{Profile, Protection};
+use crate::can::encode::OutputPlan;
 use crate::can::{CanId, Frame};
 use crate::health::{CapacityMethod, RechargeAlarm};
 use crate::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex};
@@ -68,7 +73,9 @@ signal = "Status.Temperature"
 "#;
 
 fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> {
-    let files = HashMap::from([("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC)]);
+    let own = include_str!("../../config/packwatch.dbc");
+    let files = [("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC), ("own.dbc", own)];
+    let files = HashMap::from(files);
     let read = |path: &Path| match path.to_str().and_then(|name| files.get(name)) {
         Some(text) => Ok(text.as_bytes().to_vec()),
         None => Err(std::io::ErrorKind::NotFound.into()),
@@ -177,6 +184,37 @@ fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
     let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
     assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
     assert_eq!((output.status_period_s, output.alarm_period_s), (0.2, 1.0));
+}
+
+#[test]
+fn frame_kinds_and_protection_come_from_the_configuration_and_the_layout_says_so() {
+    let text = "[output.status]\nfd = true\nbrs = true\ne2e = \"5\"\ndata_id = 0x1234\n[output.alarm]\ne2e = \"1C\"\n\
+                data_id = 7\n";
+    let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
+    let config = good(&format!("{pack}{text}"));
+    let plan = config.monitor.output.unwrap().plan;
+    assert_eq!(plan.formats(), [FrameFormat::Fd { brs: true }, FrameFormat::Classic, FrameFormat::Classic]);
+    let wanted = |profile, data_id| Some(Protection { profile, data_id });
+    assert_eq!(plan.protections(), [wanted(Profile::P05, 0x1234), None, wanted(Profile::P01C, 7)]);
+    let layout = config.output_layout.unwrap();
+    assert_eq!(layout.messages.len(), 3, "no command is taken");
+    assert_eq!(OutputPlan::new(&Database::parse(&layout.to_dbc()).unwrap()).unwrap(), plan);
+}
+
+#[test]
+fn an_own_output_dbc_is_not_moved_for_a_longer_header() {
+    let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
+    let text = "[output]\ndbc = \"own.dbc\"\n[output.status]\nfd = true\ne2e = \"5\"\ndata_id = 1\n";
+    let fault = "pack.toml:20: output.status.e2e = \"5\", signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 \
+                 bits of the header of profile 5 free";
+    assert_eq!(faults(&format!("{pack}{text}")), [fault]);
+}
+
+#[test]
+fn steps_in_ah_are_those_of_the_configured_cell() {
+    let pack = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 100");
+    let layout = good(&format!("{pack}[output]\n")).output_layout.unwrap();
+    assert_eq!(layout.signal("PACKWATCH_Alarm.Value_CapacityLow").unwrap().1.layout.factor, 0.05);
 }
 
 #[test]
@@ -430,6 +468,28 @@ fn single_faults_of_appended_tables() {
             "[output.health]\nbrs = true\n",
             "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",
         ),
+        (
+            "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
+            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: what became of a command \
+             is sent",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\n",
+            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\": commands are never taken unprotected",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\nid = 0x6B1\n",
+            "pack.toml:20: commands.id = 0x6B1, must not be that of a frame that is sent, 6B1",
+        ),
+        (
+            "[output.alarm]\ne2e = \"1A\"\ndata_id = 1\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
+            "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
+        ),
+        (
+            "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
+            "pack.toml:18: commands.e2e = \"5\", must have fd = true here and on the interface: the header of profile 5 \
+             makes the message 12 bytes long; 1A and 1C fit classic frames",
+        ),
         ("[output]\nstatus_id = 1\n", "pack.toml:16: output.status_id is not a known key, did you mean status"),
         (
             "[output]\nenabled = true\ninterfaces = [\"can7\"]\n",
@@ -614,7 +674,10 @@ proptest! {
         const SCRAPS: [&str; 14] = [
             "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
         ];
-        let full = format!("{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n");
+        let full = format!(
+            "{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n{}",
+            j1939::TABLE
+        );
         let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
         for (file, place, length, scrap) in edits {
             let text = &mut texts[file];

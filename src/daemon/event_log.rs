@@ -66,9 +66,14 @@ impl EventLog {
             EventKind::Trust { cell, trusted: true, mean_nis } => {
                 tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
             }
+            EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
             EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
             EventKind::Command { source, command, changed, refused } => {
                 tracing::info!(?source, ?command, changed, refused, "command");
+            }
+            EventKind::BadCommand { bus, intact } => {
+                let interface = self.interfaces.get(bus.index()).map_or("?", String::as_str);
+                tracing::warn!(interface, intact, "command frame not obeyed");
             }
             EventKind::Test { rule, running } => {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });

@@ -461,11 +461,13 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             }
         }
         EventKind::Bus { .. } => "bus",
+        EventKind::J1939 { .. } => "j1939",
         EventKind::Gap { .. } => "gap",
         EventKind::TimeBackwards { .. } => "time_backwards",
         EventKind::FilterReset { .. } => "filter_reset",
         EventKind::Trust { .. } => "trust",
         EventKind::Command { .. } => "command",
+        EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
         EventKind::Store { .. } => "store",

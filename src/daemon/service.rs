@@ -151,7 +151,8 @@ impl Service {
                 bus,
                 interface: interface.name.clone(),
                 fd: interface.fd,
-                ids: self.config.monitor.input.ids(bus),
+                ids: self.config.monitor.wanted_ids(bus),
+                patterns: self.config.monitor.wanted_patterns(bus),
                 receive_buffer_bytes: self.receive_buffer_bytes,
             };
             let (link, output) = Link::new(config, clock, inbox.clone());

@@ -4,10 +4,12 @@
 //! which is not known goes in as a bound: it can raise an alarm, but never say that all is well.
 
 use super::{Command, Event, EventKind, Monitor, MonitorConfig, Outputs, Source};
-use crate::alarm::{Alarm, AlarmChange, Observation, Rule};
+use crate::alarm::{Alarm, AlarmChange, Observation, Rule, Selector, Severity};
+use crate::can::Frame;
+use crate::can::encode::{self, CommandFields};
 use crate::filter::Belief;
 use crate::health::RechargeAlarm;
-use crate::quantity::{CellIndex, Channel, Timestamp};
+use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
@@ -60,6 +62,8 @@ impl Monitor {
         self.observe_alarm(Rule::StoreFailed, None, Observation::new(store), out);
         self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
+        // Whether every value is known may have changed without an alarm.
+        self.tell_j1939();
     }
 
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
@@ -197,15 +201,21 @@ impl Monitor {
         capacities.min_by(|a, b| a.mean.total_cmp(&b.mean)).filter(|_| self.learner.has_learned_all())
     }
 
-    /// After a restart: what was learned stands, though it is not learned anew.
-    pub(super) fn restate_learned(&mut self, out: &mut Outputs) {
+    /// After a restart: what was known stands, though it is not known anew.
+    pub(super) fn restate_known(&mut self, out: &mut Outputs) {
         let old = |belief: Belief| Observation { is_new: false, ..learned(belief) };
         for index in 0..self.cells.len() {
             let cell = Some(CellIndex(u16::try_from(index).unwrap_or(u16::MAX)));
             if self.learner.has_learned(index) {
                 let capacity = self.learner.capacity(&self.config.health.capacity, index);
                 self.observe_alarm(Rule::CapacityLow, cell, old(capacity), out);
-                let resistance = self.cells[index].resistance();
+            }
+            if self.cells[index].estimator.soc().is_some() {
+                let mean_nis =
+                    Observation { value: Some(self.cells[index].estimator.mean_nis()), ..Observation::default() };
+                self.observe_alarm(Rule::EstimateUntrusted, cell, mean_nis, out);
+            }
+            if let Some(resistance) = self.cells[index].discharge_resistance {
                 self.observe_alarm(Rule::ResistanceHigh, cell, old(resistance), out);
             }
             if let Some(usable) = self.cells[index].usable {
@@ -239,6 +249,19 @@ impl Monitor {
             self.send_alarm(&change.alarm, out);
         }
         self.scratch.alarm_changes = changes;
+        self.tell_j1939();
+        self.poll_j1939(out);
+    }
+
+    /// A command from the bus; one that is not intact, or that has no meaning, is told and not obeyed.
+    pub(super) fn handle_command_frame(&mut self, bus: BusIndex, frame: &Frame, is_intact: bool, out: &mut Outputs) {
+        let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
+        match fields.and_then(|fields| command_of(&fields)) {
+            Some(command) if is_intact => self.handle_command(Source::Bus(bus), command, out),
+            Some(_) | None => {
+                out.events.push(Event { time: self.now, kind: EventKind::BadCommand { bus, intact: is_intact } })
+            }
+        }
     }
 
     /// Does what somebody asks for.
@@ -275,6 +298,24 @@ impl Monitor {
         self.forget_learned();
         self.alarms.forget_learned(changes);
     }
+}
+
+/// A frame's command; `None` = it names a rule or severity that there is not.
+fn command_of(fields: &CommandFields) -> Option<Command> {
+    let which = Selector {
+        rule: fields.rule.map(|number| Rule::from_number(number).ok_or(())).transpose().ok()?,
+        severity: fields
+            .severity
+            .map(|code| Severity::ALL.into_iter().find(|s| *s as u8 == code).ok_or(()))
+            .transpose()
+            .ok()?,
+        cell: fields.cell,
+    };
+    Some(match fields.command {
+        encode::Command::Acknowledge => Command::Acknowledge(which),
+        encode::Command::Clear => Command::Clear(which),
+        encode::Command::PackReplaced => Command::PackReplaced,
+    })
 }
 
 /// A value learned anew.

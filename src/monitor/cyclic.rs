@@ -69,13 +69,15 @@ impl Monitor {
         let schedule = &self.schedule;
         let sending = self.config.output.as_ref().map(|_| schedule.status.min(schedule.health).min(schedule.alarm));
         let test = self.test.map(|test| test.next.min(test.end));
-        [sending, test].into_iter().flatten().chain([schedule.housekeeping]).min()
+        let node = self.j1939.as_ref().and_then(super::j1939::J1939::next_due);
+        [sending, test, node].into_iter().flatten().chain([schedule.housekeeping]).min()
     }
 
     pub(super) fn handle_tick(&mut self, out: &mut Outputs) {
         if take_due(&mut self.schedule.housekeeping, self.now, HOUSEKEEPING_S) {
             self.keep_house(out);
         }
+        self.poll_j1939(out);
         let Some(output) = &self.config.output else { return };
         let (status_s, health_s, alarm_s) = (output.status_period_s, output.health_period_s, output.alarm_period_s);
         if take_due(&mut self.schedule.status, self.now, status_s) {
@@ -205,6 +207,8 @@ impl Monitor {
         let seconds = seconds.clamp(0.0, MAX_TEST_S);
         self.test = Some(Test { rule, next: self.now, end: self.now.plus_secs(seconds) });
         out.events.push(Event { time: self.now, kind: EventKind::Test { rule, running: true } });
+        self.tell_j1939();
+        self.poll_j1939(out);
         self.continue_test(out);
         true
     }
@@ -224,6 +228,8 @@ impl Monitor {
         let Some(test) = self.test.take() else { return };
         self.send_alarm_fields(test_fields(test.rule, State::Inactive), out);
         out.events.push(Event { time: self.now, kind: EventKind::Test { rule: test.rule, running: false } });
+        self.tell_j1939();
+        self.poll_j1939(out);
     }
 }
 

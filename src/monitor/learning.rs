@@ -71,16 +71,20 @@ impl Monitor {
             let capacity = update.capacity;
             slot.usable = Some(usable_capacity(&self.config.model, config, &slot.estimator, capacity, slot.full_soc));
         }
-        let (usable, resistance) = (slot.usable, slot.resistance());
+        if half_cycle.mode == Mode::Discharge {
+            slot.discharge_resistance = Some(slot.resistance());
+        }
+        let (usable, resistance) = (slot.usable, slot.discharge_resistance);
         out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
         out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
-        if update.measurement.is_some() {
-            self.observe_alarm(Rule::CapacityLow, Some(cell), learned(update.capacity), out);
+        if self.learner.has_learned(index) {
+            let capacity = Observation { is_new: update.measurement.is_some(), ..learned(update.capacity) };
+            self.observe_alarm(Rule::CapacityLow, Some(cell), capacity, out);
         }
         if let Some(usable) = usable.filter(|_| restate) {
             self.observe_alarm(Rule::UsableCapacityLow, Some(cell), learned(usable), out);
         }
-        if half_cycle.mode == Mode::Discharge {
+        if let Some(resistance) = resistance.filter(|_| half_cycle.mode == Mode::Discharge) {
             self.observe_alarm(Rule::ResistanceHigh, Some(cell), learned(resistance), out);
         }
     }

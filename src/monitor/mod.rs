@@ -9,13 +9,15 @@ mod alarms;
 mod buses;
 mod cyclic;
 mod intake;
+mod j1939;
 mod learning;
 mod output;
 mod snapshot;
 mod types;
 
 pub use cyclic::MAX_TEST_S;
-pub use output::OutputConfig;
+pub use j1939::{AlarmCode, J1939Config};
+pub use output::{CommandConfig, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
@@ -26,10 +28,11 @@ use intake::Intake;
 use snapshot::PendingRestore;
 
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
-use crate::can::Frame;
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
+use crate::can::j1939::Node;
+use crate::can::{CanId, Frame};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
 use crate::filter::Belief;
 use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
@@ -60,6 +63,10 @@ pub struct MonitorConfig {
     pub rules: Vec<RuleConfig>,
     /// What is sent, when and where; `None` = the daemon only listens.
     pub output: Option<OutputConfig>,
+    /// Commands taken from the bus; `None` = none.
+    pub commands: Option<CommandConfig>,
+    /// The J1939 node; `None` = there is none.
+    pub j1939: Option<J1939Config>,
 }
 
 /// One cell's estimator and what it has consumed of the pack's totals.
@@ -75,6 +82,8 @@ struct CellSlot {
     /// Whether the present charge has tapered off at the highest voltage.
     tapered: bool,
     usable: Option<Belief>,
+    /// Resistance relative to new as the last discharge left it.
+    discharge_resistance: Option<Belief>,
     updated_in_round: bool,
 }
 
@@ -89,6 +98,7 @@ impl CellSlot {
             full_soc: 1.0,
             tapered: false,
             usable: None,
+            discharge_resistance: None,
             updated_in_round: false,
         }
     }
@@ -136,6 +146,7 @@ pub struct Monitor {
     /// A test of an alarm frame that is running; it ends with the process.
     test: Option<Test>,
     schedule: Schedule,
+    j1939: Option<j1939::J1939>,
     pending: Option<PendingRestore>,
     scratch: Scratch,
 }
@@ -147,6 +158,22 @@ struct Scratch {
     signal_changes: Vec<SignalChange>,
     alarm_changes: Vec<AlarmChange>,
     half_cycles: Vec<HalfCycle>,
+}
+
+impl MonitorConfig {
+    /// Identifiers to be received on an interface, ascending.
+    pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
+        let mut ids = self.input.ids(bus);
+        ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
+        ids.sort_unstable();
+        ids
+    }
+
+    /// Extended identifiers to be received besides, as identifier and mask.
+    pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
+        let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
+        node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
+    }
 }
 
 impl Monitor {
@@ -173,6 +200,7 @@ impl Monitor {
             store: StoreState::default(),
             test: None,
             schedule: Schedule::default(),
+            j1939: config.j1939.clone().map(j1939::J1939::new),
             pending: None,
             scratch: Scratch::default(),
             config,
@@ -196,6 +224,7 @@ impl Monitor {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
+                self.handle_j1939_frame(bus, frame, out);
             }
             Input::Command { command, .. } => {
                 self.advance(time, out);
@@ -211,6 +240,9 @@ impl Monitor {
                 self.advance(time, out);
                 self.buses.handle_event(self.now, bus, event);
                 out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
+                if event == BusEvent::Up && self.config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
+                    self.start_j1939(out);
+                }
             }
         }
     }
@@ -275,8 +307,9 @@ impl Monitor {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
         if self.apply_pending(time) {
-            self.restate_learned(out);
+            self.restate_known(out);
         }
+        self.start_j1939(out);
     }
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
@@ -306,6 +339,8 @@ impl Monitor {
             out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(elapsed_s) } });
             self.sampler.wake(time);
             self.schedule.restart(time);
+            self.now = time;
+            self.start_j1939(out);
         }
         self.now = time;
     }
@@ -337,6 +372,7 @@ impl Monitor {
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
         self.sampler.handle_gap(time);
         self.schedule.restart(time);
+        self.start_j1939(out);
         for cell in &mut self.cells {
             cell.estimator.handle_unknown_gap();
             cell.consumed = None;
@@ -346,6 +382,10 @@ impl Monitor {
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
         self.buses.handle_frame(bus);
         let Some(intact) = self.intake.judge(self.now, bus, frame, out) else { return };
+        if self.config.commands.as_ref().is_some_and(|commands| commands.bus == bus && commands.plan.id() == frame.id())
+        {
+            return self.handle_command_frame(bus, frame, intact.is_ok(), out);
+        }
         let mut readings = std::mem::take(&mut self.scratch.readings);
         self.config.input.decode(bus, frame, |Reading { channel, value }| {
             readings.push(Reading { channel, value: intact.and(value) });

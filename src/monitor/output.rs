@@ -1,6 +1,6 @@
-//! What is sent, when and where.
+//! What is sent, when and where, and the commands that are taken.
 
-use crate::can::encode::OutputPlan;
+use crate::can::encode::{CommandPlan, OutputPlan};
 use crate::quantity::BusIndex;
 
 /// The daemon's outgoing frames.
@@ -16,4 +16,13 @@ pub struct OutputConfig {
     pub health_period_s: f64,
     /// Period of the alarm frame while alarms are raised, one alarm each time in turn, s.
     pub alarm_period_s: f64,
+}
+
+/// Commands that come from the bus.
+#[derive(Debug, Clone)]
+pub struct CommandConfig {
+    /// Interface they come on.
+    pub bus: BusIndex,
+    /// What reads them; their protection is checked by one of the guards.
+    pub plan: CommandPlan,
 }

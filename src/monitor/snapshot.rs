@@ -49,6 +49,8 @@ struct CellDocument {
     full_soc: f64,
     tapered: bool,
     usable: Option<Belief>,
+    #[serde(default)]
+    discharge_resistance: Option<Belief>,
     updated_in_round: bool,
 }
 
@@ -184,6 +186,7 @@ impl CellSlot {
             full_soc: self.full_soc,
             tapered: self.tapered,
             usable: self.usable,
+            discharge_resistance: self.discharge_resistance,
             updated_in_round: self.updated_in_round,
         }
     }
@@ -197,6 +200,7 @@ impl CellSlot {
         self.full_soc = document.full_soc;
         self.tapered = document.tapered;
         self.usable = document.usable;
+        self.discharge_resistance = document.discharge_resistance;
         self.updated_in_round = document.updated_in_round;
     }
 }

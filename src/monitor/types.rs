@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::alarm::{Change, Rule, Selector, Severity, State};
 use crate::can::decode::Channel;
 use crate::can::e2e::Status;
+use crate::can::j1939::NodeEvent;
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
@@ -258,6 +259,13 @@ pub enum EventKind {
         /// What could not be done: alarms that are not healthy, a test without output.
         refused: u32,
     },
+    /// A command frame was not obeyed.
+    BadCommand {
+        /// Interface it came on.
+        bus: BusIndex,
+        /// Its protection was in order, what it asks has no meaning; otherwise it failed its check.
+        intact: bool,
+    },
     /// A test of a rule's alarm frame began or ended.
     Test {
         /// Which rule.
@@ -322,6 +330,11 @@ pub enum EventKind {
         bus: BusIndex,
         /// What.
         what: BusEvent,
+    },
+    /// The J1939 node's address or what it tells changed.
+    J1939 {
+        /// What.
+        what: NodeEvent,
     },
     /// Nobody measured for this long (asleep, or the log has a hole).
     Gap {

@@ -6,6 +6,9 @@ usage: dbc_oracle.py FILE.dbc decode [strict]   reads `message hex` lines, answe
        dbc_oracle.py FILE.dbc short             answers `message.signal` for each signal that reaches past its
                                                 message, walked bit by bit from the file's text, without cantools
        dbc_oracle.py FILE.dbc count             answers `messages signals`, as cantools counts them
+       dbc_oracle.py FILE.dbc encode [strict]   reads `message signal=value ...` lines, a value being a number or a
+                                                word of the value table, answers the payload in hex
+       dbc_oracle.py FILE.dbc about [strict]    answers `message id extended fd brs length cycle_ms profile data_id`
 """
 import re
 import sys
@@ -76,7 +79,37 @@ def count(path):
     print(len(messages), sum(len(m.signals) for m in messages))
 
 
-if sys.argv[2] == "short":
+def encode(path, strict):
+    messages = {m.name: m for m in load(path, strict).messages}
+    for line in sys.stdin:
+        name, *pairs = line.split()
+        values = dict(pair.split("=") for pair in pairs)
+        values = {k: int(v) if v.isdigit() else v for k, v in values.items()}
+        print(messages[name].encode(values, scaling=True, strict=strict).hex())
+
+
+def about(path, strict):
+    for m in load(path, strict).messages:
+        attributes = m.dbc.attributes
+
+        def value(name):
+            """The attribute's word or number; its default is a dash."""
+            found = attributes.get(name)
+            if found is None:
+                return "-"
+            words = found.definition.choices
+            return words[found.value] if words and isinstance(found.value, int) else found.value
+
+        brs = value("CANFD_BRS")
+        print(m.name, m.frame_id, int(m.is_extended_frame), int(m.is_fd), 0 if brs == "-" else brs, m.length,
+              m.cycle_time, value("E2EProfile"), value("E2EDataId"))
+
+
+if sys.argv[2] == "encode":
+    encode(sys.argv[1], strict=len(sys.argv) > 3)
+elif sys.argv[2] == "about":
+    about(sys.argv[1], strict=len(sys.argv) > 3)
+elif sys.argv[2] == "short":
     for name, _, signal, _ in reaches_past(sys.argv[1]):
         print(f"{name}.{signal}")
 elif sys.argv[2] == "count":

@@ -21,6 +21,9 @@ pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataId
 /// Length of a built-in message whose signals were moved for profile 5: what FD has above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
+/// Cycle time of a sent message for which neither settings nor base say one, ms.
+pub(super) const USUAL_PERIOD_MS: u32 = 1000;
+
 /// The DBC that ships with the program.
 ///
 /// # Errors
@@ -156,6 +159,9 @@ pub fn layout(base: Base<'_>, settings: &LayoutSettings) -> Result<Database, Vec
             }
             let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
             apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
+            if which != LaidOut::Command {
+                laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(USUAL_PERIOD_MS));
+            }
             messages.push(laid_out);
         }
     }

@@ -5,7 +5,7 @@ use crate::can::e2e::Protection;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
-use super::layout::HEADER_SIGNALS;
+use super::layout::{HEADER_SIGNALS, USUAL_PERIOD_MS};
 use super::{fd_frame, is_frame_length};
 
 /// How to make the frames of a message.
@@ -14,7 +14,7 @@ pub(super) struct MessagePlan {
     pub(super) id: CanId,
     pub(super) format: FrameFormat,
     pub(super) protection: Option<Protection>,
-    pub(super) cycle_time_ms: Option<u32>,
+    pub(super) cycle_time_ms: u32,
     len: usize,
     fields: Vec<Field>,
 }
@@ -54,7 +54,7 @@ impl MessagePlan {
             id: message.id,
             format: message.format,
             protection: message.e2e,
-            cycle_time_ms: message.cycle_time_ms,
+            cycle_time_ms: message.cycle_time_ms.unwrap_or(USUAL_PERIOD_MS),
             len: usize::from(message.len_bytes),
             fields,
         })

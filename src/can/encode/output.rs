@@ -186,8 +186,8 @@ impl OutputPlan {
         self.messages().map(|message| message.protection)
     }
 
-    /// Cycle times the DBC states for status, health and alarm frame, ms.
-    pub fn cycle_times_ms(&self) -> [Option<u32>; 3] {
+    /// Cycle times of status, health and alarm frame, ms.
+    pub fn cycle_times_ms(&self) -> [u32; 3] {
         self.messages().map(|message| message.cycle_time_ms)
     }
 

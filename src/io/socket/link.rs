@@ -47,6 +47,8 @@ pub(crate) struct LinkConfig {
     pub(crate) fd: bool,
     /// Identifiers wanted, ascending.
     pub(crate) ids: Vec<CanId>,
+    /// Extended identifiers wanted besides, as identifier and mask.
+    pub(crate) patterns: Vec<(u32, u32)>,
     /// Receive buffer to ask for, bytes.
     pub(crate) receive_buffer_bytes: usize,
 }
@@ -189,6 +191,7 @@ impl Link {
             interface: &self.config.interface,
             fd: self.config.fd,
             ids: &self.config.ids,
+            patterns: &self.config.patterns,
             receive_buffer_bytes: self.config.receive_buffer_bytes,
         };
         let opened = RawSocket::open(&raw).and_then(|socket| {
@@ -276,6 +279,11 @@ impl Link {
         }
     }
 
+    fn is_wanted(&self, id: CanId) -> bool {
+        let fits = |&(wanted, mask): &(u32, u32)| matches!(id, CanId::Extended(raw) if raw & mask == wanted);
+        self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
+    }
+
     /// Hands on one thing read; the clocks at its reading.
     async fn take(&mut self, open: &mut Open, received: RawReceived) -> Reading {
         let reading = Reading::now();
@@ -289,7 +297,7 @@ impl Link {
             open.dropped_total = total;
         }
         let what = match received.what {
-            Wire::Frame(frame) if self.config.ids.binary_search(&frame.id()).is_err() => return reading,
+            Wire::Frame(frame) if !self.is_wanted(frame.id()) => return reading,
             Wire::Frame(frame) => What::Frame(frame),
             Wire::Error(class) => What::Event(BusEvent::ErrorFrame { class }),
             Wire::Malformed => {
@@ -347,7 +355,13 @@ impl Link {
 
     /// Looks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
     async fn look(&mut self, open: &Open) -> bool {
-        let raw = RawConfig { interface: &self.config.interface, fd: false, ids: &[], receive_buffer_bytes: 0 };
+        let raw = RawConfig {
+            interface: &self.config.interface,
+            fd: false,
+            ids: &[],
+            patterns: &[],
+            receive_buffer_bytes: 0,
+        };
         if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
             return false;
         }

@@ -33,6 +33,8 @@ pub(super) struct RawConfig<'a> {
     pub(super) fd: bool,
     /// Identifiers wanted.
     pub(super) ids: &'a [CanId],
+    /// Extended identifiers wanted besides, as identifier and mask.
+    pub(super) patterns: &'a [(u32, u32)],
     /// Receive buffer to ask for, bytes.
     pub(super) receive_buffer_bytes: usize,
 }
@@ -73,7 +75,7 @@ impl RawSocket {
             socketcan::socket::CAN_RAW_FD_FRAMES,
             i32::from(config.fd),
         )?;
-        socket.set_filters(&filters(config.ids))?;
+        socket.set_filters(&filters(config.ids, config.patterns))?;
         socket.set_error_filter_accept_all()?;
         socket.as_raw_socket().set_recv_buffer_size(config.receive_buffer_bytes)?;
         let index = index_of(config.interface)?;
@@ -152,11 +154,14 @@ fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
 
 /// Filters for exactly these identifiers, data frames only. More than the kernel takes: everything comes in,
 /// and the reader passes over what it does not know.
-fn filters(ids: &[CanId]) -> Vec<CanFilter> {
-    if ids.len() > MAX_KERNEL_FILTERS {
+fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
+    if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
         return vec![CanFilter::new(0, 0)];
     }
-    ids.iter().map(|&id| CanFilter::new(wire::id_word(id), filter_mask(id))).collect()
+    let exact = ids.iter().map(|&id| CanFilter::new(wire::id_word(id), filter_mask(id)));
+    let flags = wire::EXTENDED_FLAG | wire::REMOTE_FLAG;
+    let patterns = patterns.iter().map(|&(id, mask)| CanFilter::new(id | wire::EXTENDED_FLAG, mask | flags));
+    exact.chain(patterns).collect()
 }
 
 fn filter_mask(id: CanId) -> u32 {
@@ -204,8 +209,8 @@ mod tests {
     #[test]
     fn more_identifiers_than_the_kernel_takes_open_the_filter() {
         let ids: Vec<CanId> = (0..=MAX_KERNEL_FILTERS as u16).map(CanId::Standard).collect();
-        assert_eq!(filters(&ids).len(), 1);
-        assert_eq!(filters(&ids[1..]).len(), MAX_KERNEL_FILTERS);
+        assert_eq!(filters(&ids, &[]).len(), 1);
+        assert_eq!(filters(&ids[1..], &[]).len(), MAX_KERNEL_FILTERS);
     }
 
     #[test]

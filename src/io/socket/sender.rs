@@ -30,7 +30,7 @@ impl CanSender {
     /// When the interface does not exist, is down, or this kernel has no SocketCAN.
     pub fn open(interface: &str, fd: bool) -> io::Result<Self> {
         let named = |error: io::Error| io::Error::new(error.kind(), format!("{interface}: {error}"));
-        let config = RawConfig { interface, fd, ids: &[], receive_buffer_bytes: 0 };
+        let config = RawConfig { interface, fd, ids: &[], patterns: &[], receive_buffer_bytes: 0 };
         let socket = RawSocket::open(&config).map_err(named)?;
         match socket.take_error().map_err(named)? {
             Some(error) => Err(named(error)),

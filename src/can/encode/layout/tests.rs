@@ -46,7 +46,7 @@ fn identifiers_formats_and_periods_are_as_set() {
     };
     let plan = OutputPlan::new(&built_in(&settings).unwrap()).unwrap();
     assert_eq!(plan.ids(), [CanId::Extended(5), CanId::Standard(0x6B1), CanId::Standard(7)]);
-    assert_eq!(plan.cycle_times_ms(), [Some(20), Some(1000), Some(1000)]);
+    assert_eq!(plan.cycle_times_ms(), [20, 1000, 1000]);
     let formats = [FrameFormat::Classic, FrameFormat::Fd { brs: true }, FrameFormat::Fd { brs: false }];
     assert_eq!(plan.formats(), formats);
 }
@@ -163,6 +163,13 @@ fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
     let made = layout(Base::Own(&own), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].format, FrameFormat::Fd { brs: false });
     assert_eq!(made.messages[1].format, FrameFormat::Classic);
+}
+
+#[test]
+fn a_frame_without_a_cycle_time_gets_the_usual_one_and_consumers_are_told() {
+    let text = TEXT.replace("BA_ \"GenMsgCycleTime\" BO_ 1712 100;\n", "");
+    let made = layout(Base::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
+    assert_eq!(made.messages[0].cycle_time_ms, Some(1000));
 }
 
 #[test]

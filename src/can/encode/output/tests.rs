@@ -65,7 +65,7 @@ fn faults(from: &str, to: &str) -> Vec<String> {
 fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
     let plan = plan().0;
     assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
-    assert_eq!(plan.cycle_times_ms(), [Some(100), Some(1000), Some(1000)]);
+    assert_eq!(plan.cycle_times_ms(), [100, 1000, 1000]);
     assert_eq!(plan.health_pages(), 3);
 }
 

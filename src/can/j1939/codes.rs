@@ -1,0 +1,355 @@
+//! Which codes the bus is shown, beside those that are active: at most one change a second each (J1939-73).
+//!
+//! A code is shown as soon as it becomes active, and taken away as soon as it no longer is, unless the bus saw this code
+//! change less than a second ago: then the change waits. What became active while it waited is not lost: a code that
+//! came and went in between is shown all the same, for at least a second. One that went and came stays shown; its count tells.
+//!
+//! Whether everything is known is shown the same way, but only good news waits: unknown is told at once.
+
+use super::trouble_code::{Lamp, Lamps, TroubleCode};
+use crate::quantity::Timestamp;
+
+/// Shortest time between two changes of one code on the bus, ns.
+const CHANGE_SPACING_NS: i64 = 1_000_000_000;
+
+/// Codes followed at a time: more than a configuration can name (13 rules of three severities are 39), few enough to search.
+const MAX_FOLLOWED: usize = 64;
+
+/// A code that is active and the lamp it lights.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ActiveCode {
+    /// The code.
+    pub code: TroubleCode,
+    /// Its lamp.
+    pub lamp: Lamp,
+}
+
+/// One code's way to the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Followed {
+    code: TroubleCode,
+    /// Active now.
+    is_active: bool,
+    /// Became active since the bus last saw it change.
+    is_unseen: bool,
+    /// Worst lamp since the bus last saw it change.
+    lamp: Lamp,
+    /// Lamp as it is now.
+    lamp_now: Lamp,
+    /// As the bus was told; `None` = not active.
+    shown: Option<Lamp>,
+    /// When the bus last saw it change.
+    changed_at: Option<Timestamp>,
+    /// Its change is in the message that is being sent.
+    is_in_flight: bool,
+}
+
+impl Followed {
+    /// One that has just become active.
+    fn new(active: &ActiveCode) -> Self {
+        Self {
+            code: active.code,
+            is_active: true,
+            is_unseen: true,
+            lamp: active.lamp,
+            lamp_now: active.lamp,
+            shown: None,
+            changed_at: None,
+            is_in_flight: false,
+        }
+    }
+
+    fn wanted(&self) -> Option<Lamp> {
+        (self.is_active || self.is_unseen).then_some(self.lamp)
+    }
+
+    /// When the bus may see the change; `None` = there is none to see.
+    fn due(&self) -> Option<Timestamp> {
+        (self.wanted() != self.shown).then_some(spaced(self.changed_at))
+    }
+
+    /// What the bus would be told at this time.
+    fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
+        if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
+    }
+
+    fn is_active_again(&mut self, active: &ActiveCode) {
+        // Named twice in one list: the worse lamp and the higher count hold.
+        let (lamp_before, count_before) = match self.is_active {
+            true => (self.lamp_now, self.code.occurrence_count()),
+            false => (Lamp::None, 0),
+        };
+        self.is_active = true;
+        self.is_unseen |= self.shown.is_none();
+        self.lamp_now = active.lamp.max(lamp_before);
+        self.code = active.code.with_occurrences(active.code.occurrence_count().max(count_before).into());
+    }
+
+    /// After the new list was read: keeps the worst lamp that the bus has not seen yet.
+    fn settle_lamp(&mut self) {
+        if self.is_active {
+            let is_unseen = self.shown.is_none_or(|shown| self.lamp > shown);
+            self.lamp = if is_unseen { self.lamp.max(self.lamp_now) } else { self.lamp_now };
+        }
+    }
+}
+
+/// The time from which a change may be seen again.
+fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
+    changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(CHANGE_SPACING_NS))
+}
+
+/// All of them.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) struct Codes {
+    followed: Vec<Followed>,
+    all_known: bool,
+    all_known_shown: bool,
+    known_changed_at: Option<Timestamp>,
+}
+
+impl Codes {
+    /// Takes what is active now; tells how many codes could not be followed.
+    pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) -> usize {
+        self.forget_settled(now);
+        let mut not_followed = 0;
+        self.all_known = all_known;
+        for followed in &mut self.followed {
+            followed.is_active = false;
+        }
+        for active in active {
+            match self.followed.iter().position(|followed| followed.code.is_same_failure(active.code)) {
+                Some(index) => self.followed[index].is_active_again(active),
+                None if self.followed.len() < MAX_FOLLOWED => self.followed.push(Followed::new(active)),
+                None => not_followed += 1,
+            }
+        }
+        for followed in &mut self.followed {
+            followed.settle_lamp();
+        }
+        not_followed
+    }
+
+    /// Lets go of codes of which the bus need hear nothing any more.
+    fn forget_settled(&mut self, now: Timestamp) {
+        self.followed.retain(|f| {
+            let is_settled = f.wanted().is_none() && f.shown.is_none() && !f.is_in_flight;
+            !is_settled || now < spaced(f.changed_at)
+        });
+    }
+
+    /// The bus is to be told from the beginning: it was away, or we were.
+    pub(super) fn restart(&mut self) {
+        self.followed.retain(|followed| followed.is_active);
+        for followed in &mut self.followed {
+            *followed = Followed::new(&ActiveCode { code: followed.code, lamp: followed.lamp_now });
+        }
+        self.all_known_shown = false;
+        self.known_changed_at = None;
+    }
+
+    /// When the bus may see the next change; `None` = it has seen all.
+    pub(super) fn change_due(&self) -> Option<Timestamp> {
+        let known = match (self.all_known, self.all_known_shown) {
+            (true, true) | (false, false) => None,
+            (true, false) => Some(spaced(self.known_changed_at)),
+            (false, true) => Some(Timestamp::from_nanos(i64::MIN)),
+        };
+        self.followed.iter().filter_map(Followed::due).chain(known).min()
+    }
+
+    /// How many codes a message at this time would have.
+    pub(super) fn count_at(&self, now: Timestamp) -> usize {
+        self.followed.iter().filter(|followed| followed.shown_at(now).is_some()).count()
+    }
+
+    /// The bus is told at this time: every change that is due counts as seen.
+    pub(super) fn show(&mut self, now: Timestamp) {
+        for followed in &mut self.followed {
+            if followed.due().is_some_and(|due| due <= now) {
+                followed.shown = followed.wanted();
+                followed.is_unseen = false;
+                followed.lamp = if followed.is_active { followed.lamp_now } else { Lamp::None };
+                followed.changed_at = Some(now);
+                followed.is_in_flight = true;
+            }
+        }
+        if self.all_known != self.all_known_shown && (!self.all_known || spaced(self.known_changed_at) <= now) {
+            self.all_known_shown = self.all_known;
+            self.known_changed_at = Some(now);
+        }
+    }
+
+    /// The message went out to its last byte at this time: what changed with it was seen only now.
+    pub(super) fn sent(&mut self, now: Timestamp) {
+        for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
+            followed.changed_at = Some(now);
+            followed.is_in_flight = false;
+        }
+    }
+
+    /// The lamps as shown, those of all codes, however many a message holds.
+    pub(super) fn lamps(&self) -> Lamps {
+        Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
+    }
+
+    /// The codes as shown, the most severe lamp first, then by number.
+    pub(super) fn shown(&self) -> Vec<TroubleCode> {
+        let mut shown: Vec<(Lamp, TroubleCode)> =
+            self.followed.iter().filter_map(|followed| Some((followed.shown?, followed.code))).collect();
+        shown.sort_by_key(|&(lamp, code)| (std::cmp::Reverse(lamp), code));
+        shown.into_iter().map(|(_, code)| code).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::trouble_code::LampState;
+    use super::*;
+
+    fn at(ms: i64) -> Timestamp {
+        Timestamp::from_nanos(ms * 1_000_000)
+    }
+
+    fn active(spn: u32, lamp: Lamp, count: u32) -> ActiveCode {
+        ActiveCode { code: TroubleCode::new(spn, 31, count).unwrap(), lamp }
+    }
+
+    /// Sets, and shows what may be shown.
+    fn step(codes: &mut Codes, ms: i64, now_active: &[ActiveCode]) -> Vec<u32> {
+        assert_eq!(codes.set(at(ms), now_active, true), 0);
+        codes.show(at(ms));
+        codes.sent(at(ms));
+        codes.shown().iter().map(|code| code.spn()).collect()
+    }
+
+    #[test]
+    fn a_new_code_is_shown_at_once_and_a_second_change_waits_a_second() {
+        let mut codes = Codes::default();
+        assert_eq!(step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]), [1]);
+        assert_eq!(step(&mut codes, 10, &[]), [1]);
+        assert_eq!(codes.change_due(), Some(at(1000)));
+        assert_eq!(step(&mut codes, 999, &[]), [1]);
+        assert_eq!(step(&mut codes, 1000, &[]), [] as [u32; 0]);
+        assert_eq!(codes.change_due(), None);
+    }
+
+    #[test]
+    fn a_code_that_comes_and_goes_while_it_waits_is_still_shown_for_a_second() {
+        let mut codes = Codes::default();
+        step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!(step(&mut codes, 1000, &[]), [] as [u32; 0]);
+        assert_eq!(step(&mut codes, 1100, &[active(1, Lamp::Amber, 2)]), [] as [u32; 0]);
+        assert_eq!(step(&mut codes, 1200, &[]), [] as [u32; 0]);
+        assert_eq!(step(&mut codes, 2000, &[]), [1], "shown although it is over");
+        assert_eq!(codes.shown()[0].occurrence_count(), 2);
+        assert_eq!(step(&mut codes, 2999, &[]), [1]);
+        assert_eq!(step(&mut codes, 3000, &[]), [] as [u32; 0]);
+    }
+
+    #[test]
+    fn one_that_goes_and_comes_while_it_waits_stays_shown_with_its_new_count() {
+        let mut codes = Codes::default();
+        step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!(step(&mut codes, 100, &[]), [1]);
+        assert_eq!(step(&mut codes, 200, &[active(1, Lamp::Amber, 2)]), [1]);
+        assert_eq!(codes.change_due(), None);
+        assert_eq!(codes.shown()[0].occurrence_count(), 2);
+    }
+
+    #[test]
+    fn codes_do_not_wait_for_each_other() {
+        let mut codes = Codes::default();
+        assert_eq!(step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]), [1]);
+        assert_eq!(step(&mut codes, 100, &[active(1, Lamp::Amber, 1), active(2, Lamp::Amber, 1)]), [1, 2]);
+    }
+
+    #[test]
+    fn a_worse_lamp_is_a_change_and_a_short_worst_is_not_lost() {
+        let mut codes = Codes::default();
+        let red = |codes: &Codes| codes.lamps().red;
+        step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
+        step(&mut codes, 100, &[active(1, Lamp::Red, 1)]);
+        step(&mut codes, 200, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!((red(&codes), codes.change_due()), (LampState::Off, Some(at(1000))));
+        step(&mut codes, 1000, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!(red(&codes), LampState::On, "it was red in between");
+        step(&mut codes, 1500, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!(red(&codes), LampState::On);
+        step(&mut codes, 2000, &[active(1, Lamp::Amber, 1)]);
+        assert_eq!((red(&codes), codes.change_due()), (LampState::Off, None));
+    }
+
+    #[test]
+    fn a_milder_lamp_is_shown_too() {
+        let mut codes = Codes::default();
+        step(&mut codes, 0, &[active(1, Lamp::Red, 1)]);
+        step(&mut codes, 5000, &[active(1, Lamp::Protect, 1)]);
+        assert_eq!(codes.lamps(), Lamps::of([Lamp::Protect], true));
+    }
+
+    #[test]
+    fn a_code_that_comes_back_milder_does_not_light_its_old_lamp() {
+        let mut codes = Codes::default();
+        step(&mut codes, 0, &[active(1, Lamp::Red, 1)]);
+        step(&mut codes, 1000, &[]);
+        step(&mut codes, 1500, &[active(1, Lamp::Amber, 2)]);
+        step(&mut codes, 2000, &[active(1, Lamp::Amber, 2)]);
+        assert_eq!(codes.lamps(), Lamps::of([Lamp::Amber], true));
+    }
+
+    #[test]
+    fn a_failure_named_twice_is_one_code_with_the_worse_lamp_and_the_higher_count() {
+        let mut codes = Codes::default();
+        assert_eq!(step(&mut codes, 0, &[active(1, Lamp::Red, 1), active(1, Lamp::Amber, 5)]), [1]);
+        assert_eq!(codes.lamps(), Lamps::of([Lamp::Red], true));
+        assert_eq!(codes.shown()[0].occurrence_count(), 5);
+    }
+
+    #[test]
+    fn unknown_is_told_at_once_and_known_again_after_a_second() {
+        let mut codes = Codes::default();
+        let show = |codes: &mut Codes, ms, all_known| {
+            codes.set(at(ms), &[], all_known);
+            codes.show(at(ms));
+            codes.lamps() == Lamps::default()
+        };
+        assert!(!Codes::default().all_known_shown, "nothing is known before anybody said so");
+        assert!(show(&mut codes, 0, true));
+        assert!(!show(&mut codes, 10, false));
+        assert!(!show(&mut codes, 1009, true));
+        assert!(show(&mut codes, 1010, true));
+        assert!(!show(&mut codes, 1011, false), "bad news does not wait");
+    }
+
+    #[test]
+    fn the_most_severe_come_first_then_the_lowest_number() {
+        let mut codes = Codes::default();
+        let lamps = [(4, Lamp::None), (3, Lamp::Red), (2, Lamp::Amber), (1, Lamp::Red), (5, Lamp::Protect)];
+        assert_eq!(step(&mut codes, 0, &lamps.map(|(spn, lamp)| active(spn, lamp, 1))), [1, 3, 2, 5, 4]);
+    }
+
+    #[test]
+    fn memory_is_bounded_and_given_back() {
+        let mut codes = Codes::default();
+        let many: Vec<_> = (1..=70).map(|spn| active(spn, Lamp::Amber, 1)).collect();
+        assert_eq!(codes.set(at(0), &many, true), 6);
+        codes.show(at(0));
+        codes.sent(at(0));
+        step(&mut codes, 1000, &[]);
+        step(&mut codes, 2000, &[]);
+        assert_eq!(codes.followed, []);
+    }
+
+    #[test]
+    fn after_a_restart_what_is_over_is_forgotten_and_what_is_active_is_new() {
+        let mut codes = Codes::default();
+        step(&mut codes, 0, &[active(1, Lamp::Amber, 1), active(2, Lamp::Red, 1)]);
+        codes.set(at(10), &[active(2, Lamp::Amber, 1)], true);
+        codes.restart();
+        assert_eq!(codes.lamps(), Lamps::of([], false));
+        codes.show(at(20));
+        assert_eq!(codes.shown().len(), 1);
+        assert_eq!(codes.lamps(), Lamps::of([Lamp::Amber], true));
+    }
+}

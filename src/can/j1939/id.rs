@@ -1,0 +1,118 @@
+//! The 29-bit identifier as J1939 reads it: priority, parameter group number (PGN), destination, source.
+
+use crate::can::CanId;
+
+/// Requests a parameter group, to one address or to all.
+pub const PGN_REQUEST: u32 = 59_904;
+/// Acknowledges, or here only refuses, a request.
+pub const PGN_ACKNOWLEDGEMENT: u32 = 59_392;
+/// Says who has an address ("cannot claim" from [`NULL_ADDRESS`]).
+pub const PGN_ADDRESS_CLAIMED: u32 = 60_928;
+/// Transport protocol, connection management: announces a broadcast in packets.
+pub const PGN_TRANSPORT_CONTROL: u32 = 60_416;
+/// Transport protocol, data: one packet.
+pub const PGN_TRANSPORT_DATA: u32 = 60_160;
+/// Active trouble codes.
+pub const PGN_DM1: u32 = 65_226;
+/// Previously active trouble codes.
+pub const PGN_DM2: u32 = 65_227;
+
+/// Destination of what is meant for all.
+pub const GLOBAL_ADDRESS: u8 = 255;
+/// Source of a node that has no address.
+pub const NULL_ADDRESS: u8 = 254;
+/// Largest address a node may claim.
+pub const MAX_ADDRESS: u8 = 253;
+
+/// Default priority of claims, requests, acknowledgements and diagnostic messages.
+pub(super) const PRIORITY: u8 = 6;
+/// Default priority of the transport protocol: below everything, because a transfer takes many frames.
+pub(super) const TRANSPORT_PRIORITY: u8 = 7;
+
+/// Bits of an identifier that are not its priority.
+const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
+/// PDU formats from here on (240) carry no destination: their last byte belongs to the PGN.
+const FIRST_BROADCAST_FORMAT: u8 = 240;
+
+/// An identifier taken apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Header {
+    /// Parameter group number, 18 bits.
+    pub(super) pgn: u32,
+    /// Whom it is for; [`GLOBAL_ADDRESS`] for a group without destination.
+    pub(super) destination: u8,
+    /// Who sent it.
+    pub(super) source: u8,
+}
+
+impl Header {
+    /// Takes an extended identifier apart; `None` for a standard one.
+    pub(super) fn of(id: CanId) -> Option<Self> {
+        let CanId::Extended(raw) = id else { return None };
+        let [page, format, specific, source] = (raw & WITHOUT_PRIORITY).to_be_bytes();
+        let (low, destination) =
+            if format < FIRST_BROADCAST_FORMAT { (0, specific) } else { (specific, GLOBAL_ADDRESS) };
+        Some(Self { pgn: u32::from_be_bytes([0, page, format, low]), destination, source })
+    }
+}
+
+/// The identifier of a frame; `destination` counts only for groups that carry one.
+pub(super) fn can_id(priority: u8, pgn: u32, destination: u8, source: u8) -> CanId {
+    let [_, page, format, low] = pgn.to_be_bytes();
+    let specific = if format < FIRST_BROADCAST_FORMAT { destination } else { low };
+    // Masked to 3 and 2 bits: callers pass the constants above, which fit.
+    CanId::Extended(u32::from_be_bytes([((priority & 7) << 2) | (page & 3), format, specific, source]))
+}
+
+/// Identifier and mask of one group from any source at any priority; a destination where the group carries one.
+pub(super) fn filter(pgn: u32, destination: u8) -> (u32, u32) {
+    (can_id(0, pgn, destination, 0).raw(), WITHOUT_PRIORITY & !0xFF)
+}
+
+/// A PGN as payloads carry it: three bytes, lowest first.
+pub(super) fn pgn_bytes(pgn: u32) -> [u8; 3] {
+    let [low, middle, high, _] = pgn.to_le_bytes();
+    [low, middle, high]
+}
+
+/// The PGN of three payload bytes.
+pub(super) fn pgn_of(bytes: [u8; 3]) -> u32 {
+    u32::from_le_bytes([bytes[0], bytes[1], bytes[2], 0])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn identifiers_are_those_of_the_standard() {
+        let id = |priority, pgn| can_id(priority, pgn, GLOBAL_ADDRESS, 0xF9).raw();
+        assert_eq!(id(PRIORITY, PGN_DM1), 0x18FE_CAF9);
+        assert_eq!(id(PRIORITY, PGN_DM2), 0x18FE_CBF9);
+        assert_eq!(id(PRIORITY, PGN_ADDRESS_CLAIMED), 0x18EE_FFF9);
+        assert_eq!(id(PRIORITY, PGN_REQUEST), 0x18EA_FFF9);
+        assert_eq!(id(PRIORITY, PGN_ACKNOWLEDGEMENT), 0x18E8_FFF9);
+        assert_eq!(id(TRANSPORT_PRIORITY, PGN_TRANSPORT_CONTROL), 0x1CEC_FFF9);
+        assert_eq!(id(TRANSPORT_PRIORITY, PGN_TRANSPORT_DATA), 0x1CEB_FFF9);
+    }
+
+    #[test]
+    fn every_identifier_comes_apart_as_it_was_put_together() {
+        for (pgn, destination, read) in
+            [(PGN_REQUEST, 0x21, 0x21), (PGN_DM1, 0x21, GLOBAL_ADDRESS), (0x3_EF00, 0x21, 0x21), (0x1_FECA, 7, 255)]
+        {
+            let header = Header::of(can_id(3, pgn, destination, 0x80));
+            assert_eq!(header, Some(Header { pgn, destination: read, source: 0x80 }), "{pgn:#X}");
+        }
+        assert_eq!(Header::of(CanId::Standard(0x7FF)), None);
+    }
+
+    #[test]
+    fn a_filter_leaves_priority_and_source_open() {
+        let (id, mask) = filter(PGN_REQUEST, 0x21);
+        for priority in 0..8 {
+            assert_eq!(can_id(priority, PGN_REQUEST, 0x21, 0xF3).raw() & mask, id);
+            assert_ne!(can_id(priority, PGN_REQUEST, 0x22, 0xF3).raw() & mask, id);
+        }
+    }
+}

@@ -1,0 +1,416 @@
+//! The node: claims its address, tells DM1 once a second and on every change, answers requests.
+//!
+//! * DM1 goes out once a second, also with no code, and at once on a change (how often one code may change: `codes`).
+//! * DM2 goes out only when asked for.
+//! * Messages of more than 8 bytes go one after the other; while one is being transferred a changed DM1 waits for its
+//!   end. When both wait, DM1 and DM2 take turns, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2.
+//!   A DM1 of one frame passes a DM2 that is being transferred.
+//! * A request to this node alone for anything it does not have is refused; one to all is then not for us.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+use super::address::{AddressClaim, State};
+use super::codes::{ActiveCode, Codes};
+use super::id::{
+    GLOBAL_ADDRESS, Header, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
+    PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, PRIORITY, TRANSPORT_PRIORITY, can_id, filter, pgn_bytes, pgn_of,
+};
+use super::name::Name;
+use super::transport::Transfer;
+use super::trouble_code::{DmPayload, TroubleCode, dm_payload};
+use crate::can::{CanId, Frame, FrameKind};
+use crate::quantity::Timestamp;
+
+/// Time between two cyclic DM1, ns (J1939-73).
+const DM1_PERIOD_NS: i64 = 1_000_000_000;
+/// Shortest time between two answers to requests, ns: a flood of requests brings at most 20 frames a second.
+const ANSWER_SPACING_NS: i64 = 50_000_000;
+/// Answers that may wait: the fifth would come more than 200 ms after its request, when who asked has given up (J1939-21).
+const MAX_WAITING_ANSWERS: usize = 4;
+/// Control byte of a negative acknowledgement.
+const NEGATIVE: u8 = 1;
+/// Earlier than anything.
+const LONG_AGO: Timestamp = Timestamp::from_nanos(i64::MIN);
+
+/// Who a node is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NodeConfig {
+    /// Its NAME.
+    pub name: Name,
+    /// The address it claims, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
+    pub address: u8,
+}
+
+impl NodeConfig {
+    /// Every identifier the node sends with.
+    pub fn sent_ids(&self) -> [CanId; 7] {
+        let id = |priority, pgn, source| can_id(priority, pgn, GLOBAL_ADDRESS, source);
+        [
+            id(PRIORITY, PGN_DM1, self.address),
+            id(PRIORITY, PGN_DM2, self.address),
+            id(PRIORITY, PGN_ADDRESS_CLAIMED, self.address),
+            id(PRIORITY, PGN_ADDRESS_CLAIMED, NULL_ADDRESS),
+            id(PRIORITY, PGN_ACKNOWLEDGEMENT, self.address),
+            id(TRANSPORT_PRIORITY, PGN_TRANSPORT_CONTROL, self.address),
+            id(TRANSPORT_PRIORITY, PGN_TRANSPORT_DATA, self.address),
+        ]
+    }
+}
+
+/// Something worth a line in a log.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "node_event")]
+pub enum NodeEvent {
+    /// The address is ours; codes are told from now on.
+    Claimed {
+        /// The address.
+        address: u8,
+    },
+    /// Another node took the address; nothing is told any more.
+    AddressLost {
+        /// Its NAME; our own when two nodes are configured as one.
+        to: Name,
+    },
+    /// Another node wanted the address and must give way.
+    AddressDefended {
+        /// Its NAME.
+        against: Name,
+    },
+    /// The number of active codes that are beyond what one message holds changed.
+    CodesLeftOut {
+        /// How many; 0 = all are told again.
+        codes: usize,
+    },
+}
+
+/// What the node had to leave undone.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct NodeCounters {
+    /// Claims and requests too short to be read.
+    pub malformed_frames: u64,
+    /// Requests not answered: too many at a time, or the address was lost before their turn.
+    pub answers_dropped: u64,
+    /// Codes not told, summed over messages.
+    pub codes_left_out: u64,
+}
+
+/// Where the node puts what came out; the caller empties it.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct NodeOutputs {
+    /// Frames to send, in this order.
+    pub frames: Vec<Frame>,
+    /// Events to log.
+    pub events: Vec<NodeEvent>,
+}
+
+/// An answer that is owed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Answer {
+    Dm1,
+    Dm2,
+    Refusal { pgn: u32, to: u8 },
+}
+
+/// One node. Call [`poll`](Self::poll) at [`next_due`](Self::next_due), or at every tick.
+#[derive(Debug, Clone)]
+pub struct Node {
+    address: u8,
+    claim: AddressClaim,
+    codes: Codes,
+    previously_active: Vec<TroubleCode>,
+    next_dm1: Timestamp,
+    transfer: Option<Transfer>,
+    transport_free_at: Timestamp,
+    last_transferred: u32,
+    answers: VecDeque<Answer>,
+    next_answer_at: Timestamp,
+    polled_at: Timestamp,
+    codes_left_out: usize,
+    counters: NodeCounters,
+}
+
+impl Node {
+    /// A node that is silent until it is started.
+    pub fn new(config: &NodeConfig) -> Self {
+        Self {
+            address: config.address,
+            claim: AddressClaim::new(config.name, config.address),
+            codes: Codes::default(),
+            previously_active: Vec::new(),
+            next_dm1: LONG_AGO,
+            transfer: None,
+            transport_free_at: LONG_AGO,
+            last_transferred: PGN_DM2,
+            answers: VecDeque::with_capacity(MAX_WAITING_ANSWERS),
+            next_answer_at: LONG_AGO,
+            polled_at: LONG_AGO,
+            codes_left_out: 0,
+            counters: NodeCounters::default(),
+        }
+    }
+
+    /// Claims the address. Codes are told after 300 ms without objection (`address` says why not 250).
+    pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        self.fall_silent();
+        self.codes.restart();
+        self.claim.start(now);
+        self.transport_free_at = LONG_AGO;
+        self.next_answer_at = LONG_AGO;
+        self.poll(now, out);
+    }
+
+    /// Time passed that nobody saw (asleep, the interface was away): whatever was said about the address may have
+    /// changed, so it is claimed again, also after a loss.
+    pub fn handle_gap(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        self.start(now, out);
+    }
+
+    /// What the bus shall be told: the codes that are active now, those that were, most severe or latest first, and
+    /// whether every value that could raise one is known. Sent by the next [`poll`](Self::poll).
+    pub fn set_codes(
+        &mut self,
+        now: Timestamp,
+        active: &[ActiveCode],
+        previously_active: &[TroubleCode],
+        all_known: bool,
+    ) {
+        let not_followed = self.codes.set(now, active, all_known);
+        self.counters.codes_left_out += count(not_followed);
+        self.previously_active.clear();
+        self.previously_active.extend_from_slice(previously_active);
+    }
+
+    /// A frame was received; those that do not concern the node are ignored.
+    pub fn handle_frame(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
+        let Some(header) = Header::of(frame.id()).filter(|_| frame.kind() == FrameKind::Classic) else { return };
+        match header.pgn {
+            PGN_ADDRESS_CLAIMED if header.source == self.address => self.handle_claim(now, frame, out),
+            PGN_REQUEST if header.destination == GLOBAL_ADDRESS || header.destination == self.address => {
+                self.handle_request(now, frame, header);
+            }
+            _ => return,
+        }
+        self.poll(now, out);
+    }
+
+    fn handle_claim(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
+        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
+            self.counters.malformed_frames += 1;
+            return;
+        };
+        out.events.extend(self.claim.contend(now, Name::from_bytes(bytes)));
+        if self.claim.state() == State::Lost {
+            self.fall_silent();
+        }
+    }
+
+    fn handle_request(&mut self, now: Timestamp, frame: &Frame, header: Header) {
+        let &[low, middle, high, ..] = frame.data() else {
+            self.counters.malformed_frames += 1;
+            return;
+        };
+        let is_for_all = header.destination == GLOBAL_ADDRESS;
+        let owed = match (pgn_of([low, middle, high]), self.claim.state()) {
+            // Who lost the address answers only what is asked of all: the address is another's.
+            (PGN_ADDRESS_CLAIMED, State::Lost) if !is_for_all => return,
+            (PGN_ADDRESS_CLAIMED, State::Idle | State::Claiming | State::Claimed | State::Lost) => {
+                return self.claim.asked(now);
+            }
+            (_, State::Idle | State::Claiming | State::Lost) => return,
+            (PGN_DM1, State::Claimed) => Answer::Dm1,
+            (PGN_DM2, State::Claimed) => Answer::Dm2,
+            (_, State::Claimed) if is_for_all => return,
+            (pgn, State::Claimed) => Answer::Refusal { pgn, to: header.source },
+        };
+        // The answer is a broadcast: one serves all who asked.
+        if self.answers.contains(&owed) {
+            return;
+        }
+        if self.answers.len() < MAX_WAITING_ANSWERS {
+            self.answers.push_back(owed);
+        } else {
+            self.counters.answers_dropped += 1;
+        }
+    }
+
+    /// Sends what is due.
+    pub fn poll(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        self.polled_at = now;
+        let (frame, event) = self.claim.poll(now);
+        out.frames.extend(frame);
+        if let Some(event) = event {
+            self.next_dm1 = now;
+            out.events.push(event);
+        }
+        if self.is_silent() {
+            return;
+        }
+        self.poll_transfer(now, out);
+        if self.is_turn_of_dm2() {
+            self.poll_answers(now, out);
+            self.poll_dm1(now, out);
+        } else {
+            self.poll_dm1(now, out);
+            self.poll_answers(now, out);
+        }
+    }
+
+    fn poll_transfer(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        let Some(transfer) = &mut self.transfer else { return };
+        out.frames.extend(transfer.poll(now, self.address));
+        if transfer.is_complete() {
+            // The next announcement keeps its distance too.
+            self.transport_free_at = transfer.due;
+            self.last_transferred = transfer.pgn;
+            if transfer.pgn == PGN_DM1 {
+                self.codes.sent(now);
+            }
+            self.transfer = None;
+        }
+    }
+
+    fn poll_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        let is_cyclic = self.next_dm1 <= now;
+        let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
+        if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
+            // On time, the next one keeps the rhythm; otherwise it is counted from now.
+            let rhythm = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
+            let keeps_rhythm = is_cyclic && now < rhythm;
+            self.next_dm1 = if keeps_rhythm { rhythm } else { now.plus_nanos(DM1_PERIOD_NS) };
+            self.send_dm1(now, out);
+        }
+    }
+
+    fn poll_answers(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        if now < self.next_answer_at {
+            return;
+        }
+        let ready = self.answers.iter().position(|answer| match answer {
+            Answer::Dm1 => self.can_start(now, PGN_DM1),
+            Answer::Dm2 => self.can_start(now, PGN_DM2),
+            Answer::Refusal { .. } => true,
+        });
+        let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
+        self.next_answer_at = now.plus_nanos(ANSWER_SPACING_NS);
+        match answer {
+            Answer::Dm1 => self.send_dm1(now, out),
+            Answer::Dm2 => self.send(now, PGN_DM2, dm_payload(self.codes.lamps(), &self.previously_active), out),
+            Answer::Refusal { pgn, to } => {
+                let [low, middle, high] = pgn_bytes(pgn);
+                let refusal = [NEGATIVE, 0xFF, 0xFF, 0xFF, to, low, middle, high];
+                let id = can_id(PRIORITY, PGN_ACKNOWLEDGEMENT, GLOBAL_ADDRESS, self.address);
+                out.frames.extend(Frame::classic(id, &refusal));
+            }
+        }
+    }
+
+    fn send_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
+        self.codes.show(now);
+        let payload = dm_payload(self.codes.lamps(), &self.codes.shown());
+        if payload.left_out() != self.codes_left_out {
+            self.codes_left_out = payload.left_out();
+            out.events.push(NodeEvent::CodesLeftOut { codes: self.codes_left_out });
+        }
+        self.send(now, PGN_DM1, payload, out);
+        if self.transfer.is_none_or(|transfer| transfer.pgn != PGN_DM1) {
+            self.codes.sent(now);
+        }
+    }
+
+    fn send(&mut self, now: Timestamp, pgn: u32, payload: DmPayload, out: &mut NodeOutputs) {
+        self.counters.codes_left_out += count(payload.left_out());
+        if payload.as_slice().len() <= 8 {
+            let id = can_id(PRIORITY, pgn, GLOBAL_ADDRESS, self.address);
+            out.frames.extend(Frame::classic(id, payload.as_slice()));
+        } else {
+            let (transfer, announcement) = Transfer::start(now, pgn, payload, self.address);
+            self.transfer = Some(transfer);
+            out.frames.extend(announcement);
+        }
+    }
+
+    /// After a DM1 in packets a DM2 that waits goes first.
+    fn is_turn_of_dm2(&self) -> bool {
+        self.last_transferred == PGN_DM1 && self.answers.contains(&Answer::Dm2)
+    }
+
+    /// Whether a message of this group may go out now.
+    fn can_start(&self, now: Timestamp, pgn: u32) -> bool {
+        self.start_at(now, pgn).is_some_and(|start| start <= now)
+    }
+
+    /// From when a message of this group may go out, as things stand at `now`; `None` = after another that goes first.
+    fn start_at(&self, now: Timestamp, pgn: u32) -> Option<Timestamp> {
+        let codes = if pgn == PGN_DM1 { self.codes.count_at(now) } else { self.previously_active.len() };
+        match &self.transfer {
+            // An older content must not end after a newer one.
+            Some(transfer) if codes > 1 || transfer.pgn == pgn => None,
+            None if codes > 1 && pgn == PGN_DM1 && self.is_turn_of_dm2() => None,
+            None if codes > 1 => Some(self.transport_free_at),
+            Some(_) | None => Some(LONG_AGO),
+        }
+    }
+
+    /// When [`poll`](Self::poll) has something to do, in the past = now; `None` = only a frame or [`start`](Self::start)
+    /// can change that. A poll before this time does nothing.
+    pub fn next_due(&self) -> Option<Timestamp> {
+        let claim = self.claim.next_due();
+        if self.is_silent() {
+            return claim;
+        }
+        let dm1 = self.codes.change_due().map_or(self.next_dm1, |change| change.min(self.next_dm1));
+        let dm1 = self.startable_from(PGN_DM1, dm1);
+        let answers = self.answers.iter().filter_map(|answer| match answer {
+            Answer::Dm1 => self.startable_from(PGN_DM1, self.next_answer_at),
+            Answer::Dm2 => self.startable_from(PGN_DM2, self.next_answer_at),
+            Answer::Refusal { .. } => Some(self.next_answer_at),
+        });
+        let transfer = self.transfer.map(|transfer| transfer.due);
+        claim.into_iter().chain(transfer).chain(dm1).chain(answers).min()
+    }
+
+    /// When a message wanted at `wanted` can go out.
+    fn startable_from(&self, pgn: u32, wanted: Timestamp) -> Option<Timestamp> {
+        self.start_at(wanted.max(self.polled_at), pgn).map(|start| start.max(wanted))
+    }
+
+    /// Whether nothing but address claims may be sent: the address is not ours (yet, or any more).
+    pub fn is_silent(&self) -> bool {
+        match self.claim.state() {
+            State::Idle | State::Claiming | State::Lost => true,
+            State::Claimed => false,
+        }
+    }
+
+    /// What had to be left undone since the beginning.
+    pub fn counters(&self) -> NodeCounters {
+        self.counters
+    }
+
+    /// Extended identifiers the node must receive, as identifier and mask: claims of its address, requests to it and to
+    /// all, at any priority. Claims of other addresses do not concern it.
+    pub fn wanted(&self) -> [(u32, u32); 3] {
+        let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
+        [
+            (claim | u32::from(self.address), mask | 0xFF),
+            filter(PGN_REQUEST, self.address),
+            filter(PGN_REQUEST, GLOBAL_ADDRESS),
+        ]
+    }
+
+    /// Ends what was under way.
+    fn fall_silent(&mut self) {
+        self.transfer = None;
+        self.counters.answers_dropped += count(self.answers.len());
+        self.answers.clear();
+    }
+}
+
+fn count(items: usize) -> u64 {
+    u64::try_from(items).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,474 @@
+//! The node on a fake bus with a fake clock, heard by a receiver that puts transfers together again.
+
+mod peer_log;
+mod properties;
+
+use super::super::{Lamp, MAX_CODES, NameFields};
+use super::*;
+
+const OURS: u8 = 0xF9;
+const OTHER: u8 = 0x21;
+
+fn at(ms: i64) -> Timestamp {
+    Timestamp::from_nanos(ms * 1_000_000)
+}
+
+fn name(identity_number: u32) -> Name {
+    Name::new(&NameFields { identity_number, ..Default::default() }).unwrap()
+}
+
+fn active(spn: u32, lamp: Lamp) -> ActiveCode {
+    ActiveCode { code: TroubleCode::new(spn, 31, 1).unwrap(), lamp }
+}
+
+fn frame(id: u32, data: &[u8]) -> Frame {
+    Frame::classic(CanId::Extended(id), data).unwrap()
+}
+
+fn request(pgn: u32, to: u8) -> Frame {
+    frame(0x18EA_0000 | u32::from(to) << 8 | u32::from(OTHER), &pgn_bytes(pgn))
+}
+
+fn claim_of(identity_number: u32) -> Frame {
+    frame(0x18EE_FF00 | u32::from(OURS), &name(identity_number).to_bytes())
+}
+
+/// A complete message as a receiver has it.
+#[derive(Debug, Clone, PartialEq)]
+struct Message {
+    ms: i64,
+    pgn: u32,
+    data: Vec<u8>,
+}
+
+impl Message {
+    fn codes(&self) -> Vec<u32> {
+        let codes = self.data[2..].chunks_exact(4).filter(|code| *code != [0, 0, 0, 0]);
+        codes.map(|code| u32::from(code[0]) | u32::from(code[1]) << 8 | u32::from(code[2] >> 5) << 16).collect()
+    }
+}
+
+/// A node, its bus, and what was heard.
+struct Bench {
+    node: Node,
+    now_ms: i64,
+    out: NodeOutputs,
+    frames: Vec<(i64, Frame)>,
+    events: Vec<NodeEvent>,
+    messages: Vec<Message>,
+    /// Announced transfer: group, bytes, and what came of it.
+    transfer: Option<(u32, usize, Vec<u8>)>,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self {
+            node: Node::new(&NodeConfig { name: name(100), address: OURS }),
+            now_ms: 0,
+            out: NodeOutputs::default(),
+            frames: Vec::new(),
+            events: Vec::new(),
+            messages: Vec::new(),
+            transfer: None,
+        }
+    }
+
+    /// Starts at -50 ms, so that the address is claimed at 250 ms.
+    fn start(&mut self) {
+        self.now_ms = -50;
+        self.node.start(at(-50), &mut self.out);
+    }
+
+    /// Claimed, everything known, nothing active; the first DM1 is out at 250 ms.
+    fn claimed() -> Self {
+        let mut bench = Self::new();
+        bench.set(&[]);
+        bench.start();
+        bench.run_to(250);
+        assert_eq!(bench.events, [NodeEvent::Claimed { address: OURS }]);
+        bench
+    }
+
+    fn set(&mut self, codes: &[ActiveCode]) {
+        self.node.set_codes(at(self.now_ms), codes, &[], true);
+    }
+
+    fn set_dm2(&mut self, active: &[ActiveCode], spns: std::ops::RangeInclusive<u32>) {
+        let previously: Vec<_> = spns.map(|spn| TroubleCode::new(spn, 31, 1).unwrap()).collect();
+        self.node.set_codes(at(self.now_ms), active, &previously, true);
+    }
+
+    fn receive(&mut self, frame: &Frame) {
+        self.node.handle_frame(at(self.now_ms), frame, &mut self.out);
+        self.take();
+    }
+
+    /// Polls every millisecond.
+    fn run_to(&mut self, ms: i64) {
+        self.take();
+        while self.now_ms < ms {
+            self.now_ms += 1;
+            self.node.poll(at(self.now_ms), &mut self.out);
+            self.take();
+        }
+    }
+
+    fn take(&mut self) {
+        self.events.append(&mut self.out.events);
+        for frame in std::mem::take(&mut self.out.frames) {
+            self.hear(&frame);
+            self.frames.push((self.now_ms, frame));
+        }
+    }
+
+    fn hear(&mut self, frame: &Frame) {
+        let header = Header::of(frame.id()).unwrap();
+        let (pgn, data) = match (header.pgn, frame.data()) {
+            (super::super::PGN_TRANSPORT_CONTROL, &[32, low, high, packets, 0xFF, a, b, c]) => {
+                assert_eq!(self.transfer, None, "one transfer at a time");
+                let bytes = usize::from(u16::from_le_bytes([low, high]));
+                assert_eq!(bytes.div_ceil(7), usize::from(packets));
+                self.transfer = Some((pgn_of([a, b, c]), bytes, Vec::new()));
+                return;
+            }
+            (super::super::PGN_TRANSPORT_DATA, packet) => {
+                let (pgn, bytes, mut data) = self.transfer.take().expect("announced");
+                assert_eq!(usize::from(packet[0]), data.len() / 7 + 1, "sequence number");
+                data.extend(&packet[1..]);
+                if data.len() < bytes {
+                    self.transfer = Some((pgn, bytes, data));
+                    return;
+                }
+                assert!(data[bytes..].iter().all(|&byte| byte == 0xFF), "filled with 0xFF");
+                data.truncate(bytes);
+                (pgn, data)
+            }
+            (pgn @ (PGN_DM1 | PGN_DM2), data) => (pgn, data.to_vec()),
+            _ => return,
+        };
+        self.messages.push(Message { ms: self.now_ms, pgn, data });
+    }
+
+    /// When each DM of a group was complete, and its codes.
+    fn told(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
+        self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
+    }
+
+    fn ids(&self) -> Vec<(i64, u32)> {
+        self.frames.iter().map(|(ms, frame)| (*ms, frame.id().raw())).collect()
+    }
+}
+
+#[test]
+fn nothing_is_sent_before_the_start() {
+    let mut bench = Bench::new();
+    bench.set(&[active(1, Lamp::Red)]);
+    bench.receive(&request(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS));
+    bench.run_to(3000);
+    assert_eq!((bench.frames.len(), bench.node.next_due(), bench.node.is_silent()), (0, None, true));
+}
+
+#[test]
+fn the_first_dm1_comes_300_ms_after_the_claim_and_then_one_a_second_without_any_code() {
+    let mut bench = Bench::claimed();
+    bench.run_to(3500);
+    let dm1 = 0x18FE_CA00 | u32::from(OURS);
+    assert_eq!(bench.ids(), [(-50, 0x18EE_FFF9), (250, dm1), (1250, dm1), (2250, dm1), (3250, dm1)]);
+    assert_eq!(bench.frames[1].1.data(), [0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
+}
+
+#[test]
+fn without_any_word_about_the_alarms_every_lamp_is_unknown() {
+    let mut bench = Bench::new();
+    bench.start();
+    bench.run_to(250);
+    assert_eq!(bench.frames[1].1.data(), [0x3F, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
+}
+
+#[test]
+fn a_change_is_sent_at_once_and_the_rhythm_starts_again_from_it() {
+    let mut bench = Bench::claimed();
+    bench.run_to(600);
+    bench.set(&[active(1, Lamp::Amber)]);
+    bench.run_to(1700);
+    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (601, vec![1]), (1601, vec![1])]);
+}
+
+#[test]
+fn a_flickering_code_changes_once_a_second_on_the_bus() {
+    let mut bench = Bench::claimed();
+    for step in 0..100 {
+        let codes = [active(1, Lamp::Amber)];
+        bench.set(if step % 2 == 0 { &codes } else { &[] });
+        bench.run_to(250 + 100 * (step + 1));
+    }
+    let mut changes = Vec::new();
+    let mut before = vec![];
+    for (ms, codes) in bench.told(PGN_DM1) {
+        if codes != before {
+            changes.push(ms);
+            before = codes;
+        }
+    }
+    assert!(changes.len() >= 9, "{changes:?}");
+    assert!(changes.windows(2).all(|pair| pair[1] - pair[0] >= 1000), "{changes:?}");
+}
+
+#[test]
+fn two_codes_go_by_bam_with_50_ms_between_packets() {
+    let mut bench = Bench::claimed();
+    bench.set(&[active(2, Lamp::Amber), active(1, Lamp::Red)]);
+    bench.run_to(1000);
+    assert_eq!(bench.ids()[2..], [(251, 0x1CEC_FFF9), (301, 0x1CEB_FFF9), (351, 0x1CEB_FFF9)]);
+    assert_eq!(bench.frames[2].1.data(), [32, 10, 0, 2, 0xFF, 0xCA, 0xFE, 0]);
+    assert_eq!(bench.frames[3].1.data(), [1, 0x14, 0xFF, 1, 0, 31, 1, 2]);
+    assert_eq!(bench.frames[4].1.data(), [2, 0, 31, 1, 0xFF, 0xFF, 0xFF, 0xFF]);
+}
+
+#[test]
+fn a_changed_set_waits_for_the_transfers_end() {
+    let mut bench = Bench::claimed();
+    bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
+    bench.run_to(300);
+    bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red), active(3, Lamp::Red)]);
+    bench.run_to(700);
+    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (351, vec![1, 2]), (501, vec![1, 2, 3])]);
+}
+
+#[test]
+fn a_transfer_counts_as_seen_at_its_end() {
+    let mut bench = Bench::claimed();
+    bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
+    bench.run_to(400);
+    bench.set(&[]);
+    bench.run_to(3000);
+    let wanted = [(351, vec![1, 2]), (1351, vec![1, 2]), (1351, vec![])];
+    assert_eq!(bench.told(PGN_DM1)[1..4], wanted, "a second after its last packet, behind the cyclic one");
+}
+
+#[test]
+fn dm2_comes_only_when_asked_for_and_with_the_lamps_of_now() {
+    let mut bench = Bench::claimed();
+    bench.set_dm2(&[active(9, Lamp::Amber)], 7..=7);
+    bench.run_to(5000);
+    assert_eq!(bench.told(PGN_DM2), []);
+    for to in [OURS, GLOBAL_ADDRESS] {
+        bench.receive(&request(PGN_DM2, to));
+        bench.run_to(bench.now_ms + 100);
+    }
+    assert_eq!(bench.told(PGN_DM2), [(5000, vec![7]), (5100, vec![7])]);
+    assert_eq!(bench.messages.iter().find(|m| m.pgn == PGN_DM2).unwrap().data[..2], [0x04, 0xFF]);
+    bench.receive(&request(PGN_DM2, OTHER));
+    bench.run_to(6000);
+    assert_eq!(bench.told(PGN_DM2).len(), 2, "what another is asked for is not ours");
+}
+
+#[test]
+fn dm1_asked_for_is_sent_between_two_cyclic_ones() {
+    let mut bench = Bench::claimed();
+    bench.run_to(700);
+    bench.receive(&request(PGN_DM1, OURS));
+    bench.run_to(1300);
+    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (700, vec![]), (1250, vec![])]);
+}
+
+#[test]
+fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
+    let mut bench = Bench::claimed();
+    bench.receive(&request(0xFEE5, GLOBAL_ADDRESS));
+    bench.receive(&request(0xFEE5, OTHER));
+    bench.run_to(300);
+    assert_eq!(bench.frames.len(), 2, "claim and DM1");
+    bench.receive(&request(0xFEE5, OURS));
+    let (_, refusal) = bench.frames[2];
+    assert_eq!(refusal.id().raw(), 0x18E8_FFF9);
+    assert_eq!(refusal.data(), [1, 0xFF, 0xFF, 0xFF, OTHER, 0xE5, 0xFE, 0x00]);
+}
+
+#[test]
+fn whoever_asks_hears_who_has_the_address() {
+    for to in [OURS, GLOBAL_ADDRESS] {
+        let mut bench = Bench::claimed();
+        bench.receive(&request(PGN_ADDRESS_CLAIMED, to));
+        assert_eq!(bench.ids()[2], (250, 0x18EE_FFF9));
+        assert_eq!(bench.frames[2].1.data(), name(100).to_bytes());
+    }
+}
+
+#[test]
+fn a_flood_of_requests_is_answered_every_50_ms_and_what_is_dropped_is_counted() {
+    let mut bench = Bench::claimed();
+    let mut asked = 0;
+    while bench.now_ms < 1250 {
+        bench.receive(&request(0xF000 + asked, OURS));
+        asked += 1;
+        bench.run_to(bench.now_ms + 1);
+    }
+    bench.run_to(1500);
+    let refused = bench.ids().iter().filter(|(_, id)| *id == 0x18E8_FFF9).count();
+    assert_eq!(refused, 24, "20 in the second and the 4 that waited");
+    assert_eq!(bench.node.counters().answers_dropped, u64::from(asked) - 24);
+    assert_eq!(bench.told(PGN_DM1).len(), 2, "DM1 does not suffer");
+}
+
+#[test]
+fn equal_requests_are_answered_once() {
+    let mut bench = Bench::claimed();
+    bench.set_dm2(&[active(1, Lamp::Red), active(2, Lamp::Red)], 3..=4);
+    bench.run_to(260);
+    for _ in 0..100 {
+        bench.receive(&request(PGN_DM2, GLOBAL_ADDRESS));
+    }
+    bench.run_to(1000);
+    assert_eq!(bench.told(PGN_DM2).len(), 1);
+    assert_eq!(bench.node.counters(), NodeCounters::default());
+}
+
+#[test]
+fn long_dm1_and_dm2_take_turns_under_a_flood() {
+    let mut bench = Bench::claimed();
+    let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
+    bench.set_dm2(&codes, 28..=54);
+    while bench.now_ms < 20_000 {
+        bench.receive(&request(PGN_DM2, OURS));
+        bench.receive(&request(0xF000, OURS));
+        bench.run_to(bench.now_ms + 10);
+    }
+    let (dm1, dm2) = (bench.told(PGN_DM1), bench.told(PGN_DM2));
+    assert!(dm1.len() >= 11 && dm2.len() >= 10, "{} {}", dm1.len(), dm2.len());
+    assert!(dm1.windows(2).all(|pair| pair[1].0 - pair[0].0 <= 2000), "{dm1:?}");
+    assert!(dm1[1..].iter().all(|(_, codes)| codes.len() == 27));
+}
+
+#[test]
+fn a_dm1_of_one_frame_passes_a_dm2_under_way() {
+    let mut bench = Bench::claimed();
+    bench.set_dm2(&[], 1..=27);
+    bench.receive(&request(PGN_DM2, OURS));
+    bench.run_to(400);
+    bench.set_dm2(&[active(99, Lamp::Red)], 1..=27);
+    bench.run_to(402);
+    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (401, vec![99])]);
+    bench.run_to(2000);
+    assert_eq!(bench.told(PGN_DM2), [(1050, (1..=27).collect())]);
+}
+
+#[test]
+fn of_too_many_codes_the_most_severe_are_told_and_the_rest_is_counted() {
+    let mut bench = Bench::claimed();
+    let codes: Vec<_> = (1..=30).map(|spn| active(spn, if spn > 5 { Lamp::Red } else { Lamp::Protect })).collect();
+    bench.set(&codes);
+    bench.run_to(1200);
+    let told = bench.told(PGN_DM1);
+    assert_eq!(told[1].1, (6..=30).chain(1..=2).collect::<Vec<u32>>());
+    assert_eq!(told[1].1.len(), MAX_CODES);
+    assert_eq!(bench.messages[1].data[0], 0x11, "the lamps are those of all");
+    assert_eq!(bench.events[1..], [NodeEvent::CodesLeftOut { codes: 3 }]);
+    assert_eq!(bench.node.counters().codes_left_out, 3);
+    bench.set(&[]);
+    bench.run_to(4000);
+    assert_eq!(bench.events[2..], [NodeEvent::CodesLeftOut { codes: 0 }]);
+}
+
+#[test]
+fn the_longest_dm1_still_comes_once_a_second() {
+    let mut bench = Bench::claimed();
+    let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
+    bench.set(&codes);
+    bench.run_to(10_300);
+    let ends: Vec<i64> = bench.told(PGN_DM1)[1..].iter().map(|(ms, _)| *ms).collect();
+    assert_eq!(ends.len(), 10);
+    assert!(ends.windows(2).all(|pair| pair[1] - pair[0] == 1000), "{ends:?}");
+}
+
+#[test]
+fn losing_the_address_stops_everything_even_within_a_transfer() {
+    let mut bench = Bench::claimed();
+    bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
+    bench.run_to(310);
+    bench.receive(&request(PGN_DM2, OURS));
+    bench.receive(&claim_of(99));
+    let sent = bench.frames.len();
+    bench.run_to(10_000);
+    assert_eq!(bench.events[1..], [NodeEvent::AddressLost { to: name(99) }]);
+    assert_eq!(bench.frames.len(), sent + 1);
+    assert_eq!(bench.ids()[sent].1, 0x18EE_FFFE, "cannot claim");
+    assert!(bench.node.is_silent());
+    for pgn in [PGN_DM1, PGN_DM2, 0xF000] {
+        bench.receive(&request(pgn, OURS));
+        bench.receive(&request(pgn, GLOBAL_ADDRESS));
+    }
+    bench.receive(&request(PGN_ADDRESS_CLAIMED, OURS));
+    bench.run_to(11_000);
+    assert_eq!(bench.frames.len(), sent + 1, "the address is another's, it answers");
+    bench.receive(&request(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS));
+    bench.run_to(12_000);
+    assert_eq!(bench.ids()[sent + 1].1, 0x18EE_FFFE);
+}
+
+#[test]
+fn a_weaker_contender_is_answered_and_dm1_goes_on() {
+    let mut bench = Bench::claimed();
+    bench.receive(&claim_of(101));
+    bench.run_to(1300);
+    assert_eq!(bench.events[1..], [NodeEvent::AddressDefended { against: name(101) }]);
+    assert_eq!(bench.ids()[2], (250, 0x18EE_FFF9));
+    assert_eq!(bench.told(PGN_DM1).len(), 2);
+}
+
+#[test]
+fn after_a_gap_the_address_is_claimed_again_and_the_codes_told_again() {
+    let mut bench = Bench::claimed();
+    bench.set(&[active(1, Lamp::Red)]);
+    bench.run_to(300);
+    bench.receive(&claim_of(99));
+    bench.run_to(5000);
+    bench.node.handle_gap(at(5000), &mut bench.out);
+    bench.run_to(5300);
+    assert_eq!(bench.events[2..], [NodeEvent::Claimed { address: OURS }]);
+    assert_eq!(bench.told(PGN_DM1).last(), Some(&(5300, vec![1])));
+}
+
+#[test]
+fn what_was_active_while_the_address_was_being_claimed_is_told() {
+    let mut bench = Bench::new();
+    bench.start();
+    bench.set(&[active(1, Lamp::Red)]);
+    bench.run_to(100);
+    bench.set(&[]);
+    bench.run_to(1300);
+    assert_eq!(bench.told(PGN_DM1), [(250, vec![1]), (1250, vec![])]);
+}
+
+#[test]
+fn frames_that_are_no_business_of_ours_do_nothing() {
+    let mut bench = Bench::claimed();
+    bench.receive(&frame(0x18EE_FF00 | u32::from(OTHER), &name(1).to_bytes()));
+    bench.receive(&Frame::classic(CanId::Standard(0x7FF), &[0; 8]).unwrap());
+    bench.receive(&Frame::remote(CanId::Extended(0x18EE_FFF9), 8).unwrap());
+    bench.receive(&Frame::fd(CanId::Extended(0x18EE_FFF9), false, false, &[0; 8]).unwrap());
+    bench.receive(&frame(0x19EA_F921, &[0, 0xEE, 0]));
+    assert_eq!((bench.frames.len(), bench.events.len()), (2, 1));
+    assert_eq!(bench.node.counters(), NodeCounters::default());
+}
+
+#[test]
+fn short_claims_and_requests_are_counted() {
+    let mut bench = Bench::claimed();
+    bench.receive(&frame(0x18EE_FFF9, &[0; 7]));
+    bench.receive(&frame(0x18EA_FF21, &[0, 0xEE]));
+    assert_eq!(bench.node.counters().malformed_frames, 2);
+    assert!(!bench.node.is_silent());
+}
+
+#[test]
+fn the_filters_let_through_what_concerns_the_node() {
+    let node = Bench::new().node;
+    let passes = |id: u32| node.wanted().iter().any(|(wanted, mask)| id & mask == *wanted);
+    for id in [0x18EE_FFF9, 0x1CEE_FFF9, 0x18EA_F900, 0x18EA_FFFE, 0x00EA_FF21] {
+        assert!(passes(id), "{id:08X}");
+    }
+    for id in [0x18EE_FF21, 0x18EA_2100, 0x18FE_CAF9, 0x19EA_FF21, 0x1CEC_FF21] {
+        assert!(!passes(id), "{id:08X}");
+    }
+}

@@ -1,0 +1,273 @@
+//! A trouble code, the lamps, and the payload that DM1 and DM2 share (layout: J1939-73).
+//!
+//! ```text
+//! byte 0      lamps, 2 bits each: malfunction, red stop, amber warning, protect (00 off, 01 on, 11 not available)
+//! byte 1      the same lamps' flashing: 11 = does not flash
+//! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
+//! ```
+//! No code: four zero bytes. Up to one code: filled with 0xFF to 8 bytes.
+
+use serde::{Deserialize, Serialize};
+
+use super::name::OutOfRange;
+
+/// Most codes in one message: 27, so 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of 10 ms
+/// late, a transfer ends within 0.96 s, before the next DM1 is due. Thirteen rules with two thresholds each are 26.
+pub const MAX_CODES: usize = 27;
+
+/// Bytes of a message with [`MAX_CODES`] codes.
+pub(super) const MAX_PAYLOAD: usize = 2 + 4 * MAX_CODES;
+
+/// Largest suspect parameter number: 19 bits.
+const MAX_SPN: u32 = (1 << 19) - 1;
+/// Largest failure mode identifier: 5 bits.
+const MAX_FMI: u8 = 31;
+/// Largest occurrence count; one more means "not available", so counting stops here.
+const MAX_OCCURRENCES: u8 = 126;
+/// No lamp flashes.
+const NO_FLASH: u8 = 0xFF;
+
+/// What went wrong, and how often.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct TroubleCode {
+    spn: u32,
+    fmi: u8,
+    occurrence_count: u8,
+}
+
+impl TroubleCode {
+    /// A code: suspect parameter number 1 to 524,287, failure mode identifier 0 to 31. The count saturates at 126.
+    ///
+    /// # Errors
+    /// A number that does not fit its bits; SPN 0, which would read as "no code".
+    pub fn new(spn: u32, fmi: u8, occurrence_count: u32) -> Result<Self, OutOfRange> {
+        if !(1..=MAX_SPN).contains(&spn) {
+            return Err(OutOfRange { field: "spn", found: spn.into(), lowest: 1, highest: MAX_SPN.into() });
+        }
+        if fmi > MAX_FMI {
+            return Err(OutOfRange { field: "fmi", found: fmi.into(), lowest: 0, highest: MAX_FMI.into() });
+        }
+        Ok(Self { spn, fmi, occurrence_count: 0 }.with_occurrences(occurrence_count))
+    }
+
+    /// The same code with another count, saturated at 126.
+    #[must_use]
+    pub fn with_occurrences(self, count: u32) -> Self {
+        let occurrence_count = u8::try_from(count).unwrap_or(MAX_OCCURRENCES).min(MAX_OCCURRENCES);
+        Self { occurrence_count, ..self }
+    }
+
+    /// Suspect parameter number: what is wrong.
+    pub const fn spn(self) -> u32 {
+        self.spn
+    }
+
+    /// Failure mode identifier: how it is wrong.
+    pub const fn fmi(self) -> u8 {
+        self.fmi
+    }
+
+    /// How often it became active, 126 = 126 times or more.
+    pub const fn occurrence_count(self) -> u8 {
+        self.occurrence_count
+    }
+
+    /// Whether both are about the same failure, however often it came.
+    pub(super) const fn is_same_failure(self, other: Self) -> bool {
+        self.spn == other.spn && self.fmi == other.fmi
+    }
+
+    fn to_bytes(self) -> [u8; 4] {
+        let [low, middle, high, _] = self.spn.to_le_bytes();
+        [low, middle, (high << 5) | self.fmi, self.occurrence_count]
+    }
+}
+
+/// The lamp a code lights, weakest first. The malfunction lamp is not among them: it is about emissions only.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Lamp {
+    /// None.
+    None,
+    /// Protect: something is amiss, not the electronics.
+    Protect,
+    /// Amber warning: see to it, the vehicle need not stop.
+    Amber,
+    /// Red stop: stop the vehicle.
+    Red,
+}
+
+/// What a lamp shows; the numbers are those on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+#[repr(u8)]
+pub enum LampState {
+    /// Nothing is wrong.
+    #[default]
+    Off = 0b00,
+    /// Something is wrong.
+    On = 0b01,
+    /// It is not known whether something is wrong.
+    NotAvailable = 0b11,
+}
+
+/// The lamps of a message. The malfunction lamp is always off: this program never speaks for emissions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Lamps {
+    /// Protect lamp.
+    pub protect: LampState,
+    /// Amber warning lamp.
+    pub amber: LampState,
+    /// Red stop lamp.
+    pub red: LampState,
+}
+
+impl Lamps {
+    /// The lamps for active codes. While not everything is known (`all_known` false) a lamp that no code lights is
+    /// not off but not available: unknown never looks healthy.
+    pub fn of(lit: impl IntoIterator<Item = Lamp>, all_known: bool) -> Self {
+        let dark = if all_known { LampState::Off } else { LampState::NotAvailable };
+        let mut lamps = Self { protect: dark, amber: dark, red: dark };
+        for lamp in lit {
+            match lamp {
+                Lamp::None => {}
+                Lamp::Protect => lamps.protect = LampState::On,
+                Lamp::Amber => lamps.amber = LampState::On,
+                Lamp::Red => lamps.red = LampState::On,
+            }
+        }
+        lamps
+    }
+
+    fn to_byte(self) -> u8 {
+        let bits = |state| match state {
+            LampState::Off => 0b00,
+            LampState::On => 0b01,
+            LampState::NotAvailable => 0b11,
+        };
+        (bits(self.red) << 4) | (bits(self.amber) << 2) | bits(self.protect)
+    }
+}
+
+/// The payload of a DM1 or DM2: 8 bytes, or more for a transfer in packets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DmPayload {
+    bytes: [u8; MAX_PAYLOAD],
+    len: usize,
+    left_out: usize,
+}
+
+impl DmPayload {
+    /// The bytes.
+    pub fn as_slice(&self) -> &[u8] {
+        self.bytes.get(..self.len).unwrap_or(&self.bytes)
+    }
+
+    /// Codes beyond [`MAX_CODES`] that are not in it.
+    pub const fn left_out(&self) -> usize {
+        self.left_out
+    }
+}
+
+/// Lays out lamps and codes. Of more than [`MAX_CODES`] codes the first are taken: the caller brings the most severe first.
+pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
+    let mut bytes = [0xFF; MAX_PAYLOAD];
+    bytes[0] = lamps.to_byte();
+    bytes[1] = NO_FLASH;
+    let taken = codes.len().min(MAX_CODES);
+    if taken == 0 {
+        bytes[2..6].fill(0);
+    }
+    for (place, code) in bytes[2..].chunks_exact_mut(4).zip(codes) {
+        place.copy_from_slice(&code.to_bytes());
+    }
+    // One code alone fills a frame.
+    let len = if taken < 2 { 8 } else { 2 + 4 * taken };
+    DmPayload { bytes, len, left_out: codes.len() - taken }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn code(spn: u32, fmi: u8, count: u32) -> TroubleCode {
+        TroubleCode::new(spn, fmi, count).unwrap()
+    }
+
+    #[test]
+    fn no_code_is_four_zero_bytes_and_still_a_message() {
+        let payload = dm_payload(Lamps::of([], true), &[]);
+        assert_eq!(payload.as_slice(), [0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
+    }
+
+    #[test]
+    fn unknown_is_no_lamp_off() {
+        let payload = dm_payload(Lamps::of([], false), &[]);
+        assert_eq!(payload.as_slice(), [0b00_11_11_11, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
+        let lamps = Lamps::of([Lamp::Amber], false);
+        assert_eq!(dm_payload(lamps, &[code(1, 1, 1)]).as_slice()[0], 0b00_11_01_11, "red is not known to be off");
+    }
+
+    #[test]
+    fn one_code_fills_a_frame() {
+        // SPN 520193 = 0x7F001: 0x01, 0xF0, 0x7 << 5.
+        let payload = dm_payload(Lamps::of([Lamp::Amber], true), &[code(520_193, 18, 3)]);
+        assert_eq!(payload.as_slice(), [0x04, 0xFF, 0x01, 0xF0, 0xE0 | 18, 3, 0xFF, 0xFF]);
+    }
+
+    #[test]
+    fn two_codes_are_ten_bytes() {
+        let codes = [code(524_287, 1, 126), code(91, 2, 1)];
+        let payload = dm_payload(Lamps::of([Lamp::Red, Lamp::None], true), &codes);
+        assert_eq!(payload.as_slice(), [0x10, 0xFF, 0xFF, 0xFF, 0xE1, 126, 91, 0, 2, 1]);
+    }
+
+    #[test]
+    fn five_codes_are_twenty_two_bytes() {
+        let codes = [code(1, 0, 1), code(256, 31, 2), code(65_536, 9, 3), code(131_072, 19, 4), code(262_144, 16, 5)];
+        let payload = dm_payload(Lamps::of([Lamp::Protect, Lamp::Amber, Lamp::Red], true), &codes);
+        let wanted = [0x15, 0xFF, 1, 0, 0, 1, 0, 1, 31, 2, 0, 0, 0x29, 3, 0, 0, 0x53, 4, 0, 0, 0x90, 5];
+        assert_eq!(payload.as_slice(), wanted);
+    }
+
+    #[test]
+    fn the_malfunction_lamp_is_never_lit() {
+        for lamp in [Lamp::None, Lamp::Protect, Lamp::Amber, Lamp::Red] {
+            for all_known in [false, true] {
+                assert_eq!(dm_payload(Lamps::of([lamp], all_known), &[]).as_slice()[0] >> 6, 0, "{lamp:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn counting_stops_at_126() {
+        let counts = [0, 1, 126, 127, 128, 255, 256, u32::MAX].map(|count| code(1, 0, count).occurrence_count());
+        assert_eq!(counts, [0, 1, 126, 126, 126, 126, 126, 126]);
+    }
+
+    #[test]
+    fn numbers_that_do_not_fit_are_refused() {
+        let refused = |spn, fmi| TroubleCode::new(spn, fmi, 1).unwrap_err().to_string();
+        assert_eq!(refused(0, 1), "spn = 0, must be 1 to 524287");
+        assert_eq!(refused(524_288, 1), "spn = 524288, must be 1 to 524287");
+        assert_eq!(refused(1, 32), "fmi = 32, must be 0 to 31");
+    }
+
+    #[test]
+    fn codes_beyond_the_limit_are_counted_as_left_out() {
+        let codes: Vec<_> = (1..=30).map(|spn| code(spn, 31, 1)).collect();
+        let payload = dm_payload(Lamps::default(), &codes);
+        assert_eq!((payload.as_slice().len(), payload.left_out()), (110, 3));
+        assert_eq!(payload.as_slice()[106], 27, "the first 27 are in it");
+    }
+
+    proptest! {
+        #[test]
+        fn a_code_reads_back_as_it_was(spn in 1_u32..=524_287, fmi in 0_u8..=31, count in 0_u32..=126) {
+            let [a, b, c, d] = code(spn, fmi, count).to_bytes();
+            let read = u32::from(a) | u32::from(b) << 8 | u32::from(c >> 5) << 16;
+            prop_assert_eq!((read, c & 31, u32::from(d)), (spn, fmi, count));
+        }
+    }
+}

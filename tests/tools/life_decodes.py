@@ -1,0 +1,297 @@
+"""Decodes every frame of a replayed life with cantools and compares it with what the replay reports beside.
+
+usage: life_decodes.py FILE.dbc FRAMES.log ESTIMATES.csv EVENTS.jsonl RATED_AH
+
+FRAMES, ESTIMATES and EVENTS are those of `packwatch replay`, FILE.dbc is what `packwatch dbc` wrote for the same
+configuration. The status frame's values are worked out again from the estimates (pack rule, mode, validity) and the
+alarm events, the health frame's from estimates and capacity and recharge events, the alarm frames' from the alarm
+events. Every value must agree within one bit; what is not known must be said to be. The last line is a JSON document
+with what was compared; exit status 0 only when all agrees.
+"""
+import csv
+import json
+import re
+import sys
+from collections import Counter, defaultdict
+
+import cantools
+
+MODES = {"unknown": 0, "charge": 1, "rest": 2, "discharge": 3}
+SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
+STATES = {"inactive": 0, "active": 1, "clearing": 1, "cleared": 2, "pending": 3, "latched": 4, "suppressed": 5, "unknown": 6}
+MAX_TOLD = 20
+
+
+class Reader:
+    """The frames as cantools decodes them."""
+
+    def __init__(self, path):
+        self.database = cantools.database.load_file(path, strict=True)
+        self.unavailable, self.signals = {}, {}
+        for message in self.database.messages:
+            for signal in message.signals:
+                key = message.name, signal.name
+                self.signals[key] = signal
+                words = signal.choices or {}
+                self.unavailable[key] = {code for code, word in words.items() if str(word) == "not available"}
+
+    def decode(self, frame_id, data):
+        """(name of the message, {signal: value, None for not available})"""
+        message = self.database.get_message_by_frame_id(frame_id)
+        raw = message.decode(data, decode_choices=False, scaling=False)
+        name = message.name.removeprefix("PACKWATCH_")
+        values = {}
+        for signal, code in raw.items():
+            key = message.name, signal
+            known = code not in self.unavailable[key]
+            values[signal] = self.signals[key].raw_to_scaled(code, decode_choices=False) if known else None
+        return name, values
+
+    def bit(self, message, signal):
+        return self.signals["PACKWATCH_" + message, signal].scale
+
+    def clip(self, message, signal, value):
+        """What the signal can say of a value that is too large or too small for it."""
+        found = self.signals["PACKWATCH_" + message, signal]
+        return min(max(value, float(found.minimum)), float(found.maximum))
+
+
+class Life:
+    """What the replay's reports say, up to a moment."""
+
+    def __init__(self, cells, rated_ah):
+        self.cells, self.rated_ah = cells, rated_ah
+        self.estimate = {}  # cell: row
+        self.capacity = {}  # cell: (Ah, standard deviation)
+        self.usable = {}
+        self.learned = set()
+        self.in_round = set()
+        self.pack = None
+        self.mode = "unknown"
+        self.bad, self.untrusted = set(), set()
+        self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
+        self.recharge = None  # the last told
+        self.normalised = None
+
+    def take_estimate(self, row):
+        cell = int(row["cell"])
+        self.estimate[cell] = row
+        self.capacity[cell] = float(row["capacity_ah"]), float(row["capacity_std_ah"])
+        second = cell in self.in_round
+        self.in_round.add(cell)
+        if second or len(self.in_round) == self.cells:
+            self.in_round.clear()
+            self.pack = self.combined()
+
+    def combined(self):
+        shares = [(float(row["soc"]), float(row["soc_std"]), self.capacity[cell][0], cell)
+                  for cell, row in sorted(self.estimate.items())]
+        weakest = min(shares, key=lambda share: share[0] * share[2])
+        dischargeable = weakest[0] * weakest[2]
+        capacity = dischargeable + min((1.0 - soc) * ah for soc, _, ah, _ in shares)
+        return (dischargeable / capacity, weakest[1], weakest[3]) if capacity > 0 else None
+
+    def take_event(self, event):
+        kind = event["event"]
+        if kind == "mode":
+            self.mode = event["to"]
+        elif kind == "capacity":
+            cell = event["cell"]
+            self.capacity[cell] = event["capacity_ah"], event["capacity_std_ah"]
+            if event["usable_capacity_ah"] is not None:
+                self.usable[cell] = event["usable_capacity_ah"], event["usable_capacity_std_ah"]
+            if event["measured_ah"] is not None:
+                self.learned.add(cell)
+        elif kind == "recharge_period":
+            self.recharge = event["seconds"] if event["seconds"] is not None else self.recharge
+            self.normalised = event["normalised_s"] if event["normalised_s"] is not None else self.normalised
+        elif kind in ("signal_bad", "signal_good"):
+            (self.bad.add if kind == "signal_bad" else self.bad.discard)(json.dumps(event["channel"]))
+        elif kind == "trust":
+            (self.untrusted.discard if event["trusted"] else self.untrusted.add)(event["cell"])
+        elif kind == "gap":
+            self.pack, self.mode = None, "unknown"
+        elif kind == "alarm":
+            key = event["rule"], event["cell"], event["severity"]
+            if event["active"]:
+                self.alarms[key] = event
+            else:
+                self.alarms.pop(key, None)
+
+    def validity(self):
+        if self.pack is None:
+            return 0
+        return 3 if self.untrusted else 2 if self.bad else 1
+
+    def status(self):
+        soc, std, cell = self.pack or (None, None, None)
+        highest = max((SEVERITIES[severity] for _, _, severity in self.alarms), default=0)
+        return {
+            "Soc": scaled(soc, 100), "SocStd": scaled(std, 100), "LimitingCell": cell, "Mode": MODES[self.mode],
+            "Validity": self.validity(), "ActiveAlarms": len(self.alarms),
+            "HighestSeverity": highest if highest or self.pack else None,
+        }
+
+    def health(self):
+        if len(self.learned) < self.cells:
+            known = dict.fromkeys(("Capacity", "CapacityStd", "Soh", "UsableCapacity", "UsableCapacityStd",
+                                   "ResistanceRatio", "NormalizedRechargePeriod"))
+        else:
+            ah, std = min(self.capacity.values())
+            usable, usable_std = min(self.usable.values(), default=(None, None))
+            ratio = max(float(row["resistance_ratio"]) for row in self.estimate.values())
+            known = {"Capacity": ah, "CapacityStd": std, "Soh": 100 * ah / self.rated_ah, "UsableCapacity": usable,
+                     "UsableCapacityStd": usable_std, "ResistanceRatio": 100 * ratio,
+                     "NormalizedRechargePeriod": self.normalised}
+        return known | {"RechargePeriod": self.recharge}
+
+
+def scaled(value, factor):
+    return None if value is None else factor * value
+
+
+def snake(word):
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", word).lower()
+
+
+def nanos(text):
+    seconds, fraction = text.split(".")
+    return int(seconds) * 10**9 + int(fraction.ljust(9, "0"))
+
+
+def frames(path):
+    """(time, identifier, data) of each line, classic or FD."""
+    with open(path) as lines:
+        for line in lines:
+            stamp, _, frame = line.split()
+            number, data = frame.split("#", 1)
+            # FD: a second # and a digit of flags.
+            yield nanos(stamp[1:-1]), int(number, 16), bytes.fromhex(data[2:] if data.startswith("#") else data)
+
+
+class Comparison:
+    def __init__(self, reader, rules):
+        self.reader, self.rules = reader, rules
+        self.frames, self.values = Counter(), Counter()
+        self.faults, self.told = 0, []
+        self.counters = {}
+        self.untold = 0  # recharge periods whose event is not in the log
+
+    def fault(self, time, message, what):
+        self.faults += 1
+        if len(self.told) < MAX_TOLD:
+            self.told.append(f"{time / 1e9:.3f} {message}: {what}")
+
+    def value(self, time, message, signal, found, wanted):
+        self.values[f"{message}.{signal}"] += 1
+        if (found is None) != (wanted is None):
+            self.fault(time, message, f"{signal} is {found}, must be {wanted}")
+        elif wanted is not None:
+            wanted = self.reader.clip(message, signal, wanted)
+            if abs(found - wanted) > self.reader.bit(message, signal) * (1 + 1e-9):
+                self.fault(time, message, f"{signal} is {found}, must be {wanted}")
+
+    def counter(self, time, message, values):
+        """A protected message counts its frames, to 14 (profile 1) or 255 (profile 5)."""
+        if "E2eCounter" not in values:
+            return
+        last = self.counters.get(message)
+        self.counters[message] = counter = values["E2eCounter"]
+        limit = 256 if self.reader.signals["PACKWATCH_" + message, "E2eCounter"].length == 8 else 15
+        if last is not None and counter != (last + 1) % limit:
+            self.fault(time, message, f"E2eCounter is {counter} after {last}")
+        self.values[f"{message}.E2eCounter"] += 1
+
+
+def compare(reader, life, estimates, events, frame_list):
+    rules = {code: snake(str(word)) for code, word in reader.signals["PACKWATCH_Alarm", "Rule"].choices.items()}
+    result = Comparison(reader, rules)
+    told = defaultdict(list)  # alarm events by time, for the frames that go out at once
+    for event in events:
+        if event["event"] == "alarm":
+            told[event["time"]].append(event)
+    periods = [event["seconds"] for event in events if event["event"] == "recharge_period"]
+    done = 0
+    estimate, event = 0, 0
+    for time, frame_id, data in frame_list:
+        # What has the frame's own time was taken in before it.
+        while estimate < len(estimates) and estimates[estimate][0] <= time:
+            life.take_estimate(estimates[estimate][1])
+            estimate += 1
+        while event < len(events) and events[event]["time"] <= time:
+            done += events[event]["event"] == "recharge_period"
+            life.take_event(events[event])
+            event += 1
+        message, values = reader.decode(frame_id, data)
+        result.frames[message] += 1
+        result.counter(time, message, values)
+        if message == "Status":
+            for signal, wanted in life.status().items():
+                result.value(time, message, signal, values[signal], wanted)
+        elif message == "Health":
+            for signal, wanted in life.health().items():
+                if signal in values:
+                    if signal == "RechargePeriod" and values[signal] is not None:
+                        # Sent as soon as the charge leaves the window; the event comes at the charge's end, if the
+                        # log has it.
+                        coming = periods[done] if done < len(periods) else None
+                        if coming is not None and abs(values[signal] - coming) <= 1:
+                            wanted = coming
+                        elif done == len(periods) and abs(values[signal] - (wanted or 0)) > 1:
+                            result.untold += 1
+                            continue
+                    result.value(time, message, signal, values[signal], wanted)
+        else:
+            compare_alarm(result, life, time, values, told)
+    for time, left in told.items():
+        for alarm in left:
+            result.fault(time, "Alarm", f"no frame at once for {alarm}")
+    return result
+
+
+def compare_alarm(result, life, time, values, told):
+    """A frame at an alarm event's own time is that event's, until it has one; the others repeat what is raised or unknown."""
+    rule, cell = result.rules[values["Rule"]], values["Cell"]
+    severity = {number: word for word, number in SEVERITIES.items()}[values["Severity"]]
+    name = next(signal for signal in values if signal.startswith("Value_"))
+    threshold = name.replace("Value_", "Threshold_")
+    factor = 100 if result.reader.signals["PACKWATCH_Alarm", name].unit == "%" else 1
+    key = rule, cell, severity
+    at_once = next((e for e in told.get(time, []) if (e["rule"], e["cell"], e["severity"]) == key), None)
+    result.value(time, "Alarm", "Test", values["Test"], 0)
+    event = at_once or life.alarms.get(key)
+    if at_once:
+        told[time].remove(at_once)
+        result.value(time, "Alarm", name, values[name], scaled(at_once["value"], factor))
+        result.frames["Alarm at once"] += 1
+    elif event and rule == "capacity_low" and values["State"] == STATES["active"]:
+        result.value(time, "Alarm", name, values[name], life.capacity[cell][0])
+    if event:
+        result.value(time, "Alarm", "State", values["State"], STATES[event["state"]])
+        result.value(time, "Alarm", "Acknowledged", values["Acknowledged"], event["acknowledged"])
+        result.value(time, "Alarm", threshold, values[threshold], factor * event["threshold"])
+    elif values["State"] == STATES["unknown"]:
+        # Not raised, and nobody can say whether it should be.
+        result.value(time, "Alarm", name, values[name], None)
+        result.frames["Alarm unknown"] += 1
+    else:
+        result.fault(time, "Alarm", f"{key} is sent and is not raised")
+
+
+def main():
+    dbc, frame_log, estimate_csv, event_log, rated_ah = sys.argv[1:]
+    with open(estimate_csv) as rows:
+        estimates = [(nanos(row["time_s"]), row) for row in csv.DictReader(rows)]
+    with open(event_log) as lines:
+        events = [json.loads(line) for line in lines]
+    life = Life(len({row["cell"] for _, row in estimates}), float(rated_ah))
+    result = compare(Reader(dbc), life, estimates, events, frames(frame_log))
+    for line in result.told:
+        print(line)
+    print(json.dumps({"faults": result.faults, "cells": life.cells, "frames": dict(result.frames),
+                      "values": sum(result.values.values()), "untold": result.untold, "per_signal": dict(result.values)}))
+    sys.exit(result.faults != 0)
+
+
+if __name__ == "__main__":
+    main()
