@@ -171,7 +171,7 @@ fn open(config: &Config) -> Result<Vec<Channel>, String> {
     let message = layout.message(crate::can::encode::LaidOut::Alarm.message()).ok_or_else(nothing)?;
     let reader = AlarmReader::new(message).ok_or_else(nothing)?;
     let interfaces = output.buses.iter().filter_map(|bus| config.interfaces.get(bus.index()));
-    interfaces
+    let channels: Result<Vec<Channel>, String> = interfaces
         .map(|interface| {
             let listener = CanListener::open(&interface.name, interface.fd, &[message.id]);
             let report = ChannelReport {
@@ -187,7 +187,8 @@ fn open(config: &Config) -> Result<Vec<Channel>, String> {
             let listener = listener.map_err(|error| error.to_string())?;
             Ok(Channel { listener, reader: reader.clone(), check, report })
         })
-        .collect()
+        .collect();
+    channels.and_then(|channels| if channels.is_empty() { Err(nothing()) } else { Ok(channels) })
 }
 
 async fn watch(channels: &mut [Channel], client: &ControlClient, rule: Rule, duration: Duration) -> Result<(), String> {

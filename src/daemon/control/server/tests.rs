@@ -102,6 +102,29 @@ fn a_silent_client_is_sent_away() {
 }
 
 #[test]
+fn a_client_that_never_reads_holds_up_nobody_and_is_sent_away() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (_server, path) = serve_patiently(&folder, Duration::from_millis(200)).await;
+        let deaf = connect(&path).await;
+        let flood = REPLACED.to_line().repeat(100);
+        let mut client = connect(&path).await;
+        let mut served = 0;
+        // Until its connection is closed, which is when a write to it fails.
+        loop {
+            match deaf.try_write(flood.as_bytes()) {
+                Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => break,
+                Ok(_) | Err(_) => {}
+            }
+            client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+            assert!(line(&mut client).await.contains("\"ok\":true"), "not served beside a deaf one");
+            served += 1;
+        }
+        assert!(served > 0);
+    });
+}
+
+#[test]
 fn nine_clients_are_one_too_many_until_one_goes() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
