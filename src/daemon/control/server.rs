@@ -130,12 +130,12 @@ async fn serve_connection(stream: UnixStream, desk: &Desk) {
             Err(_) => {
                 let limit = desk.max_silence.as_secs_f64();
                 let silent = Answer::Error(format!("no request within {limit} s, the connection is closed"));
-                return drop(send(&mut write, &silent, desk).await);
+                return drop(send(&mut write, silent, desk).await);
             }
         }
         if line.len() > MAX_REQUEST_BYTES {
             let long = format!("a request of more than {MAX_REQUEST_BYTES} bytes, must be a line of at most that many");
-            return drop(send(&mut write, &Answer::Error(long), desk).await);
+            return drop(send(&mut write, Answer::Error(long), desk).await);
         }
         let answer = match Request::parse(&line) {
             Err(fault) => Answer::Error(fault),
@@ -151,7 +151,7 @@ async fn serve_connection(stream: UnixStream, desk: &Desk) {
                 ask(desk, request).await
             }
         };
-        if send(&mut write, &answer, desk).await.is_err() {
+        if send(&mut write, answer, desk).await.is_err() {
             return;
         }
     }
@@ -167,8 +167,9 @@ async fn ask(desk: &Desk, request: Request) -> Answer {
 }
 
 /// Writes an answer; one that is not taken in time ends the connection.
-async fn send(write: &mut OwnedWriteHalf, answer: &Answer, desk: &Desk) -> std::io::Result<()> {
-    let line = answer.to_line();
+async fn send(write: &mut OwnedWriteHalf, answer: Answer, desk: &Desk) -> std::io::Result<()> {
+    // A long list takes milliseconds to write down: not on the thread of the estimation loop.
+    let line = tokio::task::spawn_blocking(move || answer.to_line()).await?;
     timeout(desk.max_silence, write.write_all(&line)).await.unwrap_or_else(|late| Err(late.into()))
 }
 
