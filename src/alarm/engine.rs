@@ -14,7 +14,7 @@ use super::{Observation, Outcome, Rule, RuleConfig, Scope, Selector, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// An alarm as it stands.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {
     /// Which rule.
     pub rule: Rule,
@@ -286,6 +286,12 @@ impl AlarmEngine {
     /// Thresholds, and those of them with an alarm whose value is not known.
     pub fn unknown(&self) -> (usize, usize) {
         (self.rules.len(), self.rules.iter().filter(|rule| rule.unknown > 0).count())
+    }
+
+    /// The thresholds with unknown values: rule, severity, how many of their alarms.
+    pub fn unknown_thresholds(&self) -> impl Iterator<Item = (Rule, Severity, usize)> + '_ {
+        let waiting = self.rules.iter().filter(|rule| rule.unknown > 0);
+        waiting.map(|rule| (rule.config.rule, rule.config.severity, rule.unknown))
     }
 
     /// For the `turn`-th of the thresholds with unknown values, counted round and round, one such alarm that is not

@@ -1,7 +1,10 @@
 //! The command line: one file per command; here only parsing, dispatch and exit codes.
 #![expect(clippy::print_stderr, reason = "talking to the terminal is this layer's work")]
 
+mod alarms;
 mod check;
+mod command;
+mod control_args;
 mod dbc;
 mod demo;
 #[cfg(feature = "lab")]
@@ -11,6 +14,7 @@ mod run;
 #[cfg(feature = "lab")]
 mod score;
 mod simulate;
+mod test_alarm;
 
 use std::process::ExitCode;
 
@@ -31,6 +35,16 @@ pub struct Cli {
 enum Command {
     /// Run the service on live CAN interfaces
     Run(run::Args),
+    /// Show the alarms of the running daemon
+    Alarms(alarms::Args),
+    /// Tell the running daemon that alarms were seen
+    Acknowledge(command::AlarmArgs),
+    /// End latched alarms of the running daemon that are healthy again; nothing learned is lost
+    Clear(command::AlarmArgs),
+    /// Tell the running daemon that another pack is connected
+    PackReplaced(command::ReplacedArgs),
+    /// Send a rule's alarm frame, marked as a test, and see what goes out on every interface
+    TestAlarm(test_alarm::Args),
     /// Replay journals, candump logs or CSV files through the same core
     Replay(Box<replay::Args>),
     /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
@@ -75,6 +89,11 @@ impl From<crate::config::ConfigFaults> for Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(args) => run::run(&args),
+        Command::Alarms(args) => alarms::run(&args),
+        Command::Acknowledge(args) => command::acknowledge(&args),
+        Command::Clear(args) => command::clear(&args),
+        Command::PackReplaced(args) => command::pack_replaced(&args),
+        Command::TestAlarm(args) => test_alarm::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),

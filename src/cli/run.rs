@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::Failure;
 use crate::config;
+use crate::daemon::control::ControlSetting;
 use crate::daemon::snapshot_file;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
@@ -42,6 +43,10 @@ pub(crate) struct Args {
     /// Receive buffer to ask the kernel for, per interface
     #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = buffer_bytes)]
     receive_buffer: usize,
+    /// Socket for `packwatch alarms` and its like, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock under
+    /// systemd, else /run/packwatch/control.sock where that can be made)
+    #[arg(long, value_name = "PATH")]
+    control: Option<PathBuf>,
 }
 
 /// Longest time an option takes, s: ten years.
@@ -76,6 +81,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
         receive_buffer_bytes: args.receive_buffer,
+        control: ControlSetting::from_path(args.control.clone()),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))
 }

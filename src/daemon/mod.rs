@@ -1,6 +1,8 @@
 //! The loops round the core: the live service and the replay of records.
 
+pub(crate) mod alarm_test;
 mod background_file;
+pub mod control;
 mod event_log;
 pub mod logging;
 pub mod replay;

@@ -15,6 +15,8 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until, timeout};
 
 use super::background_file::BackgroundFile;
+use super::control::protocol::{Answer, Request};
+use super::control::{Asked, ControlServer, ControlSetting, MAX_CONNECTIONS, answer};
 use super::event_log::{self, EventLog};
 use super::snapshot_file;
 use crate::config::Config;
@@ -22,7 +24,7 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::journal::JournalWriter;
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received, What};
-use crate::monitor::{Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{Command, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::BusIndex;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
@@ -55,6 +57,8 @@ pub struct Service {
     pub duration: Option<Duration>,
     /// Receive buffer asked for per interface, bytes.
     pub receive_buffer_bytes: usize,
+    /// The control socket.
+    pub control: ControlSetting,
 }
 
 /// Why the service could not start, or not end as it should.
@@ -71,6 +75,9 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
+    /// The control socket is another daemon's, or cannot be made.
+    #[error("{0}")]
+    Control(String),
     /// The runtime or a signal handler could not be set up.
     #[error("cannot start: {0}")]
     Start(#[from] io::Error),
@@ -91,16 +98,22 @@ impl Service {
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
+        // Before any file is opened: a second daemon must not take those of the first.
+        let (asked, requests) = mpsc::channel(MAX_CONNECTIONS);
+        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Control)?;
         let mut engine = self.engine(clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
         drop(sender);
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        let mut service = Loop { engine, inbox, clock, outputs, batch: Vec::with_capacity(BATCH) };
+        let works = !std::mem::take(&mut engine.lost_file);
+        engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
+        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::with_capacity(BATCH) };
         notify(&[NotifyState::Ready, NotifyState::Status("running")]);
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         service.run(stop).await;
         notify(&[NotifyState::Stopping]);
+        drop(control);
         service.finish(links, snapshot.as_deref()).await
     }
 
@@ -118,15 +131,16 @@ impl Service {
             tracing::info!(away_s, "state taken up");
         }
         let mut record = open_journal(self.record.as_deref(), &names)?;
+        let mut lost_file = false;
         let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, self.away_s));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
-            record = None;
+            (record, lost_file) = (None, true);
         }
         let frames = self.frames.as_deref().map(create).transpose()?;
         let events = self.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        Ok(Engine { monitor, outputs: Outputs::default(), record, frames, events, names, log })
+        Ok(Engine { monitor, outputs: Outputs::default(), record, frames, events, names, log, lost_file })
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
@@ -159,6 +173,8 @@ struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
+    /// A file was given up, and the core has not been told yet.
+    lost_file: bool,
 }
 
 impl Engine {
@@ -176,25 +192,25 @@ impl Engine {
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
                 |file: &mut _| candump::write_line(file, transmit.time, StampDigits::Nanos, name, &transmit.frame);
-            write_or_stop(&mut self.frames, "frames", write);
+            self.lost_file |= write_or_stop(&mut self.frames, "frames", write);
         }
         for event in &self.outputs.events {
             self.log.log(event);
-            write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
+            self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }
 
     fn stop_recording(&mut self, error: &io::Error) {
         tracing::error!(%error, "recording stopped");
-        self.record = None;
+        (self.record, self.lost_file) = (None, true);
     }
 
     fn flush(&mut self) {
         if let Some(Err(error)) = self.record.as_mut().map(JournalWriter::flush) {
             self.stop_recording(&error);
         }
-        write_or_stop(&mut self.frames, "frames", Write::flush);
-        write_or_stop(&mut self.events, "events", Write::flush);
+        self.lost_file |= write_or_stop(&mut self.frames, "frames", Write::flush);
+        self.lost_file |= write_or_stop(&mut self.events, "events", Write::flush);
     }
 
     fn close_files(&mut self) {
@@ -214,6 +230,7 @@ impl Engine {
 struct Loop {
     engine: Engine,
     inbox: mpsc::Receiver<Received>,
+    requests: mpsc::Receiver<Asked>,
     clock: MappedClock,
     outputs: Vec<LinkOutput>,
     batch: Vec<Received>,
@@ -241,6 +258,8 @@ impl Loop {
                         flushed = now;
                     }
                 }
+                // Each is taken between two ticks, and there are never more than connections.
+                Some(asked) = self.requests.recv() => self.answer(asked).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }
                 }
@@ -250,6 +269,39 @@ impl Loop {
 
     /// What came before the tick is handed over before it.
     async fn tick(&mut self) {
+        self.drain().await;
+        if std::mem::take(&mut self.engine.lost_file) {
+            // The journal may be the one that is lost: the core is told all the same.
+            self.engine.handle(&Input::Store { time: self.clock.now(), works: false }, &self.outputs);
+        }
+        self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
+    }
+
+    /// Somebody on this computer asks.
+    async fn answer(&mut self, asked: Asked) {
+        let alarms = self.engine.monitor.alarms();
+        let answer = match asked.request {
+            Request::Alarms { all } => answer::list(alarms, self.clock.now(), all),
+            Request::Command(command) => match answer::meaningless(alarms, &command) {
+                Some(error) => error,
+                None => self.obey(command).await,
+            },
+        };
+        // A client that has gone wants no answer.
+        let _ = asked.answer.send(answer);
+    }
+
+    /// Hands a command to the core like any other input, after what came before it.
+    async fn obey(&mut self, command: Command) -> Answer {
+        self.drain().await;
+        let time = self.clock.now();
+        self.engine.handle(&Input::Command { time, command }, &self.outputs);
+        let Engine { monitor, outputs, .. } = &self.engine;
+        answer::outcome(monitor.alarms(), &command, &outputs.events, time)
+    }
+
+    /// Hands over what the interfaces have received so far.
+    async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
             // Lets the interfaces' tasks take what is in their sockets, and send.
             tokio::task::yield_now().await;
@@ -263,7 +315,6 @@ impl Loop {
             }
             self.handle_batch();
         }
-        self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
     }
 
     /// Interfaces merge by time; what one interface delivered keeps its order.
@@ -332,16 +383,16 @@ impl Stop {
     }
 }
 
-/// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on.
+/// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.
 fn write_or_stop(
     file: &mut Option<BackgroundFile>,
     what: &str,
     write: impl FnOnce(&mut BackgroundFile) -> io::Result<()>,
-) {
-    if let Some(Err(error)) = file.as_mut().map(write) {
-        tracing::error!(what, %error, "file given up");
-        *file = None;
-    }
+) -> bool {
+    let Some(Err(error)) = file.as_mut().map(write) else { return false };
+    tracing::error!(what, %error, "file given up");
+    *file = None;
+    true
 }
 
 /// Tells the service manager; without one nothing happens.

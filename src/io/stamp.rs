@@ -76,9 +76,48 @@ fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     era * 146_097 + of_era * 365 + of_era / 4 - of_era / 100 + of_year - 719_468
 }
 
+/// A point in time as people read it, UTC, to the second: `2008-04-02T13:08:17Z`.
+pub fn format_utc(time: Timestamp) -> String {
+    let seconds = time.nanos().div_euclid(1_000_000_000);
+    let (days, of_day) = (seconds.div_euclid(86_400), seconds.rem_euclid(86_400));
+    let (year, month, day) = date_of(days);
+    let (hour, minute, second) = (of_day / 3600, of_day / 60 % 60, of_day % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}Z")
+}
+
+/// The same to the microsecond: `2008-04-02T13:08:17.921000Z`.
+pub fn format_utc_micros(time: Timestamp) -> String {
+    let whole = format_utc(time);
+    let micros = time.nanos().rem_euclid(1_000_000_000) / 1000;
+    format!("{}.{micros:06}Z", whole.trim_end_matches('Z'))
+}
+
+/// Year, month and day of a number of days from 1970-01-01; the reverse of `days_from_epoch`.
+fn date_of(days: i64) -> (i64, i64, i64) {
+    let days = days + 719_468;
+    let (era, of_era) = (days.div_euclid(146_097), days.rem_euclid(146_097));
+    let year_of_era = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
+    let of_year = of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let shifted_month = (5 * of_year + 2) / 153;
+    let day = of_year - (153 * shifted_month + 2) / 5 + 1;
+    let month = if shifted_month < 10 { shifted_month + 3 } else { shifted_month - 9 };
+    let year = era * 400 + year_of_era + i64::from(month <= 2);
+    (year, month, day)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn dates_are_written_as_they_are_read() {
+        for days in (-100_000..100_000).step_by(17).chain([-1, 0, 11_016, 11_017]) {
+            let time = Timestamp::from_nanos((days * 86_400 + 47_297) * 1_000_000_000);
+            let text = format_utc(time);
+            assert_eq!(parse_stamp(&text), Some(time), "{text}");
+        }
+        assert_eq!(format_utc(Timestamp::from_secs(1_207_141_697.921)), "2008-04-02T13:08:17Z");
+    }
 
     #[test]
     fn seconds_keep_every_digit() {

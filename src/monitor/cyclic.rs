@@ -12,7 +12,7 @@ use crate::quantity::Timestamp;
 /// Period of a test's frames, s: a consumer that looks once a second sees several.
 const TEST_PERIOD_S: f64 = 0.1;
 /// Longest test, s: one that is forgotten ends by itself.
-const MAX_TEST_S: f64 = 600.0;
+pub const MAX_TEST_S: f64 = 600.0;
 
 /// A test of an alarm frame that is running.
 #[derive(Debug, Clone, Copy)]

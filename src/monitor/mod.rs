@@ -15,6 +15,7 @@ mod output;
 mod snapshot;
 mod types;
 
+pub use cyclic::MAX_TEST_S;
 pub use j1939::{AlarmCode, J1939Config};
 pub use output::{CommandConfig, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};

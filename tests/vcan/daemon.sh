@@ -7,10 +7,12 @@ packwatch=${PACKWATCH_BIN:?names the program under test}
 config=$tmp/config
 cp -r "$(dirname "${BASH_SOURCE[0]}")/../../config" "$config"
 
-# daemon NAME CONFIG ARGS...
+# daemon NAME CONFIG ARGS...: without a control socket, unless ARGS say where: a packwatch of this machine's own may have
+# the usual one.
 daemon() {
     local name=$1 file=$2 base=$tmp/$1
     shift 2
+    [[ " $* " == *" --control "* ]] || set -- --control none "$@"
     start "$name" "$packwatch" run -c "$file" --record "$base.journal" --frames "$base.sent" --events "$base.events" \
         --snapshot "$base.json" "$@"
 }

@@ -2,15 +2,18 @@
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
 //!   `CanSender::open("vcan0", fd)?` then `sender.send(&frame)?`; a full transmit queue is waited for, within a limit.
+//! * `CanListener`: takes what has come of some identifiers, for `test-alarm`.
 //! * `Link`: the daemon's task per interface: receives, sends, and lives through every state of the interface.
 //!
 //! Underneath: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
 
 mod link;
+mod listener;
 mod raw;
 mod sender;
 mod wire;
 
 pub(crate) use link::{Link, LinkConfig, LinkOutput, Received, What};
+pub(crate) use listener::CanListener;
 pub(crate) use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
 pub use sender::CanSender;

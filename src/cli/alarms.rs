@@ -1,0 +1,206 @@
+//! `packwatch alarms`: the alarms of the running daemon, as a table or as its own JSON.
+
+use std::fmt::Write as _;
+
+use super::Failure;
+use super::control_args::{ControlArgs, print};
+use crate::alarm::{Alarm, Rule, Severity, State, Unit};
+use crate::daemon::control::protocol::{AlarmList, Request, contents};
+use crate::io::stamp;
+use crate::quantity::CellIndex;
+
+/// Arguments of `alarms`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// The daemon's answer as it is, a line of JSON (cells from 0, times in ns since 1970)
+    #[arg(long)]
+    json: bool,
+    /// Alarms at rest and unknown ones too
+    #[arg(long)]
+    all: bool,
+    #[command(flatten)]
+    control: ControlArgs,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let line = args.control.client().ask_line(Request::Alarms { all: args.all }).map_err(Failure::new)?;
+    let list: AlarmList = contents(&line).map_err(Failure::new)?;
+    if args.json { print(&String::from_utf8_lossy(&line)) } else { print(&table(&list)) }
+}
+
+const HEAD: [&str; 11] = [
+    "rule",
+    "severity",
+    "cell",
+    "state",
+    "value",
+    "threshold",
+    "probability",
+    "raised",
+    "first",
+    "last",
+    "acknowledged",
+];
+
+fn table(list: &AlarmList) -> String {
+    let mut text = String::new();
+    if list.alarms.is_empty() {
+        text.push_str("no alarm\n");
+    } else {
+        let rows: Vec<[String; HEAD.len()]> = list.alarms.iter().map(row).collect();
+        let width = |column: usize| {
+            let longest = rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+            longest.max(HEAD[column].len())
+        };
+        let widths: [usize; HEAD.len()] = std::array::from_fn(width);
+        push_row(&mut text, &HEAD.map(str::to_owned), &widths);
+        rows.iter().for_each(|row| push_row(&mut text, row, &widths));
+    }
+    if list.omitted > 0 {
+        let _ = writeln!(text, "and {} more, for which the answer had no room", list.omitted);
+    }
+    let _ = write!(text, "{} thresholds", list.thresholds);
+    if list.unknown.is_empty() {
+        text.push_str(", all of them judged\n");
+    } else {
+        let names = list
+            .unknown
+            .iter()
+            .map(|unknown| format!("{} {} ({})", unknown.rule.name(), severity(unknown.severity), unknown.alarms));
+        let names: Vec<String> = names.collect();
+        let _ = writeln!(text, ", not known for {} of them (alarms): {}", names.len(), names.join(", "));
+    }
+    text
+}
+
+fn push_row(text: &mut String, row: &[String], widths: &[usize]) {
+    let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+    text.push_str(cells.join("  ").trim_end());
+    text.push('\n');
+}
+
+fn row(alarm: &Alarm) -> [String; HEAD.len()] {
+    let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc);
+    let has_been = alarm.occurrences > 0;
+    [
+        alarm.rule.name().to_owned(),
+        severity(alarm.severity).to_owned(),
+        cell(alarm.cell),
+        state_name(alarm.state).to_owned(),
+        alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
+        with_unit(alarm.rule, alarm.threshold),
+        alarm.probability.map_or_else(|| "-".to_owned(), |probability| format!("{:.1} %", 100.0 * probability)),
+        alarm.occurrences.to_string(),
+        stamp(alarm.first_raised),
+        stamp(alarm.last_raised),
+        match (has_been, alarm.is_acknowledged) {
+            (false, _) => "-",
+            (true, true) => "yes",
+            (true, false) => "no",
+        }
+        .to_owned(),
+    ]
+}
+
+/// A cell as people count, from 1.
+pub(super) fn cell(cell: Option<CellIndex>) -> String {
+    cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
+}
+
+/// A value of a rule with its unit; fractions as percent.
+pub(super) fn with_unit(rule: Rule, value: f64) -> String {
+    let unit = rule.row().unit;
+    match unit {
+        Unit::Fraction => format!("{:.1} %", 100.0 * value),
+        Unit::Ratio => format!("{value:.2}"),
+        Unit::AmpereHours => format!("{value:.3} {}", unit.symbol()),
+        Unit::Seconds | Unit::Celsius | Unit::Cycles => format!("{value:.1} {}", unit.symbol()),
+    }
+}
+
+/// A severity as people write it.
+pub(super) fn severity(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Info => "info",
+        Severity::Warning => "warning",
+        Severity::Severe => "severe",
+    }
+}
+
+/// Where an alarm is, in a word.
+pub(super) fn state_name(state: State) -> &'static str {
+    match state {
+        State::Unknown => "unknown",
+        State::Inactive => "inactive",
+        State::Pending => "pending",
+        State::Active => "active",
+        State::Clearing => "clearing",
+        State::Suppressed => "suppressed",
+        State::Latched => "latched",
+        State::Cleared => "cleared",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::daemon::control::protocol::UnknownAlarms;
+    use crate::quantity::Timestamp;
+
+    fn alarm() -> Alarm {
+        Alarm {
+            rule: Rule::SocLow,
+            severity: Severity::Warning,
+            cell: None,
+            state: State::Active,
+            value: Some(0.084),
+            probability: Some(0.973),
+            threshold: 0.1,
+            occurrences: 2,
+            first_raised: Some(Timestamp::from_secs(0.0)),
+            last_raised: Some(Timestamp::from_secs(86_400.5)),
+            raised_value: Some(0.09),
+            is_acknowledged: false,
+        }
+    }
+
+    #[test]
+    fn the_table_counts_cells_from_1_and_says_what_is_unknown() {
+        let missing = Alarm {
+            rule: Rule::InputMissing,
+            cell: Some(CellIndex(0)),
+            state: State::Suppressed,
+            value: None,
+            probability: None,
+            threshold: 2.0,
+            is_acknowledged: true,
+            ..alarm()
+        };
+        let unknown = UnknownAlarms { rule: Rule::CapacityLow, severity: Severity::Severe, alarms: 96 };
+        let list = AlarmList {
+            time: Timestamp::ZERO,
+            thresholds: 3,
+            unknown: vec![unknown],
+            alarms: vec![missing, alarm()],
+            omitted: 0,
+        };
+        let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>().join(" ");
+        let lines: Vec<String> = table(&list).lines().map(words).collect();
+        assert_eq!(
+            lines,
+            [
+                "rule severity cell state value threshold probability raised first last acknowledged",
+                "input_missing warning 1 suppressed unknown 2.0 s - 2 1970-01-01T00:00:00Z 1970-01-02T00:00:00Z yes",
+                "soc_low warning pack active 8.4 % 10.0 % 97.3 % 2 1970-01-01T00:00:00Z 1970-01-02T00:00:00Z no",
+                "3 thresholds, not known for 1 of them (alarms): capacity_low severe (96)",
+            ]
+        );
+    }
+
+    #[test]
+    fn no_alarm_is_said() {
+        let list = AlarmList { time: Timestamp::ZERO, thresholds: 2, unknown: vec![], alarms: vec![], omitted: 0 };
+        assert_eq!(table(&list), "no alarm\n2 thresholds, all of them judged\n");
+    }
+}

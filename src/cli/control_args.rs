@@ -1,0 +1,76 @@
+//! What the commands to a running daemon have in common: its socket, and which alarms are meant.
+
+use std::path::PathBuf;
+
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+
+use crate::alarm::{Rule, Selector, Severity};
+use crate::cli::Failure;
+use crate::daemon::control::client::ControlClient;
+use crate::daemon::control::protocol::SEVERITIES;
+use crate::quantity::{CellIndex, MAX_CELLS};
+
+/// Where the daemon listens.
+#[derive(Debug, clap::Args)]
+pub(crate) struct ControlArgs {
+    /// Control socket of the daemon (default: where `packwatch run` makes it)
+    #[arg(long, value_name = "PATH")]
+    control: Option<PathBuf>,
+}
+
+impl ControlArgs {
+    /// The daemon there.
+    pub(crate) fn client(&self) -> ControlClient {
+        ControlClient::new(self.control.as_deref())
+    }
+}
+
+/// Which alarms are meant.
+#[derive(Debug, clap::Args)]
+#[group(id = "which", required = true, multiple = true)]
+pub(crate) struct SelectorArgs {
+    /// Those of this rule
+    #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true, group = "which")]
+    rule: Option<Rule>,
+    /// Those of this severity
+    #[arg(long, value_parser = severity_parser(), group = "which")]
+    severity: Option<Severity>,
+    /// Those of this cell, the first is 1
+    #[arg(long, value_name = "N", value_parser = cell, group = "which")]
+    cell: Option<CellIndex>,
+    /// All of them
+    #[arg(long, conflicts_with_all = ["rule", "severity", "cell"], group = "which")]
+    all: bool,
+}
+
+impl SelectorArgs {
+    /// The same for the daemon.
+    pub(crate) fn selector(&self) -> Selector {
+        Selector { rule: self.rule, severity: self.severity, cell: self.cell }
+    }
+}
+
+/// Reads a rule's name; a wrong one gets the names there are, and the one that is near.
+pub(crate) fn rule_parser() -> impl TypedValueParser<Value = Rule> {
+    let find = |name: String| Rule::ALL.into_iter().find(|rule| rule.name() == name).ok_or("no such rule");
+    PossibleValuesParser::new(Rule::ALL.map(Rule::name)).try_map(find)
+}
+
+fn severity_parser() -> impl TypedValueParser<Value = Severity> {
+    let find = |name: String| SEVERITIES.iter().find(|(known, _)| *known == name).map(|(_, s)| *s).ok_or("no such one");
+    PossibleValuesParser::new(SEVERITIES.map(|(name, _)| name)).try_map(find)
+}
+
+fn cell(text: &str) -> Result<CellIndex, String> {
+    let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
+    number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell's number, 1 to {MAX_CELLS}"))
+}
+
+/// Writes to standard output; a reader that has seen enough (`| head`) is no failure.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    use std::io::Write as _;
+    match std::io::stdout().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::new(error.to_string())),
+        Ok(()) | Err(_) => Ok(()),
+    }
+}

@@ -1,0 +1,120 @@
+//! `packwatch test-alarm`: has the running daemon send a rule's alarm frame as a test, and tells what really went out.
+//!
+//! Success only when every channel saw at least one such frame, whole and in sequence.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::Failure;
+use super::alarms::state_name;
+use super::control_args::{ControlArgs, print, rule_parser};
+use crate::alarm::{Rule, State};
+use crate::config;
+use crate::daemon::alarm_test::{self, ChannelReport};
+use crate::io::stamp;
+use crate::monitor::MAX_TEST_S;
+
+/// Arguments of `test-alarm`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Whose frame is sent; no alarm is raised
+    #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true)]
+    rule: Rule,
+    /// Configuration the daemon runs with
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// How long it is sent
+    #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
+    duration: f64,
+    #[command(flatten)]
+    control: ControlArgs,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= MAX_TEST_S => Ok(value),
+        _ => Err(format!("must be seconds, above 0 to {MAX_TEST_S}")),
+    }
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let config = config::load(&args.config)?;
+    let duration = Duration::from_secs_f64(args.duration);
+    let reports = alarm_test::run(&config, &args.control.client(), args.rule, duration).map_err(Failure::new)?;
+    print(&table(args.rule, &reports))?;
+    let bad: Vec<&str> = reports.iter().filter(|report| !report.is_good()).map(|r| r.interface.as_str()).collect();
+    if bad.is_empty() {
+        return Ok(());
+    }
+    let path = args.config.display();
+    Err(Failure::new(format!(
+        "the test did not come through on {}; is the interface up, and does the daemon run with {path}?",
+        bad.join(", ")
+    )))
+}
+
+fn table(rule: Rule, reports: &[ChannelReport]) -> String {
+    let mut text = format!("test of {}, as seen on the interfaces:\n", rule.name());
+    let _ = writeln!(
+        text,
+        "{:<12} {:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} end-to-end",
+        "interface", "what", "id", "frames", "first", "last", "ended"
+    );
+    for report in reports {
+        let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc_micros);
+        let _ = writeln!(
+            text,
+            "{:<12} {:<12} {:>10} {:>6}  {:<27} {:<27} {:<7} {}",
+            report.interface,
+            report.what,
+            report.id.to_string(),
+            report.seen.tests,
+            stamp(report.seen.first),
+            stamp(report.seen.last),
+            if report.seen.ended { "yes" } else { "no" },
+            protection(report)
+        );
+        push_notes(&mut text, report);
+    }
+    text.push_str("every frame counted had the test marker\n");
+    text
+}
+
+fn protection(report: &ChannelReport) -> String {
+    let Some(counts) = &report.protection else { return "none".to_owned() };
+    if report.is_intact() {
+        return format!("intact, {} checked", counts.total());
+    }
+    let found =
+        counts.iter().filter(|(_, count)| *count > 0).map(|(status, count)| format!("{} {count}", status.name()));
+    format!("BROKEN: {}", found.collect::<Vec<_>>().join(", "))
+}
+
+/// States with a code of their own on the wire.
+const ON_THE_WIRE: [State; 7] =
+    [State::Inactive, State::Active, State::Cleared, State::Pending, State::Latched, State::Suppressed, State::Unknown];
+
+/// What else was on the channel.
+fn push_notes(text: &mut String, report: &ChannelReport) {
+    let seen = &report.seen;
+    for ((rule, state), count) in &seen.real {
+        let name = Rule::from_number(*rule).map_or("unknown rule", Rule::name);
+        let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == *state);
+        let kind = if found.is_some_and(State::is_raised) { "REAL, " } else { "" };
+        let word = found.map_or("in an unknown state", state_name);
+        let _ = writeln!(text, "  meanwhile {kind}without the marker: {name} {word}, {count} frames");
+    }
+    let others = [
+        (seen.foreign, "test frames of other rules"),
+        (seen.unreadable, "frames that could not be read"),
+        (u64::from(report.dropped), "frames lost by this computer before they were seen"),
+    ];
+    for (count, what) in others.into_iter().filter(|(count, _)| *count > 0) {
+        let _ = writeln!(text, "  meanwhile {count} {what}");
+    }
+    if let Some(error) = &report.error {
+        let _ = writeln!(text, "  listening ended early: {error}");
+    }
+}

@@ -1,0 +1,72 @@
+//! The control socket: how people on this computer look at the alarms of a running daemon and tell it what to do.
+//!
+//! A Unix stream socket; one JSON document per line in, one per line out, in the order of asking:
+//! ```text
+//! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
+//! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
+//! {"version":1,"request":"nonsense"}                  {"version":1,"ok":false,"error":"..."}
+//! ```
+//! [`protocol`] has every request and answer; cells count from 0 there, as in events.
+//!
+//! * Whoever can open the socket may look (mode 0660); what changes something is done only for the daemon's own user
+//!   and for root, as the kernel names them (`SO_PEERCRED`). Others get an error.
+//! * Connections are tasks of their own. They talk with the loop over a bounded queue, one request each at a time; one
+//!   that never reads or writes holds up nobody and is closed.
+//! * A command reaches the core as an input like any other, so it is in the journal and replays.
+
+pub(crate) mod answer;
+pub(crate) mod client;
+mod listener;
+pub(crate) mod protocol;
+mod server;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+pub(crate) use server::{Asked, ControlServer};
+
+/// Connections at once: a person, a display and a script, with room; each is a task and a few kilobytes.
+pub(crate) const MAX_CONNECTIONS: usize = 8;
+/// Bytes of a request, its line's end included: the longest that makes sense has under 200.
+pub(crate) const MAX_REQUEST_BYTES: usize = 4096;
+/// Time a client has for a request and for taking its answer: a script needs milliseconds, and a place of the few must
+/// not be held for ever.
+pub(crate) const MAX_SILENCE: Duration = Duration::from_secs(10);
+/// Alarms listed in an answer: a line of a few hundred kilobytes, made in a few milliseconds; the rest is counted.
+pub(crate) const MAX_LISTED: usize = 1024;
+
+/// The socket of a daemon that systemd did not start.
+const STANDARD_PATH: &str = "/run/packwatch/control.sock";
+/// Its name in the folder systemd made.
+const FILE_NAME: &str = "control.sock";
+
+/// Where the control socket is to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ControlSetting {
+    /// `$RUNTIME_DIRECTORY/control.sock` under systemd, else `/run/packwatch/control.sock`; where that cannot be made,
+    /// the daemon goes without.
+    Standard,
+    /// There is none.
+    Off,
+    /// There, or the daemon does not start.
+    At(PathBuf),
+}
+
+impl ControlSetting {
+    /// As written on the command line: a path, or `none`.
+    pub fn from_path(path: Option<PathBuf>) -> Self {
+        match path {
+            None => Self::Standard,
+            Some(path) if path.as_os_str() == "none" => Self::Off,
+            Some(path) => Self::At(path),
+        }
+    }
+}
+
+/// Where the socket is when nobody says where.
+pub(crate) fn standard_path() -> PathBuf {
+    let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
+    // systemd puts a colon between several; the first is the unit's own.
+    let folder = folders.and_then(|folders| std::env::split_paths(&folders).next());
+    folder.map_or_else(|| PathBuf::from(STANDARD_PATH), |folder| folder.join(FILE_NAME))
+}

@@ -1,0 +1,186 @@
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+use tokio::io::AsyncRead;
+
+use super::super::protocol::{Done, contents};
+use super::*;
+use crate::monitor::Command;
+use crate::quantity::Timestamp;
+
+fn block_on(test: impl Future<Output = ()>) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(test);
+}
+
+fn done(changed: u32) -> Answer {
+    Answer::Done(Done { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
+}
+
+/// A server whose loop answers everything with the number of requests so far.
+async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
+    serve_patiently(folder, MAX_SILENCE).await
+}
+
+async fn serve_patiently(folder: &TempDir, max_silence: Duration) -> (ControlServer, PathBuf) {
+    let path = folder.path().join("control.sock");
+    let (sender, mut requests) = mpsc::channel::<Asked>(MAX_CONNECTIONS);
+    tokio::spawn(async move {
+        let mut count = 0;
+        while let Some(asked) = requests.recv().await {
+            count += 1;
+            let _ = asked.answer.send(done(count));
+        }
+    });
+    let bound = bind(&path).await.map_err(|error| format!("{error:?}")).unwrap();
+    (ControlServer::serve(bound, sender, max_silence).unwrap(), path)
+}
+
+async fn connect(path: &Path) -> UnixStream {
+    UnixStream::connect(path).await.unwrap()
+}
+
+async fn line(stream: &mut (impl AsyncRead + Unpin)) -> String {
+    let mut line = Vec::new();
+    BufReader::new(stream).read_until(b'\n', &mut line).await.unwrap();
+    String::from_utf8(line).unwrap()
+}
+
+const REPLACED: Request = Request::Command(Command::PackReplaced);
+
+#[test]
+fn requests_of_a_connection_are_answered_in_turn() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (_server, path) = serve(&folder).await;
+        let mut client = connect(&path).await;
+        for count in 1..4 {
+            client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+            let done: Done = contents(line(&mut client).await.as_bytes()).unwrap();
+            assert_eq!(done.changed, count);
+        }
+        client.write_all(b"rubbish\n").await.unwrap();
+        assert!(line(&mut client).await.contains("no JSON document"));
+        client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+        assert!(line(&mut client).await.contains("\"changed\":4"), "not served after rubbish");
+    });
+}
+
+#[test]
+fn a_request_that_is_too_long_ends_its_connection() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (_server, path) = serve(&folder).await;
+        let mut client = connect(&path).await;
+        client.write_all(&[b' '; MAX_REQUEST_BYTES + 1]).await.unwrap();
+        assert!(line(&mut client).await.contains("more than 4096 bytes"));
+        assert_eq!(line(&mut client).await, "");
+        // The longest that is allowed is served.
+        let mut longest = REPLACED.to_line().into_bytes();
+        longest.splice(0..0, std::iter::repeat_n(b' ', MAX_REQUEST_BYTES - longest.len()));
+        let mut client = connect(&path).await;
+        client.write_all(&longest).await.unwrap();
+        assert!(line(&mut client).await.contains("\"changed\":1"));
+    });
+}
+
+#[test]
+fn a_silent_client_is_sent_away() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        // Real time: a socket knows no other.
+        let max_silence = Duration::from_millis(200);
+        let (_server, path) = serve_patiently(&folder, max_silence).await;
+        let mut client = connect(&path).await;
+        let asked = tokio::time::Instant::now();
+        client.write_all(b"{\"version\"").await.unwrap();
+        assert!(line(&mut client).await.contains("no request within 0.2 s"));
+        let waited = asked.elapsed();
+        assert!(waited >= max_silence, "{waited:?}");
+        assert_eq!(line(&mut client).await, "");
+    });
+}
+
+#[test]
+fn a_client_that_never_reads_holds_up_nobody_and_is_sent_away() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (_server, path) = serve_patiently(&folder, Duration::from_millis(200)).await;
+        let deaf = connect(&path).await;
+        let flood = REPLACED.to_line().repeat(100);
+        let mut client = connect(&path).await;
+        let mut served = 0;
+        // Until its connection is closed, which is when a write to it fails.
+        loop {
+            match deaf.try_write(flood.as_bytes()) {
+                Err(error) if error.kind() != std::io::ErrorKind::WouldBlock => break,
+                Ok(_) | Err(_) => {}
+            }
+            client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+            assert!(line(&mut client).await.contains("\"ok\":true"), "not served beside a deaf one");
+            served += 1;
+        }
+        assert!(served > 0);
+    });
+}
+
+#[test]
+fn nine_clients_are_one_too_many_until_one_goes() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let (_server, path) = serve(&folder).await;
+        let mut clients = Vec::new();
+        for _ in 0..MAX_CONNECTIONS {
+            let mut client = connect(&path).await;
+            client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
+            assert!(line(&mut client).await.contains("\"ok\":true"));
+            clients.push(client);
+        }
+        let mut ninth = connect(&path).await;
+        let refused = line(&mut ninth).await;
+        assert!(refused.contains("\"ok\":false") && refused.contains("8 connections"), "{refused}");
+        clients.pop();
+        loop {
+            let mut next = connect(&path).await;
+            // Refused ones are closed at once; the write may find that.
+            let _ = next.write_all(REPLACED.to_line().as_bytes()).await;
+            if line(&mut next).await.contains("\"ok\":true") {
+                break;
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+    });
+}
+
+#[test]
+fn a_dead_daemons_socket_is_replaced_and_a_live_ones_is_not() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("control.sock");
+        drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
+        assert!(path.exists(), "the file of a dead daemon stays");
+        let (server, path) = serve(&folder).await;
+        let (sender, _requests) = mpsc::channel(1);
+        let second = ControlServer::start(&ControlSetting::At(path.clone()), sender).await.unwrap_err();
+        let own = format!("process {} of user", std::process::id());
+        assert!(second.contains("control.sock") && second.contains(&own), "{second}");
+        use std::os::unix::fs::PermissionsExt as _;
+        assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o660);
+        drop(server);
+        assert!(!path.exists(), "the file stays after the end");
+    });
+}
+
+#[test]
+fn what_is_no_socket_is_left_alone() {
+    block_on(async {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("control.sock");
+        std::fs::write(&path, "mine").unwrap();
+        let (sender, _requests) = mpsc::channel(1);
+        let error = ControlServer::start(&ControlSetting::At(path.clone()), sender.clone()).await.unwrap_err();
+        assert!(error.ends_with("is there and no socket"), "{error}");
+        assert_eq!(std::fs::read(&path).unwrap(), b"mine");
+        assert!(ControlServer::start(&ControlSetting::Off, sender).await.unwrap().is_none());
+    });
+}
