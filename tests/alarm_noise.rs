@@ -163,17 +163,17 @@ fn temperature_day(alarm: &str) -> Day {
     })
 }
 
-/// A cell that is discharged to 10 % in the first hour, kept there, 0.6 % more or less, and charged in the last. Both
-/// sensors are noisy (50 mA, 10 mV); the estimate is what the rule compares.
+/// A cell that is discharged to 10 % in the first hour, kept there, 0.6 % more or less every four minutes, and charged in
+/// the last. Both sensors are noisy (50 mA, 10 mV); the estimate, which the filter makes smooth, is what the rule compares.
 fn soc_day(alarm: &str) -> Day {
     let (mut noise, mut soc) = (Noise::new(2), 0.3);
     day(configuration(alarm), Rule::SocLow, |config, t| {
         let model = &config.model;
-        let target = 0.1 + 0.2 * away(t) + 0.006 * wander(t);
+        let target = 0.1 + 0.2 * away(t) + 0.006 * (t / 40.0).sin();
         // The charge that leads there in this second.
         let current_a = (soc - target) * model.capacity_ah * 3600.0;
         soc = soc_after(soc, current_a, model.capacity_ah);
-        // Branch in balance with the current: at such currents a millivolt.
+        // Branch in balance with the current.
         let place = model.place(soc, 25.0);
         let voltage_v = terminal_v(model, &place, 1.0, 0.025 * current_a, current_a);
         (current_a + 0.05 * noise.next(), voltage_v + 0.01 * noise.next(), 25.0)
