@@ -189,10 +189,15 @@ pub(super) struct Machine {
 }
 
 impl Machine {
-    /// Takes a value.
+    /// Takes a value. One that is learned while its inputs are lost (their loss ends the half-cycle before) may raise the
+    /// alarm; to one that is raised already it says nothing before they are back: it would clear, or look fresh.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, seen: &Observation) -> Option<Change> {
-        (self.seen, self.is_suspended) = (Observation { is_new: false, ..*seen }, false);
-        self.judge(now, rule, seen.is_new)
+        self.seen = *seen;
+        if self.is_suspended && self.state == State::Suppressed {
+            return None;
+        }
+        self.is_suspended = false;
+        self.judge(now, rule)
     }
 
     /// Lets time pass over a value that still holds.
@@ -209,12 +214,12 @@ impl Machine {
         self.tell(now, rule, Verdict::Unknown, false)
     }
 
-    /// It is valid again: the value stands as it was.
+    /// It is valid again: the value stands as it was, or as it was learned since.
     pub(super) fn resume(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if !std::mem::take(&mut self.is_suspended) {
             return None;
         }
-        self.judge(now, rule, false)
+        self.judge(now, rule)
     }
 
     /// The time up to the next look is not known or nobody looked: it does not count.
@@ -283,9 +288,11 @@ impl Machine {
         self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
     }
 
-    fn judge(&mut self, now: Timestamp, rule: &RuleConfig, is_new: bool) -> Option<Change> {
+    fn judge(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         let (verdict, probability) = Verdict::of(rule, &self.seen);
         self.probability = probability;
+        // New only once, however often it is judged.
+        let is_new = std::mem::take(&mut self.seen.is_new);
         self.tell(now, rule, verdict, is_new)
     }
 

@@ -260,6 +260,26 @@ fn a_learned_value_whose_inputs_are_lost_is_suppressed_and_stands_when_they_are_
 }
 
 #[test]
+fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_raised() {
+    for (value, change, state) in [(1.2, Change::Resumed, State::Active), (1.6, Change::Cleared, State::Cleared)] {
+        let (mut machine, rule) = machine_in(State::Active);
+        let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
+        assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));
+        assert_eq!(machine.observe(at(200.2), &rule, &Observation::new(Some(value))), None);
+        assert_eq!((machine.value(), machine.state), (None, State::Suppressed), "neither cleared nor fresh");
+        assert_eq!(machine.suspend(at(200.3), &rule), None);
+        assert_eq!(machine.resume(at(300.0), &rule), Some(change));
+        assert_eq!((machine.value(), machine.state), (Some(value), state));
+    }
+    let (mut machine, rule) = machine_in(State::Inactive);
+    let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
+    assert_eq!(machine.suspend(at(200.0), &rule), None);
+    let last = Observation::new(Some(1.2));
+    assert_eq!(machine.observe(at(200.2), &rule, &last), Some(Change::Raised), "the last half-cycle of a drive");
+    assert_eq!(machine.suspend(at(200.3), &rule), Some(Change::Suppressed));
+}
+
+#[test]
 fn wire_codes_are_those_of_the_alarm_frame() {
     let codes = STATES.map(State::wire_code);
     assert_eq!(codes, [6, 0, 3, 1, 1, 5, 4, 2]);

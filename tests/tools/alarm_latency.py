@@ -1,0 +1,199 @@
+"""Time from one frame on vcan0 to the frame that answers it, both as the kernel stamped them on one listening socket.
+
+usage: alarm_latency.py alarm FILE COUNT   half-cycles for a daemon with the configuration of alarm_latency.test: from the
+                                           frame that completes one to the alarm frame it causes
+       alarm_latency.py loop FILE COUNT    frames 0x123 for somebody who answers each with the same data under 0x321
+       alarm_latency.py echo               is such a somebody: the least a program can do
+       alarm_latency.py report FOLDER      what was measured, and whether it is good; needs the daemon's files too
+
+FILE gets {"late_ns": [...], ...}. After a frame is sent this program sleeps before it looks for the answer: with one CPU
+it would otherwise stand in the way of the program that answers.
+"""
+import json
+import random
+import re
+import socket
+import struct
+import sys
+import time
+from pathlib import Path
+
+SO_TIMESTAMPNS = 35  # linux/socket.h; not in Python's module
+TIMESPEC, FRAME = struct.Struct("@ll"), struct.Struct("=IB3x8s")
+CELL, ALARM, ASK, ANSWER = 0x100, 0x6B2, 0x123, 0x321
+# Bits of the alarm frame as config/packwatch.dbc has them, start and length.
+RULE, STATE = (16, 5), (21, 3)
+CAPACITY_LOW, ACTIVE, CLEARED = 1, 1, 2
+# A new mode counts after 10 ms (min_duration_s of the configuration); the frame after that decides.
+MODE_S = 0.012
+# A half-cycle flows at little more than nothing, so that it may last seconds and still be weak; a strong one has a pulse.
+IDLE_A, PULSE_A, PULSE_S = 0.008, 20.0, 0.006
+# The first half-cycles have no whole one before them.
+WARM_UP = 4
+PEERS = {
+    "daemon": "packwatch, half-cycle to alarm",
+    "echo": "program that only echoes",
+    "player": "candump | sed | canplayer",
+    "cansend": "candump | cansend for each frame",
+}
+# First look for the answer, and how long to look.
+LOOK_S, PATIENCE_S = 0.003, 2.0
+
+
+def raw(*ids):
+    s = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    filters = b"".join(struct.pack("=II", i, 0xDFFFFFFF) for i in ids)
+    s.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+    s.bind(("vcan0",))
+    return s
+
+
+def frame(can_id, data):
+    return FRAME.pack(can_id, len(data), data)
+
+
+def cell(current_a):
+    voltage_v = 3.75 - 0.045 * current_a
+    data = round(voltage_v * 1e5).to_bytes(3, "little") + round(current_a * 1e4).to_bytes(3, "little", signed=True)
+    return frame(CELL, data + (2500).to_bytes(2, "little"))
+
+
+def bits(data, start, length):
+    return int.from_bytes(data, "little") >> start & (1 << length) - 1
+
+
+class Listener:
+    """Frames of these identifiers with the kernel's stamps."""
+
+    def __init__(self, *ids):
+        self.socket = raw(*ids)
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.socket.setblocking(False)
+
+    def read(self):
+        """What has come: [(ns, id, data)]."""
+        seen = []
+        while True:
+            try:
+                data, control, _, _ = self.socket.recvmsg(72, 128)
+            except BlockingIOError:
+                return seen
+            seconds, nanoseconds = TIMESPEC.unpack(control[0][2][: TIMESPEC.size])
+            can_id, length, payload = FRAME.unpack(data)
+            seen.append((seconds * 10**9 + nanoseconds, can_id, payload[:length]))
+
+    def stamp_of(self, is_answer):
+        """The stamp of the first such frame, None when there is none for too long; and all that came."""
+        seen, deadline = [], time.monotonic() + PATIENCE_S
+        time.sleep(LOOK_S)
+        while True:
+            seen += self.read()
+            stamp = next((stamp for stamp, i, data in seen if is_answer(i, data)), None)
+            if stamp or time.monotonic() > deadline:
+                return stamp, seen
+            time.sleep(0.001)
+
+
+def pause():
+    """Somewhere else in the other's periods each time."""
+    time.sleep(random.uniform(0.001, 0.011))
+
+
+def measure_alarm(count):
+    """Strong and weak half-cycles in turn: each one's end clears or raises the alarm."""
+    listener, sender = Listener(CELL, ALARM), raw()
+    late_ns, without, strong, sign = [], 0, True, 1
+    for turn in range(count + WARM_UP):
+        listener.read()
+        sender.send(cell(sign * IDLE_A))
+        time.sleep(MODE_S)
+        sender.send(cell(sign * IDLE_A))
+        # The half-cycle that is complete now is the one before: a weak one before a strong one.
+        change = (CAPACITY_LOW, ACTIVE if strong else CLEARED)
+        if turn >= WARM_UP:
+            answered, seen = listener.stamp_of(lambda i, d: i == ALARM and (bits(d, *RULE), bits(d, *STATE)) == change)
+            asked = [stamp for stamp, i, _ in seen if i == CELL][1]
+            if answered is None:
+                without += 1
+            else:
+                late_ns.append(answered - asked)
+        sender.send(cell(sign * (PULSE_A if strong else IDLE_A)))
+        time.sleep(PULSE_S)
+        sender.send(cell(sign * IDLE_A))
+        pause()
+        strong, sign = not strong, -sign
+    return {"late_ns": late_ns, "without": without}
+
+
+def measure_loop(count):
+    listener, sender = Listener(ASK, ANSWER), raw()
+    late_ns, without = [], 0
+    for number in range(count):
+        data = struct.pack("<II", number, 0xA5A5A5A5)
+        listener.read()
+        sender.send(frame(ASK, data))
+        answered, seen = listener.stamp_of(lambda i, d: (i, d) == (ANSWER, data))
+        asked = next(stamp for stamp, i, d in seen if (i, d) == (ASK, data))
+        if answered is None:
+            without += 1
+        else:
+            late_ns.append(answered - asked)
+        pause()
+    return {"late_ns": late_ns, "without": without}
+
+
+def echo():
+    s = raw(ASK)
+    while True:
+        s.send(frame(ANSWER, s.recv(16)[8:]))
+
+
+def at(late_ns, share):
+    """Nearest rank, in ms."""
+    return sorted(late_ns)[max(0, -(-len(late_ns) * share // 100) - 1)] / 1e6
+
+
+def decided_by_frame(folder, late_ns):
+    """Those that a frame has decided. The daemon looks at the clock too, ten times a second, and where that look falls
+    between the two frames it has confirmed the mode; its events say at which input's time each alarm changed."""
+    stamp = re.compile(r"^\((\d+)\.(\d{9})\)", re.MULTILINE)
+    frames = {int(a + b) for a, b in stamp.findall((folder / "watched.journal").read_text())}
+    events = map(json.loads, (folder / "watched.events").read_text().splitlines())
+    changed_at = [event["time"] for event in events if event["event"] == "alarm"]
+    assert len(changed_at) >= len(late_ns), f"{len(changed_at)} alarms in the events, {len(late_ns)} on the bus"
+    return [late for late, time in zip(late_ns, changed_at[-len(late_ns) :]) if time in frames]
+
+
+def report(folder):
+    found = {peer: json.loads((folder / f"{peer}.json").read_text()) for peer in PEERS}
+    measured = found["daemon"]["late_ns"]
+    found["daemon"]["late_ns"] = decided_by_frame(folder, measured)
+    print(f"{'ms':34} {'p50':>8} {'p99':>8} {'max':>8}   of")
+    for peer, row in found.items():
+        late_ns = row["late_ns"]
+        values = " ".join(f"{at(late_ns, share):8.3f}" for share in (50, 99, 100))
+        print(f"{PEERS[peer]:34} {values}   {len(late_ns)}")
+    daemon = found["daemon"]
+    print(f"decided by the clock between two frames, not counted: {len(measured) - len(daemon['late_ns'])}")
+    lost = {peer: row["without"] for peer, row in found.items() if row["without"]}
+    assert not lost, f"frames without an answer: {lost}"
+    assert len(daemon["late_ns"]) >= 1000 and min(daemon["late_ns"]) > 0, "too few, or before the frame"
+    slowest, usual = at(daemon["late_ns"], 99), at(found["cansend"]["late_ns"], 50)
+    assert slowest < usual, f"p99 of the daemon, {slowest} ms, is not below the median of cansend per frame, {usual} ms"
+
+
+def main(words):
+    match words:
+        case ["alarm", name, count]:
+            Path(name).write_text(json.dumps(measure_alarm(int(count))))
+        case ["loop", name, count]:
+            Path(name).write_text(json.dumps(measure_loop(int(count))))
+        case ["echo"]:
+            echo()
+        case ["report", folder]:
+            report(Path(folder))
+        case _:
+            sys.exit(__doc__)
+
+
+main(sys.argv[1:])
