@@ -199,6 +199,16 @@ impl Pack {
         }
     }
 
+    /// From here on the cells grow old in another way: fade is rarely a straight line.
+    pub fn set_ageing(&mut self, ageing: Ageing) {
+        self.settings.ageing = ageing;
+    }
+
+    /// From here on the surroundings have this temperature, degrees C; the cells follow where their model has heat.
+    pub fn set_ambient(&mut self, ambient_c: f64) {
+        self.settings.ambient_c = ambient_c;
+    }
+
     /// Cycles completed.
     pub fn cycles(&self) -> u32 {
         self.cycles
