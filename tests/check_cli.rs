@@ -64,7 +64,7 @@ fn a_good_file_is_explained() {
         "CellVoltages.CellVoltage96 [Page = 31]",
         "cells 89-96; not available 8000",
         "pack current from -15 to 30 A, stale after 0.5 s",
-        "severe when a cell's capacity is below 1.82 Ah (70 % of rated) with a probability above 50 %, cleared at 1.872 Ah",
+        "severe when a cell's capacity is below 1.82 Ah (70 % of rated) with a probability above 80 %, cleared at 1.872 Ah",
     ] {
         assert!(said.contains(part), "{part} in\n{said}");
     }

@@ -60,7 +60,7 @@ pub struct ThresholdState {
     pub severity: Severity,
     /// Whether one of its alarms is raised.
     pub is_raised: bool,
-    /// Times they were raised, together.
+    /// Times the one of them that was raised most often was.
     pub occurrences: u32,
 }
 
@@ -268,7 +268,7 @@ impl AlarmEngine {
                 rule: rule.config.rule,
                 severity: rule.config.severity,
                 is_raised: machines.iter().any(|machine| machine.state.is_raised()),
-                occurrences: machines.iter().fold(0, |sum: u32, machine| sum.saturating_add(machine.occurrences)),
+                occurrences: machines.iter().map(|machine| machine.occurrences).max().unwrap_or(0),
             }
         })
     }

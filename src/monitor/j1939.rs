@@ -2,7 +2,7 @@
 //!
 //! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. Of the thresholds
 //! of a rule that share a parameter number and are raised for any cell, the gravest is told. The occurrence count is
-//! that of a threshold's alarms together.
+//! that of the one of its alarms that was raised most often.
 
 use super::{Event, EventKind, Monitor, Outputs, Transmit};
 use crate::alarm::{Rule, Severity};
