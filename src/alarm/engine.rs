@@ -225,8 +225,9 @@ impl AlarmEngine {
         self.command(which, changes, Machine::acknowledge)
     }
 
-    /// Somebody clears the alarms: latched ones end, past ones are forgotten; those that are beyond their threshold, or
-    /// whose value is not known, stay and count as refused. No learned value is touched.
+    /// Somebody clears the alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten;
+    /// those that are active, or whose value has not been healthy since, stay and count as refused. No learned value is
+    /// touched.
     pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> Outcome {
         self.command(which, changes, Machine::clear)
     }
@@ -414,7 +415,7 @@ impl AlarmEngine {
             rule: rule.config.rule,
             severity: rule.config.severity,
             cell: rule.cell(slot),
-            state: machine.state,
+            state: machine.shown(),
             value: machine.value(),
             probability: machine.probability.filter(|_| machine.is_known),
             threshold: rule.config.threshold,

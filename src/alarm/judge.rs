@@ -5,14 +5,18 @@
 //!
 //! ```text
 //! beyond    P(truth beyond the set threshold)   >  p
-//! healthy   P(truth beyond the clear threshold) <= p
+//! healthy   P(truth beyond the clear threshold) <= min(p, 0.5)
 //! ```
 //!
-//! As the clear threshold is on the healthy side of the set threshold, the second probability is the larger one: no
-//! value is both. With p = 0.5 this is the plain comparison. A value without a standard deviation where one is needed is
+//! where the second holds at most at p = 0.5: an alarm is cleared by a value that is at the clear threshold or better,
+//! never by doubt that has grown. As the clear threshold is on the healthy side of the set threshold, the second
+//! probability is the larger one: no value is both. With p = 0.5 this is the plain comparison. A value without a standard deviation where one is needed is
 //! not to be judged.
 
 use super::{Direction, Rule, Severity};
+
+/// Highest probability of being beyond the clear threshold that clears.
+const CLEAR_LEVEL: f64 = 0.5;
 
 /// How a value is compared with a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -100,7 +104,7 @@ impl Verdict {
             When::Mean => (set < 0.0, clear >= 0.0),
             When::Probability(level) => {
                 let (Some(beyond), Some(std)) = (probability, std) else { return (Self::Unknown, None) };
-                (beyond > level, probability_beyond(clear, std) <= level)
+                (beyond > level, probability_beyond(clear, std) <= level.min(CLEAR_LEVEL))
             }
         };
         let verdict = match (is_beyond, is_healthy) {
@@ -163,10 +167,14 @@ mod tests {
         let rule = low(When::Probability(0.95));
         assert_eq!(verdict(&rule, 1.4 - 0.1 * 1.65, Some(0.1)), Verdict::Beyond);
         assert_eq!(verdict(&rule, 1.4 - 0.1 * 1.64, Some(0.1)), Verdict::Between);
-        // Cleared when the clear threshold would not be passed either.
-        assert_eq!(verdict(&rule, 1.5 - 0.1 * 1.64, Some(0.1)), Verdict::Healthy);
+        // Cleared by a value at the clear threshold, not by doubt.
+        assert_eq!(verdict(&rule, 1.5 - 0.1 * 1.64, Some(0.1)), Verdict::Between);
+        assert_eq!(verdict(&rule, 1.2, Some(10.0)), Verdict::Between);
+        assert_eq!(verdict(&rule, 1.5, Some(10.0)), Verdict::Healthy);
         let early = low(When::Probability(0.05));
         assert_eq!(verdict(&early, 1.4 + 0.1 * 1.64, Some(0.1)), Verdict::Beyond);
+        assert_eq!(verdict(&early, 1.5 + 0.1 * 1.64, Some(0.1)), Verdict::Between);
+        assert_eq!(verdict(&early, 1.5 + 0.1 * 1.65, Some(0.1)), Verdict::Healthy);
         let (_, probability) = Verdict::of(&rule, &Observation::new(Some(1.3)).with_std(0.1));
         assert!((probability.expect("known") - 0.841_344_746_068_543).abs() < 1e-12);
     }

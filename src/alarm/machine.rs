@@ -245,6 +245,8 @@ impl Machine {
     pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
         match step(self.state, Told::Clear) {
             Step::Refuse => Err(Refusal::NotHealthy),
+            // Beyond again, only not for long enough yet.
+            Step::Rest if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
             Step::Rest => {
                 self.is_acknowledged = true;
                 self.enter(if self.is_known { State::Inactive } else { State::Unknown });
@@ -258,6 +260,15 @@ impl Machine {
                 }
                 Ok(Change::Forgotten)
             }
+        }
+    }
+
+    /// Its state as others see it: what is not known is shown so, also before the first look after a restart.
+    pub(super) fn shown(&self) -> State {
+        match self.state {
+            State::Inactive | State::Cleared if !self.is_known => State::Unknown,
+            State::Active | State::Clearing if !self.is_known => State::Suppressed,
+            state => state,
         }
     }
 

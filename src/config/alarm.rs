@@ -127,6 +127,8 @@ impl Alarm {
     fn clear(&self, rated: &Rated, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
+            // A fault that has only just begun is no end of the one before.
+            None if lasts_only_while_there(self.rule) => Some(0.0),
             None => {
                 let hysteresis = self.hysteresis.unwrap_or(USUAL_HYSTERESIS * set.abs());
                 Some(set - beyond_sign(self.rule) * hysteresis)
@@ -151,6 +153,11 @@ impl Alarm {
         };
         self.thresholds().filter_map(rule).collect()
     }
+}
+
+/// Whether the value of a rule is for how long something has been out of order: only 0 says that it is in order.
+fn lasts_only_while_there(rule: Rule) -> bool {
+    matches!(rule, Rule::BusFault | Rule::StoreFailed)
 }
 
 /// 1 where larger values are worse, -1 where smaller ones are.
@@ -227,11 +234,38 @@ fn check_thresholds(alarm: &Alarm, rated: &Rated, faults: &mut Faults) {
             }
             Some(Some(_)) | None => {}
         }
+        check_reachable(alarm, key, rated, set, &threshold, faults);
         if let Some((other, value)) = milder.filter(|(_, value)| sign * (set - value) <= 0.0) {
             let beyond = if sign > 0.0 { "above" } else { "below" };
             place.fault(faults, key, &format!("must be {beyond} {other} = {value}: it is the graver one"));
         }
         milder = Some((key, set));
+    }
+}
+
+/// An alarm that no value can clear would stay for ever.
+fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold: &Threshold, faults: &mut Faults) {
+    let written = if threshold.clear.is_some() { key } else { "hysteresis" };
+    if lasts_only_while_there(alarm.rule) {
+        if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
+            alarm.place.fault(faults, written, "must not be given: it is cleared at 0, when all is in order again");
+        }
+        return;
+    }
+    let Some(clear) = alarm.clear(rated, set, threshold) else { return };
+    let (low, high) = match alarm.rule.row().unit {
+        Unit::Fraction => (0.0, 1.0),
+        Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
+        Unit::Celsius => return,
+    };
+    let is_within = (0.0..=high).contains(&set); // otherwise there is a fault already, or it is never raised
+    if is_within && !(low..=high).contains(&clear) {
+        let range = if high.is_finite() { format!("{low} to {high}") } else { format!("{low} or more") };
+        alarm.place.fault(
+            faults,
+            written,
+            &format!("must leave a value that clears {key} within {range}, not {clear}"),
+        );
     }
 }
 

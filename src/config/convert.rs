@@ -126,6 +126,7 @@ pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: 
     let rated = Rated::new(rated_ah, raw.recharge.as_ref()?);
     let rules = raw.alarms.iter().flat_map(|alarm| alarm.rules(&rated)).collect();
     Some(MonitorConfig {
+        interfaces: raw.interfaces.len(),
         input: traffic.input,
         guards: traffic.guards,
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },

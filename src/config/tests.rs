@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use proptest::prelude::*;
 
+mod alarms;
 mod j1939;
 
 use super::*;
@@ -133,15 +134,6 @@ fn a_total_voltage_means_one_cell_of_a_series() {
     assert_eq!((sample.cells, sample.voltage_source), (1, VoltageSource::PackTotal { series: 4 }));
     assert_eq!(sample.voltage.max, 4.7, "100 V by four cells is more than the cell model allows");
     assert_eq!(sample.sensor_of_cell, [Some(SensorIndex(0))]);
-}
-
-#[test]
-fn a_relative_threshold_is_of_the_rated_capacity() {
-    let alarm = "[[alarm]]\nrule = \"capacity_low\"\nwarning = \"75 %\"\n";
-    assert_eq!(good(&format!("{PACK}{alarm}")).monitor.rules[0].threshold, 1.5);
-    let rated = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 4");
-    let config = good(&format!("{rated}{alarm}"));
-    assert_eq!((config.monitor.rules[0].threshold, config.monitor.model.rated_capacity_ah), (3.0, 4.0));
 }
 
 fn decoded(config: &Config, id: u16, payload: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> {
@@ -370,64 +362,6 @@ fn single_faults_of_appended_tables() {
             "pack.toml:18: usable.cutoff_v = 4.2, must be below the cell model's voltage_max_v = 4.2",
         ),
         (
-            "[[alarm]]\nrule = \"capacity_low\"\n",
-            "pack.toml:15: alarm[1] has no threshold, must have info, warning or severe",
-        ),
-        (
-            "[[alarm]]\nrule = \"usable_capacity_low\"\nwarning = 1\n",
-            "pack.toml:16: alarm[1].rule = \"usable_capacity_low\", must have a table [usable] that states the load",
-        ),
-        (
-            "[[alarm]]\nrule = \"input_missing\"\nwarning = \"80 %\"\n",
-            "pack.toml:17: alarm[1].warning = \"80 %\", must be a number: nothing is 100 % for this rule",
-        ),
-        (
-            "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\n[[alarm]]\nrule = \"input_missing\"\nwarning = 2\n",
-            "pack.toml:20: alarm[2].warning = 2, must be one per rule, alarm[1] in line 15 has one",
-        ),
-        (
-            "[[alarm]]\nrule = \"capacity_low\"\nwarning = { set = 1.5, clear = \"74 %\" }\n",
-            "pack.toml:17: alarm[1].warning = { set = 1.5, clear = \"74 %\" }, must clear at 1.5 or above it, on the \
-             healthy side, not at 1.48",
-        ),
-        (
-            "[[alarm]]\nrule = \"temperature_high\"\nsevere = { set = 60, clear = 61 }\n",
-            "pack.toml:17: alarm[1].severe = { set = 60, clear = 61 }, must clear at 60 or below it, on the healthy \
-             side, not at 61",
-        ),
-        (
-            "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1.4\nsevere = 1.5\n",
-            "pack.toml:18: alarm[1].severe = 1.5, must be below warning = 1.4: it is the graver one",
-        ),
-        (
-            "[[alarm]]\nrule = \"soc_low\"\nwarning = 10\n",
-            "pack.toml:17: alarm[1].warning = 10, must be 0 to 1, or a text like \"20 %\"",
-        ),
-        (
-            "[[alarm]]\nrule = \"soc_low\"\nwarning = { set = 0.1, clera = 0.2 }\n",
-            "pack.toml:17: alarm[1].warning = { set = 0.1, clera = 0.2 }, must be a number, a text like \"80 %\", or { set \
-             = ..., clear = ... } of these, -1000000000 to 1000000000 (the rule's)",
-        ),
-        (
-            "[[alarm]]\nrule = \"input_missing\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
-            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\": the value of this rule has no standard \
-             deviation",
-        ),
-        (
-            "[[alarm]]\nrule = \"recharge_period_low\"\nwarning = 1\nwhen = { probability = 0.9 }\n",
-            "pack.toml:18: alarm[1].when = { probability = 0.9 }, must be \"mean\" with recharge.alarm_on = \"raw\": that \
-             period has no standard deviation",
-        ),
-        (
-            "[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\nwhen = { probability = 1.5 }\n",
-            "pack.toml:18: alarm[1].when = { probability = 1.5 }, must be \"mean\", or { probability = ... } above 0 and \
-             below 1",
-        ),
-        (
-            "[[alarm]]\nrule = \"bms_disagrees\"\nwarning = 0.1\n",
-            "pack.toml:16: alarm[1].rule = \"bms_disagrees\", must have [input.reported_soc] or [input.reported_soh]",
-        ),
-        (
             "[output.status]\nid = 0x800\n",
             "pack.toml:16: output.status.id = 0x800, must be 0 to 0x7FF, or extended = true",
         ),
@@ -467,28 +401,6 @@ fn single_faults_of_appended_tables() {
         (
             "[output.health]\nbrs = true\n",
             "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",
-        ),
-        (
-            "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
-            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: what became of a command \
-             is sent",
-        ),
-        (
-            "[output]\n[commands]\nenabled = true\n",
-            "pack.toml:16: commands.e2e is not set, must be \"1A\", \"1C\" or \"5\": commands are never taken unprotected",
-        ),
-        (
-            "[output]\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\nid = 0x6B1\n",
-            "pack.toml:20: commands.id = 0x6B1, must not be that of a frame that is sent, 6B1",
-        ),
-        (
-            "[output.alarm]\ne2e = \"1A\"\ndata_id = 1\n[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
-            "pack.toml:21: commands.data_id = 1, must differ from those of the frames that are sent",
-        ),
-        (
-            "[output]\n[commands]\nenabled = true\ne2e = \"5\"\ndata_id = 1\n",
-            "pack.toml:18: commands.e2e = \"5\", must have fd = true here and on the interface: the header of profile 5 \
-             makes the message 12 bytes long; 1A and 1C fit classic frames",
         ),
         ("[output]\nstatus_id = 1\n", "pack.toml:16: output.status_id is not a known key, did you mean status"),
         (

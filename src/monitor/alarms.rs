@@ -13,24 +13,30 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
+/// Command frames that are not obeyed are told at most this often, s.
+const BAD_COMMAND_S: f64 = 1.0;
 
-/// What the rules about inputs look at; `None` = not known.
-#[derive(Debug, Clone, Copy, Default)]
+/// What the rules about inputs look at.
+#[derive(Debug, Clone, Copy)]
 struct InputState {
-    silence_s: Option<f64>,
-    bad_share: Option<f64>,
-    /// Whether a reading has come since the last look.
-    is_new: bool,
+    silence_s: Observation,
+    bad_share: Observation,
 }
 
 impl InputState {
     fn worst(self, other: Self) -> Self {
-        let max = |a: Option<f64>, b: Option<f64>| a.map_or(b, |a| Some(b.map_or(a, |b| a.max(b))));
-        Self {
-            silence_s: max(self.silence_s, other.silence_s),
-            bad_share: max(self.bad_share, other.bad_share),
-            is_new: self.is_new || other.is_new,
-        }
+        Self { silence_s: worst(self.silence_s, other.silence_s), bad_share: worst(self.bad_share, other.bad_share) }
+    }
+}
+
+/// The larger of two values; a bound where one is not known.
+fn worst(a: Observation, b: Observation) -> Observation {
+    let is_known = |seen: &Observation| seen.value.is_some() && !seen.is_bound;
+    Observation {
+        value: a.value.map_or(b.value, |a| Some(b.value.map_or(a, |b| a.max(b)))),
+        std: None,
+        is_bound: !is_known(&a) || !is_known(&b),
+        is_new: a.is_new || b.is_new,
     }
 }
 
@@ -57,9 +63,11 @@ impl Monitor {
         self.watch_inputs(out);
         self.watch_learned(out);
         self.watch_pack(out);
-        let (bus, store) = (self.buses.worst_s(self.now), self.store.failing_s(self.now));
-        self.observe_alarm(Rule::BusFault, None, Observation::new(bus), out);
-        self.observe_alarm(Rule::StoreFailed, None, Observation::new(store), out);
+        let (fault_s, is_whole) = self.buses.worst_s(self.now, self.config.interfaces);
+        let bus = Observation { is_bound: !is_whole, ..Observation::new(fault_s) };
+        self.observe_alarm(Rule::BusFault, None, bus, out);
+        let store = Observation::new(self.store.failing_s(self.now));
+        self.observe_alarm(Rule::StoreFailed, None, store, out);
         self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
         // Whether every value is known may have changed without an alarm.
@@ -69,17 +77,19 @@ impl Monitor {
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
     /// what belongs to no cell under the pack.
     fn watch_inputs(&mut self, out: &mut Outputs) {
-        let mut pack = InputState::default();
+        let mut pack: Option<InputState> = None;
         for index in 0..self.sampler.channels().len() {
             let channel = self.sampler.channels()[index];
             let state = self.input_state(channel);
             if let Channel::CellVoltage(cell) = channel {
                 self.observe_input(Some(cell), state, out);
             } else {
-                pack = pack.worst(state);
+                pack = Some(pack.map_or(state, |pack| pack.worst(state)));
             }
         }
-        self.observe_input(None, pack, out);
+        if let Some(pack) = pack {
+            self.observe_input(None, pack, out);
+        }
     }
 
     fn input_state(&self, channel: Channel) -> InputState {
@@ -87,25 +97,28 @@ impl Monitor {
         // Since waking nothing may have come yet: that is neither silence nor its end.
         let heard = self.sampler.heard_since_waking(channel);
         let beyond = |silence: &f64| heard || self.config.missing_after_s().is_some_and(|limit| *silence > limit);
+        // The share of what came before the silence says nothing about what does not come.
+        let share = self.sampler.bad_share(channel).filter(|_| heard && !self.sampler.is_silent(channel, self.now));
         InputState {
-            silence_s: silence_s.filter(beyond),
-            bad_share: self.sampler.bad_share(channel),
-            is_new: silence_s.is_some_and(|silence_s| heard && silence_s <= HOUSEKEEPING_S),
+            silence_s: Observation::new(silence_s.filter(beyond)),
+            bad_share: Observation {
+                value: share,
+                is_new: silence_s.is_some_and(|silence_s| heard && silence_s <= HOUSEKEEPING_S),
+                ..Observation::default()
+            },
         }
     }
 
     fn observe_input(&mut self, cell: Option<CellIndex>, state: InputState, out: &mut Outputs) {
-        self.observe_alarm(Rule::InputMissing, cell, Observation::new(state.silence_s), out);
-        let bad = Observation { is_new: state.is_new, ..Observation::new(state.bad_share) };
-        self.observe_alarm(Rule::InputImplausible, cell, bad, out);
+        self.observe_alarm(Rule::InputMissing, cell, state.silence_s, out);
+        self.observe_alarm(Rule::InputImplausible, cell, state.bad_share, out);
     }
 
     /// What was learned of a cell stands only while its inputs can renew it.
     fn watch_learned(&mut self, out: &mut Outputs) {
-        let current_bad = self.sampler.is_bad(Channel::Current);
-        let mut all_valid = !current_bad;
+        let mut all_valid = true;
         for (index, cell) in (0..self.config.sample.cells).map(CellIndex).enumerate() {
-            let valid = !current_bad && !self.sampler.is_bad(self.voltage_channel(cell));
+            let valid = self.inputs_valid(cell);
             all_valid &= valid;
             for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
                 self.alarms.set_inputs_valid(self.now, rule, Some(cell), valid, &mut self.scratch.alarm_changes);
@@ -118,6 +131,12 @@ impl Monitor {
             self.alarms.set_inputs_valid(self.now, rule, None, all_valid, &mut self.scratch.alarm_changes);
         }
         self.report_alarms(out);
+    }
+
+    /// Whether what an estimate of a cell is made of comes in.
+    pub(super) fn inputs_valid(&self, cell: CellIndex) -> bool {
+        let is_lost = |channel| self.sampler.is_lost(channel, self.now);
+        !is_lost(Channel::Current) && !is_lost(self.voltage_channel(cell))
     }
 
     /// The channel a cell's voltage comes on.
@@ -153,8 +172,8 @@ impl Monitor {
     fn spread(&self) -> Option<Spread> {
         let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
         for (slot, cell) in self.cells.iter().zip((0..).map(CellIndex)) {
-            let fresh = slot.consumed.is_some() && !self.sampler.is_bad(self.voltage_channel(cell));
-            let Some(soc) = slot.estimator.soc().filter(|_| fresh) else { continue };
+            let is_fresh = self.sampler.is_fresh(self.voltage_channel(cell), self.now);
+            let Some(soc) = slot.estimator.soc().filter(|_| is_fresh) else { continue };
             known += 1;
             spread = Some(match spread {
                 None => Spread { lowest: soc, highest: soc, is_whole: false },
@@ -202,7 +221,7 @@ impl Monitor {
     }
 
     /// After a restart: what was known stands, though it is not known anew.
-    pub(super) fn restate_known(&mut self, out: &mut Outputs) {
+    pub(super) fn restate_known(&mut self, was_away_briefly: bool, out: &mut Outputs) {
         let old = |belief: Belief| Observation { is_new: false, ..learned(belief) };
         for index in 0..self.cells.len() {
             let cell = Some(CellIndex(u16::try_from(index).unwrap_or(u16::MAX)));
@@ -210,7 +229,8 @@ impl Monitor {
                 let capacity = self.learner.capacity(&self.config.health.capacity, index);
                 self.observe_alarm(Rule::CapacityLow, cell, old(capacity), out);
             }
-            if self.cells[index].estimator.soc().is_some() {
+            // A measured value is as old as the state; after a moment only it may still be taken for the present one.
+            if was_away_briefly && self.cells[index].estimator.soc().is_some() {
                 let mean_nis =
                     Observation { value: Some(self.cells[index].estimator.mean_nis()), ..Observation::default() };
                 self.observe_alarm(Rule::EstimateUntrusted, cell, mean_nis, out);
@@ -258,7 +278,10 @@ impl Monitor {
         let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
         match fields.and_then(|fields| command_of(&fields)) {
             Some(command) if is_intact => self.handle_command(Source::Bus(bus), command, out),
+            // Told once a second: the guard counts them all.
+            Some(_) | None if self.bad_command_told.is_some_and(|told| self.now.since(told) < BAD_COMMAND_S) => {}
             Some(_) | None => {
+                self.bad_command_told = Some(self.now);
                 out.events.push(Event { time: self.now, kind: EventKind::BadCommand { bus, intact: is_intact } })
             }
         }

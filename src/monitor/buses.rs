@@ -55,11 +55,12 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// For how long the worst interface has been out of order, s; 0 = all that was heard of are in order, `None` =
-    /// nothing was heard of any.
-    pub(super) fn worst_s(&self, now: Timestamp) -> Option<f64> {
+    /// For how long the worst of `interfaces` has been out of order, s; 0 = all that was heard of are in order, `None` =
+    /// nothing was heard of any. And whether something was heard of each.
+    pub(super) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
-        known.map(|state| state.fault_s(now)).max_by(f64::total_cmp)
+        let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
+        (worst_s, known.count() >= interfaces)
     }
 
     fn state(&mut self, bus: BusIndex) -> &mut BusState {
@@ -99,18 +100,18 @@ mod tests {
             (BusEvent::SendFailed { frames: 3 }, None),
         ] {
             let mut buses = Buses::default();
-            assert_eq!(buses.worst_s(at(0.0)), None);
+            assert_eq!(buses.worst_s(at(0.0), 1).0, None);
             buses.handle_event(at(1.0), BUS, BusEvent::Up);
-            assert_eq!(buses.worst_s(at(2.0)), Some(0.0));
+            assert_eq!(buses.worst_s(at(2.0), 1).0, Some(0.0));
             buses.handle_event(at(3.0), BUS, fault);
-            assert!(buses.worst_s(at(3.0)).is_some_and(|fault_s| fault_s > 0.0));
+            assert!(buses.worst_s(at(3.0), 1).0.is_some_and(|fault_s| fault_s > 0.0));
             buses.handle_event(at(3.8), BUS, fault);
-            assert_eq!(buses.worst_s(at(4.5)), Some(1.5), "{fault:?}");
+            assert_eq!(buses.worst_s(at(4.5), 1).0, Some(1.5), "{fault:?}");
             if let Some(end) = end {
-                assert_eq!(buses.worst_s(at(9.0)), Some(6.0), "{fault:?}");
+                assert_eq!(buses.worst_s(at(9.0), 1).0, Some(6.0), "{fault:?}");
                 buses.handle_event(at(9.0), BUS, end);
             }
-            assert_eq!(buses.worst_s(at(9.0)), Some(0.0), "{fault:?}");
+            assert_eq!(buses.worst_s(at(9.0), 1).0, Some(0.0), "{fault:?}");
         }
     }
 
@@ -121,6 +122,6 @@ mod tests {
         buses.handle_frame(BUS);
         buses.handle_event(at(1.0), BUS, BusEvent::ErrorFrame { class: 0x4 });
         buses.handle_event(at(1.0), BUS, BusEvent::Dropped { frames: 9 });
-        assert_eq!(buses.worst_s(at(2.0)), Some(0.0));
+        assert_eq!(buses.worst_s(at(2.0), 1).0, Some(0.0));
     }
 }

@@ -224,7 +224,7 @@ impl Monitor {
         }
     }
 
-    fn end_test(&mut self, out: &mut Outputs) {
+    pub(super) fn end_test(&mut self, out: &mut Outputs) {
         let Some(test) = self.test.take() else { return };
         self.send_alarm_fields(test_fields(test.rule, State::Inactive), out);
         out.events.push(Event { time: self.now, kind: EventKind::Test { rule: test.rule, running: false } });

@@ -28,7 +28,8 @@ pub(super) struct IntakeState {
 
 impl Intake {
     pub(super) fn new(config: &MonitorConfig) -> Self {
-        let gate = FloodGate::new(&config.flood, config.input.messages());
+        let commands = config.commands.iter().map(|commands| (commands.bus, commands.plan.id(), 1));
+        let gate = FloodGate::new(&config.flood, config.input.messages().chain(commands));
         Self { gate, guards: Guards::new(config.guards.clone()) }
     }
 

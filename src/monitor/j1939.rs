@@ -71,10 +71,10 @@ impl J1939 {
 
 impl Monitor {
     /// Claims the address: at the start, after time asleep, when the interface comes back.
-    pub(super) fn start_j1939(&mut self, out: &mut Outputs) {
+    pub(super) fn start_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
         let Some(j1939) = &mut self.j1939 else { return };
-        j1939.node.handle_gap(self.now, &mut j1939.out);
-        j1939.hand_on(self.now, out);
+        j1939.node.handle_gap(now, &mut j1939.out);
+        j1939.hand_on(now, out);
     }
 
     pub(super) fn handle_j1939_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
@@ -107,6 +107,8 @@ impl Monitor {
                 j1939.previously_active.push(code);
             }
         }
+        // The gravest rule that was active first: what does not fit is cut off at the end.
+        j1939.previously_active.reverse();
         let test = self.test.map(|_| ActiveCode { code: j1939.config.test_code, lamp: Lamp::None });
         j1939.active.extend(test);
         let (_, unknown) = self.alarms.unknown();

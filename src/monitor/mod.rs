@@ -45,6 +45,8 @@ const ASLEEP_S: f64 = 5.0;
 /// Everything the core must know, already checked.
 #[derive(Debug, Clone)]
 pub struct MonitorConfig {
+    /// How many interfaces there are.
+    pub interfaces: usize,
     /// What input frames mean.
     pub input: InputMap,
     /// Input messages with end-to-end protection.
@@ -143,6 +145,8 @@ pub struct Monitor {
     alarms: AlarmEngine,
     buses: Buses,
     store: StoreState,
+    /// When a command frame that was not obeyed was last told.
+    bad_command_told: Option<Timestamp>,
     /// A test of an alarm frame that is running; it ends with the process.
     test: Option<Test>,
     schedule: Schedule,
@@ -198,6 +202,7 @@ impl Monitor {
             updated_cells: 0,
             buses: Buses::default(),
             store: StoreState::default(),
+            bad_command_told: None,
             test: None,
             schedule: Schedule::default(),
             j1939: config.j1939.clone().map(j1939::J1939::new),
@@ -241,7 +246,7 @@ impl Monitor {
                 self.buses.handle_event(self.now, bus, event);
                 out.events.push(Event { time: self.now, kind: EventKind::Bus { bus, what: event } });
                 if event == BusEvent::Up && self.config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
-                    self.start_j1939(out);
+                    self.start_j1939(self.now, out);
                 }
             }
         }
@@ -306,10 +311,15 @@ impl Monitor {
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        if self.apply_pending(time) {
-            self.restate_known(out);
+        let is_restored = self.apply_pending(time);
+        let was_away_briefly = time.since(self.now) <= ASLEEP_S;
+        if is_restored {
+            self.restate_known(was_away_briefly, out);
         }
-        self.start_j1939(out);
+        // After a longer time `advance` finds the gap and claims the address.
+        if was_away_briefly {
+            self.start_j1939(time, out);
+        }
     }
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
@@ -339,8 +349,7 @@ impl Monitor {
             out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(elapsed_s) } });
             self.sampler.wake(time);
             self.schedule.restart(time);
-            self.now = time;
-            self.start_j1939(out);
+            self.start_j1939(time, out);
         }
         self.now = time;
     }
@@ -365,6 +374,8 @@ impl Monitor {
     /// The record goes on at `time`, but how far that is from before nobody knows.
     fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.fall_asleep(out);
+        self.end_test(out);
+        self.bad_command_told = None;
         if let Some(change) = self.detector.settle() {
             self.complete_mode(change, out);
         }
@@ -372,7 +383,7 @@ impl Monitor {
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
         self.sampler.handle_gap(time);
         self.schedule.restart(time);
-        self.start_j1939(out);
+        self.start_j1939(self.now, out);
         for cell in &mut self.cells {
             cell.estimator.handle_unknown_gap();
             cell.consumed = None;
@@ -472,7 +483,10 @@ impl Monitor {
             slot.trusted = trusted;
             out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
         }
-        self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
+        // Without a current the filter goes on, but its innovations say nothing about its model.
+        if self.inputs_valid(cell) {
+            self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
+        }
     }
 
     /// Once every cell has a new estimate, or one has its second: the pack's values.

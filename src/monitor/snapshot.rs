@@ -13,7 +13,7 @@ use crate::quantity::Timestamp;
 use crate::sample::SamplerState;
 
 /// Layout version of [`Snapshot`].
-const SNAPSHOT_VERSION: u32 = 1;
+const SNAPSHOT_VERSION: u32 = 2;
 
 /// State of a [`Monitor`] at one moment.
 #[derive(Debug, Clone, Serialize, Deserialize)]

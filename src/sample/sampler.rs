@@ -237,15 +237,27 @@ impl Sampler {
         Some((hottest, fresh.clone().all(|value| value.is_some())))
     }
 
-    /// What the pack reports of itself, when it is fresh.
+    /// The last good value of a channel, when it is young enough.
     pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         let limits = self.limits(channel);
         self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, &limits))
     }
 
-    /// Whether a channel's value cannot be used now; `false` for one from which nothing came yet, as long as it may.
-    pub fn is_bad(&self, channel: Channel) -> bool {
-        self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad())
+    /// Whether a channel is lost: its latest reading is bad or too old, and so is its last good one. A single bad reading
+    /// loses nothing, and one from which nothing came yet is not lost as long as it may come.
+    pub fn is_lost(&self, channel: Channel, now: Timestamp) -> bool {
+        let is_bad = self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad());
+        is_bad && self.reported(channel, now).is_none()
+    }
+
+    /// Whether a good value that is young enough has come since the start or the last waking.
+    pub fn is_fresh(&self, channel: Channel, now: Timestamp) -> bool {
+        self.heard_since_waking(channel) && self.reported(channel, now).is_some()
+    }
+
+    /// Whether nothing, good or bad, came for longer than a value may be old.
+    pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
+        self.silence_s(channel, now).is_none_or(|silence_s| silence_s > self.limits(channel).max_age_s)
     }
 
     /// Whether anything has come on the channel since the start or the last waking.

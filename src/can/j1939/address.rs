@@ -92,11 +92,21 @@ pub(super) struct AddressClaim {
     /// When a claim (or "cannot claim", in state lost) is to be sent.
     send_at: Option<Timestamp>,
     last_sent: Option<Timestamp>,
+    /// The claim that begins the contention is still to be sent.
+    is_first: bool,
 }
 
 impl AddressClaim {
     pub(super) fn new(name: Name, address: u8) -> Self {
-        Self { name, address, state: State::Idle, unopposed_at: Timestamp::ZERO, send_at: None, last_sent: None }
+        Self {
+            name,
+            address,
+            state: State::Idle,
+            unopposed_at: Timestamp::ZERO,
+            send_at: None,
+            last_sent: None,
+            is_first: false,
+        }
     }
 
     pub(super) const fn state(&self) -> State {
@@ -107,17 +117,19 @@ impl AddressClaim {
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;
+        self.is_first = true;
         self.happens(now, Happening::Started);
     }
 
     /// Another node claims our address.
     pub(super) fn contend(&mut self, now: Timestamp, by: Name) -> Option<NodeEvent> {
-        let before = self.state;
+        let (before, was_answered) = (self.state, self.send_at.is_none());
         self.happens(now, if by <= self.name { Happening::ClaimedByStronger } else { Happening::ClaimedByWeaker });
         match (before, self.state) {
             (State::Claiming | State::Claimed, State::Lost) => Some(NodeEvent::AddressLost { to: by }),
+            // Told once per answer: a flood of claims is answered at a limited rate.
             (State::Claiming | State::Claimed, State::Claiming | State::Claimed) => {
-                Some(NodeEvent::AddressDefended { against: by })
+                was_answered.then_some(NodeEvent::AddressDefended { against: by })
             }
             (State::Idle | State::Lost, _) | (_, State::Idle) => None,
         }
@@ -140,7 +152,8 @@ impl AddressClaim {
             Answer::CannotClaim if before == State::Lost && self.send_at.is_some() => {}
             Answer::CannotClaim => self.send_at = Some(spaced.plus_nanos(self.loser_delay_ns())),
         }
-        if state == State::Claiming {
+        // Only the beginning counts: requests and weaker claims, however many, must not keep the node silent.
+        if happening == Happening::Started {
             self.unopposed_at = now.plus_nanos(CONTENTION_NS);
         }
     }
@@ -160,7 +173,7 @@ impl AddressClaim {
             }
             self.send_at = None;
             self.last_sent = Some(now);
-            if self.state == State::Claiming {
+            if self.state == State::Claiming && std::mem::take(&mut self.is_first) {
                 self.unopposed_at = now.plus_nanos(CONTENTION_NS);
             }
             return (self.frame(), None);

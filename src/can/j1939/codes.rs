@@ -12,7 +12,7 @@ use crate::quantity::Timestamp;
 /// Shortest time between two changes of one code on the bus, ns.
 const CHANGE_SPACING_NS: i64 = 1_000_000_000;
 
-/// Codes followed at a time: more than a configuration can name (13 rules of three severities are 39), few enough to search.
+/// Codes followed at a time: more than a configuration can name (14 rules of three severities are 42), few enough to search.
 const MAX_FOLLOWED: usize = 64;
 
 /// A code that is active and the lamp it lights.

@@ -12,7 +12,8 @@ use serde::{Deserialize, Serialize};
 use super::name::OutOfRange;
 
 /// Most codes in one message: 27, so 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of 10 ms
-/// late, a transfer ends within 0.96 s, before the next DM1 is due. Thirteen rules with two thresholds each are 26.
+/// late, a transfer ends within 0.96 s, before the next DM1 is due. Of a rule's thresholds that share a
+/// parameter number only the gravest is told: fourteen rules are 14.
 pub const MAX_CODES: usize = 27;
 
 /// Bytes of a message with [`MAX_CODES`] codes.

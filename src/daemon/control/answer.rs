@@ -69,10 +69,9 @@ pub(crate) fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event],
         return Answer::Error("the daemon's core did not say what became of it".to_owned());
     };
     let mut refused_alarms: Vec<Alarm> = match command {
-        Command::Clear(which) if refused > 0 => engine
-            .raised()
-            .filter(|alarm| alarm.state != State::Latched && which.matches(alarm.rule, alarm.severity, alarm.cell))
-            .collect(),
+        Command::Clear(which) if refused > 0 => {
+            engine.raised().filter(|alarm| which.matches(alarm.rule, alarm.severity, alarm.cell)).collect()
+        }
         _ => Vec::new(),
     };
     shorten(&mut refused_alarms);
