@@ -1,4 +1,5 @@
-//! `packwatch test-alarm`: has the running daemon send a rule's alarm frame as a test, and tells what really went out.
+//! `packwatch test-alarm`: has the running daemon send a rule's alarm frame as a test, and the test code in DM1 where
+//! there is a J1939 node, and tells what really went out.
 //!
 //! Success only when every channel saw at least one such frame, whole and in sequence.
 
@@ -11,7 +12,7 @@ use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
 use crate::alarm::{Rule, State};
 use crate::config;
-use crate::daemon::alarm_test::{self, ChannelReport};
+use crate::daemon::alarm_test::{self, ChannelReport, Real};
 use crate::io::stamp;
 use crate::monitor::MAX_TEST_S;
 
@@ -44,7 +45,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let duration = Duration::from_secs_f64(args.duration);
     let reports = alarm_test::run(&config, &args.control.client(), args.rule, duration).map_err(Failure::new)?;
     print(&table(args.rule, &reports))?;
-    let bad: Vec<&str> = reports.iter().filter(|report| !report.is_good()).map(|r| r.interface.as_str()).collect();
+    let bad = reports.iter().filter(|report| !report.is_good());
+    let bad: Vec<String> = bad.map(|report| format!("{} ({})", report.interface, report.what)).collect();
     if bad.is_empty() {
         return Ok(());
     }
@@ -99,12 +101,12 @@ const ON_THE_WIRE: [State; 7] =
 /// What else was on the channel.
 fn push_notes(text: &mut String, report: &ChannelReport) {
     let seen = &report.seen;
-    for ((rule, state), count) in &seen.real {
-        let name = Rule::from_number(*rule).map_or("unknown rule", Rule::name);
-        let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == *state);
-        let kind = if found.is_some_and(State::is_raised) { "REAL, " } else { "" };
-        let word = found.map_or("in an unknown state", state_name);
-        let _ = writeln!(text, "  meanwhile {kind}without the marker: {name} {word}, {count} frames");
+    push_code(text, report);
+    for (real, count) in &seen.real {
+        let _ = match *real {
+            Real::Alarm { rule, state } => writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state)),
+            Real::Code { spn, fmi } => writeln!(text, "  meanwhile REAL: SPN {spn}, FMI {fmi}, in {count} DM1"),
+        };
     }
     let others = [
         (seen.foreign, "test frames of other rules"),
@@ -116,5 +118,64 @@ fn push_notes(text: &mut String, report: &ChannelReport) {
     }
     if let Some(error) = &report.error {
         let _ = writeln!(text, "  listening ended early: {error}");
+    }
+}
+
+fn alarm_words(rule: u8, state: u8) -> String {
+    let name = Rule::from_number(rule).map_or("unknown rule", Rule::name);
+    let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == state);
+    let kind = if found.is_some_and(State::is_raised) { "REAL, " } else { "" };
+    format!("{kind}without the marker: {name} {}", found.map_or("in an unknown state", state_name))
+}
+
+/// What DM1 told of the test: a trouble code has no marker, so its number is what to look for.
+fn push_code(text: &mut String, report: &ChannelReport) {
+    let Some(code) = report.test_code else { return };
+    let seen = &report.seen;
+    let messages = seen.tests + seen.without_code + seen.unreadable;
+    let (spn, fmi) = (code.spn(), code.fmi());
+    let _ = writeln!(text, "  {} of {messages} DM1 had the test code, SPN {spn}, FMI {fmi}", seen.tests);
+    if seen.tests == 0 {
+        text.push_str("  no DM1 with the test code was seen; has the node its address?\n");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::can::CanId;
+    use crate::can::j1939::TroubleCode;
+    use crate::daemon::alarm_test::Seen;
+
+    fn dm1(seen: Seen) -> String {
+        let report = ChannelReport {
+            interface: "can0".to_owned(),
+            what: "J1939 DM1",
+            id: CanId::Extended(0x18FE_CAF9),
+            seen,
+            test_code: Some(TroubleCode::new(524_286, 31, 0).unwrap()),
+            protection: None,
+            dropped: 0,
+            error: None,
+        };
+        table(Rule::SocLow, &[report])
+    }
+
+    #[test]
+    fn dm1_has_a_line_of_its_own_and_real_codes_are_told_as_real() {
+        let real = [(Real::Code { spn: 520_196, fmi: 9 }, 2)].into();
+        let text = dm1(Seen { tests: 4, without_code: 2, ended: true, real, ..Seen::default() });
+        let line = text.lines().nth(2).unwrap();
+        assert!(line.starts_with("can0         J1939 DM1      18FECAF9      4  "), "{text}");
+        assert!(text.contains("\n  4 of 6 DM1 had the test code, SPN 524286, FMI 31\n"), "{text}");
+        assert!(text.contains("\n  meanwhile REAL: SPN 520196, FMI 9, in 2 DM1\n"), "{text}");
+        assert!(!text.contains("has the node its address?"), "{text}");
+    }
+
+    #[test]
+    fn a_node_that_tells_nothing_is_asked_after() {
+        let text = dm1(Seen::default());
+        assert!(text.contains("  0 of 0 DM1 had the test code"), "{text}");
+        assert!(text.contains("  no DM1 with the test code was seen; has the node its address?\n"), "{text}");
     }
 }

@@ -4,6 +4,7 @@ pub(crate) mod alarm_test;
 mod background_file;
 pub mod control;
 mod event_log;
+mod j1939_carrier;
 pub mod logging;
 pub mod replay;
 pub mod service;

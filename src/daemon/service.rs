@@ -18,7 +18,7 @@ use super::background_file::BackgroundFile;
 use super::control::protocol::{Answer, Request};
 use super::control::{Asked, ControlServer, ControlSetting, MAX_CONNECTIONS, answer};
 use super::event_log::{self, EventLog};
-use super::snapshot_file;
+use super::{j1939_carrier, snapshot_file};
 use crate::config::Config;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::{MappedClock, Reading};
@@ -111,6 +111,9 @@ impl Service {
         let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::with_capacity(BATCH) };
         notify(&[NotifyState::Ready, NotifyState::Status("running")]);
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
+        if self.config.monitor.j1939.is_some() {
+            j1939_carrier::tell();
+        }
         service.run(stop).await;
         notify(&[NotifyState::Stopping]);
         drop(control);

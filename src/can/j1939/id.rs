@@ -30,7 +30,7 @@ pub(super) const PRIORITY: u8 = 6;
 pub(super) const TRANSPORT_PRIORITY: u8 = 7;
 
 /// Bits of an identifier that are not its priority.
-const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
+pub(super) const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
 /// PDU formats from here on (240) carry no destination: their last byte belongs to the PGN.
 const FIRST_BROADCAST_FORMAT: u8 = 240;
 

@@ -10,6 +10,7 @@
 //! | `trouble_code` | a code, the lamps, and the payload of DM1 and DM2 |
 //! | `codes` | which codes the bus is shown: at most one change a second each, nothing lost in between |
 //! | `transport` | payloads of more than 8 bytes, broadcast in packets (BAM) |
+//! | `dm1_receiver` | the other side, for tests of what goes out: puts the DM1 of one address together again |
 //! | `address` | claiming the address, defending it, falling silent |
 //! | `node` | all of it together |
 //!
@@ -25,6 +26,7 @@
 
 mod address;
 mod codes;
+mod dm1_receiver;
 mod id;
 mod name;
 mod node;
@@ -32,10 +34,11 @@ mod transport;
 mod trouble_code;
 
 pub use codes::ActiveCode;
+pub use dm1_receiver::{Dm1Receiver, HeardDm1};
 pub use id::{
     GLOBAL_ADDRESS, MAX_ADDRESS, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
     PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA,
 };
 pub use name::{Name, NameFields, OutOfRange};
 pub use node::{Node, NodeConfig, NodeCounters, NodeEvent, NodeOutputs};
-pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_payload};
+pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_codes, dm_payload};

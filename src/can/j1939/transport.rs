@@ -12,9 +12,9 @@ use crate::quantity::Timestamp;
 pub(super) const PACKET_SPACING_NS: i64 = 50_000_000;
 
 /// Control byte of a broadcast announcement.
-const BAM: u8 = 32;
+pub(super) const BAM: u8 = 32;
 /// Payload bytes in one packet.
-const PACKET_BYTES: usize = 7;
+pub(super) const PACKET_BYTES: usize = 7;
 
 // Sequence numbers are one byte and start at 1.
 const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);

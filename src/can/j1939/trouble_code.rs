@@ -5,7 +5,8 @@
 //! byte 1      the same lamps' flashing: 11 = does not flash
 //! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
-//! No code: four zero bytes. Up to one code: filled with 0xFF to 8 bytes.
+//! No code: four zero bytes. Up to one code: filled with 0xFF to 8 bytes. The highest bit of an occurrence count is the
+//! conversion method: set, the number is laid out in one of three older ways that cannot be told apart.
 
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,12 @@ const MAX_FMI: u8 = 31;
 const MAX_OCCURRENCES: u8 = 126;
 /// No lamp flashes.
 const NO_FLASH: u8 = 0xFF;
+/// Conversion method, beside the occurrence count.
+const OLD_CONVERSION: u8 = 0x80;
+/// In place of a code: there is none.
+const NO_CODE: [u8; 4] = [0x00; 4];
+/// In place of a code: not available, or filled up.
+const NOT_AVAILABLE: [u8; 4] = [0xFF; 4];
 
 /// What went wrong, and how often.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
@@ -74,13 +81,22 @@ impl TroubleCode {
     }
 
     /// Whether both are about the same failure, however often it came.
-    pub(super) const fn is_same_failure(self, other: Self) -> bool {
+    pub const fn is_same_failure(self, other: Self) -> bool {
         self.spn == other.spn && self.fmi == other.fmi
     }
 
     fn to_bytes(self) -> [u8; 4] {
         let [low, middle, high, _] = self.spn.to_le_bytes();
         [low, middle, (high << 5) | self.fmi, self.occurrence_count]
+    }
+
+    /// The reverse; `None` = in an older layout, or about no parameter.
+    fn from_bytes([low, middle, high_and_fmi, count]: [u8; 4]) -> Option<Self> {
+        if count & OLD_CONVERSION != 0 {
+            return None;
+        }
+        let spn = u32::from_le_bytes([low, middle, high_and_fmi >> 5, 0]);
+        Self::new(spn, high_and_fmi & MAX_FMI, count.into()).ok()
     }
 }
 
@@ -186,6 +202,14 @@ pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     DmPayload { bytes, len, left_out: codes.len() - taken }
 }
 
+/// The codes of a DM1 or DM2 from any node; `None` = too short, or with a code that cannot be read. An occurrence count
+/// that is not available (127) reads as 126.
+pub fn dm_codes(payload: &[u8]) -> Option<Vec<TroubleCode>> {
+    let (places, _) = payload.get(2..)?.as_chunks::<4>();
+    let codes = places.iter().filter(|place| **place != NO_CODE && **place != NOT_AVAILABLE);
+    if places.is_empty() { None } else { codes.map(|place| TroubleCode::from_bytes(*place)).collect() }
+}
+
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -263,12 +287,37 @@ mod tests {
         assert_eq!(payload.as_slice()[106], 27, "the first 27 are in it");
     }
 
+    #[test]
+    fn no_code_reads_as_none_and_what_cannot_be_read_is_not_taken_for_none() {
+        assert_eq!(dm_codes(&[0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]), Some(vec![]));
+        assert_eq!(dm_codes(&[0x00, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]), Some(vec![]), "not available");
+        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2, 3, 0xFF, 0xFF]), Some(vec![code(520_193, 18, 3)]));
+        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2, 0x83, 0xFF, 0xFF]), None, "old conversion method");
+        assert_eq!(dm_codes(&[0x04, 0xFF, 0, 0, 18, 3, 0xFF, 0xFF]), None, "about no parameter");
+        assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2]), None, "too short");
+        assert_eq!(dm_codes(&[]), None);
+    }
+
     proptest! {
         #[test]
         fn a_code_reads_back_as_it_was(spn in 1_u32..=524_287, fmi in 0_u8..=31, count in 0_u32..=126) {
             let [a, b, c, d] = code(spn, fmi, count).to_bytes();
             let read = u32::from(a) | u32::from(b) << 8 | u32::from(c >> 5) << 16;
             prop_assert_eq!((read, c & 31, u32::from(d)), (spn, fmi, count));
+        }
+
+        #[test]
+        fn a_message_reads_back_as_it_was(
+            parts in prop::collection::vec((1_u32..=524_287, 0_u8..=31, 0_u32..=126), 0..=MAX_CODES),
+        ) {
+            let codes: Vec<_> = parts.into_iter().map(|(spn, fmi, count)| code(spn, fmi, count)).collect();
+            prop_assert_eq!(dm_codes(dm_payload(Lamps::default(), &codes).as_slice()), Some(codes));
+        }
+
+        #[test]
+        fn any_bytes_are_read_or_refused(bytes in prop::collection::vec(any::<u8>(), 0..=120)) {
+            let read = dm_codes(&bytes);
+            prop_assert!(read.is_none_or(|codes| codes.len() <= bytes.len() / 4));
         }
     }
 }

@@ -19,14 +19,14 @@ pub(crate) struct CanListener {
 }
 
 impl CanListener {
-    /// Opens the interface for these identifiers, ascending; `fd` = FD frames too.
+    /// Opens the interface for these identifiers, ascending, and for extended ones by identifier and mask; `fd` = FD
+    /// frames too.
     ///
     /// # Errors
     /// When the interface does not exist, is down, or this kernel has no SocketCAN.
-    pub(crate) fn open(interface: &str, fd: bool, ids: &[CanId]) -> io::Result<Self> {
+    pub(crate) fn open(interface: &str, fd: bool, ids: &[CanId], patterns: &[(u32, u32)]) -> io::Result<Self> {
         let named = |error: io::Error| io::Error::new(error.kind(), format!("{interface}: {error}"));
-        let config =
-            RawConfig { interface, fd, ids, patterns: &[], receive_buffer_bytes: DEFAULT_RECEIVE_BUFFER_BYTES };
+        let config = RawConfig { interface, fd, ids, patterns, receive_buffer_bytes: DEFAULT_RECEIVE_BUFFER_BYTES };
         let socket = RawSocket::open(&config).map_err(named)?;
         if let Some(error) = socket.take_error().map_err(named)? {
             return Err(named(error));
