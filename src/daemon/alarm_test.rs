@@ -125,6 +125,7 @@ impl ChannelReport {
 }
 
 /// How a channel's frames are read.
+#[expect(clippy::large_enum_variant, reason = "one per channel of a test: a handful")]
 enum Reader {
     Alarm { reader: AlarmReader, check: Option<(CheckConfig, Receiver)> },
     Dm1 { receiver: Dm1Receiver, test_code: TroubleCode },
