@@ -1,0 +1,151 @@
+//! The running loop: what the interfaces receive, the ticks, and what people ask, handed to the core in their order.
+
+use std::path::Path;
+use std::time::Duration;
+
+use sd_notify::NotifyState;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
+
+use super::engine::Engine;
+use super::stop::Stop;
+use super::{INBOX, ServiceError, notify};
+use crate::daemon::control::protocol::{Answer, Request};
+use crate::daemon::control::{Asked, answer};
+use crate::daemon::snapshot_file;
+use crate::io::clock::MappedClock;
+use crate::io::socket::{LinkOutput, Received, What};
+use crate::monitor::{Command, Input, TICK_PERIOD_MS};
+
+/// Of these, handed over between two looks at the timer: under one tick's time of a full bus.
+const BATCH: usize = 256;
+/// Time the interfaces have to send what is queued when the daemon stops.
+const DRAIN_LIMIT: Duration = Duration::from_millis(500);
+/// How often files are handed to the operating system: what a crash of the daemon can lose.
+const FLUSH_PERIOD: Duration = Duration::from_secs(1);
+
+/// The running loop.
+#[derive(Debug)]
+pub(super) struct Loop {
+    pub(super) engine: Engine,
+    pub(super) inbox: mpsc::Receiver<Received>,
+    pub(super) requests: mpsc::Receiver<Asked>,
+    pub(super) clock: MappedClock,
+    pub(super) outputs: Vec<LinkOutput>,
+    pub(super) batch: Vec<Received>,
+}
+
+impl Loop {
+    pub(super) async fn run(&mut self, mut stop: Stop) {
+        let mut ticks = interval(Duration::from_millis(u64::from(TICK_PERIOD_MS)));
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
+        let (mut fed, mut flushed) = (Instant::now(), Instant::now());
+        loop {
+            // In this order: a bus that never falls silent must hold up neither the stop nor the ticks.
+            tokio::select! {
+                biased;
+                () = stop.wait() => return,
+                now = ticks.tick() => {
+                    self.tick().await;
+                    if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
+                        notify(&[NotifyState::Watchdog]);
+                        fed = now;
+                    }
+                    if now.duration_since(flushed) >= FLUSH_PERIOD {
+                        self.engine.flush();
+                        flushed = now;
+                    }
+                }
+                // Each is taken between two ticks, and there are never more than connections.
+                Some(asked) = self.requests.recv() => self.answer(asked).await,
+                received = self.inbox.recv_many(&mut self.batch, BATCH) => {
+                    if received > 0 { self.handle_batch() }
+                }
+            }
+        }
+    }
+
+    /// What came before the tick is handed over before it.
+    async fn tick(&mut self) {
+        self.drain().await;
+        if std::mem::take(&mut self.engine.lost_file) {
+            // The journal may be the one that is lost: the core is told all the same.
+            self.engine.handle(&Input::Store { time: self.clock.now(), works: false }, &self.outputs);
+        }
+        self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
+    }
+
+    /// Somebody on this computer asks.
+    async fn answer(&mut self, asked: Asked) {
+        let alarms = self.engine.monitor.alarms();
+        let answer = match asked.request {
+            Request::Alarms { all } => answer::list(alarms, self.clock.now(), all),
+            Request::Command(command) => match answer::meaningless(alarms, &command) {
+                Some(error) => error,
+                None => self.obey(command).await,
+            },
+        };
+        // A client that has gone wants no answer.
+        let _ = asked.answer.send(answer);
+    }
+
+    /// Hands a command to the core like any other input, after what came before it.
+    async fn obey(&mut self, command: Command) -> Answer {
+        self.drain().await;
+        let time = self.clock.now();
+        self.engine.handle(&Input::Command { time, command }, &self.outputs);
+        let Engine { monitor, outputs, .. } = &self.engine;
+        answer::outcome(monitor.alarms(), &command, &outputs.events, time)
+    }
+
+    /// Hands over what the interfaces have received so far.
+    async fn drain(&mut self) {
+        for _ in 0..INBOX / BATCH {
+            // Lets the interfaces' tasks take what is in their sockets, and send.
+            tokio::task::yield_now().await;
+            while self.batch.len() < BATCH
+                && let Ok(received) = self.inbox.try_recv()
+            {
+                self.batch.push(received);
+            }
+            if self.batch.is_empty() {
+                break;
+            }
+            self.handle_batch();
+        }
+    }
+
+    /// Interfaces merge by time; what one interface delivered keeps its order.
+    fn handle_batch(&mut self) {
+        self.batch.sort_by_key(|received| received.time);
+        for received in &self.batch {
+            let Received { time, bus, what } = *received;
+            let input = match &what {
+                What::Frame(frame) => Input::Frame { time, bus, frame },
+                What::Event(event) => Input::Bus { time, bus, event: *event },
+            };
+            self.engine.handle(&input, &self.outputs);
+        }
+        self.batch.clear();
+    }
+
+    /// Sends what is queued, closes the files, stores the state.
+    pub(super) async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
+        self.outputs.clear();
+        self.inbox.close();
+        let drained = async { while links.join_next().await.is_some() {} };
+        if timeout(DRAIN_LIMIT, drained).await.is_err() {
+            tracing::warn!("not every queued frame was sent before the stop");
+        }
+        // The state first: the files may hang on a disk that does not answer.
+        let stored = snapshot.map_or(Ok(()), |path| {
+            snapshot_file::write(path, &self.engine.monitor.snapshot())
+                .map_err(|error| ServiceError::File { path: path.to_owned(), error })
+        });
+        self.engine.close_files();
+        tracing::info!("stopped");
+        stored
+    }
+}
