@@ -3,13 +3,14 @@
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use proptest::prelude::*;
 
 mod alarms;
 mod cell_model;
 mod j1939;
+mod protect;
 
 use super::*;
 use crate::can::dbc::FrameFormat;
@@ -74,7 +75,7 @@ signal = "Cells.CellVoltage{n}"
 signal = "Status.Temperature"
 "#;
 
-fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> {
+fn read_texts(pack: &str, cell: &str, dbc: &str) -> Result<(Config, Description), Vec<String>> {
     let own = include_str!("../../config/packwatch.dbc");
     let files = [("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC), ("own.dbc", own)];
     let files = HashMap::from(files);
@@ -82,15 +83,15 @@ fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> 
         Some(text) => Ok(text.as_bytes().to_vec()),
         None => Err(std::io::ErrorKind::NotFound.into()),
     };
-    load_with(&PathBuf::from("pack.toml"), &read).map_err(|faults| faults.0)
+    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
 }
 
 fn good(pack: &str) -> Config {
-    load_texts(pack, CELL, DBC).unwrap()
+    read_texts(pack, CELL, DBC).unwrap().0
 }
 
 fn faults(pack: &str) -> Vec<String> {
-    load_texts(pack, CELL, DBC).unwrap_err()
+    read_texts(pack, CELL, DBC).unwrap_err()
 }
 
 /// The test configuration with `from` replaced, which must be there.
@@ -437,7 +438,7 @@ fn broken_syntax_hides_no_other_fault_and_invents_none() {
         assert!(all.contains(&fault.to_owned()), "{all:#?}");
     }
     assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
-    let all = load_texts(PACK, DBC, DBC).unwrap_err();
+    let all = read_texts(PACK, DBC, DBC).unwrap_err();
     assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more faults of syntax from here"));
 }
 
@@ -470,7 +471,7 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
         pack_with("cells = 4", "cells = 0\nx = 1").replace("\"charge\"", "\"in\"") + "[recharge]\nto_soc = 0.1\n";
     let cell = CELL.replace("capacity_ah = 1.9", "capacity_ah = 0").replace("[0, 0.5, 1]", "[0, 0.5, 0.5]");
     let dbc = DBC.replace("BO_ 272 Cells: 8 A", "BO_ 4000 Cells: 8 A");
-    let all = load_texts(&pack, &cell, &dbc).unwrap_err();
+    let all = read_texts(&pack, &cell, &dbc).unwrap_err();
     let expected = [
         "pack.toml:2: pack.cells = 0, must be 1 to 1024",
         "pack.toml:3: pack.x is not a known key",
@@ -546,7 +547,7 @@ proptest! {
             text.splice(from..to, SCRAPS[scrap.index(SCRAPS.len())].chars());
         }
         let texts = texts.map(|chars| chars.into_iter().collect::<String>());
-        if let Err(faults) = load_texts(&texts[0], &texts[1], &texts[2]) {
+        if let Err(faults) = read_texts(&texts[0], &texts[1], &texts[2]) {
             prop_assert!(!faults.is_empty());
             for fault in faults {
                 prop_assert!(!fault.contains('\n') && !fault.contains("not usable"), "{fault}");

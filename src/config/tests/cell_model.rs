@@ -46,11 +46,11 @@ fn faults_of_a_cell_model() {
     ];
     for (from, to, fault) in table {
         assert!(CELL.contains(from), "{from}");
-        assert_eq!(load_texts(PACK, &CELL.replacen(from, to, 1), DBC).unwrap_err(), [*fault], "{from} -> {to}");
+        assert_eq!(read_texts(PACK, &CELL.replacen(from, to, 1), DBC).unwrap_err(), [*fault], "{from} -> {to}");
     }
     let branch = "[[tables.branches]]\nr_ohm = [[1, 1, 1], [1, 1, 1]]\nc_farad = [[1, 1, 1], [1, 1, 1]]\n";
-    let four = load_texts(PACK, &format!("{CELL}{}", branch.repeat(3)), DBC).unwrap_err();
+    let four = read_texts(PACK, &format!("{CELL}{}", branch.repeat(3)), DBC).unwrap_err();
     assert_eq!(four, ["cell.toml:14: tables.branches: 4 tables [[tables.branches]], must be 1 to 3"]);
-    let none = load_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
+    let none = read_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
     assert_eq!(none, ["cell.toml:9: tables.branches: 0 tables [[tables.branches]], must be 1 to 3"]);
 }
