@@ -1,13 +1,14 @@
 //! Alarm rules through the whole core: from input frames to events and alarm frames, and commands back.
 #![allow(clippy::unwrap_used, reason = "a test")]
 
-use std::path::Path;
+#[path = "common/config.rs"]
+mod config;
 
 use packwatch::alarm::{Change, Rule, Selector, State};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
-use packwatch::config::{self, Config};
+use packwatch::config::Config;
 use packwatch::monitor::{BusEvent, Command, Event, EventKind, Input, Monitor, Outputs, Source};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
@@ -32,7 +33,7 @@ cell_model = "cells/example_nmc_2600.toml"
 [[interface]]
 name = "can0"
 [input]
-dbc = ["test.dbc"]
+dbc = ["pack.dbc"]
 [input.current]
 signal = "Status.Current"
 positive = "discharge"
@@ -60,13 +61,7 @@ data_id = 0x0321
 "#;
 
 fn load(alarms: &str) -> Config {
-    let (pack, here) = (format!("{PACK}{alarms}"), Path::new(env!("CARGO_MANIFEST_DIR")).join("config"));
-    let read = |path: &Path| match path.to_str() {
-        Some("pack.toml") => Ok(pack.clone().into_bytes()),
-        Some("test.dbc") => Ok(DBC.into()),
-        _ => std::fs::read(here.join(path)),
-    };
-    config::load_with(Path::new("pack.toml"), &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
+    config::load(&format!("{PACK}{alarms}"), DBC)
 }
 
 /// An alarm frame, taken apart by hand as the shipped DBC lays it out.
