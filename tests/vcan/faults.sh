@@ -21,3 +21,27 @@ feed() {
 }
 # The number of the sample that was last on the bus.
 sample() { echo $((16#$(grep -oE ' 7F0#[0-9A-F]+' "$tmp/dump.log" | tail -n 1 | cut -d '#' -f 2 || echo 0))); }
+
+# ---- what was learned ----------------------------------------------------------------------------------------------------------------
+
+# told EVENT: how many the daemon `main` has told, in all its runs.
+told() { cat "$tmp"/main*.events | grep -cE "\"event\":\"$1\"" || true; }
+# Capacities, half-cycles, alarms raised or cleared: told.
+told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
+# Of this run's capacities, COUNT or more?
+learned_more() { (($(told capacity) >= $1)); }
+
+# fault NAME: from here on it happens.
+fault() {
+    fault_name=$1 fault_before=$(told_all)
+    running main || fail "$fault_name: the daemon is not running before"
+}
+
+# survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored what it told.
+survived() {
+    running main || fail "$fault_name: the daemon ended"
+    wait_for 15 "learning after $fault_name" learned_more $(($(told capacity) + 4))
+    echo "$fault_name: $*; learned (capacities, half-cycles, alarms) before $fault_before, after $(told_all)$(stored)"
+}
+# TODO with the store
+stored() { :; }
