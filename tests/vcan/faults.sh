@@ -8,19 +8,33 @@ fast=$tmp/fast
 tools() { python3 "$here/fault_tools.py" "$@"; }
 
 # pack SECONDS: fast_pack's files in $fast; $fast/fast.toml is the daemon's.
-pack() {
-    "$here/fast_pack" "$fast" --seconds "$1"
-    pack_at=''
+pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
+
+# feed: the pack on vcan0 from where it was, whatever becomes of the interface. dump.log has its samples and our frames, of all feeds.
+feed() {
+    if [[ -z ${pids[dump]-} ]]; then
+        start dump candump -L any,6B0:7F0,7F0:7FF
+        wait_for 5 "receiver" receiving any 1
+    fi
+    start feed python3 "$here/fault_tools.py" play "$fast/pack.log" vcan0 --from "$(sample)"
+}
+unfed() { stop feed; }
+# The number of the sample that was last on the bus.
+sample() {
+    local last
+    last=$(grep -oE ' 7F0#[0-9A-F]{8}$' "$tmp/dump.log" | tail -n 1) || true
+    last=${last#*#}
+    echo $((16#${last:-0}))
 }
 
-# feed [INTERFACE]: the pack on the bus, from now on, whatever becomes of the interface. What is told of it: dump.log.
-feed() {
-    start dump candump -L "${1-vcan0},6B0:7F0,7F0:7FF"
-    wait_for 5 "receiver" receiving "${1-vcan0}" 1
-    start feed python3 "$here/fault_tools.py" play "$fast/pack.log" "${1-vcan0}"
+# again WHAT...: the daemon `main` once more, after `stop main` or the like; what it told before counts on.
+runs=0
+again() {
+    local file
+    for file in "$tmp"/main.*; do [[ ! -e $file ]] || mv "$file" "$tmp/main-$runs.${file##*.}"; done
+    runs=$((runs + 1))
+    daemon main "$@"
 }
-# The number of the sample that was last on the bus.
-sample() { echo $((16#$(grep -oE ' 7F0#[0-9A-F]+' "$tmp/dump.log" | tail -n 1 | cut -d '#' -f 2 || echo 0))); }
 
 # ---- what was learned ----------------------------------------------------------------------------------------------------------------
 
@@ -28,8 +42,9 @@ sample() { echo $((16#$(grep -oE ' 7F0#[0-9A-F]+' "$tmp/dump.log" | tail -n 1 | 
 told() { cat "$tmp"/main*.events | grep -cE "\"event\":\"$1\"" || true; }
 # Capacities, half-cycles, alarms raised or cleared: told.
 told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
-# Of this run's capacities, COUNT or more?
-learned_more() { (($(told capacity) >= $1)); }
+# told_more EVENT COUNT: COUNT or more?
+told_more() { (($(told "$1") >= $2)); }
+learned_more() { told_more capacity "$1"; }
 
 # fault NAME: from here on it happens.
 fault() {
