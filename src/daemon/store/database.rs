@@ -105,10 +105,8 @@ pub(super) struct Ledger {
 /// A state to be stored.
 #[derive(Debug)]
 pub(crate) struct StateRecord {
-    /// As a JSON document.
+    /// The state's document.
     pub(crate) parts: Parts,
-    /// When it was taken.
-    pub(crate) stamp: Stamp,
     /// To the last bit (on stop), not rounded.
     pub(crate) exact: bool,
 }
@@ -116,10 +114,8 @@ pub(crate) struct StateRecord {
 /// A state as it was stored.
 #[derive(Debug)]
 pub(crate) struct StoredState {
-    /// As a JSON document.
+    /// The state's document, JSON.
     pub(crate) json: Vec<u8>,
-    /// When it was taken.
-    pub(crate) stamp: Stamp,
     /// What was wrong with a later one.
     pub(crate) lost_later: Option<String>,
 }
@@ -163,7 +159,7 @@ impl Database {
         }
         prepare(&connection)?;
         if !is_new {
-            check(&connection)?;
+            check(&mut connection)?;
         }
         schema::migrate(&mut connection, version, migrations)?;
         let ledger = open_pack(&connection, now)?;
@@ -191,9 +187,9 @@ impl Database {
         }
         let packed = match state {
             None => None,
-            Some(StateRecord { parts, stamp, exact }) => {
+            Some(StateRecord { parts, exact }) => {
                 let packed = self.shelf.pack(parts, exact);
-                write_state(&transaction, &packed, &stamp)?;
+                write_state(&transaction, &packed)?;
                 Some(packed)
             }
         };
@@ -208,17 +204,17 @@ impl Database {
 
     /// The latest state; `None` = none was stored. A damaged one is an error in words: the history may still be good.
     pub(crate) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-        let Some(full) = slot(&self.connection, 0)? else { return Ok(Ok(None)) };
-        let Some(base) = self.shelf.base() else {
-            return Ok(Err("the stored state is damaged".to_owned()));
-        };
-        let delta = slot(&self.connection, 1)?.filter(|delta| delta.serial == full.serial);
-        let (parts, stamp, lost_later) = match delta.map(|slot| (packed::read_delta(&slot.record, base), slot.stamp)) {
-            None => (base.clone(), full.stamp, None),
-            Some((Ok(parts), stamp)) => (parts, stamp, None),
-            Some((Err(damaged), _)) => (base.clone(), full.stamp, Some(damaged.to_string())),
-        };
-        Ok(Ok(Some(StoredState { json: parts.join(), stamp, lost_later })))
+        read_state(&self.connection, &self.shelf)
+    }
+
+    /// When in this boot another pack was connected last, boot time.
+    pub(crate) fn last_reset_ns(&self, boot: BootId) -> rusqlite::Result<Option<i64>> {
+        self.connection.query_row(
+            "SELECT max(m.boottime_ns) FROM reset r JOIN moment m ON m.id = r.moment WHERE r.reason = 'pack_replaced' AND \
+             m.boot = ?1",
+            [boot.0],
+            |row| row.get(0),
+        )
     }
 
     /// Forgets the state: what follows starts from the configuration.
@@ -240,14 +236,35 @@ impl Database {
     }
 
     fn fill_shelf(&mut self) -> rusqlite::Result<()> {
-        let Some(full) = slot(&self.connection, 0)? else { return Ok(()) };
-        let room = slot(&self.connection, 1)?.map_or(0, |delta| delta.room);
         // A damaged one is told when the state is asked for.
-        if let Ok(shelf) = Shelf::with_base(full.serial, &full.record, room) {
-            self.shelf = shelf;
-        }
+        self.shelf = read_shelf(&self.connection)?;
         Ok(())
     }
+}
+
+/// The shelf with the full record that is stored, if it is good.
+pub(super) fn read_shelf(connection: &Connection) -> rusqlite::Result<Shelf> {
+    let Some(full) = slot(connection, 0)? else { return Ok(Shelf::default()) };
+    let room = slot(connection, 1)?.map_or(0, |delta| delta.room);
+    Ok(Shelf::with_base(full.serial, &full.record, room).unwrap_or_default())
+}
+
+/// As [`Database::state`].
+pub(super) fn read_state(
+    connection: &Connection,
+    shelf: &Shelf,
+) -> rusqlite::Result<Result<Option<StoredState>, String>> {
+    if slot(connection, 0)?.is_none() {
+        return Ok(Ok(None));
+    }
+    let Some((serial, base)) = shelf.base() else { return Ok(Err("the stored state is damaged".to_owned())) };
+    let delta = slot(connection, 1)?.filter(|delta| delta.serial == serial);
+    let (parts, lost_later) = match delta.map(|slot| packed::read_delta(&slot.record, base, serial)) {
+        None => (base.clone(), None),
+        Some(Ok(parts)) => (parts, None),
+        Some(Err(damaged)) => (base.clone(), Some(damaged.to_string())),
+    };
+    Ok(Ok(Some(StoredState { json: parts.join(), lost_later })))
 }
 
 fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
@@ -267,7 +284,7 @@ fn prepare(connection: &Connection) -> rusqlite::Result<()> {
 }
 
 /// Looks through the file, for a bounded time.
-fn check(connection: &Connection) -> Result<(), OpenError> {
+fn check(connection: &mut Connection) -> Result<(), OpenError> {
     let started = Instant::now();
     connection.progress_handler(CHECK_STEPS, Some(move || started.elapsed() > MAX_CHECK))?;
     let found = connection.query_row("PRAGMA quick_check(1)", [], |row| row.get::<_, String>(0));
@@ -339,9 +356,7 @@ fn write_batch(transaction: &Transaction<'_>, ledger: &mut Ledger, batch: &Batch
 /// Writes a moment; returns its values.
 pub(super) fn write_moment(connection: &Connection, stamp: &Stamp, pack: i64) -> rusqlite::Result<Vec<Value>> {
     connection
-        .prepare_cached(
-            "INSERT INTO moment (wall_ns, time_ns, boottime_ns, boot, pack) VALUES (?1, ?2, ?3, ?4, ?5)",
-        )?
+        .prepare_cached("INSERT INTO moment (wall_ns, time_ns, boottime_ns, boot, pack) VALUES (?1, ?2, ?3, ?4, ?5)")?
         .execute(params![stamp.wall_ns, stamp.time.nanos(), stamp.boottime_ns, stamp.boot.0, pack])?;
     Ok(moment_values(connection.last_insert_rowid(), stamp, pack))
 }
@@ -355,9 +370,8 @@ pub(super) fn write_row(
     values: &[Value],
 ) -> rusqlite::Result<()> {
     let columns = table.columns().join(", ");
-    let places = |first: usize| {
-        (first..first + values.len()).map(|number| format!("?{number}")).collect::<Vec<_>>().join(", ")
-    };
+    let places =
+        |first: usize| (first..first + values.len()).map(|number| format!("?{number}")).collect::<Vec<_>>().join(", ");
     if table == Table::HalfCycle {
         let sql = format!("INSERT OR REPLACE INTO half_cycle (moment, {columns}) VALUES (?1, {})", places(2));
         let bound = moment.iter().take(1).chain(values);
@@ -368,8 +382,7 @@ pub(super) fn write_row(
     let chained: Vec<Value> = moment.iter().chain(values).cloned().collect();
     ledger.head.append(table, &chained);
     let own = [Value::Integer(ledger.head.count), Value::Blob(ledger.head.hash.to_vec())];
-    let sql =
-        format!("INSERT INTO {} (seq, hash, moment, {columns}) VALUES (?1, ?2, ?3, {})", table.name(), places(4));
+    let sql = format!("INSERT INTO {} (seq, hash, moment, {columns}) VALUES (?1, ?2, ?3, {})", table.name(), places(4));
     let bound = own.iter().chain(moment.iter().take(1)).chain(values);
     connection.prepare_cached(&sql)?.execute(rusqlite::params_from_iter(bound)).map(drop)
 }
@@ -386,57 +399,34 @@ fn replace_pack(connection: &Connection, ledger: &mut Ledger, stamp: &Stamp) -> 
         .map(drop)
 }
 
-fn write_state(
-    transaction: &Transaction<'_>,
-    packed: &super::shelf::Packed,
-    stamp: &Stamp,
-) -> rusqlite::Result<()> {
+fn write_state(transaction: &Transaction<'_>, packed: &super::shelf::Packed) -> rusqlite::Result<()> {
     let slot = i64::from(!packed.is_full);
-    let values = params![
-        slot,
-        packed.serial,
-        stamp.wall_ns,
-        stamp.time.nanos(),
-        stamp.boottime_ns,
-        stamp.boot.0,
-        i64::try_from(packed.length).unwrap_or(i64::MAX),
-        packed.bytes,
-    ];
+    let length = i64::try_from(packed.length).unwrap_or(i64::MAX);
+    let values = params![slot, packed.serial, length, packed.bytes];
     // An update of equal length overwrites in place, page by changed page.
     let updated = transaction
-        .prepare_cached(
-            "UPDATE state SET serial = ?2, wall_ns = ?3, time_ns = ?4, boottime_ns = ?5, boot = ?6, length = ?7, \
-             bytes = ?8 WHERE slot = ?1",
-        )?
+        .prepare_cached("UPDATE state SET serial = ?2, length = ?3, bytes = ?4 WHERE slot = ?1")?
         .execute(values)?;
     if updated == 0 {
-        transaction.execute("INSERT INTO state VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)", values)?;
+        transaction.execute("INSERT INTO state VALUES (?1, ?2, ?3, ?4)", values)?;
     }
     Ok(())
 }
 
 /// A slot of `state`.
-pub(super) struct Slot {
-    pub(super) serial: i64,
-    pub(super) stamp: Stamp,
-    pub(super) record: Vec<u8>,
+struct Slot {
+    serial: i64,
+    record: Vec<u8>,
     room: usize,
 }
 
-pub(super) fn slot(connection: &Connection, slot: i64) -> rusqlite::Result<Option<Slot>> {
-    let sql = "SELECT serial, wall_ns, time_ns, boottime_ns, boot, length, bytes FROM state WHERE slot = ?1";
+fn slot(connection: &Connection, slot: i64) -> rusqlite::Result<Option<Slot>> {
     connection
-        .query_row(sql, [slot], |row| {
-            let stamp = Stamp {
-                wall_ns: row.get(1)?,
-                time: crate::quantity::Timestamp::from_nanos(row.get(2)?),
-                boottime_ns: row.get(3)?,
-                boot: BootId(row.get(4)?),
-            };
-            let mut record: Vec<u8> = row.get(6)?;
+        .query_row("SELECT serial, length, bytes FROM state WHERE slot = ?1", [slot], |row| {
+            let mut record: Vec<u8> = row.get(2)?;
             let room = record.len();
-            record.truncate(usize::try_from(row.get::<_, i64>(5)?).unwrap_or(usize::MAX));
-            Ok(Slot { serial: row.get(0)?, stamp, record, room })
+            record.truncate(usize::try_from(row.get::<_, i64>(1)?).unwrap_or(usize::MAX));
+            Ok(Slot { serial: row.get(0)?, record, room })
         })
         .optional()
 }

@@ -44,11 +44,11 @@ pub(super) fn full(parts: &Parts) -> Vec<u8> {
     let mut record = vec![FULL];
     push_section(&mut record, &parts.skeleton);
     push_numbers(&mut record, parts, &vec![0; parts.bits.len()], |bits| bits);
-    sealed(record)
+    sealed(record, 0)
 }
 
-/// What differs from `base`.
-pub(super) fn delta(parts: &Parts, base: &Parts) -> Vec<u8> {
+/// What differs from `base`, the full record of number `serial`.
+pub(super) fn delta(parts: &Parts, base: &Parts, serial: i64) -> Vec<u8> {
     let mut record = vec![DELTA];
     if parts.skeleton == base.skeleton {
         push_section(&mut record, &[]);
@@ -57,27 +57,21 @@ pub(super) fn delta(parts: &Parts, base: &Parts) -> Vec<u8> {
         push_skeleton(&mut record, &parts.skeleton, &base.skeleton);
         push_numbers(&mut record, parts, &base.aligned_to(&parts.skeleton), rounded);
     }
-    sealed(record)
-}
-
-/// Whether a record is a full one.
-#[cfg(test)]
-pub(super) fn is_full(record: &[u8]) -> bool {
-    record.first() == Some(&FULL)
+    sealed(record, serial)
 }
 
 /// Reads a full record.
 pub(super) fn read_full(record: &[u8]) -> Result<Parts, Damaged> {
-    let mut reader = Reader::open(record, FULL)?;
+    let mut reader = Reader::open(record, FULL, 0)?;
     let mut parts = Parts::of_skeleton(reader.section()?);
     let zeros = vec![0; parts.bits.len()];
     reader.numbers(&mut parts, &zeros, |bits| bits)?;
     Ok(parts)
 }
 
-/// Reads a delta record.
-pub(super) fn read_delta(record: &[u8], base: &Parts) -> Result<Parts, Damaged> {
-    let mut reader = Reader::open(record, DELTA)?;
+/// Reads a delta record to `base`, the full record of number `serial`.
+pub(super) fn read_delta(record: &[u8], base: &Parts, serial: i64) -> Result<Parts, Damaged> {
+    let mut reader = Reader::open(record, DELTA, serial)?;
     let skeleton = reader.skeleton(&base.skeleton)?;
     if skeleton.is_empty() {
         let mut parts = Parts { bits: vec![0; base.bits.len()], ..base.clone() };
@@ -180,10 +174,16 @@ fn push_packed(record: &mut Vec<u8>, bytes: &[u8], packed: Option<Vec<u8>>) {
     record.extend_from_slice(stored);
 }
 
-fn sealed(mut record: Vec<u8>) -> Vec<u8> {
-    let hash = Sha256::digest(&record);
-    record.extend_from_slice(&hash[..HASH_BYTES]);
+/// Appends the hash of the record and of the number of what it is based on.
+fn sealed(mut record: Vec<u8>, serial: i64) -> Vec<u8> {
+    let seal = seal(&record, serial);
+    record.extend_from_slice(&seal);
     record
+}
+
+fn seal(body: &[u8], serial: i64) -> [u8; HASH_BYTES] {
+    let hash = Sha256::new().chain_update(serial.to_le_bytes()).chain_update(body).finalize();
+    std::array::from_fn(|index| hash[index])
 }
 
 /// What is left of a record.
@@ -192,10 +192,10 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn open(record: &'a [u8], kind: u8) -> Result<Self, Damaged> {
+    fn open(record: &'a [u8], kind: u8, serial: i64) -> Result<Self, Damaged> {
         let (body, hash) =
             record.len().checked_sub(HASH_BYTES).map(|at| record.split_at(at)).ok_or(Damaged("too short"))?;
-        if Sha256::digest(body)[..HASH_BYTES] != *hash {
+        if seal(body, serial) != *hash {
             return Err(Damaged("its hash differs"));
         }
         match body.split_first() {
@@ -264,9 +264,7 @@ impl<'a> Reader<'a> {
                 (SAME, true) => round(base[index]),
                 (SAME, false) => base[index],
                 (NEW, true) => round(base[index]) ^ floats.next().ok_or(MISSING)?,
-                (NEW, false) => {
-                    base[index].wrapping_add(unzigzag(whole.next().ok_or(MISSING)?).cast_unsigned())
-                }
+                (NEW, false) => base[index].wrapping_add(unzigzag(whole.next().ok_or(MISSING)?).cast_unsigned()),
                 (REFERENCE, true) => {
                     distance = distance.wrapping_add(unzigzag(references.varint()?));
                     let back = usize::try_from(distance).ok().and_then(|back| index.checked_sub(back));
@@ -308,11 +306,7 @@ mod tests {
 
     /// Documents of a few levels with every kind of value.
     fn document() -> impl Strategy<Value = Value> {
-        let float = prop_oneof![
-            Just(0.0),
-            -1e6..1e6,
-            any::<f64>().prop_filter("finite", |value| value.is_finite()),
-        ];
+        let float = prop_oneof![Just(0.0), -1e6..1e6, any::<f64>().prop_filter("finite", |value| value.is_finite()),];
         let leaf = prop_oneof![
             Just(Value::Null),
             any::<bool>().prop_map(Value::from),
@@ -350,14 +344,14 @@ mod tests {
         #[test]
         fn a_delta_record_gives_the_state_rounded_whatever_its_base(value in document(), base in document()) {
             let (parts, base) = (parts(&value), parts(&base));
-            prop_assert_eq!(read_delta(&delta(&parts, &base), &base).unwrap(), near(parts));
+            prop_assert_eq!(read_delta(&delta(&parts, &base, 3), &base, 3).unwrap(), near(parts));
         }
 
         #[test]
         fn any_bytes_are_an_error_or_a_state(bytes in prop::collection::vec(any::<u8>(), 0..300), seal in any::<bool>()) {
-            let bytes = if seal { sealed(bytes) } else { bytes };
+            let bytes = if seal { sealed(bytes, 0) } else { bytes };
             let _ = read_full(&bytes);
-            let _ = read_delta(&bytes, &parts(&json!({"a": [1.5, 2]})));
+            let _ = read_delta(&bytes, &parts(&json!({"a": [1.5, 2]})), 0);
         }
 
         #[test]
@@ -384,6 +378,8 @@ mod tests {
         let numbers: Vec<f64> = (1..1000).map(|n| 1.0 / f64::from(n)).collect();
         let base = parts(&json!({ "a": numbers, "b": vec![0.5; 999] }));
         let same = parts(&json!({ "a": numbers, "b": numbers }));
-        assert!(delta(&same, &base).len() < 150, "{}", delta(&same, &base).len());
+        let delta = delta(&same, &base, 1);
+        assert!(delta.len() < 150, "{}", delta.len());
+        assert!(read_delta(&delta, &base, 2).is_err(), "to another base");
     }
 }

@@ -131,7 +131,14 @@ impl Row {
 fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
     Some(match *kind {
         EventKind::HalfCycle {
-            cell, mode, charge_ah, swing, swing_std, duration_s, mean_current_a, mean_temperature_c,
+            cell,
+            mode,
+            charge_ah,
+            swing,
+            swing_std,
+            duration_s,
+            mean_current_a,
+            mean_temperature_c,
         } => (
             Table::HalfCycle,
             vec![
@@ -170,7 +177,17 @@ fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
             ],
         ),
         EventKind::Alarm {
-            rule, cell, change, state, active, severity, value, probability, threshold, occurrences, acknowledged,
+            rule,
+            cell,
+            change,
+            state,
+            active,
+            severity,
+            value,
+            probability,
+            threshold,
+            occurrences,
+            acknowledged,
         } => (
             Table::Alarm,
             vec![

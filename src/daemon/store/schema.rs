@@ -99,10 +99,6 @@ CREATE TABLE reset (
 CREATE TABLE state (
     slot INTEGER PRIMARY KEY,
     serial INTEGER NOT NULL,
-    wall_ns INTEGER NOT NULL,
-    time_ns INTEGER NOT NULL,
-    boottime_ns INTEGER NOT NULL,
-    boot BLOB NOT NULL,
     length INTEGER NOT NULL,
     bytes BLOB NOT NULL
 ) STRICT;

@@ -51,9 +51,9 @@ impl Shelf {
         Ok(Self { base: Some(base), delta_room })
     }
 
-    /// The state of the full record.
-    pub(super) fn base(&self) -> Option<&Parts> {
-        self.base.as_ref().map(|base| &base.parts)
+    /// The full record's number and state.
+    pub(super) fn base(&self) -> Option<(i64, &Parts)> {
+        self.base.as_ref().map(|base| (base.serial, &base.parts))
     }
 
     /// Packs a state; `exact` asks for a full record.
@@ -61,7 +61,7 @@ impl Shelf {
         let serial = self.base.as_ref().map_or(0, |base| base.serial);
         let delta = self.base.as_ref().filter(|base| !exact && base.excess <= base.full_bytes);
         let record = delta.and_then(|base| {
-            let record = packed::delta(&parts, &base.parts);
+            let record = packed::delta(&parts, &base.parts, base.serial);
             ((record.len() as f64) <= MAX_DELTA * base.full_bytes as f64).then_some(record)
         });
         match record {

@@ -5,6 +5,8 @@
 
 use std::fmt;
 
+use serde::{Deserialize, Serialize};
+
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 
@@ -12,7 +14,8 @@ use crate::quantity::Timestamp;
 const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 
 /// One boot of one computer, as the kernel names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "String", try_from = "String")]
 pub(crate) struct BootId(pub(super) [u8; 16]);
 
 impl BootId {
@@ -36,6 +39,20 @@ impl BootId {
     }
 }
 
+impl From<BootId> for String {
+    fn from(boot: BootId) -> Self {
+        boot.to_string()
+    }
+}
+
+impl TryFrom<String> for BootId {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        Self::parse(&text).ok_or_else(|| format!("boot {text:?}, must be 32 hexadecimal digits"))
+    }
+}
+
 impl fmt::Display for BootId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:032x}", u128::from_be_bytes(self.0))
@@ -43,7 +60,7 @@ impl fmt::Display for BootId {
 }
 
 /// A moment on every clock.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Stamp {
     /// The wall clock, ns since 1970; may be wrong.
     pub(crate) wall_ns: i64,
