@@ -9,7 +9,9 @@ mod dbc;
 mod demo;
 #[cfg(feature = "lab")]
 mod fit;
+mod history;
 mod replay;
+mod reset;
 mod run;
 #[cfg(feature = "lab")]
 mod score;
@@ -43,6 +45,10 @@ enum Command {
     Clear(command::AlarmArgs),
     /// Tell the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
+    /// Begin anew with what is learned, whether a daemon runs or not
+    Reset(reset::Args),
+    /// Show, export or verify what the store has kept
+    History(Box<history::Args>),
     /// Send a rule's alarm frame, marked as a test, and see what goes out on every interface
     TestAlarm(test_alarm::Args),
     /// Replay journals, candump logs or CSV files through the same core
@@ -93,6 +99,8 @@ pub fn main() -> ExitCode {
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
         Command::PackReplaced(args) => command::pack_replaced(&args),
+        Command::Reset(args) => reset::run(&args),
+        Command::History(args) => history::run(&args),
         Command::TestAlarm(args) => test_alarm::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),
