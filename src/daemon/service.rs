@@ -6,6 +6,8 @@
 
 mod engine;
 mod live;
+pub(crate) mod readiness;
+mod reload;
 mod stop;
 
 use std::io;
@@ -26,10 +28,14 @@ use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
+use reload::Reload;
 use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
+
+/// Threads for what would hold up the loop: reading a configuration, long answers. More would only wait for the disk.
+const BLOCKING_THREADS: usize = 4;
 
 /// What to run.
 #[derive(Debug)]
@@ -50,6 +56,8 @@ pub struct Service {
     pub snapshot: Option<PathBuf>,
     /// Stop after this long; `None` = when told to.
     pub duration: Option<Duration>,
+    /// How long the first usable reading is waited for before the service calls itself ready.
+    pub ready_timeout: Duration,
     /// Receive buffer asked for per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
@@ -84,12 +92,14 @@ impl Service {
     /// # Errors
     /// When it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         runtime.block_on(self.serve())
     }
 
     async fn serve(mut self) -> Result<(), ServiceError> {
         let stop = Stop::new(self.duration)?;
+        let reload = Reload::new(&self.config)?;
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
@@ -103,8 +113,7 @@ impl Service {
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         let works = !std::mem::take(&mut engine.lost_file);
         engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
-        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new() };
-        notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        let mut service = Loop { engine, inbox, requests, reload, clock, outputs, batch: Vec::new() };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::tell();

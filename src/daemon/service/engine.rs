@@ -3,6 +3,9 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use tokio::time::Instant;
+
+use super::readiness::Readiness;
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
@@ -10,7 +13,8 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Input, Monitor, Outputs};
+use crate::monitor::{Input, Monitor, MonitorConfig, Outputs};
+use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
 #[derive(Debug)]
@@ -22,6 +26,7 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
+    pub(super) readiness: Readiness,
     /// A file was given up, and the core has not been told yet.
     pub(super) lost_file: bool,
 }
@@ -34,10 +39,12 @@ impl Engine {
         let restored = service.restore.take();
         let now = clock.now();
         let is_restored = restored.is_some();
+        let mut restored_s = None;
         if let Some(snapshot) = restored {
             let away_s = service.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0));
             // Before any file is opened: a start that fails leaves what an earlier run has recorded.
             monitor.restore(snapshot, service.away_s)?;
+            restored_s = Some(away_s);
             tracing::info!(away_s, "state taken up");
         }
         let mut record = open_journal(service.record.as_deref(), &names)?;
@@ -50,7 +57,8 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        Ok(Self { monitor, outputs: Outputs::default(), record, frames, events, names, log, lost_file })
+        let readiness = Readiness::new(&names, service.ready_timeout, restored_s, Instant::now());
+        Ok(Self { monitor, outputs: Outputs::default(), record, frames, events, names, log, readiness, lost_file })
     }
 
     /// Journals one input, hands it to the core, and hands on what comes of it.
@@ -60,6 +68,30 @@ impl Engine {
         }
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
+        self.hand_on(links);
+    }
+
+    /// Gives the core another configuration; the journal says that it did.
+    ///
+    /// # Errors
+    /// Why the core does not take it; then nothing has changed.
+    pub(super) fn reconfigure(
+        &mut self,
+        config: MonitorConfig,
+        time: Timestamp,
+        links: &[LinkOutput],
+    ) -> Result<(), Vec<String>> {
+        self.outputs.clear();
+        self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
+        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
+            self.stop_recording(&error);
+        }
+        self.hand_on(links);
+        Ok(())
+    }
+
+    /// What came out of the core: frames to the interfaces, events to the log, both to their files.
+    fn hand_on(&mut self, links: &[LinkOutput]) {
         for transmit in &self.outputs.frames {
             if let Some(link) = links.get(transmit.bus.index()) {
                 link.send(transmit.frame);
@@ -71,6 +103,7 @@ impl Engine {
         }
         for event in &self.outputs.events {
             self.log.log(event);
+            self.readiness.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }

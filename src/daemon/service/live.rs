@@ -9,6 +9,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
+use super::reload::Reload;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
@@ -31,6 +32,7 @@ pub(super) struct Loop {
     pub(super) engine: Engine,
     pub(super) inbox: mpsc::Receiver<Received>,
     pub(super) requests: mpsc::Receiver<Asked>,
+    pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
@@ -49,6 +51,7 @@ impl Loop {
                 () = stop.wait() => return,
                 now = ticks.tick() => {
                     self.tick().await;
+                    self.tell_manager(now);
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -60,10 +63,24 @@ impl Loop {
                 }
                 // Each is taken between two ticks, and there are never more than connections.
                 Some(asked) = self.requests.recv() => self.answer(asked).await,
+                // At most one a second is read.
+                step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }
                 }
             }
+        }
+    }
+
+    /// Says when the service is ready, and how it is when that has changed.
+    fn tell_manager(&mut self, now: Instant) {
+        let Engine { readiness, monitor, .. } = &mut self.engine;
+        let told = readiness.poll(monitor, now);
+        let ready = told.ready.then_some(NotifyState::Ready);
+        let status = told.status.as_deref().map(NotifyState::Status);
+        if ready.is_some() || status.is_some() {
+            tracing::info!(ready = told.ready, "{}", told.status.as_deref().unwrap_or("ready"));
+            notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
         }
     }
 
@@ -101,7 +118,7 @@ impl Loop {
     }
 
     /// Hands over what the interfaces have received so far.
-    async fn drain(&mut self) {
+    pub(super) async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
             // Lets the interfaces' tasks take what is in their sockets, and send.
             tokio::task::yield_now().await;
