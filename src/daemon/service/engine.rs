@@ -5,7 +5,7 @@ use std::path::Path;
 
 use tokio::time::Instant;
 
-use super::readiness::Readiness;
+use super::readiness::{Readiness, restored_words};
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
@@ -13,7 +13,7 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Input, Monitor, MonitorConfig, Outputs};
+use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs};
 use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
@@ -39,17 +39,21 @@ impl Engine {
         let restored = service.restore.take();
         let now = clock.now();
         let is_restored = restored.is_some();
-        let mut restored_s = None;
+        let mut told = None;
         if let Some(snapshot) = restored {
-            let away_s = service.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0));
+            let stamped_s = now.since(snapshot.time);
             // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-            monitor.restore(snapshot, service.away_s)?;
-            restored_s = Some(away_s);
-            tracing::info!(away_s, "state taken up");
+            monitor.restore(snapshot, service.away)?;
+            told = Some(restored_words(match service.away {
+                Away::Seconds(age_s) => Some(age_s),
+                Away::AsStamped => Some(stamped_s).filter(|age_s| *age_s >= 0.0),
+                Away::Unknown => None,
+            }));
+            tracing::info!(away = %service.away, stamped_s, "state taken up");
         }
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
-        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away_s));
+        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
             (record, lost_file) = (None, true);
@@ -57,7 +61,7 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        let readiness = Readiness::new(&names, service.ready_timeout, restored_s, Instant::now());
+        let readiness = Readiness::new(&names, service.ready_timeout, told, Instant::now());
         Ok(Self { monitor, outputs: Outputs::default(), record, frames, events, names, log, readiness, lost_file })
     }
 

@@ -4,7 +4,6 @@
 //! names what is not as it should be, and is told anew when it has changed, at most every [`STATUS_PERIOD`]. Times are
 //! the caller's; what is to be told is returned, so that this file needs no service manager.
 
-use std::fmt::Write as _;
 use std::time::Duration;
 
 use tokio::time::Instant;
@@ -56,15 +55,15 @@ pub(super) struct Readiness {
     store_works: bool,
     /// Why the last reload was refused.
     refused: Option<String>,
-    /// Age of the state that was taken up, s.
-    restored_s: Option<f64>,
+    /// What is told of the state that was taken up.
+    restored: Option<String>,
     told: String,
     told_at: Option<Instant>,
 }
 
 impl Readiness {
     /// Of a service that starts now with these interfaces and waits this long for its first reading.
-    pub(super) fn new(names: &[String], timeout: Duration, restored_s: Option<f64>, now: Instant) -> Self {
+    pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
         Self {
             interfaces: names.iter().map(|name| (name.clone(), Interface::Unknown)).collect(),
             began: now,
@@ -75,7 +74,7 @@ impl Readiness {
             inputs: 0,
             store_works: true,
             refused: None,
-            restored_s,
+            restored,
             told: String::new(),
             told_at: None,
         }
@@ -170,9 +169,9 @@ impl Readiness {
                 format!("running: {count} interface{plural}, first frame after {:.1} s", after.as_secs_f64())
             }
         };
-        if let Some(age_s) = self.restored_s {
-            // Writing to a string cannot fail.
-            let _ = write!(line, ", restored state {} old", words_s(age_s));
+        if let Some(restored) = &self.restored {
+            line.push_str(", ");
+            line.push_str(restored);
         }
         line
     }
@@ -198,6 +197,14 @@ impl Readiness {
         }
         problems.extend(self.refused.as_ref().map(|why| format!("reload refused: {why}")));
         problems
+    }
+}
+
+/// What is told of a state of that age, s.
+pub(super) fn restored_words(age_s: Option<f64>) -> String {
+    match age_s {
+        Some(age_s) => format!("restored state {} old", words_s(age_s)),
+        None => "restored state of unknown age".to_owned(),
     }
 }
 

@@ -14,12 +14,12 @@ struct Scene {
 }
 
 impl Scene {
-    fn new(restored_s: Option<f64>) -> Self {
+    fn new(restored: Option<String>) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
         let config = config::load(&path).expect("the example is good");
         let names: Vec<_> = ["can0", "can1"].map(str::to_owned).to_vec();
         let began = Instant::now();
-        let readiness = Readiness::new(&names, Duration::from_secs(10), restored_s, began);
+        let readiness = Readiness::new(&names, Duration::from_secs(10), restored, began);
         Self { monitor: Monitor::new(config.monitor), readiness, began, at_s: 0.0 }
     }
 
@@ -72,7 +72,7 @@ fn ready_comes_with_the_first_usable_reading_and_not_before() {
 
 #[test]
 fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_interface() {
-    let mut scene = Scene::new(Some(12.4));
+    let mut scene = Scene::new(Some(restored_words(Some(12.4))));
     scene.bus(0.0, 0, BusEvent::Up);
     scene.bus(0.1, 1, BusEvent::Missing);
     assert!(!scene.tick(9.8).ready);
