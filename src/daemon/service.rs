@@ -17,6 +17,7 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
@@ -113,7 +114,8 @@ impl Service {
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         let works = !std::mem::take(&mut engine.lost_file);
         engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
-        let mut service = Loop { engine, inbox, requests, reload, clock, outputs, batch: Vec::new() };
+        let mut service =
+            Loop { engine, inbox, requests, reload, clock, outputs, batch: Vec::new(), left_out_told: Instant::now() };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::tell();

@@ -14,7 +14,7 @@ use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
 use crate::daemon::control::{Asked, answer};
-use crate::daemon::snapshot_file;
+use crate::daemon::{logging, snapshot_file};
 use crate::io::clock::MappedClock;
 use crate::io::socket::{LinkOutput, Received, What};
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
@@ -23,6 +23,8 @@ use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 const BATCH: usize = 256;
 /// Time the interfaces have to send what is queued when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
+/// How often it is told how many lines were left out of the log.
+const LEFT_OUT_PERIOD: Duration = Duration::from_secs(60);
 /// How often files are handed to the operating system: what a crash of the daemon can lose.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
@@ -36,6 +38,7 @@ pub(super) struct Loop {
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
+    pub(super) left_out_told: Instant,
 }
 
 impl Loop {
@@ -74,6 +77,13 @@ impl Loop {
 
     /// Says when the service is ready, and how it is when that has changed.
     fn tell_manager(&mut self, now: Instant) {
+        if now.duration_since(self.left_out_told) >= LEFT_OUT_PERIOD {
+            self.left_out_told = now;
+            let lines = logging::take_left_out();
+            if lines > 0 {
+                tracing::warn!(left_out = lines, "lines left out of the log");
+            }
+        }
         let Engine { readiness, monitor, .. } = &mut self.engine;
         let told = readiness.poll(monitor, now);
         let ready = told.ready.then_some(NotifyState::Ready);
