@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::Failure;
 use crate::config;
 use crate::daemon::control::ControlSetting;
+use crate::daemon::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::daemon::snapshot_file;
 use crate::daemon::store::StateSetting;
 use crate::daemon::{logging, service::Service};
@@ -43,6 +44,9 @@ pub(crate) struct Args {
     /// Stop after this time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
     duration: Option<f64>,
+    /// Wait this long for the first usable frame before the service manager is told that the service is ready
+    #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = ready_seconds)]
+    ready_timeout: f64,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
@@ -64,6 +68,13 @@ fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if (0.0..=MAX_SECONDS).contains(&value) => Ok(value),
         _ => Err(format!("must be seconds, 0 to {MAX_SECONDS}")),
+    }
+}
+
+fn ready_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=MAX_READY_TIMEOUT_S).contains(&value) => Ok(value),
+        _ => Err(format!("must be seconds, 0 to {MAX_READY_TIMEOUT_S}")),
     }
 }
 
@@ -94,6 +105,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         away: args.away.unwrap_or_default(),
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
+        ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
         state: StateSetting::from_path(args.state.clone()),
         control: ControlSetting::from_path(args.control.clone()),

@@ -6,6 +6,8 @@
 
 mod engine;
 mod live;
+pub(crate) mod readiness;
+mod reload;
 mod stop;
 
 use std::io;
@@ -15,6 +17,7 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
@@ -27,10 +30,14 @@ use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
+use reload::Reload;
 use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
+
+/// Threads for what would hold up the loop: reading a configuration, long answers. More would only wait for the disk.
+const BLOCKING_THREADS: usize = 4;
 
 /// What to run.
 #[derive(Debug)]
@@ -51,6 +58,8 @@ pub struct Service {
     pub snapshot: Option<PathBuf>,
     /// Stop after this long; `None` = when told to.
     pub duration: Option<Duration>,
+    /// How long the first usable reading is waited for before the service calls itself ready.
+    pub ready_timeout: Duration,
     /// Receive buffer asked for per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
@@ -90,12 +99,14 @@ impl Service {
     /// # Errors
     /// When it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         runtime.block_on(self.serve())
     }
 
     async fn serve(mut self) -> Result<(), ServiceError> {
         let stop = Stop::new(self.duration)?;
+        let reload = Reload::new(&self.config)?;
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
@@ -108,8 +119,8 @@ impl Service {
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         engine.tell_works(clock.now(), &outputs);
-        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new() };
-        notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        let mut service =
+            Loop { engine, inbox, requests, reload, clock, outputs, batch: Vec::new(), left_out_told: Instant::now() };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::tell();

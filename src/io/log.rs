@@ -96,6 +96,11 @@ pub enum Record {
         /// They could.
         works: bool,
     },
+    /// The recorded run took another configuration over here.
+    Reload {
+        /// When.
+        time: Timestamp,
+    },
     /// The recorded run took up a stored state here.
     Restore {
         /// When.
@@ -115,7 +120,7 @@ impl Record {
             Self::UnknownGap { time } => Input::UnknownGap { time: *time },
             Self::Command { time, command } => Input::Command { time: *time, command: *command },
             Self::Store { time, works } => Input::Store { time: *time, works: *works },
-            Self::Restore { .. } => return None,
+            Self::Restore { .. } | Self::Reload { .. } => return None,
         })
     }
 
@@ -128,6 +133,7 @@ impl Record {
             | Self::UnknownGap { time }
             | Self::Command { time, .. }
             | Self::Store { time, .. }
+            | Self::Reload { time }
             | Self::Restore { time, .. } => time,
         }
     }
@@ -140,6 +146,7 @@ impl Record {
             | Self::UnknownGap { time }
             | Self::Command { time, .. }
             | Self::Store { time, .. }
+            | Self::Reload { time }
             | Self::Restore { time, .. } => *time = placed,
         }
         self
@@ -412,6 +419,7 @@ impl State {
             Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
             Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
             Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
+            Some(Mark::Reload { time }) => Some(Record::Reload { time }),
             Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
             Some(Mark::Bus { time, interface, event }) => {
                 let bus = self.bus(interface)?;

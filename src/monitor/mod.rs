@@ -8,6 +8,7 @@
 mod alarms;
 mod buses;
 mod cyclic;
+mod heard;
 mod intake;
 mod j1939;
 mod learning;
@@ -129,6 +130,8 @@ pub struct Monitor {
     config: MonitorConfig,
     /// Whether an input has come.
     started: bool,
+    /// Whether a usable reading has come since then.
+    heard: bool,
     /// Time of the latest input that did something.
     now: Timestamp,
     /// Inputs that came with a time before `now`.
@@ -194,6 +197,7 @@ impl Monitor {
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
             started: false,
+            heard: false,
             now: Timestamp::ZERO,
             time_backwards: 0,
             detector: TransitionDetector::default(),
@@ -409,6 +413,7 @@ impl Monitor {
         });
         for reading in readings.drain(..) {
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
+            self.note_heard(&reading);
             self.report_signals(out);
             if reading.channel == Channel::Current {
                 self.observe_current(self.sampler.pack_current_a(self.now), out);
