@@ -6,6 +6,7 @@
 
 mod engine;
 mod live;
+mod seeing;
 mod stop;
 
 use std::io;
@@ -18,6 +19,10 @@ use tokio::task::JoinSet;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
+use super::status::StatusServer;
+use super::status::collect::Identity;
+use super::status::document::ConfigFile;
+use super::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
@@ -26,6 +31,7 @@ use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
+use seeing::Seeing;
 use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
@@ -54,6 +60,10 @@ pub struct Service {
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
+    /// The status sockets.
+    pub status: SocketSetting,
+    /// Where the configuration came from, for those who look.
+    pub config_file: Option<ConfigFile>,
 }
 
 /// Why the service could not start, or not end as it should.
@@ -70,9 +80,9 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
-    /// The control socket is another daemon's, or cannot be made.
+    /// The control or status socket is another daemon's, or cannot be made.
     #[error("{0}")]
-    Control(String),
+    Socket(String),
     /// The runtime or a signal handler could not be set up.
     #[error("cannot start: {0}")]
     Start(#[from] io::Error),
@@ -95,7 +105,8 @@ impl Service {
         let snapshot = self.snapshot.take();
         // Before any file is opened: a second daemon must not take those of the first.
         let (asked, requests) = mpsc::channel(MAX_CONNECTIONS);
-        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Control)?;
+        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Socket)?;
+        let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
         let mut engine = Engine::new(&mut self, clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
         drop(sender);
@@ -103,7 +114,8 @@ impl Service {
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         let works = !std::mem::take(&mut engine.lost_file);
         engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
-        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new() };
+        let seeing = Seeing::new(status, self.identity(clock));
+        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new(), seeing };
         notify(&[NotifyState::Ready, NotifyState::Status("running")]);
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
@@ -113,6 +125,11 @@ impl Service {
         notify(&[NotifyState::Stopping]);
         drop(control);
         service.finish(links, snapshot.as_deref()).await
+    }
+
+    fn identity(&self, clock: MappedClock) -> Identity {
+        let interfaces = self.config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+        Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {

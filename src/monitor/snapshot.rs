@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
 use super::intake::IntakeState;
-use super::{CellSlot, Consumed, Monitor};
+use super::{CellSlot, Consumed, Monitor, Statistics};
 use crate::alarm::AlarmState;
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
@@ -38,6 +38,8 @@ pub struct Snapshot {
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
+    #[serde(default)]
+    statistics: Statistics,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -104,6 +106,7 @@ impl Monitor {
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
             intake: self.intake.snapshot(),
+            statistics: self.statistics.clone(),
         }
     }
 
@@ -155,6 +158,8 @@ impl Monitor {
         self.alarms.restore(&snapshot.alarms);
         self.schedule = snapshot.schedule;
         self.intake.restore(&snapshot.intake);
+        self.statistics = snapshot.statistics;
+        self.statistics.restores += 1;
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
         true

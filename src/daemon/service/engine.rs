@@ -6,6 +6,7 @@ use std::path::Path;
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
+use crate::daemon::status::collect::RecentEvents;
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
@@ -22,6 +23,8 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
+    /// For those who look.
+    pub(super) recent: RecentEvents,
     /// A file was given up, and the core has not been told yet.
     pub(super) lost_file: bool,
 }
@@ -50,7 +53,17 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        Ok(Self { monitor, outputs: Outputs::default(), record, frames, events, names, log, lost_file })
+        Ok(Self {
+            monitor,
+            outputs: Outputs::default(),
+            record,
+            frames,
+            events,
+            names,
+            log,
+            recent: RecentEvents::default(),
+            lost_file,
+        })
     }
 
     /// Journals one input, hands it to the core, and hands on what comes of it.
@@ -71,6 +84,7 @@ impl Engine {
         }
         for event in &self.outputs.events {
             self.log.log(event);
+            self.recent.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }

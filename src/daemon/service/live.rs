@@ -9,6 +9,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
+use super::seeing::Seeing;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
@@ -34,6 +35,7 @@ pub(super) struct Loop {
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
+    pub(super) seeing: Seeing,
 }
 
 impl Loop {
@@ -48,7 +50,9 @@ impl Loop {
                 biased;
                 () = stop.wait() => return,
                 now = ticks.tick() => {
+                    self.seeing.note_tick(now);
                     self.tick().await;
+                    self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -127,6 +131,9 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
+            if matches!(what, What::Frame(_)) {
+                self.seeing.note_frame(time, self.clock.now());
+            }
         }
         self.batch.clear();
     }
