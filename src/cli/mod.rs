@@ -7,6 +7,7 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
 mod replay;
@@ -14,6 +15,7 @@ mod run;
 #[cfg(feature = "lab")]
 mod score;
 mod simulate;
+mod status;
 mod test_alarm;
 
 use std::process::ExitCode;
@@ -35,6 +37,10 @@ pub struct Cli {
 enum Command {
     /// Run the service on live CAN interfaces
     Run(run::Args),
+    /// Show what the running daemon knows: pack, cells, alarms, interfaces
+    Status(status::Args),
+    /// Serve the status of the running daemon as metrics for Prometheus
+    Exporter(exporter::Args),
     /// Show the alarms of the running daemon
     Alarms(alarms::Args),
     /// Tell the running daemon that alarms were seen
@@ -66,7 +72,7 @@ enum Command {
 /// Why a command ended without success: what to print and the exit code.
 #[derive(Debug)]
 pub struct Failure {
-    /// For the terminal, without the program's name.
+    /// For the terminal, without the program's name; empty = the output has said it.
     pub message: String,
     /// Exit code.
     pub code: u8,
@@ -89,6 +95,8 @@ impl From<crate::config::ConfigFaults> for Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(args) => run::run(&args),
+        Command::Status(args) => status::run(&args),
+        Command::Exporter(args) => exporter::run(&args),
         Command::Alarms(args) => alarms::run(&args),
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
@@ -107,7 +115,9 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{}", failure.message);
+            if !failure.message.is_empty() {
+                eprintln!("{}", failure.message);
+            }
             ExitCode::from(failure.code)
         }
     }

@@ -10,6 +10,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
 use super::reload::Reload;
+use super::seeing::Seeing;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
@@ -40,6 +41,7 @@ pub(super) struct Loop {
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
     pub(super) left_out_told: Instant,
+    pub(super) seeing: Seeing,
 }
 
 impl Loop {
@@ -55,8 +57,10 @@ impl Loop {
                 biased;
                 () = stop.wait() => return,
                 now = ticks.tick() => {
+                    self.seeing.note_tick(now);
                     self.tick().await;
                     self.tell_manager(now);
+                    self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -156,6 +160,9 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
+            if matches!(what, What::Frame(_)) {
+                self.seeing.note_frame(time, self.clock.now());
+            }
         }
         self.batch.clear();
     }

@@ -7,12 +7,14 @@
 //!
 //! Underneath: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
 
+mod counters;
 mod link;
 mod listener;
 mod raw;
 mod sender;
 mod wire;
 
+pub(crate) use counters::{LinkCounters, LinkState};
 pub(crate) use link::{Link, LinkConfig, LinkOutput, Received, What};
 pub(crate) use listener::CanListener;
 pub(crate) use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
