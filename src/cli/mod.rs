@@ -10,6 +10,7 @@ mod demo;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+mod generate;
 mod replay;
 mod run;
 #[cfg(feature = "lab")]
@@ -61,6 +62,9 @@ enum Command {
     Check(check::Args),
     /// Write the DBC of the frames as they are configured, for those who receive them
     Dbc(dbc::Args),
+    /// Write manual pages and shell completions
+    #[command(hide = true)]
+    Generate(generate::Args),
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
@@ -107,6 +111,7 @@ pub fn main() -> ExitCode {
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
         Command::Dbc(args) => dbc::run(&args),
+        Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]

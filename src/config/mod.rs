@@ -17,6 +17,7 @@ mod describe;
 mod document;
 mod j1939;
 mod keys;
+mod manual;
 mod output;
 mod pattern;
 mod protect;
@@ -27,6 +28,7 @@ mod setting;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
+pub use manual::manual;
 pub use reference::reference;
 use resolve::Databases;
 
