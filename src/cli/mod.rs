@@ -7,6 +7,7 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+mod doctor;
 #[cfg(feature = "lab")]
 mod fit;
 mod replay;
@@ -53,6 +54,8 @@ enum Command {
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
+    /// Listen to a pack, or replay a log, and tell what is probably wrong with wiring or configuration
+    Doctor(Box<doctor::Args>),
     /// Write the DBC of the frames as they are configured, for those who receive them
     Dbc(dbc::Args),
     /// Fit a cell model to measured data
@@ -98,6 +101,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Dbc(args) => dbc::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
@@ -107,7 +111,9 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{}", failure.message);
+            if !failure.message.is_empty() {
+                eprintln!("{}", failure.message);
+            }
             ExitCode::from(failure.code)
         }
     }

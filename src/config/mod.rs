@@ -24,11 +24,13 @@ mod reference;
 mod resolve;
 mod schema;
 mod setting;
+mod survey;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
 pub use reference::reference;
 use resolve::Databases;
+pub use survey::{Survey, survey};
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]

@@ -26,7 +26,7 @@ use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
-use stop::Stop;
+pub(super) use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
