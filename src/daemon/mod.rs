@@ -3,6 +3,7 @@
 pub(crate) mod alarm_test;
 mod background_file;
 pub mod control;
+pub mod doctor;
 mod event_log;
 pub(crate) mod exporter;
 mod j1939_carrier;

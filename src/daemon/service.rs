@@ -37,7 +37,7 @@ use engine::Engine;
 use live::Loop;
 use reload::Reload;
 use seeing::Seeing;
-use stop::Stop;
+pub(super) use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
