@@ -100,6 +100,7 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
+        away: args.away,
         interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
     })
 }

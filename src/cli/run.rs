@@ -9,6 +9,7 @@ use crate::daemon::control::ControlSetting;
 use crate::daemon::snapshot_file;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
+use crate::monitor::Away;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -28,9 +29,9 @@ pub(crate) struct Args {
     /// Start from a stored state
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state, where its stamp does not tell (it came from a log)
-    #[arg(long, value_name = "SECONDS", requires = "restore", value_parser = seconds)]
-    away: Option<f64>,
+    /// Age of the stored state, where its stamp does not tell (it came from a log), or unknown
+    #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
+    away: Option<Away>,
     /// Store the state here on stopping
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
@@ -61,6 +62,14 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+/// Age of a stored state.
+pub(crate) fn away(text: &str) -> Result<Away, String> {
+    match text {
+        "unknown" => Ok(Away::Unknown),
+        _ => seconds(text).map(Away::Seconds).map_err(|must| format!("{must}, or unknown")),
+    }
+}
+
 fn buffer_bytes(text: &str) -> Result<usize, String> {
     match text.parse::<usize>() {
         Ok(value) if value <= MAX_BUFFER_BYTES => Ok(value),
@@ -77,7 +86,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
-        away_s: args.away,
+        away: args.away.unwrap_or_default(),
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
         receive_buffer_bytes: args.receive_buffer,

@@ -20,7 +20,9 @@ use crate::can::Frame;
 use crate::io::log::{LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{
+    Away, Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS,
+};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use intake::{DroppedSummary, ProtectedSummary};
@@ -66,6 +68,8 @@ pub struct Settings {
     pub snapshot_at: Option<When>,
     /// State to start from.
     pub restore: Option<Snapshot>,
+    /// How old it is; `None` = as the journal says, or else its stamp.
+    pub away: Option<Away>,
     /// Names of the interfaces, for the frames that would be sent.
     pub interfaces: Vec<String>,
 }
@@ -310,11 +314,13 @@ impl Replay {
         let first = self.window.first.unwrap_or(record.time());
         self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
         let recorded = match record {
-            Record::Restore { away_s, .. } => Some(*away_s),
+            Record::Restore { away, .. } => Some(*away),
             _ => None,
         };
         match (self.settings.restore.take(), recorded) {
-            (Some(snapshot), recorded) => self.monitor.restore(snapshot, recorded.flatten())?,
+            (Some(snapshot), recorded) => {
+                self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
+            }
             (None, Some(_)) => self
                 .summary
                 .notes

@@ -21,7 +21,7 @@ use super::j1939_carrier;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
-use crate::monitor::{Input, RestoreError, Snapshot};
+use crate::monitor::{Away, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
 use engine::Engine;
@@ -44,8 +44,8 @@ pub struct Service {
     pub events: Option<PathBuf>,
     /// State to start from.
     pub restore: Option<Snapshot>,
-    /// Age of that state, s; `None` = as its stamp says.
-    pub away_s: Option<f64>,
+    /// Age of that state.
+    pub away: Away,
     /// Where the state goes when the daemon stops.
     pub snapshot: Option<PathBuf>,
     /// Stop after this long; `None` = when told to.

@@ -17,7 +17,7 @@ use super::journal::{self, Mark};
 use super::lines::{self, Lines, RawLine};
 use crate::can::Frame;
 use crate::can::decode::Channel;
-use crate::monitor::{BusEvent, Command, Input};
+use crate::monitor::{Away, BusEvent, Command, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Where a part with an unknown gap before it is put: this long after the record so far.
@@ -100,8 +100,8 @@ pub enum Record {
     Restore {
         /// When.
         time: Timestamp,
-        /// How old the state was, s.
-        away_s: Option<f64>,
+        /// How old the state was.
+        away: Away,
     },
 }
 
@@ -410,7 +410,7 @@ impl State {
         match mark {
             Some(Mark::Tick { time }) => Some(Record::Tick { time }),
             Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
-            Some(Mark::Restore { time, away_s }) => Some(Record::Restore { time, away_s }),
+            Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
             Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
             Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
             Some(Mark::Bus { time, interface, event }) => {

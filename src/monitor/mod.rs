@@ -25,7 +25,7 @@ use alarms::StoreState;
 use buses::Buses;
 use cyclic::{Schedule, Test};
 use intake::Intake;
-use snapshot::PendingRestore;
+use snapshot::{PendingRestore, Taken};
 
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
@@ -311,10 +311,14 @@ impl Monitor {
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        let is_restored = self.apply_pending(time);
-        let was_away_briefly = time.since(self.now) <= ASLEEP_S;
-        if is_restored {
+        let taken = self.apply_pending(time);
+        let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
+        if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
+        }
+        if taken == Taken::Ageless {
+            // Claims the address, too.
+            self.handle_unknown_gap(time, out);
         }
         // After a longer time `advance` finds the gap and claims the address.
         if was_away_briefly {

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
 use super::intake::IntakeState;
-use super::{CellSlot, Consumed, Monitor};
+use super::{Away, CellSlot, Consumed, MERGE_TOLERANCE_NS, Monitor};
 use crate::alarm::AlarmState;
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
@@ -75,11 +75,22 @@ pub enum RestoreError {
     },
 }
 
+/// What became of a restore that waited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// There was none.
+    Nothing,
+    /// The state is taken up, and was taken at `Monitor::now`.
+    Aged,
+    /// The state is taken up, but nobody knows when it was taken.
+    Ageless,
+}
+
 /// A restore that waits for the first input, whose time is "now".
 #[derive(Debug)]
 pub(super) struct PendingRestore {
     snapshot: Box<Snapshot>,
-    away_s: Option<f64>,
+    away: Away,
 }
 
 impl Monitor {
@@ -108,12 +119,12 @@ impl Monitor {
     }
 
     /// Takes up a stored state in a monitor that has had no input yet. The first input's time is "now": the
-    /// snapshot was taken `away_s` seconds before it (`None`: as long before as the two stamps say), its stamps
-    /// are moved onto the present clock, and the time away is a gap like any other.
+    /// snapshot was taken `away` before it, its stamps are moved onto the present clock, and the time away is a gap like
+    /// any other.
     ///
     /// # Errors
     /// When the snapshot's version or shape does not fit.
-    pub fn restore(&mut self, snapshot: Snapshot, away_s: Option<f64>) -> Result<(), RestoreError> {
+    pub fn restore(&mut self, snapshot: Snapshot, away: Away) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
         }
@@ -128,14 +139,20 @@ impl Monitor {
                 allowed: format!("{} cells of {branches} branches", self.cells.len()),
             });
         }
-        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away_s });
+        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away });
         Ok(())
     }
 
-    /// Takes the waiting snapshot up, if there is one; `now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp) -> bool {
-        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return false };
-        let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
+    /// Takes the waiting snapshot up, if there is one; `self.now` becomes when it was taken, on the present clock.
+    pub(super) fn apply_pending(&mut self, now: Timestamp) -> Taken {
+        let Some(PendingRestore { mut snapshot, away }) = self.pending.take() else { return Taken::Nothing };
+        let taken = match away {
+            Away::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
+            Away::Seconds(away_s) => Some(now.plus_secs(-away_s)),
+            Away::AsStamped | Away::Unknown => None,
+        };
+        let outcome = if taken.is_some() { Taken::Aged } else { Taken::Ageless };
+        let taken = taken.unwrap_or(now);
         let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
         snapshot.rebase(by_nanos);
         let branches = self.config.model.branches.len();
@@ -157,7 +174,7 @@ impl Monitor {
         self.intake.restore(&snapshot.intake);
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
-        true
+        outcome
     }
 }
 

@@ -35,14 +35,14 @@ impl Engine {
         let now = clock.now();
         let is_restored = restored.is_some();
         if let Some(snapshot) = restored {
-            let away_s = service.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0));
+            let stamped_s = now.since(snapshot.time);
             // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-            monitor.restore(snapshot, service.away_s)?;
-            tracing::info!(away_s, "state taken up");
+            monitor.restore(snapshot, service.away)?;
+            tracing::info!(away = %service.away, stamped_s, "state taken up");
         }
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
-        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away_s));
+        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
             (record, lost_file) = (None, true);
