@@ -18,6 +18,7 @@ use tokio::task::JoinSet;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
+use super::store::StateSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
@@ -54,6 +55,8 @@ pub struct Service {
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
+    /// Where state and history are kept.
+    pub state: StateSetting,
 }
 
 /// Why the service could not start, or not end as it should.
@@ -70,6 +73,9 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
+    /// The state folder is another daemon's.
+    #[error("{0}")]
+    Store(String),
     /// The control socket is another daemon's, or cannot be made.
     #[error("{0}")]
     Control(String),
@@ -101,8 +107,7 @@ impl Service {
         drop(sender);
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        let works = !std::mem::take(&mut engine.lost_file);
-        engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
+        engine.tell_works(clock.now(), &outputs);
         let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new() };
         notify(&[NotifyState::Ready, NotifyState::Status("running")]);
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
