@@ -113,6 +113,18 @@ impl EventLog {
                     "another pack: what was learned of the old one is forgotten"
                 );
             }
+            EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),
+            EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
+                let cell = cell.map(number);
+                tracing::warn!(
+                    ?rule,
+                    ?severity,
+                    cell,
+                    active,
+                    occurrences,
+                    "stored alarm dropped, nothing watches it now"
+                );
+            }
             EventKind::Store { works: true } => tracing::info!("files can be written"),
             EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
             EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),

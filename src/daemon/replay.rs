@@ -492,6 +492,8 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::Reconfigured { .. } => "reconfigured",
+        EventKind::AlarmDropped { .. } => "alarm_dropped",
         EventKind::Store { .. } => "store",
     };
     *summary.events.entry(name).or_default() += 1;

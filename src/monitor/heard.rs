@@ -20,24 +20,6 @@ impl Monitor {
         self.sampler.channels().len()
     }
 
-    /// Stands in for the real one.
-    ///
-    /// # Errors
-    /// Never.
-    pub fn reconfigure(
-        &mut self,
-        config: super::MonitorConfig,
-        _now: crate::quantity::Timestamp,
-        _out: &mut super::Outputs,
-    ) -> Result<(), String> {
-        if config.sample.cells != self.config.sample.cells {
-            return Err("another number of cells: needs a restart".to_owned());
-        }
-        self.alarms = crate::alarm::AlarmEngine::new(config.rules.clone(), config.sample.cells);
-        self.config = config;
-        Ok(())
-    }
-
     /// After the sampler has judged it.
     #[inline]
     pub(super) fn note_heard(&mut self, reading: &Reading) {

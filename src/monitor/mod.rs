@@ -13,12 +13,14 @@ mod intake;
 mod j1939;
 mod learning;
 mod output;
+mod reconfigure;
 mod snapshot;
 mod types;
 
 pub use cyclic::MAX_TEST_S;
 pub use j1939::{AlarmCode, J1939Config};
 pub use output::{CommandConfig, OutputConfig};
+pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use snapshot::{RestoreError, Snapshot};
 pub use types::*;
 
@@ -315,7 +317,7 @@ impl Monitor {
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        let taken = self.apply_pending(time);
+        let taken = self.apply_pending(time, out);
         let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
         if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
