@@ -2,11 +2,11 @@
 //! and what comes in other messages goes on.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
-use std::path::Path;
+#[path = "common/config.rs"]
+mod config;
 
 use packwatch::can::e2e::{Profile, Protection, Status};
 use packwatch::can::{CanId, Frame};
-use packwatch::config;
 use packwatch::monitor::{Away, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, Timestamp};
 
@@ -56,15 +56,7 @@ data_id = 0x4567
 "#;
 
 fn configuration() -> MonitorConfig {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
-    let read = |path: &Path| match path.file_name().and_then(|name| name.to_str()) {
-        Some("pack.toml") => Ok(PACK.as_bytes().to_vec()),
-        Some("pack.dbc") => Ok(DBC.as_bytes().to_vec()),
-        _ => std::fs::read(path),
-    };
-    config::load_with(&folder.join("pack.toml"), &read)
-        .unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
-        .monitor
+    config::load(PACK, DBC).monitor
 }
 
 /// A bus with three senders, and the core behind it.

@@ -1,13 +1,14 @@
 //! A pack of two cells on hand-made frames: what the tests of alarms and of restarts share.
 #![allow(dead_code, clippy::unwrap_used, reason = "shared by tests, each of which uses some of it")]
 
-use std::path::Path;
+#[path = "../common/config.rs"]
+mod config;
 
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
-use packwatch::config::{self, Config};
+use packwatch::config::Config;
 use packwatch::monitor::{
     Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
 };
@@ -34,7 +35,7 @@ cell_model = "cells/example_nmc_2600.toml"
 [[interface]]
 name = "can0"
 [input]
-dbc = ["test.dbc"]
+dbc = ["pack.dbc"]
 [input.current]
 signal = "Status.Current"
 positive = "discharge"
@@ -62,13 +63,7 @@ data_id = 0x0321
 "#;
 
 pub(crate) fn load(alarms: &str) -> Config {
-    let (pack, here) = (format!("{PACK}{alarms}"), Path::new(env!("CARGO_MANIFEST_DIR")).join("config"));
-    let read = |path: &Path| match path.to_str() {
-        Some("pack.toml") => Ok(pack.clone().into_bytes()),
-        Some("test.dbc") => Ok(DBC.into()),
-        _ => std::fs::read(here.join(path)),
-    };
-    config::load_with(Path::new("pack.toml"), &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
+    config::load(&format!("{PACK}{alarms}"), DBC)
 }
 
 /// An alarm frame, taken apart by hand as the shipped DBC lays it out.
