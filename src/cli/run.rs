@@ -8,6 +8,7 @@ use crate::config;
 use crate::daemon::control::ControlSetting;
 use crate::daemon::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::daemon::snapshot_file;
+use crate::daemon::store::StateSetting;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
 use crate::monitor::Away;
@@ -33,6 +34,10 @@ pub(crate) struct Args {
     /// Age of the stored state, where its stamp does not tell (it came from a log), or unknown
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Away>,
+    /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
+    /// /var/lib/packwatch where that can be made). The state in it is taken up, unless --restore says another
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
     /// Store the state here on stopping
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
@@ -102,6 +107,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         duration: args.duration.map(Duration::from_secs_f64),
         ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
+        state: StateSetting::from_path(args.state.clone()),
         control: ControlSetting::from_path(args.control.clone()),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))

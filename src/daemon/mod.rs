@@ -9,3 +9,4 @@ pub mod logging;
 pub mod replay;
 pub mod service;
 pub mod snapshot_file;
+pub mod store;

@@ -21,6 +21,7 @@ use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
+use super::store::StateSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
@@ -63,6 +64,8 @@ pub struct Service {
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
+    /// Where state and history are kept.
+    pub state: StateSetting,
 }
 
 /// Why the service could not start, or not end as it should.
@@ -79,6 +82,9 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
+    /// The state folder is another daemon's.
+    #[error("{0}")]
+    Store(String),
     /// The control socket is another daemon's, or cannot be made.
     #[error("{0}")]
     Control(String),
@@ -112,8 +118,7 @@ impl Service {
         drop(sender);
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        let works = !std::mem::take(&mut engine.lost_file);
-        engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
+        engine.tell_works(clock.now(), &outputs);
         let mut service =
             Loop { engine, inbox, requests, reload, clock, outputs, batch: Vec::new(), left_out_told: Instant::now() };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");

@@ -8,7 +8,7 @@ use packwatch::alarm::{Change, Rule};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
-use packwatch::config::{self, Config};
+use packwatch::config::Config;
 use packwatch::monitor::{
     Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
 };

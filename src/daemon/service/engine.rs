@@ -1,19 +1,23 @@
 //! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::readiness::{Readiness, restored_words};
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
+use crate::daemon::snapshot_file;
+use crate::daemon::store::hold::Hold;
+use crate::daemon::store::{Candidate, Progress, Store};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Reconfigured};
+use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
@@ -26,34 +30,40 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
+    /// A file was given up.
+    lost_file: bool,
+    /// State and history.
+    store: Option<Store>,
+    /// Whether they can be written.
+    store_works: bool,
+    /// What the core was told last of all this.
+    told_works: Option<bool>,
+    hold: Hold,
+    /// Frames have come since the last checkpoint.
+    is_fresh: bool,
     pub(super) readiness: Readiness,
-    /// A file was given up, and the core has not been told yet.
-    pub(super) lost_file: bool,
 }
 
 impl Engine {
     /// The core and the files round it.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
+        let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
         let names: Vec<String> = service.config.interfaces.iter().map(|i| i.name.clone()).collect();
         let mut monitor = Monitor::new(service.config.monitor.clone());
-        let restored = service.restore.take();
         let now = clock.now();
-        let is_restored = restored.is_some();
-        let mut told = None;
-        if let Some(snapshot) = restored {
-            let stamped_s = now.since(snapshot.time);
-            // Before any file is opened: a start that fails leaves what an earlier run has recorded.
+        let mut stamped_s = 0.0;
+        // Before any file is opened: a start that fails leaves what an earlier run has recorded.
+        let away = if let Some(snapshot) = service.restore.take() {
+            stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.away)?;
-            told = Some(restored_words(match service.away {
-                Away::Seconds(age_s) => Some(age_s),
-                Away::AsStamped => Some(stamped_s).filter(|age_s| *age_s >= 0.0),
-                Away::Unknown => None,
-            }));
             tracing::info!(away = %service.away, stamped_s, "state taken up");
-        }
+            Some(service.away)
+        } else {
+            take_up(&mut monitor, found.states, service.record.as_deref())
+        };
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
-        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away));
+        let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
             (record, lost_file) = (None, true);
@@ -61,8 +71,28 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        let readiness = Readiness::new(&names, service.ready_timeout, told, Instant::now());
-        Ok(Self { monitor, outputs: Outputs::default(), record, frames, events, names, log, readiness, lost_file })
+        let restored = away.map(|away| match away {
+            Away::Seconds(age_s) => restored_words(Some(age_s)),
+            Away::AsStamped => restored_words(Some(stamped_s).filter(|age_s| *age_s >= 0.0)),
+            Away::Unknown => restored_words(None),
+        });
+        let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
+        Ok(Self {
+            monitor,
+            outputs: Outputs::default(),
+            record,
+            frames,
+            events,
+            names,
+            log,
+            readiness,
+            lost_file,
+            store,
+            store_works: found.works,
+            told_works: None,
+            hold: Hold::default(),
+            is_fresh: false,
+        })
     }
 
     /// Journals one input, hands it to the core, and hands on what comes of it.
@@ -72,7 +102,8 @@ impl Engine {
         }
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
-        self.hand_on(links);
+        self.is_fresh |= matches!(input, Input::Frame { .. });
+        self.hand_on(input.time(), links);
     }
 
     /// Gives the core another configuration; the journal says that it did.
@@ -91,15 +122,17 @@ impl Engine {
         if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
             self.stop_recording(&error);
         }
-        self.hand_on(links);
+        self.hand_on(time, links);
         Ok(changed)
     }
 
     /// What came out of the core: frames to the interfaces, events to the log, both to their files.
-    fn hand_on(&mut self, links: &[LinkOutput]) {
+    fn hand_on(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        let ticket = self.keep(time);
         for transmit in &self.outputs.frames {
-            if let Some(link) = links.get(transmit.bus.index()) {
-                link.send(transmit.frame);
+            match ticket.or_else(|| self.hold.behind(transmit)) {
+                Some(ticket) => self.hold.push(ticket, *transmit),
+                None => send(links, transmit),
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -110,6 +143,65 @@ impl Engine {
             self.log.log(event);
             self.readiness.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
+        }
+    }
+
+    /// Makes what was learned durable; the ticket its announcement waits for. A store that fails is not waited for.
+    fn keep(&mut self, now: Timestamp) -> Option<u64> {
+        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
+        if !self.store_works {
+            return None;
+        }
+        self.hold.begin(ticket, Instant::now());
+        Some(ticket)
+    }
+
+    /// How far the store is, told whenever that changes; `None` = there is none.
+    pub(super) fn store_progress(&self) -> Option<watch::Receiver<Progress>> {
+        self.store.as_ref().map(Store::progress)
+    }
+
+    /// The store has come further, or has failed.
+    pub(super) fn settle(&mut self, progress: Progress, time: Timestamp, links: &[LinkOutput]) {
+        self.hold.release(progress.ticket, |transmit| send(links, transmit));
+        self.store_works = progress.works;
+        self.tell_works(time, links);
+    }
+
+    /// Nothing waits any longer: the daemon stops.
+    pub(super) fn let_go(&mut self, links: &[LinkOutput]) {
+        self.hold.release(u64::MAX, |transmit| send(links, transmit));
+    }
+
+    /// With every tick: what has waited too long goes, and the store gets its checkpoints.
+    pub(super) fn look_after_store(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        if let Some(ticket) = self.hold.overdue(Instant::now()) {
+            self.hold.release(ticket, |transmit| send(links, transmit));
+            tracing::warn!("the disk is slow: announced before it was stored");
+            self.store_works = false;
+        }
+        if let Some(store) = &mut self.store
+            && store.tick(&self.monitor, time, self.is_fresh)
+        {
+            self.is_fresh = false;
+        }
+        self.tell_works(time, links);
+    }
+
+    /// Tells the core when it has changed whether files can be written.
+    pub(super) fn tell_works(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        // The journal may be the file that is lost: the core is told all the same.
+        let works = self.store_works && !self.lost_file;
+        if self.told_works != Some(works) {
+            self.told_works = Some(works);
+            self.handle(&Input::Store { time, works }, links);
+        }
+    }
+
+    /// The last state, on the disk.
+    pub(super) fn close_store(&mut self, time: Timestamp) {
+        if let Some(store) = self.store.take() {
+            store.finish(&self.monitor, time);
         }
     }
 
@@ -136,6 +228,38 @@ impl Engine {
             }
         }
     }
+}
+
+fn send(links: &[LinkOutput], transmit: &Transmit) {
+    if let Some(link) = links.get(transmit.bus.index()) {
+        link.send(transmit.frame);
+    }
+}
+
+/// Takes up the first of the stored states that fits; how old it is. Beside a journal goes what it began from.
+fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> Option<Away> {
+    for Candidate { snapshot, away, source } in states {
+        let beside = journal.map(|path| with_suffix(path, ".state.json"));
+        let written = beside.as_deref().map(|path| snapshot_file::write(path, &snapshot));
+        match monitor.restore(snapshot, away) {
+            Ok(()) => {
+                tracing::info!(source, %away, "state taken up");
+                if let Some(Err(error)) = written {
+                    tracing::error!(%error, "the state this record begins from is not beside it");
+                }
+                return Some(away);
+            }
+            Err(error) => tracing::error!(source, %error, "a stored state does not fit and is not used"),
+        }
+    }
+    tracing::info!("no stored state: nothing is known of the cells yet");
+    None
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
 }
 
 /// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use sd_notify::NotifyState;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
@@ -14,6 +14,7 @@ use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
 use crate::daemon::control::{Asked, answer};
+use crate::daemon::store::Progress;
 use crate::daemon::{logging, snapshot_file};
 use crate::io::clock::MappedClock;
 use crate::io::socket::{LinkOutput, Received, What};
@@ -45,6 +46,7 @@ impl Loop {
     pub(super) async fn run(&mut self, mut stop: Stop) {
         let mut ticks = interval(Duration::from_millis(u64::from(TICK_PERIOD_MS)));
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let mut stored = self.engine.store_progress();
         let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
         let (mut fed, mut flushed) = (Instant::now(), Instant::now());
         loop {
@@ -63,6 +65,9 @@ impl Loop {
                         self.engine.flush();
                         flushed = now;
                     }
+                }
+                progress = next_progress(&mut stored) => {
+                    self.engine.settle(progress, self.clock.now(), &self.outputs);
                 }
                 // Each is taken between two ticks, and there are never more than connections.
                 Some(asked) = self.requests.recv() => self.answer(asked).await,
@@ -89,8 +94,8 @@ impl Loop {
         let ready = told.ready.then_some(NotifyState::Ready);
         let status = told.status.as_deref().map(NotifyState::Status);
         if ready.is_some() || status.is_some() {
-            let ready = if told.ready { "ready; " } else { "" };
-            tracing::info!("{ready}{}", told.status.as_deref().unwrap_or("as before"));
+            let head = if told.ready { "ready; " } else { "" };
+            tracing::info!("{head}{}", told.status.as_deref().unwrap_or("as before"));
             notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
         }
     }
@@ -98,10 +103,7 @@ impl Loop {
     /// What came before the tick is handed over before it.
     async fn tick(&mut self) {
         self.drain().await;
-        if std::mem::take(&mut self.engine.lost_file) {
-            // The journal may be the one that is lost: the core is told all the same.
-            self.engine.handle(&Input::Store { time: self.clock.now(), works: false }, &self.outputs);
-        }
+        self.engine.look_after_store(self.clock.now(), &self.outputs);
         self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
     }
 
@@ -161,6 +163,7 @@ impl Loop {
 
     /// Sends what is queued, closes the files, stores the state.
     pub(super) async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
+        self.engine.let_go(&self.outputs);
         self.outputs.clear();
         self.inbox.close();
         let drained = async { while links.join_next().await.is_some() {} };
@@ -168,6 +171,7 @@ impl Loop {
             tracing::warn!("not every queued frame was sent before the stop");
         }
         // The state first: the files may hang on a disk that does not answer.
+        self.engine.close_store(self.clock.now());
         let stored = snapshot.map_or(Ok(()), |path| {
             snapshot_file::write(path, &self.engine.monitor.snapshot())
                 .map_err(|error| ServiceError::File { path: path.to_owned(), error })
@@ -176,4 +180,16 @@ impl Loop {
         tracing::info!("stopped");
         stored
     }
+}
+
+/// How far the store is, once that has changed.
+async fn next_progress(stored: &mut Option<watch::Receiver<Progress>>) -> Progress {
+    if let Some(receiver) = stored
+        && receiver.changed().await.is_ok()
+    {
+        return *receiver.borrow_and_update();
+    }
+    // No store, or its thread has ended.
+    *stored = None;
+    std::future::pending().await
 }
