@@ -11,6 +11,7 @@ use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
 use crate::daemon::snapshot_file;
+use crate::daemon::status::collect::RecentEvents;
 use crate::daemon::store::hold::Hold;
 use crate::daemon::store::{Candidate, Progress, Store};
 use crate::io::candump::{self, StampDigits};
@@ -42,6 +43,8 @@ pub(super) struct Engine {
     /// Frames have come since the last checkpoint.
     is_fresh: bool,
     pub(super) readiness: Readiness,
+    /// For those who look.
+    pub(super) recent: RecentEvents,
 }
 
 impl Engine {
@@ -92,6 +95,7 @@ impl Engine {
             told_works: None,
             hold: Hold::default(),
             is_fresh: false,
+            recent: RecentEvents::default(),
         })
     }
 
@@ -142,6 +146,7 @@ impl Engine {
         for event in &self.outputs.events {
             self.log.log(event);
             self.readiness.note(event);
+            self.recent.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }

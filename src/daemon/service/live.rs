@@ -10,6 +10,7 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
 use super::reload::Reload;
+use super::seeing::Seeing;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
@@ -40,6 +41,7 @@ pub(super) struct Loop {
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
     pub(super) left_out_told: Instant,
+    pub(super) seeing: Seeing,
 }
 
 impl Loop {
@@ -55,8 +57,10 @@ impl Loop {
                 biased;
                 () = stop.wait() => return,
                 now = ticks.tick() => {
+                    self.seeing.note_tick(now);
                     self.tick().await;
                     self.tell_manager(now);
+                    self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -94,8 +98,8 @@ impl Loop {
         let ready = told.ready.then_some(NotifyState::Ready);
         let status = told.status.as_deref().map(NotifyState::Status);
         if ready.is_some() || status.is_some() {
-            let head = if told.ready { "ready; " } else { "" };
-            tracing::info!("{head}{}", told.status.as_deref().unwrap_or("as before"));
+            let prefix = if told.ready { "ready; " } else { "" };
+            tracing::info!("{prefix}{}", told.status.as_deref().unwrap_or("as before"));
             notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
         }
     }
@@ -157,6 +161,9 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
+            if matches!(what, What::Frame(_)) {
+                self.seeing.note_frame(time, self.clock.now());
+            }
         }
         self.batch.clear();
     }
