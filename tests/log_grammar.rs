@@ -9,7 +9,7 @@ use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
 use packwatch::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
-use packwatch::monitor::{BusEvent, Input};
+use packwatch::monitor::{Away, BusEvent, Input};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
 
@@ -269,19 +269,21 @@ fn a_journal_gives_back_what_was_written() {
     ];
     inputs.extend(events.map(|event| Input::Bus { time: at(1_700_000_001_000_000_000), bus: BusIndex(1), event }));
     let mut journal = JournalWriter::new(Vec::new(), vec!["can0".into(), "can1".into()]).expect("memory");
-    journal.restored(at(1_700_000_000_000_000_000), Some(0.1)).expect("memory");
+    let aways = [Away::Seconds(0.1), Away::AsStamped, Away::Unknown];
+    let taken_up = at(1_700_000_000_000_000_000);
+    aways.iter().try_for_each(|away| journal.restored(taken_up, *away)).expect("memory");
     inputs.iter().try_for_each(|input| journal.append(input)).expect("memory");
     let text = journal.into_inner();
     let folder = tempfile::tempdir().expect("a folder");
     let (records, counts) = read(&[file(folder.path(), "j", &text)], true, |_| {}).expect("read");
-    assert_eq!(records[0], Record::Restore { time: at(1_700_000_000_000_000_000), away_s: Some(0.1) });
+    assert_eq!(records[..3], aways.map(|away| Record::Restore { time: taken_up, away }));
     let back: Vec<_> = records.iter().filter_map(Record::input).collect();
     assert_eq!(back, inputs);
     assert_eq!((counts.bad_lines, counts.ignored_lines, counts.time_backwards), (0, 1, 1));
 
     // Torn in the middle of its last line: that line is not taken for a shorter one.
     let (records, counts) = read(&[file(folder.path(), "t", &text[..text.len() - 2])], false, |_| {}).expect("read");
-    assert_eq!((records.len(), counts.bad_lines), (inputs.len(), 1));
+    assert_eq!((records.len(), counts.bad_lines), (inputs.len() + 2, 1));
 }
 
 #[test]

@@ -5,10 +5,14 @@
 //! discharge 125 and never below 1.2 Ah, those of B0006 at 109. Each model knows its cell's first five cycles only.
 #![expect(clippy::unwrap_used, reason = "helpers of tests: a missing piece is a failed test")]
 
+#[path = "common/window.rs"]
+mod window;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use serde_json::Value;
+use window::{By, windowed};
 
 /// The measured data, or `None` where it is not.
 #[expect(clippy::print_stdout, reason = "a skipped test says so")]
@@ -191,50 +195,8 @@ fn usable_capacity_follows_the_published_one_from_a_start_twenty_percent_wrong()
     }
 }
 
-/// Uniform numbers in [0, 1): splitmix64.
-struct Uniform(u64);
-
-impl Uniform {
-    fn draw(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-}
-
-/// Writes the life to `to` with only a random window of 40 to 70 % left of each record, by its duration or by the
-/// charge moved in it; time stamps stay true, so the rest is a gap of known length and unknown current.
-fn windowed(life: &Path, to: &Path, seed: u64, by_charge: bool) {
-    let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
-    let mut reader = csv::Reader::from_reader(file);
-    let mut writer = csv::Writer::from_path(to).unwrap();
-    writer.write_record(reader.headers().unwrap()).unwrap();
-    let rows: Vec<csv::StringRecord> = reader.records().map(Result::unwrap).collect();
-    let mut uniform = Uniform(seed);
-    for record in rows.chunk_by(|a, b| a[0] == b[0]) {
-        let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
-        let mut along = vec![0.0];
-        for pair in record.windows(2) {
-            let dt_s = number(&pair[1], 2) - number(&pair[0], 2);
-            let step = if by_charge { 0.5 * (number(&pair[0], 3) + number(&pair[1], 3)).abs() * dt_s } else { dt_s };
-            along.push(along[along.len() - 1] + step);
-        }
-        let whole = along[along.len() - 1];
-        let length = whole * (0.4 + 0.3 * uniform.draw());
-        let from = (whole - length) * uniform.draw();
-        for (row, &at) in record.iter().zip(&along) {
-            if (from..=from + length).contains(&at) {
-                writer.write_record(row).unwrap();
-            }
-        }
-    }
-    writer.flush().unwrap();
-}
-
-/// Seed of the windows, and whether they are measured by charge.
-const RUNS: [(u64, bool); 4] = [(1, false), (2, false), (3, true), (4, true)];
+/// Seed of the windows, and what they are counted in.
+const RUNS: [(u64, By); 4] = [(1, By::Duration), (2, By::Duration), (3, By::Charge), (4, By::Charge)];
 
 #[test]
 fn usable_capacity_is_learned_from_windows_of_the_swings() {
@@ -244,14 +206,14 @@ fn usable_capacity_is_learned_from_windows_of_the_swings() {
     for cell in ["B0005", "B0006"] {
         let discharges = discharges(&data, cell);
         let (mut sum_ah, mut sum_covered) = (0.0, 0.0);
-        for (seed, by_charge) in RUNS {
-            windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, by_charge);
+        for (seed, by) in RUNS {
+            windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, by);
             let config = configuration(folder.path(), cell, &[], "");
             let path = folder.path().join("events.jsonl");
             let times = data.join(format!("{cell}_cycles.csv"));
             replay_rows(&config, &rows, &times, &["--events", path.to_str().unwrap()]);
             let life = score(&events(&path), &discharges);
-            let by = if by_charge { "charge" } else { "duration" };
+            let by = format!("{by:?}").to_lowercase();
             println!(
                 "{cell} in windows of its {by} (seed {seed}): mean absolute error {:.4} Ah, covered {:.3}",
                 life.mean_absolute_ah, life.covered

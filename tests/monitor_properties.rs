@@ -8,7 +8,7 @@ use std::path::Path;
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
-use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
+use packwatch::monitor::{Away, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
 use packwatch::quantity::{BusIndex, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
@@ -114,7 +114,7 @@ fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
 const WHAT: [&str; 3] = ["estimates", "events", "frames"];
 
 /// The differences between a monitor that never stopped and ones restored at `splits`: a line for the first of each kind.
-fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away_s: Option<f64>) -> Vec<String> {
+fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Away) -> Vec<String> {
     let mut found = Vec::new();
     for &split in splits {
         let (mut whole, mut out) = (Monitor::new(config.clone()), wanting_estimates());
@@ -125,7 +125,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
         let text = serde_json::to_string(&whole.snapshot()).expect("a snapshot is a document");
         let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
         let mut restored = Monitor::new(config.clone());
-        restored.restore(snapshot, away_s).expect("fits");
+        restored.restore(snapshot, away).expect("fits");
         let mut told = [false; 3];
         for (nth, record) in (0..).zip(&records[split..]) {
             let expected = outputs(&mut whole, record, &mut out);
@@ -153,7 +153,7 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
     found
 }
 
-/// Splits anywhere, and (for `away_s` = 0, which says that no time passed) between two inputs of one stamp.
+/// Splits anywhere, and (for `away` = 0 s, which says that no time passed) between two inputs of one stamp.
 fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
     draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
         .map(|k| k + 1)
@@ -174,13 +174,13 @@ fn results(found: Vec<String>, frames: bool) -> Vec<String> {
 #[test]
 fn a_restored_cell_estimates_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    assert_same(&results(differences(&config, &records, &splits(&records, 6, false), None), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 6, false), Away::AsStamped), false));
 }
 
 #[test]
 fn a_restored_cell_that_was_not_away_estimates_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Some(0.0)), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Away::Seconds(0.0)), false));
 }
 
 #[test]
@@ -194,27 +194,85 @@ fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
         out.events.iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. }))
     });
     let split = told.expect("a half-cycle");
-    assert_same(&results(differences(&config, &records, &[split], None), false));
+    assert_same(&results(differences(&config, &records, &[split], Away::AsStamped), false));
 }
 
 #[test]
 fn a_restored_pack_estimates_as_if_it_had_never_stopped() {
     let (config, records) = pack();
-    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), None), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Away::AsStamped), false));
 }
 
 #[test]
 fn a_restored_cell_sends_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    let mut found = differences(&config, &records, &splits(&records, 3, false), None);
-    found.extend(differences(&config, &records, &splits(&records, 2, true), Some(0.0)));
+    let mut found = differences(&config, &records, &splits(&records, 3, false), Away::AsStamped);
+    found.extend(differences(&config, &records, &splits(&records, 2, true), Away::Seconds(0.0)));
     assert_same(&results(found, true));
 }
 
 #[test]
 fn a_restored_pack_sends_as_if_it_had_never_stopped() {
     let (config, records) = pack();
-    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), None), true));
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Away::AsStamped), true));
+}
+
+/// The whole run against one that goes on with an `edit`ed configuration from one split to the next: a line for the first
+/// difference of each kind. (The event that says so is not among them: it comes between two inputs.)
+fn reload_differences(
+    config: &MonitorConfig,
+    records: &[Record],
+    splits: &[usize],
+    edit: impl Fn(&mut MonitorConfig),
+) -> Vec<String> {
+    let (mut whole, mut reloaded) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
+    let (mut out_whole, mut out_reloaded) = (wanting_estimates(), wanting_estimates());
+    let (mut found, mut told, mut is_edited) = (Vec::new(), [false; 3], false);
+    for (nth, record) in records.iter().enumerate() {
+        if splits.contains(&nth) {
+            let mut other = config.clone();
+            is_edited = !is_edited;
+            if is_edited {
+                edit(&mut other);
+            }
+            let done = reloaded.reconfigure(other, record.time(), &mut out_reloaded).expect("taken over");
+            assert_eq!(done.alarms_ended, 0);
+        }
+        let expected = outputs(&mut whole, record, &mut out_whole);
+        let got = outputs(&mut reloaded, record, &mut out_reloaded);
+        for kind in 0..3 {
+            if expected[kind] != got[kind] && !told[kind] {
+                told[kind] = true;
+                let (what, at_s) = (WHAT[kind], record.time().secs());
+                found.push(format!("{what} differ at {at_s} s\n  {:.300}\n  {:.300}", expected[kind], got[kind]));
+            }
+        }
+    }
+    let end = |monitor: &Monitor| serde_json::to_value(monitor.snapshot()).expect("a document");
+    if end(&whole) != end(&reloaded) {
+        found.push("the states at the end differ".to_owned());
+    }
+    found
+}
+
+#[test]
+fn a_reload_of_the_same_configuration_changes_nothing() {
+    for (config, records) in [paper(), pack()] {
+        assert_same(&reload_differences(&config, &records, &splits(&records, 20, false), |_| {}));
+    }
+}
+
+#[test]
+fn other_thresholds_and_periods_change_no_estimate() {
+    for (config, records) in [paper(), pack()] {
+        let found = reload_differences(&config, &records, &splits(&records, 20, false), |config| {
+            config.rules.iter_mut().for_each(|rule| rule.threshold = rule.clear);
+            config.flood.max_frames_per_s = config.flood.max_frames_per_s.saturating_add(2000);
+            config.output.as_mut().expect("sends").status_period_s *= 10.0;
+        });
+        assert!(found.iter().any(|line| line.starts_with("frames")), "the edit does something");
+        assert_same(&found.into_iter().filter(|line| line.starts_with("estimates")).collect::<Vec<_>>());
+    }
 }
 
 /// All ticks against only those at `next_due`: every frame and event must be the same, in order.

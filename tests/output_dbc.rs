@@ -9,6 +9,7 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use oracle::{ask, hex, python, values};
+use packwatch::alarm::Rule;
 use packwatch::can::dbc::Database;
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
@@ -296,6 +297,24 @@ fn what_a_consumer_reads_of_the_dbc_is_the_configuration() {
             format!("PACKWATCH_{name} {id} {extended} {fd} {fd} {length} 250 {profile} {data_id}")
         });
         assert_eq!(ask(&python, &path, &["about", "strict"], &[]), wanted.collect::<Vec<_>>(), "{case:?}");
+    }
+}
+
+/// `capacity_low` as the DBC writes it: `CapacityLow`.
+fn camel_case(name: &str) -> String {
+    let capital = |word: &str| word[..1].to_uppercase() + &word[1..];
+    name.split('_').map(capital).collect()
+}
+
+#[test]
+fn every_rule_is_named_in_the_value_tables_by_its_number() {
+    let text = include_str!("../config/packwatch.dbc");
+    let dbc = Database::parse(text).unwrap();
+    let rules = Rule::ALL.map(|rule| (i64::from(rule as u8), camel_case(rule.name())));
+    for signal in ["PACKWATCH_Alarm.Rule", "PACKWATCH_Command.Rule"] {
+        let table = &dbc.signal(signal).unwrap().1.values;
+        assert_eq!(table[..rules.len()], rules, "{signal}");
+        assert_eq!(table.len(), rules.len() + 1, "{signal}: and one code for none or all");
     }
 }
 

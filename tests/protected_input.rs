@@ -2,12 +2,12 @@
 //! and what comes in other messages goes on.
 #![expect(clippy::unwrap_used, reason = "helpers of tests")]
 
-use std::path::Path;
+#[path = "common/config.rs"]
+mod config;
 
 use packwatch::can::e2e::{Profile, Protection, Status};
 use packwatch::can::{CanId, Frame};
-use packwatch::config;
-use packwatch::monitor::{Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Away, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, Timestamp};
 
 const BUS: BusIndex = BusIndex(0);
@@ -56,15 +56,7 @@ data_id = 0x4567
 "#;
 
 fn configuration() -> MonitorConfig {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
-    let read = |path: &Path| match path.file_name().and_then(|name| name.to_str()) {
-        Some("pack.toml") => Ok(PACK.as_bytes().to_vec()),
-        Some("pack.dbc") => Ok(DBC.as_bytes().to_vec()),
-        _ => std::fs::read(path),
-    };
-    config::load_with(&folder.join("pack.toml"), &read)
-        .unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")))
-        .monitor
+    config::load(PACK, DBC).monitor
 }
 
 /// A bus with three senders, and the core behind it.
@@ -371,7 +363,7 @@ fn a_restart_keeps_the_counts_and_waits_for_a_first_frame() {
     let text = serde_json::to_string(&bench.monitor.snapshot()).unwrap();
     let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
     let mut monitor = Monitor::new(configuration());
-    monitor.restore(snapshot, Some(10.0)).unwrap();
+    monitor.restore(snapshot, Away::Seconds(10.0)).unwrap();
     let mut after = Bench { counters: bench.counters, ..Bench::with(monitor) };
     after.cycle();
     after.cycle();
@@ -387,5 +379,5 @@ fn a_snapshot_of_an_earlier_version_without_these_counts_is_taken_up() {
     let mut document = serde_json::to_value(bench.monitor.snapshot()).unwrap();
     assert!(document.as_object_mut().unwrap().remove("intake").is_some());
     let mut monitor = Monitor::new(configuration());
-    monitor.restore(serde_json::from_value(document).unwrap(), Some(1.0)).unwrap();
+    monitor.restore(serde_json::from_value(document).unwrap(), Away::Seconds(1.0)).unwrap();
 }

@@ -7,7 +7,6 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 use crate::alarm::{Rule, Selector, Severity};
 use crate::cli::Failure;
 use crate::daemon::control::client::ControlClient;
-use crate::daemon::control::protocol::SEVERITIES;
 use crate::quantity::{CellIndex, MAX_CELLS};
 
 /// Where the daemon listens.
@@ -57,8 +56,8 @@ pub(crate) fn rule_parser() -> impl TypedValueParser<Value = Rule> {
 }
 
 fn severity_parser() -> impl TypedValueParser<Value = Severity> {
-    let find = |name: String| SEVERITIES.iter().find(|(known, _)| *known == name).map(|(_, s)| *s).ok_or("no such one");
-    PossibleValuesParser::new(SEVERITIES.map(|(name, _)| name)).try_map(find)
+    let find = |name: String| Severity::ALL.into_iter().find(|known| known.name() == name).ok_or("no such one");
+    PossibleValuesParser::new(Severity::ALL.map(Severity::name)).try_map(find)
 }
 
 fn cell(text: &str) -> Result<CellIndex, String> {

@@ -7,9 +7,11 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+mod doctor;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+mod generate;
 mod replay;
 mod run;
 #[cfg(feature = "lab")]
@@ -59,8 +61,13 @@ enum Command {
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
+    /// Listen to a pack, or replay a log, and tell what is probably wrong with wiring or configuration
+    Doctor(Box<doctor::Args>),
     /// Write the DBC of the frames as they are configured, for those who receive them
     Dbc(dbc::Args),
+    /// Write manual pages and shell completions
+    #[command(hide = true)]
+    Generate(generate::Args),
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
@@ -106,7 +113,9 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Dbc(args) => dbc::run(&args),
+        Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]

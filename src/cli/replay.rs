@@ -6,14 +6,15 @@ mod report;
 use std::io;
 use std::path::Path;
 
-pub(crate) use args::Args;
-use report::Bar;
+pub(crate) use args::{Args, CsvSign, column};
+pub(crate) use report::Bar;
 
 use super::Failure;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::daemon::replay::{self, ReplayError, Settings, Sinks, Summary};
 use crate::daemon::snapshot_file;
+use crate::daemon::store::Recorder;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
@@ -100,6 +101,13 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
+        away: args.away,
+        store: args
+            .state
+            .as_deref()
+            .map(|path| Recorder::create(path, &config.store))
+            .transpose()
+            .map_err(Failure::new)?,
         interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
     })
 }

@@ -8,10 +8,13 @@ use sha2::{Digest, Sha256};
 use super::Failure;
 use crate::config;
 use crate::daemon::control::ControlSetting;
+use crate::daemon::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::daemon::snapshot_file;
 use crate::daemon::status::document::ConfigFile;
+use crate::daemon::store::StateSetting;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
+use crate::monitor::Away;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -31,15 +34,22 @@ pub(crate) struct Args {
     /// Start from a stored state
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state, where its stamp does not tell (it came from a log)
-    #[arg(long, value_name = "SECONDS", requires = "restore", value_parser = seconds)]
-    away: Option<f64>,
+    /// Age of the stored state, where its stamp does not tell (it came from a log), or unknown
+    #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
+    away: Option<Away>,
+    /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
+    /// /var/lib/packwatch where that can be made). The state in it is taken up, unless --restore says another
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
     /// Store the state here on stopping
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
     /// Stop after this time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
     duration: Option<f64>,
+    /// Wait this long for the first usable frame before the service manager is told that the service is ready
+    #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = ready_seconds)]
+    ready_timeout: f64,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
@@ -68,6 +78,21 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
+fn ready_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=MAX_READY_TIMEOUT_S).contains(&value) => Ok(value),
+        _ => Err(format!("must be seconds, 0 to {MAX_READY_TIMEOUT_S}")),
+    }
+}
+
+/// Age of a stored state.
+pub(crate) fn away(text: &str) -> Result<Away, String> {
+    match text {
+        "unknown" => Ok(Away::Unknown),
+        _ => seconds(text).map(Away::Seconds).map_err(|must| format!("{must}, or unknown")),
+    }
+}
+
 fn buffer_bytes(text: &str) -> Result<usize, String> {
     match text.parse::<usize>() {
         Ok(value) if value <= MAX_BUFFER_BYTES => Ok(value),
@@ -91,10 +116,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
-        away_s: args.away,
+        away: args.away.unwrap_or_default(),
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
+        ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
+        state: StateSetting::from_path(args.state.clone()),
         control: ControlSetting::from_path(args.control.clone()),
         status: ControlSetting::from_path(args.status.clone()),
         config_file: config_file(&args.config),

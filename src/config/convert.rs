@@ -2,12 +2,13 @@
 
 use std::num::NonZeroU32;
 
+use super::StoreConfig;
 use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
     Method, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge,
-    ReportedSocInput, ReportedSohInput, SECTIONS, TemperatureInput, TemperatureLimits, Transition, Usable,
+    ReportedSocInput, ReportedSohInput, SECTIONS, Store, TemperatureInput, TemperatureLimits, Transition, Usable,
     VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
@@ -62,6 +63,7 @@ pub(crate) struct Raw {
     pub(crate) output_alarm: Option<OutputAlarm>,
     pub(crate) output_written: bool,
     pub(crate) commands: Option<Commands>,
+    pub(crate) store: Option<Store>,
 }
 
 impl Raw {
@@ -104,6 +106,7 @@ impl Raw {
             output_status: walk.one(),
             output_health: walk.one(),
             output_alarm: walk.one(),
+            store: walk.one(),
         }
     }
 }
@@ -263,7 +266,7 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
     }
 }
 
-fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
+pub(crate) fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
     let dead_band_a = keys.dead_band_a.unwrap_or(pack_ah / 50.0);
     TransitionConfig {
         dead_band_a,
@@ -303,6 +306,11 @@ fn recharge(keys: &Recharge, rated_ah: f64) -> RechargeConfig {
         min_coverage: keys.min_coverage,
         alarm_on: keys.alarm_on,
     }
+}
+
+/// How state and history are kept.
+pub(crate) fn store(keys: &Store) -> StoreConfig {
+    StoreConfig { checkpoint_s: keys.checkpoint_s, max_half_cycles: keys.max_half_cycles }
 }
 
 fn usable(keys: &Usable, rated_ah: f64) -> UsableConfig {

@@ -17,6 +17,7 @@ mod describe;
 mod document;
 mod j1939;
 mod keys;
+mod manual;
 mod output;
 mod pattern;
 mod protect;
@@ -24,11 +25,14 @@ mod reference;
 mod resolve;
 mod schema;
 mod setting;
+mod survey;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
+pub use manual::manual;
 pub use reference::reference;
 use resolve::Databases;
+pub use survey::{Survey, survey};
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -41,6 +45,17 @@ pub struct Config {
     pub monitor: MonitorConfig,
     /// Layout of what is sent, for consumers; `None` = nothing is sent.
     pub output_layout: Option<Database>,
+    /// How state and history are kept.
+    pub store: StoreConfig,
+}
+
+/// How state and history are kept.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StoreConfig {
+    /// Period of the state's checkpoints, s.
+    pub checkpoint_s: f64,
+    /// Half-cycles kept, one row per cell each; beyond, the oldest are thinned.
+    pub max_half_cycles: u32,
 }
 
 /// One CAN interface.
@@ -115,7 +130,8 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
     let traffic = convert::Traffic { input: resolve::input_map(&found)?, guards, output, commands, j1939 };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
-    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout };
+    let store = convert::store(raw.store.as_ref()?);
+    let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
 }

@@ -163,6 +163,3 @@ pub(crate) fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
     }
     words
 }
-
-#[cfg(test)]
-mod tests;

@@ -3,12 +3,14 @@
 #![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use proptest::prelude::*;
 
 mod alarms;
+mod cell_model;
 mod j1939;
+mod protect;
 
 use super::*;
 use crate::can::dbc::FrameFormat;
@@ -73,7 +75,7 @@ signal = "Cells.CellVoltage{n}"
 signal = "Status.Temperature"
 "#;
 
-fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> {
+fn read_texts(pack: &str, cell: &str, dbc: &str) -> Result<(Config, Description), Vec<String>> {
     let own = include_str!("../../config/packwatch.dbc");
     let files = [("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC), ("own.dbc", own)];
     let files = HashMap::from(files);
@@ -81,15 +83,15 @@ fn load_texts(pack: &str, cell: &str, dbc: &str) -> Result<Config, Vec<String>> 
         Some(text) => Ok(text.as_bytes().to_vec()),
         None => Err(std::io::ErrorKind::NotFound.into()),
     };
-    load_with(&PathBuf::from("pack.toml"), &read).map_err(|faults| faults.0)
+    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
 }
 
 fn good(pack: &str) -> Config {
-    load_texts(pack, CELL, DBC).unwrap()
+    read_texts(pack, CELL, DBC).unwrap().0
 }
 
 fn faults(pack: &str) -> Vec<String> {
-    load_texts(pack, CELL, DBC).unwrap_err()
+    read_texts(pack, CELL, DBC).unwrap_err()
 }
 
 /// The test configuration with `from` replaced, which must be there.
@@ -436,7 +438,7 @@ fn broken_syntax_hides_no_other_fault_and_invents_none() {
         assert!(all.contains(&fault.to_owned()), "{all:#?}");
     }
     assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
-    let all = load_texts(PACK, DBC, DBC).unwrap_err();
+    let all = read_texts(PACK, DBC, DBC).unwrap_err();
     assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more faults of syntax from here"));
 }
 
@@ -469,7 +471,7 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
         pack_with("cells = 4", "cells = 0\nx = 1").replace("\"charge\"", "\"in\"") + "[recharge]\nto_soc = 0.1\n";
     let cell = CELL.replace("capacity_ah = 1.9", "capacity_ah = 0").replace("[0, 0.5, 1]", "[0, 0.5, 0.5]");
     let dbc = DBC.replace("BO_ 272 Cells: 8 A", "BO_ 4000 Cells: 8 A");
-    let all = load_texts(&pack, &cell, &dbc).unwrap_err();
+    let all = read_texts(&pack, &cell, &dbc).unwrap_err();
     let expected = [
         "pack.toml:2: pack.cells = 0, must be 1 to 1024",
         "pack.toml:3: pack.x is not a known key",
@@ -484,59 +486,6 @@ fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
 }
 
 #[test]
-fn faults_of_a_cell_model() {
-    let table: &[(&str, &str, &str)] = &[
-        ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
-        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a text that is not empty"),
-        (
-            "capacity_ah = 1.9",
-            "capacity_ah = -1.9",
-            "cell.toml:4: capacity_ah = -1.9, must be above 0 and at most 100000",
-        ),
-        (
-            "voltage_max_v = 4.2",
-            "voltage_max_v = 2.5",
-            "cell.toml:6: voltage_max_v = 2.5, must be above voltage_min_v = 2.5",
-        ),
-        (
-            "[3.0, 3.6, 4.1]",
-            "[3.0, 3.6, 3.6]",
-            "cell.toml:12: tables.ocv_v: 3.6 follows 3.6 at 10 degrees C, must rise strictly with soc",
-        ),
-        ("[3.0, 3.6, 4.1]", "[3.0, 3.6]", "cell.toml:12: tables.ocv_v: row 1 has 2 values, must be 3, one per soc"),
-        ("[[3.0, 3.6, 4.1], ", "[", "cell.toml:12: tables.ocv_v: 1 rows, must be 2, one per temperature_c"),
-        ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0 and at most 100"),
-        ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be above 0"),
-        ("[[100, 100, 100]", "[[100, 0, 100]", "cell.toml:16: tables.branches[1].c_farad = 0, must be above 0"),
-        (
-            "c_farad = [[100, 100, 100], ",
-            "c_farad = [",
-            "cell.toml:16: tables.branches[1].c_farad: 1 rows, must be 2, one per temperature_c",
-        ),
-        (
-            "temperature_c = [10, 30]",
-            "temperature_c = [30, 10]",
-            "cell.toml:11: tables.temperature_c: 10 follows 30, must rise strictly",
-        ),
-        (
-            "[provenance]",
-            "[thermal]\nheat_capacity_j_per_k = 1\nresistance_k_per_w = 0\n[provenance]",
-            "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
-        ),
-        ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
-    ];
-    for (from, to, fault) in table {
-        assert!(CELL.contains(from), "{from}");
-        assert_eq!(load_texts(PACK, &CELL.replacen(from, to, 1), DBC).unwrap_err(), [*fault], "{from} -> {to}");
-    }
-    let branch = "[[tables.branches]]\nr_ohm = [[1, 1, 1], [1, 1, 1]]\nc_farad = [[1, 1, 1], [1, 1, 1]]\n";
-    let four = load_texts(PACK, &format!("{CELL}{}", branch.repeat(3)), DBC).unwrap_err();
-    assert_eq!(four, ["cell.toml:14: tables.branches: 4 tables [[tables.branches]], must be 1 to 3"]);
-    let none = load_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
-    assert_eq!(none, ["cell.toml:9: tables.branches: 0 tables [[tables.branches]], must be 1 to 3"]);
-}
-
-#[test]
 fn text_that_is_not_utf_8_is_refused_with_its_line() {
     let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
     assert_eq!(load_with(Path::new("pack.toml"), &read).unwrap_err().0, ["pack.toml:2: is not UTF-8 text"]);
@@ -545,7 +494,7 @@ fn text_that_is_not_utf_8_is_refused_with_its_line() {
 #[test]
 fn every_default_is_a_value_its_key_allows() {
     use super::schema::Presence;
-    for info in keys::SECTIONS.iter().chain(cell_model::SECTIONS) {
+    for info in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS) {
         for key in info.keys.unwrap_or(&[]) {
             assert!(!key.about.trim().is_empty() && key.about.trim().ends_with('.'), "{}.{}", info.path, key.name);
             if key.presence == Presence::Optional {
@@ -570,7 +519,7 @@ fn the_reference_page_is_the_one_in_the_repository() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/config/REFERENCE.md");
     let page = std::fs::read_to_string(path).unwrap();
     assert!(page == reference(), "write it anew: packwatch check --reference > config/REFERENCE.md");
-    for key in keys::SECTIONS.iter().chain(cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
+    for key in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
         assert!(page.contains(&format!("| `{}` |", key.name)), "{}", key.name);
     }
 }
@@ -598,7 +547,7 @@ proptest! {
             text.splice(from..to, SCRAPS[scrap.index(SCRAPS.len())].chars());
         }
         let texts = texts.map(|chars| chars.into_iter().collect::<String>());
-        if let Err(faults) = load_texts(&texts[0], &texts[1], &texts[2]) {
+        if let Err(faults) = read_texts(&texts[0], &texts[1], &texts[2]) {
             prop_assert!(!faults.is_empty());
             for fault in faults {
                 prop_assert!(!fault.contains('\n') && !fault.contains("not usable"), "{fault}");

@@ -15,12 +15,15 @@ mod intake;
 mod rows;
 
 use super::event_log;
+use super::store::Recorder;
 use crate::alarm::Change;
 use crate::can::Frame;
 use crate::io::log::{LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{
+    Away, Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS,
+};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use intake::{DroppedSummary, ProtectedSummary};
@@ -66,6 +69,10 @@ pub struct Settings {
     pub snapshot_at: Option<When>,
     /// State to start from.
     pub restore: Option<Snapshot>,
+    /// How old it is; `None` = as the journal says, or else its stamp.
+    pub away: Option<Away>,
+    /// Where state and history are kept, as the daemon keeps them.
+    pub store: Option<Recorder>,
     /// Names of the interfaces, for the frames that would be sent.
     pub interfaces: Vec<String>,
 }
@@ -93,6 +100,9 @@ pub enum ReplayError {
     /// The snapshot does not fit.
     #[error(transparent)]
     Restore(#[from] RestoreError),
+    /// State or history cannot be written.
+    #[error("{0}")]
+    Store(String),
     /// The moment of the snapshot lies beyond the log.
     #[error("no snapshot taken: the log ends at {end_s} s, before the moment asked for")]
     SnapshotNotReached {
@@ -250,6 +260,8 @@ struct Replay {
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: Summary,
+    /// A reload of the recorded run was noted.
+    reloaded: bool,
     usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
 }
 
@@ -271,6 +283,7 @@ impl Replay {
             snapshot_at: None,
             snapshot: None,
             summary: Summary::default(),
+            reloaded: false,
             usable: BTreeMap::new(),
         })
     }
@@ -299,10 +312,23 @@ impl Replay {
             self.ticks.advance(time);
         }
         self.make_ticks()?;
+        if let Record::Reload { time } = record {
+            self.note_reload(*time);
+        }
         if let Some(input) = record.input() {
             self.feed(input)?;
         }
         Ok(true)
+    }
+
+    /// The first of the recorded run's reloads is noted: from there this replay may differ from it.
+    fn note_reload(&mut self, time: Timestamp) {
+        if !std::mem::replace(&mut self.reloaded, true) {
+            let at_s = time.secs();
+            self.summary.notes.push(format!(
+                "the recorded run took another configuration over at {at_s:.3} s: from there its results may differ"
+            ));
+        }
     }
 
     /// The first record of all.
@@ -310,11 +336,13 @@ impl Replay {
         let first = self.window.first.unwrap_or(record.time());
         self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
         let recorded = match record {
-            Record::Restore { away_s, .. } => Some(*away_s),
+            Record::Restore { away, .. } => Some(*away),
             _ => None,
         };
         match (self.settings.restore.take(), recorded) {
-            (Some(snapshot), recorded) => self.monitor.restore(snapshot, recorded.flatten())?,
+            (Some(snapshot), recorded) => {
+                self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
+            }
             (None, Some(_)) => self
                 .summary
                 .notes
@@ -339,6 +367,9 @@ impl Replay {
         self.pace.wait(input.time());
         self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
         self.monitor.handle(input, &mut self.out);
+        if let Some(store) = &mut self.settings.store {
+            store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
+        }
         self.write_out()?;
         Ok(())
     }
@@ -370,6 +401,9 @@ impl Replay {
     fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
         self.ticks.sleep();
         self.make_ticks()?;
+        if let (Some(store), Some(end)) = (self.settings.store.take(), self.span.latest) {
+            store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
+        }
         if self.settings.snapshot && self.snapshot.is_none() {
             // A moment within the last record's tick period was reached as well.
             let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
@@ -470,6 +504,8 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::Reconfigured { .. } => "reconfigured",
+        EventKind::AlarmDropped { .. } => "alarm_dropped",
         EventKind::Store { .. } => "store",
     };
     *summary.events.entry(name).or_default() += 1;

@@ -6,6 +6,8 @@
 
 mod engine;
 mod live;
+pub(crate) mod readiness;
+mod reload;
 mod seeing;
 mod stop;
 
@@ -16,26 +18,32 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
 use super::status::StatusServer;
 use super::status::collect::Identity;
 use super::status::document::ConfigFile;
+use super::store::StateSetting;
 use super::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
-use crate::monitor::{Input, RestoreError, Snapshot};
+use crate::monitor::{Away, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
+use reload::Reload;
 use seeing::Seeing;
-use stop::Stop;
+pub(super) use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
+
+/// Threads for what would hold up the loop: reading a configuration, long answers. More would only wait for the disk.
+const BLOCKING_THREADS: usize = 4;
 
 /// What to run.
 #[derive(Debug)]
@@ -50,16 +58,20 @@ pub struct Service {
     pub events: Option<PathBuf>,
     /// State to start from.
     pub restore: Option<Snapshot>,
-    /// Age of that state, s; `None` = as its stamp says.
-    pub away_s: Option<f64>,
+    /// Age of that state.
+    pub away: Away,
     /// Where the state goes when the daemon stops.
     pub snapshot: Option<PathBuf>,
     /// Stop after this long; `None` = when told to.
     pub duration: Option<Duration>,
+    /// How long the first usable reading is waited for before the service calls itself ready.
+    pub ready_timeout: Duration,
     /// Receive buffer asked for per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
+    /// Where state and history are kept.
+    pub state: StateSetting,
     /// The status sockets.
     pub status: SocketSetting,
     /// Where the configuration came from, for those who look.
@@ -80,6 +92,9 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
+    /// The state folder is another daemon's.
+    #[error("{0}")]
+    Store(String),
     /// The control or status socket is another daemon's, or cannot be made.
     #[error("{0}")]
     Socket(String),
@@ -94,12 +109,14 @@ impl Service {
     /// # Errors
     /// When it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         runtime.block_on(self.serve())
     }
 
     async fn serve(mut self) -> Result<(), ServiceError> {
         let stop = Stop::new(self.duration)?;
+        let reload = Reload::new(&self.config)?;
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
@@ -112,11 +129,19 @@ impl Service {
         drop(sender);
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        let works = !std::mem::take(&mut engine.lost_file);
-        engine.handle(&Input::Store { time: clock.now(), works }, &outputs);
+        engine.tell_works(clock.now(), &outputs);
         let seeing = Seeing::new(status, self.identity(clock));
-        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new(), seeing };
-        notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        let mut service = Loop {
+            engine,
+            inbox,
+            requests,
+            reload,
+            clock,
+            outputs,
+            batch: Vec::new(),
+            left_out_told: Instant::now(),
+            seeing,
+        };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::tell();

@@ -8,18 +8,21 @@
 //! TICK (1700000000.130000000)
 //! BUS (1700000000.200000000) can0 up|down|missing|dropped N|error_frame CLASS|send_failed N
 //! GAP (1700000000.300000000)
-//! RESTORE (1700000000.000000000) AWAY_SECONDS|-
+//! RESTORE (1700000000.000000000) AWAY_SECONDS|-|unknown
 //! COMMAND (1700000000.400000000) {"command":"acknowledge",...}
 //! STORE (1700000000.500000000) works|fails
+//! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `RESTORE` stands first in the journal of a run that took up a stored state, and says how long it was away.
+//! `RELOAD`: from here on another configuration held, which the journal does not carry.
+//! `RESTORE` stands first in the journal of a run that took up a stored state, and says how long it was away (`-`: as
+//! the stamps say).
 //! A last line without line feed was torn by a power cut and is a bad line, even where it could be read.
 
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use crate::monitor::{BusEvent, Command, Input};
+use crate::monitor::{Away, BusEvent, Command, Input};
 use crate::quantity::Timestamp;
 
 /// First line of every journal.
@@ -31,9 +34,10 @@ pub(crate) enum Mark<'a> {
     Tick { time: Timestamp },
     Bus { time: Timestamp, interface: &'a [u8], event: BusEvent },
     Gap { time: Timestamp },
-    Restore { time: Timestamp, away_s: Option<f64> },
+    Restore { time: Timestamp, away: Away },
     Command { time: Timestamp, command: Command },
     Store { time: Timestamp, works: bool },
+    Reload { time: Timestamp },
 }
 
 /// Reads a journal line that does not begin with `(`; `None` = none of the journal's.
@@ -44,7 +48,7 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
     let Some(space) = memchr::memchr(b' ', line) else { return Ok(None) };
     let keyword = &line[..space];
-    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE"].contains(&keyword) {
+    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"].contains(&keyword) {
         return Ok(None);
     }
     let shifted = |e: LineError| LineError { column: e.column + space + 1, ..e };
@@ -52,12 +56,13 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let fail = |expected| Err(LineError { column: line.len() - rest.len() + 1, expected });
     let rest_text = rest.strip_prefix(b" ").unwrap_or_default();
     match keyword {
-        b"TICK" | b"GAP" if !rest.is_empty() => fail("the line's end after the stamp"),
+        b"TICK" | b"GAP" | b"RELOAD" if !rest.is_empty() => fail("the line's end after the stamp"),
         b"TICK" => Ok(Some(Mark::Tick { time })),
         b"GAP" => Ok(Some(Mark::Gap { time })),
+        b"RELOAD" => Ok(Some(Mark::Reload { time })),
         b"RESTORE" => match parse_away(rest_text) {
-            Some(away_s) => Ok(Some(Mark::Restore { time, away_s })),
-            None => fail("seconds away, or -"),
+            Some(away) => Ok(Some(Mark::Restore { time, away })),
+            None => fail("seconds away, - or unknown"),
         },
         b"COMMAND" => match serde_json::from_slice(rest_text) {
             Ok(command) => Ok(Some(Mark::Command { time, command })),
@@ -77,11 +82,8 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     }
 }
 
-fn parse_away(text: &[u8]) -> Option<Option<f64>> {
-    match text {
-        b"-" => Some(None),
-        _ => std::str::from_utf8(text).ok()?.parse().ok().filter(|s: &f64| s.is_finite()).map(Some),
-    }
+fn parse_away(text: &[u8]) -> Option<Away> {
+    std::str::from_utf8(text).ok()?.parse().ok()
 }
 
 fn parse_bus(text: &[u8]) -> Option<(&[u8], BusEvent)> {
@@ -117,16 +119,22 @@ impl<W: Write> JournalWriter<W> {
         Ok(Self { out, interfaces })
     }
 
-    /// Notes that a stored state was taken up, `away_s` seconds old (`None`: as the stamps say); before any input.
+    /// Notes that a stored state was taken up, and how old it was; before any input.
     ///
     /// # Errors
     /// Those of the file.
-    pub fn restored(&mut self, now: Timestamp, away_s: Option<f64>) -> io::Result<()> {
+    pub fn restored(&mut self, now: Timestamp, away: Away) -> io::Result<()> {
         self.mark("RESTORE", now)?;
-        match away_s {
-            Some(away_s) => writeln!(self.out, " {away_s:?}"),
-            None => writeln!(self.out, " -"),
-        }
+        writeln!(self.out, " {away}")
+    }
+
+    /// Notes that another configuration was taken over.
+    ///
+    /// # Errors
+    /// Those of the file.
+    pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
+        self.mark("RELOAD", time)?;
+        self.out.write_all(b"\n")
     }
 
     /// Appends one input, as it is handed to the core.

@@ -242,13 +242,17 @@ impl Monitor {
                 self.observe_alarm(Rule::UsableCapacityLow, cell, old(usable), out);
             }
         }
-        let period = match self.config.health.recharge.alarm_on {
-            RechargeAlarm::Raw => self.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
-            RechargeAlarm::Normalised => self.normalised_recharge.map(learned),
-        };
-        if let Some(period) = period {
+        if let Some(period) = self.known_recharge_period() {
             let period = Observation { is_new: false, ..period };
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
+        }
+    }
+
+    /// The last recharge period, of the kind the rule about it compares.
+    pub(super) fn known_recharge_period(&self) -> Option<Observation> {
+        match self.config.health.recharge.alarm_on {
+            RechargeAlarm::Raw => self.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
+            RechargeAlarm::Normalised => self.normalised_recharge.map(learned),
         }
     }
 

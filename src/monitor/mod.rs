@@ -8,10 +8,12 @@
 mod alarms;
 mod buses;
 mod cyclic;
+mod heard;
 mod intake;
 mod j1939;
 mod learning;
 mod output;
+mod reconfigure;
 mod snapshot;
 mod statistics;
 mod types;
@@ -20,6 +22,7 @@ mod view;
 pub use cyclic::MAX_TEST_S;
 pub use j1939::{AlarmCode, J1939Config};
 pub use output::{CommandConfig, OutputConfig};
+pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use snapshot::{RestoreError, Snapshot};
 pub use statistics::{AlarmCounts, BusStatistics, Statistics};
 pub use types::*;
@@ -29,7 +32,7 @@ use alarms::StoreState;
 use buses::Buses;
 use cyclic::{Schedule, Test};
 use intake::Intake;
-use snapshot::PendingRestore;
+use snapshot::{PendingRestore, Taken};
 
 use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
@@ -131,6 +134,8 @@ pub struct Monitor {
     config: MonitorConfig,
     /// Whether an input has come.
     started: bool,
+    /// Whether a usable reading has come since then.
+    heard: bool,
     /// Time of the latest input that did something.
     now: Timestamp,
     /// Inputs that came with a time before `now`.
@@ -197,6 +202,7 @@ impl Monitor {
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
             started: false,
+            heard: false,
             now: Timestamp::ZERO,
             time_backwards: 0,
             detector: TransitionDetector::default(),
@@ -323,10 +329,14 @@ impl Monitor {
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        let is_restored = self.apply_pending(time);
-        let was_away_briefly = time.since(self.now) <= ASLEEP_S;
-        if is_restored {
+        let taken = self.apply_pending(time, out);
+        let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
+        if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
+        }
+        if taken == Taken::Ageless {
+            // Claims the address, too.
+            self.handle_unknown_gap(time, out);
         }
         // After a longer time `advance` finds the gap and claims the address.
         if was_away_briefly {
@@ -415,6 +425,7 @@ impl Monitor {
         });
         for reading in readings.drain(..) {
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
+            self.note_heard(&reading);
             self.report_signals(out);
             if reading.channel == Channel::Current {
                 self.observe_current(self.sampler.pack_current_a(self.now), out);

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
 use super::intake::IntakeState;
-use super::{CellSlot, Consumed, Monitor, Statistics};
-use crate::alarm::AlarmState;
+use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
+use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
 use crate::health::{Learner, PackState, RechargeTimer, TransitionDetector};
@@ -77,11 +77,22 @@ pub enum RestoreError {
     },
 }
 
+/// What became of a restore that waited.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Taken {
+    /// There was none.
+    Nothing,
+    /// The state is taken up, and was taken at `Monitor::now`.
+    Aged,
+    /// The state is taken up, but nobody knows when it was taken.
+    Ageless,
+}
+
 /// A restore that waits for the first input, whose time is "now".
 #[derive(Debug)]
 pub(super) struct PendingRestore {
     snapshot: Box<Snapshot>,
-    away_s: Option<f64>,
+    away: Away,
 }
 
 impl Monitor {
@@ -111,12 +122,12 @@ impl Monitor {
     }
 
     /// Takes up a stored state in a monitor that has had no input yet. The first input's time is "now": the
-    /// snapshot was taken `away_s` seconds before it (`None`: as long before as the two stamps say), its stamps
-    /// are moved onto the present clock, and the time away is a gap like any other.
+    /// snapshot was taken `away` before it, its stamps are moved onto the present clock, and the time away is a gap like
+    /// any other.
     ///
     /// # Errors
     /// When the snapshot's version or shape does not fit.
-    pub fn restore(&mut self, snapshot: Snapshot, away_s: Option<f64>) -> Result<(), RestoreError> {
+    pub fn restore(&mut self, snapshot: Snapshot, away: Away) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
         }
@@ -131,14 +142,20 @@ impl Monitor {
                 allowed: format!("{} cells of {branches} branches", self.cells.len()),
             });
         }
-        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away_s });
+        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away });
         Ok(())
     }
 
-    /// Takes the waiting snapshot up, if there is one; `now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp) -> bool {
-        let Some(PendingRestore { mut snapshot, away_s }) = self.pending.take() else { return false };
-        let taken = away_s.map_or(snapshot.time.min(now), |away_s| now.plus_secs(-away_s));
+    /// Takes the waiting snapshot up, if there is one; `self.now` becomes when it was taken, on the present clock.
+    pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Taken {
+        let Some(PendingRestore { mut snapshot, away }) = self.pending.take() else { return Taken::Nothing };
+        let taken = match away {
+            Away::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
+            Away::Seconds(away_s) => Some(now.plus_secs(-away_s)),
+            Away::AsStamped | Away::Unknown => None,
+        };
+        let outcome = if taken.is_some() { Taken::Aged } else { Taken::Ageless };
+        let taken = taken.unwrap_or(now);
         let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
         snapshot.rebase(by_nanos);
         let branches = self.config.model.branches.len();
@@ -155,14 +172,27 @@ impl Monitor {
         self.pack = snapshot.pack;
         self.updated_cells = snapshot.updated_cells;
         self.time_backwards = snapshot.time_backwards;
-        self.alarms.restore(&snapshot.alarms);
         self.schedule = snapshot.schedule;
+        self.restore_alarms(now, &snapshot.alarms, out);
         self.intake.restore(&snapshot.intake);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
-        true
+        outcome
+    }
+}
+
+impl Monitor {
+    /// Takes the stored alarms up. Those that nothing watches any more end, here and for whoever saw them on the bus.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmState, out: &mut Outputs) {
+        for orphan in self.alarms.restore(state) {
+            let StoredAlarm { rule, severity, cell, .. } = orphan;
+            let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
+            out.events
+                .push(Event { time, kind: EventKind::AlarmDropped { rule, severity, cell, active, occurrences } });
+            self.send_alarm_end(rule, severity, cell, out);
+        }
     }
 }
 

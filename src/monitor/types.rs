@@ -85,6 +85,47 @@ pub enum Input<'a> {
     },
 }
 
+/// How long before the first input a stored state was taken ([`Monitor::restore`](super::Monitor::restore)).
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Away {
+    /// As long as the two stamps say. A state that was taken after "now" ([`MERGE_TOLERANCE_NS`] aside) has another clock's
+    /// stamp: then nobody knows.
+    #[default]
+    AsStamped,
+    /// This long, s.
+    Seconds(f64),
+    /// Nobody knows: as after [`Input::UnknownGap`].
+    Unknown,
+}
+
+/// As in a journal: seconds, `-` for "as stamped", or `unknown`.
+impl std::fmt::Display for Away {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::AsStamped => f.write_str("-"),
+            Self::Seconds(seconds) => write!(f, "{seconds:?}"),
+            Self::Unknown => f.write_str("unknown"),
+        }
+    }
+}
+
+/// What is neither of the three.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("must be seconds, 0 or more, or unknown")]
+pub struct NoAway;
+
+impl std::str::FromStr for Away {
+    type Err = NoAway;
+
+    fn from_str(text: &str) -> Result<Self, NoAway> {
+        match text {
+            "-" => Ok(Self::AsStamped),
+            "unknown" => Ok(Self::Unknown),
+            _ => text.parse().ok().filter(|s: &f64| s.is_finite() && *s >= 0.0).map(Self::Seconds).ok_or(NoAway),
+        }
+    }
+}
+
 /// What people may ask of the daemon.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "command")]
@@ -279,6 +320,24 @@ pub enum EventKind {
         capacity_ah: Option<f64>,
         /// Its standard deviation, Ah.
         capacity_std_ah: Option<f64>,
+    },
+    /// The configuration is another one from here on.
+    Reconfigured {
+        /// Alarms, raised or past, that ended because no threshold watches them any more.
+        alarms_ended: u32,
+    },
+    /// A stored state has an alarm that no configured threshold watches any more: it is over.
+    AlarmDropped {
+        /// Which rule.
+        rule: Rule,
+        /// Its severity.
+        severity: Severity,
+        /// Which cell; `None` = the pack.
+        cell: Option<CellIndex>,
+        /// Whether it was raised.
+        active: bool,
+        /// Times it was raised.
+        occurrences: u32,
     },
     /// Whether files can be written has changed.
     Store {

@@ -117,6 +117,15 @@ impl Sampler {
         Self { config, channels, sensors, voltages, flow_a, state, next_stale: None }
     }
 
+    /// Other limits for the same signals.
+    ///
+    /// # Panics
+    /// When the signals are others: the caller has checked.
+    pub fn reconfigure(&mut self, config: &SampleConfig) {
+        let state = std::mem::replace(self, Self::new(config.clone())).state;
+        assert!(self.restore(&state).is_ok(), "the same signals");
+    }
+
     /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
     pub fn handle_reading(
         &mut self,

@@ -14,6 +14,7 @@ use serde_json::Value;
 
 use crate::least_squares::{Method, Swing};
 use crate::swings::{Ends, Reading, Weighed, charge_variance, weigh};
+use crate::window::{By, windowed};
 use crate::{PEERS, Score, Source, follow, score};
 
 /// The measured data, or `None` where it is not.
@@ -64,47 +65,6 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     let path = folder.join("config.toml");
     std::fs::write(&path, text).unwrap();
     path
-}
-
-/// Uniform numbers in [0, 1): splitmix64, as in `measured_life`, so that its windows come again.
-struct Uniform(u64);
-
-impl Uniform {
-    fn draw(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        ((z ^ (z >> 31)) >> 11) as f64 / (1_u64 << 53) as f64
-    }
-}
-
-/// Writes the life with a random window of 40 to 70 % of each record's charge.
-fn windowed(life: &Path, to: &Path, seed: u64) {
-    let file = std::io::BufReader::new(flate2::read::GzDecoder::new(std::fs::File::open(life).unwrap()));
-    let mut reader = csv::Reader::from_reader(file);
-    let mut writer = csv::Writer::from_path(to).unwrap();
-    writer.write_record(reader.headers().unwrap()).unwrap();
-    let rows: Vec<csv::StringRecord> = reader.records().map(Result::unwrap).collect();
-    let mut uniform = Uniform(seed);
-    for record in rows.chunk_by(|a, b| a[0] == b[0]) {
-        let number = |row: &csv::StringRecord, column: usize| row[column].parse::<f64>().unwrap();
-        let mut along = vec![0.0];
-        for pair in record.windows(2) {
-            let dt_s = number(&pair[1], 2) - number(&pair[0], 2);
-            let step = 0.5 * (number(&pair[0], 3) + number(&pair[1], 3)).abs() * dt_s;
-            along.push(along[along.len() - 1] + step);
-        }
-        let whole = along[along.len() - 1];
-        let length = whole * (0.4 + 0.3 * uniform.draw());
-        let from = (whole - length) * uniform.draw();
-        for (row, at) in record.iter().zip(&along) {
-            if (from..=from + length).contains(at) {
-                writer.write_record(row).unwrap();
-            }
-        }
-    }
-    writer.flush().unwrap();
 }
 
 /// What was told after a discharge.
@@ -322,7 +282,7 @@ fn usable_capacity_from_windows_is_level_with_the_best_least_squares_on_them() {
     heading();
     for (cell, seed) in [("B0005", 3), ("B0005", 4), ("B0006", 3), ("B0006", 4)] {
         let name = format!("{cell} in windows, seed {seed}");
-        windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed);
+        windowed(&data.join(format!("{cell}.csv.gz")), &rows, seed, By::Charge);
         let life = live(&configuration(folder.path(), cell, 1.0, false), &rows, &data, cell);
         ours.push(print_ours(&name, &life));
         peers.push(print_peers(&name, "voltage, loaded", &life, &life.loaded));

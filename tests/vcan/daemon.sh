@@ -13,6 +13,7 @@ daemon() {
     local name=$1 file=$2 base=$tmp/$1
     shift 2
     [[ " $* " == *" --control "* ]] || set -- --control none "$@"
+    [[ " $* " == *" --state "* ]] || set -- --state none "$@"
     start "$name" "$packwatch" run -c "$file" --record "$base.journal" --frames "$base.sent" --events "$base.events" \
         --snapshot "$base.json" "$@"
 }

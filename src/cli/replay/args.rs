@@ -3,8 +3,10 @@
 use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
+use crate::cli::run::away;
 use crate::daemon::replay::When;
 use crate::io::stamp;
+use crate::monitor::Away;
 
 /// Which way a CSV's positive current flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -31,7 +33,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "X", value_parser = positive)]
     pub(crate) speed: Option<f64>,
     /// Play the frames onto this CAN interface instead of through the core
-    #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore"])]
+    #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore", "state"])]
     pub(crate) to: Option<String>,
     /// Write every estimate, as CSV
     #[arg(long, value_name = "FILE.csv")]
@@ -52,9 +54,15 @@ pub(crate) struct Args {
     /// 2008-04-02T13:08:17 (UTC); the end when not given
     #[arg(long, value_name = "WHEN", requires = "snapshot", value_parser = when, allow_hyphen_values = true)]
     pub(crate) snapshot_at: Option<When>,
+    /// Keep state and history in this new folder, as `packwatch run` does, with the log's clock as wall clock
+    #[arg(long, value_name = "DIR")]
+    pub(crate) state: Option<PathBuf>,
     /// Start from a written state
     #[arg(long, value_name = "FILE")]
     pub(crate) restore: Option<PathBuf>,
+    /// Age of that state, or unknown (default: as the journal says, else as its stamp does)
+    #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
+    pub(crate) away: Option<Away>,
     /// Leave out what is before; as --snapshot-at
     #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
     pub(crate) from: Option<When>,
@@ -117,7 +125,7 @@ fn when(text: &str) -> Result<When, String> {
         .ok_or_else(|| "must be seconds, +seconds or like 2008-04-02T13:08:17.921".to_owned())
 }
 
-fn column(text: &str) -> Result<(String, String), String> {
+pub(crate) fn column(text: &str) -> Result<(String, String), String> {
     const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
     let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
     if !ROLES.contains(&role) {

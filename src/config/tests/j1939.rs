@@ -142,7 +142,7 @@ fn what_the_node_sends_must_not_be_an_input_or_a_frame_of_ours() {
         .replace("BO_ 256 Status", &format!("BO_ {} Status", 0x8000_0000_u32 | 0x18FE_CAF9))
         .replace("VAL_ 256 Current", &format!("VAL_ {} Current", 0x8000_0000_u32 | 0x18FE_CAF9));
     let fault = "pack.toml:16: j1939.address = 249, must not be the address of an input, Status has 18FECAF9";
-    assert_eq!(load_texts(&with(TABLE), CELL, &dbc).unwrap_err(), [fault]);
+    assert_eq!(read_texts(&with(TABLE), CELL, &dbc).unwrap_err(), [fault]);
     let output = format!("[output]\n[output.status]\nextended = true\nid = 0x18EEFFF9\n{TABLE}");
     let fault =
         "pack.toml:20: j1939.address = 249, must not be the address in the identifier of a frame of [output], 18EEFFF9";

@@ -19,10 +19,6 @@ use crate::quantity::{CellIndex, MAX_CELLS, Timestamp};
 /// Version of requests and answers.
 pub(crate) const VERSION: u64 = 1;
 
-/// Severities as people write them.
-pub(crate) const SEVERITIES: [(&str, Severity); 3] =
-    [("info", Severity::Info), ("warning", Severity::Warning), ("severe", Severity::Severe)];
-
 /// Names of the requests.
 const REQUESTS: [&str; 5] = ["alarms", "acknowledge", "clear", "pack_replaced", "test"];
 
@@ -208,9 +204,9 @@ fn rule(found: &Value) -> Result<Rule, String> {
 }
 
 fn severity(found: &Value) -> Result<Severity, String> {
-    let named = SEVERITIES.iter().find(|(name, _)| found.as_str() == Some(name));
-    let fault = || must_be("severity", Some(found), &SEVERITIES.map(|(name, _)| name).join(", "));
-    named.map(|(_, severity)| *severity).ok_or_else(fault)
+    let named = |severity: &Severity| found.as_str() == Some(severity.name());
+    let fault = || must_be("severity", Some(found), &Severity::ALL.map(Severity::name).join(", "));
+    Severity::ALL.into_iter().find(named).ok_or_else(fault)
 }
 
 fn cell(found: &Value) -> Result<CellIndex, String> {
@@ -289,6 +285,10 @@ mod tests {
         assert!(
             fault(r#"{"version":1,"request":"clear","rule":"soc"}"#)
                 .starts_with(r#"rule = "soc", must be capacity_low, "#)
+        );
+        assert_eq!(
+            fault(r#"{"version":1,"request":"clear","severity":"bad"}"#),
+            r#"severity = "bad", must be info, warning, severe"#
         );
         assert_eq!(fault(r#"{"version":1,"request":"clear","cell":1024}"#), "cell = 1024, must be 0 to 1023");
         assert_eq!(

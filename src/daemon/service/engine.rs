@@ -1,17 +1,25 @@
 //! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use tokio::sync::watch;
+use tokio::time::Instant;
+
+use super::readiness::{Readiness, restored_words};
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
+use crate::daemon::snapshot_file;
 use crate::daemon::status::collect::RecentEvents;
+use crate::daemon::store::hold::Hold;
+use crate::daemon::store::{Candidate, Progress, Store};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Input, Monitor, Outputs};
+use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
+use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
 #[derive(Debug)]
@@ -23,29 +31,42 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
+    /// A file was given up.
+    lost_file: bool,
+    /// State and history.
+    store: Option<Store>,
+    /// Whether they can be written.
+    store_works: bool,
+    /// What the core was told last of all this.
+    told_works: Option<bool>,
+    hold: Hold,
+    /// Frames have come since the last checkpoint.
+    is_fresh: bool,
+    pub(super) readiness: Readiness,
     /// For those who look.
     pub(super) recent: RecentEvents,
-    /// A file was given up, and the core has not been told yet.
-    pub(super) lost_file: bool,
 }
 
 impl Engine {
     /// The core and the files round it.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
+        let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
         let names: Vec<String> = service.config.interfaces.iter().map(|i| i.name.clone()).collect();
         let mut monitor = Monitor::new(service.config.monitor.clone());
-        let restored = service.restore.take();
         let now = clock.now();
-        let is_restored = restored.is_some();
-        if let Some(snapshot) = restored {
-            let away_s = service.away_s.unwrap_or_else(|| now.since(snapshot.time).max(0.0));
-            // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-            monitor.restore(snapshot, service.away_s)?;
-            tracing::info!(away_s, "state taken up");
-        }
+        let mut stamped_s = 0.0;
+        // Before any file is opened: a start that fails leaves what an earlier run has recorded.
+        let away = if let Some(snapshot) = service.restore.take() {
+            stamped_s = now.since(snapshot.time);
+            monitor.restore(snapshot, service.away)?;
+            tracing::info!(away = %service.away, stamped_s, "state taken up");
+            Some(service.away)
+        } else {
+            take_up(&mut monitor, found.states, service.record.as_deref())
+        };
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
-        let marked = record.as_mut().filter(|_| is_restored).map(|journal| journal.restored(now, service.away_s));
+        let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
             (record, lost_file) = (None, true);
@@ -53,6 +74,12 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
+        let restored = away.map(|away| match away {
+            Away::Seconds(age_s) => restored_words(Some(age_s)),
+            Away::AsStamped => restored_words(Some(stamped_s).filter(|age_s| *age_s >= 0.0)),
+            Away::Unknown => restored_words(None),
+        });
+        let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
@@ -61,8 +88,14 @@ impl Engine {
             events,
             names,
             log,
-            recent: RecentEvents::default(),
+            readiness,
             lost_file,
+            store,
+            store_works: found.works,
+            told_works: None,
+            hold: Hold::default(),
+            is_fresh: false,
+            recent: RecentEvents::default(),
         })
     }
 
@@ -73,9 +106,37 @@ impl Engine {
         }
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
+        self.is_fresh |= matches!(input, Input::Frame { .. });
+        self.hand_on(input.time(), links);
+    }
+
+    /// Gives the core another configuration; the journal says that it did.
+    ///
+    /// # Errors
+    /// Why the core does not take it; then nothing has changed.
+    pub(super) fn reconfigure(
+        &mut self,
+        config: MonitorConfig,
+        time: Timestamp,
+        links: &[LinkOutput],
+    ) -> Result<Reconfigured, Vec<String>> {
+        self.outputs.clear();
+        let changed =
+            self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
+        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
+            self.stop_recording(&error);
+        }
+        self.hand_on(time, links);
+        Ok(changed)
+    }
+
+    /// What came out of the core: frames to the interfaces, events to the log, both to their files.
+    fn hand_on(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        let ticket = self.keep(time);
         for transmit in &self.outputs.frames {
-            if let Some(link) = links.get(transmit.bus.index()) {
-                link.send(transmit.frame);
+            match ticket.or_else(|| self.hold.behind(transmit)) {
+                Some(ticket) => self.hold.push(ticket, *transmit),
+                None => send(links, transmit),
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -84,8 +145,68 @@ impl Engine {
         }
         for event in &self.outputs.events {
             self.log.log(event);
+            self.readiness.note(event);
             self.recent.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
+        }
+    }
+
+    /// Makes what was learned durable; the ticket its announcement waits for. A store that fails is not waited for.
+    fn keep(&mut self, now: Timestamp) -> Option<u64> {
+        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
+        if !self.store_works {
+            return None;
+        }
+        self.hold.begin(ticket, Instant::now());
+        Some(ticket)
+    }
+
+    /// How far the store is, told whenever that changes; `None` = there is none.
+    pub(super) fn store_progress(&self) -> Option<watch::Receiver<Progress>> {
+        self.store.as_ref().map(Store::progress)
+    }
+
+    /// The store has come further, or has failed.
+    pub(super) fn settle(&mut self, progress: Progress, time: Timestamp, links: &[LinkOutput]) {
+        self.hold.release(progress.ticket, |transmit| send(links, transmit));
+        self.store_works = progress.works;
+        self.tell_works(time, links);
+    }
+
+    /// Nothing waits any longer: the daemon stops.
+    pub(super) fn let_go(&mut self, links: &[LinkOutput]) {
+        self.hold.release(u64::MAX, |transmit| send(links, transmit));
+    }
+
+    /// With every tick: what has waited too long goes, and the store gets its checkpoints.
+    pub(super) fn look_after_store(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        if let Some(ticket) = self.hold.overdue(Instant::now()) {
+            self.hold.release(ticket, |transmit| send(links, transmit));
+            tracing::warn!("the disk is slow: announced before it was stored");
+            self.store_works = false;
+        }
+        if let Some(store) = &mut self.store
+            && store.tick(&self.monitor, time, self.is_fresh)
+        {
+            self.is_fresh = false;
+        }
+        self.tell_works(time, links);
+    }
+
+    /// Tells the core when it has changed whether files can be written.
+    pub(super) fn tell_works(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        // The journal may be the file that is lost: the core is told all the same.
+        let works = self.store_works && !self.lost_file;
+        if self.told_works != Some(works) {
+            self.told_works = Some(works);
+            self.handle(&Input::Store { time, works }, links);
+        }
+    }
+
+    /// The last state, on the disk.
+    pub(super) fn close_store(&mut self, time: Timestamp) {
+        if let Some(store) = self.store.take() {
+            store.finish(&self.monitor, time);
         }
     }
 
@@ -112,6 +233,38 @@ impl Engine {
             }
         }
     }
+}
+
+fn send(links: &[LinkOutput], transmit: &Transmit) {
+    if let Some(link) = links.get(transmit.bus.index()) {
+        link.send(transmit.frame);
+    }
+}
+
+/// Takes up the first of the stored states that fits; how old it is. Beside a journal goes what it began from.
+fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> Option<Away> {
+    for Candidate { snapshot, away, source } in states {
+        let beside = journal.map(|path| with_suffix(path, ".state.json"));
+        let written = beside.as_deref().map(|path| snapshot_file::write(path, &snapshot));
+        match monitor.restore(snapshot, away) {
+            Ok(()) => {
+                tracing::info!(source, %away, "state taken up");
+                if let Some(Err(error)) = written {
+                    tracing::error!(%error, "the state this record begins from is not beside it");
+                }
+                return Some(away);
+            }
+            Err(error) => tracing::error!(source, %error, "a stored state does not fit and is not used"),
+        }
+    }
+    tracing::info!("no stored state: nothing is known of the cells yet");
+    None
+}
+
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
 }
 
 /// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.

@@ -4,17 +4,19 @@ use std::path::Path;
 use std::time::Duration;
 
 use sd_notify::NotifyState;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
+use super::reload::Reload;
 use super::seeing::Seeing;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
 use crate::daemon::control::{Asked, answer};
-use crate::daemon::snapshot_file;
+use crate::daemon::store::Progress;
+use crate::daemon::{logging, snapshot_file};
 use crate::io::clock::MappedClock;
 use crate::io::socket::{LinkOutput, Received, What};
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
@@ -23,6 +25,8 @@ use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 const BATCH: usize = 256;
 /// Time the interfaces have to send what is queued when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
+/// How often it is told how many lines were left out of the log.
+const LEFT_OUT_PERIOD: Duration = Duration::from_secs(60);
 /// How often files are handed to the operating system: what a crash of the daemon can lose.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
@@ -32,9 +36,11 @@ pub(super) struct Loop {
     pub(super) engine: Engine,
     pub(super) inbox: mpsc::Receiver<Received>,
     pub(super) requests: mpsc::Receiver<Asked>,
+    pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
+    pub(super) left_out_told: Instant,
     pub(super) seeing: Seeing,
 }
 
@@ -42,6 +48,7 @@ impl Loop {
     pub(super) async fn run(&mut self, mut stop: Stop) {
         let mut ticks = interval(Duration::from_millis(u64::from(TICK_PERIOD_MS)));
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
+        let mut stored = self.engine.store_progress();
         let watchdog = sd_notify::watchdog_enabled().map(|period| period / 2);
         let (mut fed, mut flushed) = (Instant::now(), Instant::now());
         loop {
@@ -52,6 +59,7 @@ impl Loop {
                 now = ticks.tick() => {
                     self.seeing.note_tick(now);
                     self.tick().await;
+                    self.tell_manager(now);
                     self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
@@ -62,8 +70,13 @@ impl Loop {
                         flushed = now;
                     }
                 }
+                progress = next_progress(&mut stored) => {
+                    self.engine.settle(progress, self.clock.now(), &self.outputs);
+                }
                 // Each is taken between two ticks, and there are never more than connections.
                 Some(asked) = self.requests.recv() => self.answer(asked).await,
+                // At most one a second is read.
+                step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }
                 }
@@ -71,13 +84,30 @@ impl Loop {
         }
     }
 
+    /// Says when the service is ready, and how it is when that has changed.
+    fn tell_manager(&mut self, now: Instant) {
+        if now.duration_since(self.left_out_told) >= LEFT_OUT_PERIOD {
+            self.left_out_told = now;
+            let lines = logging::take_left_out();
+            if lines > 0 {
+                tracing::warn!(left_out = lines, "lines left out of the log");
+            }
+        }
+        let Engine { readiness, monitor, .. } = &mut self.engine;
+        let told = readiness.poll(monitor, now);
+        let ready = told.ready.then_some(NotifyState::Ready);
+        let status = told.status.as_deref().map(NotifyState::Status);
+        if ready.is_some() || status.is_some() {
+            let prefix = if told.ready { "ready; " } else { "" };
+            tracing::info!("{prefix}{}", told.status.as_deref().unwrap_or("as before"));
+            notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
+        }
+    }
+
     /// What came before the tick is handed over before it.
     async fn tick(&mut self) {
         self.drain().await;
-        if std::mem::take(&mut self.engine.lost_file) {
-            // The journal may be the one that is lost: the core is told all the same.
-            self.engine.handle(&Input::Store { time: self.clock.now(), works: false }, &self.outputs);
-        }
+        self.engine.look_after_store(self.clock.now(), &self.outputs);
         self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
     }
 
@@ -105,7 +135,7 @@ impl Loop {
     }
 
     /// Hands over what the interfaces have received so far.
-    async fn drain(&mut self) {
+    pub(super) async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
             // Lets the interfaces' tasks take what is in their sockets, and send.
             tokio::task::yield_now().await;
@@ -140,6 +170,7 @@ impl Loop {
 
     /// Sends what is queued, closes the files, stores the state.
     pub(super) async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
+        self.engine.let_go(&self.outputs);
         self.outputs.clear();
         self.inbox.close();
         let drained = async { while links.join_next().await.is_some() {} };
@@ -147,6 +178,7 @@ impl Loop {
             tracing::warn!("not every queued frame was sent before the stop");
         }
         // The state first: the files may hang on a disk that does not answer.
+        self.engine.close_store(self.clock.now());
         let stored = snapshot.map_or(Ok(()), |path| {
             snapshot_file::write(path, &self.engine.monitor.snapshot())
                 .map_err(|error| ServiceError::File { path: path.to_owned(), error })
@@ -155,4 +187,16 @@ impl Loop {
         tracing::info!("stopped");
         stored
     }
+}
+
+/// How far the store is, once that has changed.
+async fn next_progress(stored: &mut Option<watch::Receiver<Progress>>) -> Progress {
+    if let Some(receiver) = stored
+        && receiver.changed().await.is_ok()
+    {
+        return *receiver.borrow_and_update();
+    }
+    // No store, or its thread has ended.
+    *stored = None;
+    std::future::pending().await
 }

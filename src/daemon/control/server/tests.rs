@@ -1,3 +1,5 @@
+//! The control socket under clients good and bad: each is answered or let go, and none holds up the loop or the others.
+
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;

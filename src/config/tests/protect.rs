@@ -1,14 +1,8 @@
-//! Protected inputs, good and bad, compared word for word.
+//! `[[input.protected]]`: what becomes of it, and every fault, word for word.
 
-#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
-
-use std::path::Path;
-
-use crate::can::CanId;
-use crate::can::e2e::{CheckConfig, Profile, Protection};
+use super::*;
+use crate::can::e2e::CheckConfig;
 use crate::can::guard::GuardConfig;
-use crate::config::{Description, read_all};
-use crate::quantity::BusIndex;
 
 const DBC: &str = r#"VERSION ""
 NS_ :
@@ -31,22 +25,6 @@ BA_DEF_DEF_ "GenMsgCycleTime" 0;
 BA_ "GenMsgCycleTime" BO_ 256 100;
 "#;
 
-const CELL: &str = r#"format = 1
-name = "test"
-rated_capacity_ah = 2.0
-capacity_ah = 1.9
-voltage_min_v = 2.5
-voltage_max_v = 4.2
-[tables]
-soc = [0, 0.5, 1]
-temperature_c = [10, 30]
-ocv_v = [[3.0, 3.6, 4.1], [3.0, 3.6, 4.2]]
-r0_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
-[[tables.branches]]
-r_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
-c_farad = [[100, 100, 100], [100, 100, 100]]
-"#;
-
 /// 15 lines.
 const PACK: &str = r#"[pack]
 cells = 2
@@ -65,14 +43,8 @@ signal = "Cells.Voltage{n}"
 signal = "Status.Temperature"
 "#;
 
-fn read(pack: &str) -> Result<(crate::config::Config, Description), Vec<String>> {
-    let read = |path: &Path| match path.to_str() {
-        Some("pack.toml") => Ok(pack.as_bytes().to_vec()),
-        Some("pack.dbc") => Ok(DBC.as_bytes().to_vec()),
-        Some("cell.toml") => Ok(CELL.as_bytes().to_vec()),
-        _ => Err(std::io::ErrorKind::NotFound.into()),
-    };
-    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
+fn read(pack: &str) -> Result<(Config, Description), Vec<String>> {
+    read_texts(pack, CELL, DBC)
 }
 
 fn protected(table: &str) -> String {

@@ -1,0 +1,56 @@
+//! The cell model's file: every fault, word for word.
+
+use super::*;
+
+#[test]
+fn faults_of_a_cell_model() {
+    let table: &[(&str, &str, &str)] = &[
+        ("format = 1", "format = 2", "cell.toml:1: format = 2, must be 1"),
+        ("name = \"test\"\n", "", "cell.toml:1: name is missing, must be a text that is not empty"),
+        (
+            "capacity_ah = 1.9",
+            "capacity_ah = -1.9",
+            "cell.toml:4: capacity_ah = -1.9, must be above 0 and at most 100000",
+        ),
+        (
+            "voltage_max_v = 4.2",
+            "voltage_max_v = 2.5",
+            "cell.toml:6: voltage_max_v = 2.5, must be above voltage_min_v = 2.5",
+        ),
+        (
+            "[3.0, 3.6, 4.1]",
+            "[3.0, 3.6, 3.6]",
+            "cell.toml:12: tables.ocv_v: 3.6 follows 3.6 at 10 degrees C, must rise strictly with soc",
+        ),
+        ("[3.0, 3.6, 4.1]", "[3.0, 3.6]", "cell.toml:12: tables.ocv_v: row 1 has 2 values, must be 3, one per soc"),
+        ("[[3.0, 3.6, 4.1], ", "[", "cell.toml:12: tables.ocv_v: 1 rows, must be 2, one per temperature_c"),
+        ("[3.0, 3.6, 4.1]", "[3.0, nan, 4.1]", "cell.toml:12: tables.ocv_v = nan, must be above 0 and at most 100"),
+        ("[[0.1, 0.1, 0.1]", "[[0.1, -0.1, 0.1]", "cell.toml:13: tables.r0_ohm = -0.1, must be above 0"),
+        ("[[100, 100, 100]", "[[100, 0, 100]", "cell.toml:16: tables.branches[1].c_farad = 0, must be above 0"),
+        (
+            "c_farad = [[100, 100, 100], ",
+            "c_farad = [",
+            "cell.toml:16: tables.branches[1].c_farad: 1 rows, must be 2, one per temperature_c",
+        ),
+        (
+            "temperature_c = [10, 30]",
+            "temperature_c = [30, 10]",
+            "cell.toml:11: tables.temperature_c: 10 follows 30, must rise strictly",
+        ),
+        (
+            "[provenance]",
+            "[thermal]\nheat_capacity_j_per_k = 1\nresistance_k_per_w = 0\n[provenance]",
+            "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
+        ),
+        ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
+    ];
+    for (from, to, fault) in table {
+        assert!(CELL.contains(from), "{from}");
+        assert_eq!(read_texts(PACK, &CELL.replacen(from, to, 1), DBC).unwrap_err(), [*fault], "{from} -> {to}");
+    }
+    let branch = "[[tables.branches]]\nr_ohm = [[1, 1, 1], [1, 1, 1]]\nc_farad = [[1, 1, 1], [1, 1, 1]]\n";
+    let four = read_texts(PACK, &format!("{CELL}{}", branch.repeat(3)), DBC).unwrap_err();
+    assert_eq!(four, ["cell.toml:14: tables.branches: 4 tables [[tables.branches]], must be 1 to 3"]);
+    let none = read_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
+    assert_eq!(none, ["cell.toml:9: tables.branches: 0 tables [[tables.branches]], must be 1 to 3"]);
+}

@@ -1,0 +1,213 @@
+//! A JSON document taken apart into its numbers and the rest, and put together again.
+//!
+//! The rest, the skeleton, is the document with every number replaced by a letter that says what kind it was. A state
+//! changes from minute to minute in its numbers; its skeleton hardly changes at all.
+
+/// Placeholder of a floating-point number.
+pub(super) const FLOAT: u8 = b'.';
+/// Placeholder of a whole number that fits an `i64`.
+pub(super) const INT: u8 = b'0';
+/// Placeholder of a larger whole number.
+pub(super) const BIG: u8 = b'9';
+
+/// A document in its parts.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) struct Parts {
+    /// Everything but the numbers.
+    pub(super) skeleton: Vec<u8>,
+    /// What each number is: the placeholders in their order.
+    pub(super) kinds: Vec<u8>,
+    /// The numbers' bits in the same order.
+    pub(super) bits: Vec<u64>,
+}
+
+impl Parts {
+    /// Takes a compact JSON document apart; `None` when a number in it cannot be read.
+    pub(super) fn of(json: &[u8]) -> Option<Self> {
+        let mut parts = Self { skeleton: Vec::with_capacity(json.len()), ..Self::default() };
+        let mut at = 0;
+        while let Some(&byte) = json.get(at) {
+            let end = token_end(json, at);
+            if byte == b'-' || byte.is_ascii_digit() {
+                let (kind, bits) = number(&json[at..end])?;
+                parts.skeleton.push(kind);
+                parts.kinds.push(kind);
+                parts.bits.push(bits);
+            } else {
+                parts.skeleton.extend_from_slice(&json[at..end]);
+            }
+            at = end;
+        }
+        Some(parts)
+    }
+
+    /// A skeleton whose numbers are all 0 so far.
+    pub(super) fn of_skeleton(skeleton: Vec<u8>) -> Self {
+        let mut kinds = Vec::new();
+        let mut at = 0;
+        while let Some(&byte) = skeleton.get(at) {
+            if is_placeholder(byte) {
+                kinds.push(byte);
+            }
+            at = token_end(&skeleton, at);
+        }
+        Self { skeleton, bits: vec![0; kinds.len()], kinds }
+    }
+
+    /// The document.
+    pub(super) fn join(&self) -> Vec<u8> {
+        let mut json = Vec::with_capacity(self.skeleton.len() + 10 * self.bits.len());
+        let mut numbers = self.kinds.iter().zip(&self.bits);
+        let mut at = 0;
+        while let Some(&byte) = self.skeleton.get(at) {
+            let end = token_end(&self.skeleton, at);
+            match numbers.next_if_placeholder(byte) {
+                Some((kind, bits)) => write_number(&mut json, kind, bits),
+                None => json.extend_from_slice(&self.skeleton[at..end]),
+            }
+            at = end;
+        }
+        json
+    }
+
+    /// The numbers of `self` that stand at the places of `skeleton`'s numbers; 0 where there was none.
+    pub(super) fn aligned_to(&self, skeleton: &[u8]) -> Vec<u64> {
+        let known: std::collections::HashMap<u64, u64> =
+            paths(&self.skeleton).into_iter().zip(self.bits.iter().copied()).collect();
+        paths(skeleton).into_iter().map(|path| known.get(&path).copied().unwrap_or(0)).collect()
+    }
+}
+
+/// Takes the next number where the skeleton has a placeholder.
+trait NextNumber {
+    fn next_if_placeholder(&mut self, byte: u8) -> Option<(u8, u64)>;
+}
+
+impl<'a, I: Iterator<Item = (&'a u8, &'a u64)>> NextNumber for I {
+    fn next_if_placeholder(&mut self, byte: u8) -> Option<(u8, u64)> {
+        if is_placeholder(byte) { self.next().map(|(kind, bits)| (*kind, *bits)) } else { None }
+    }
+}
+
+const fn is_placeholder(byte: u8) -> bool {
+    matches!(byte, FLOAT | INT | BIG)
+}
+
+/// End of the string, number or single byte that begins at `at`.
+fn token_end(text: &[u8], at: usize) -> usize {
+    let rest = &text[at + 1..];
+    let length = match text[at] {
+        b'"' => string_length(rest),
+        byte if byte == b'-' || byte.is_ascii_digit() => {
+            rest.iter().take_while(|b| matches!(b, b'0'..=b'9' | b'.' | b'e' | b'E' | b'+' | b'-')).count()
+        }
+        _ => 0,
+    };
+    at + 1 + length
+}
+
+/// Bytes up to and including the closing quote.
+fn string_length(rest: &[u8]) -> usize {
+    let mut at = 0;
+    while let Some(&byte) = rest.get(at) {
+        match byte {
+            b'"' => return at + 1,
+            b'\\' => at += 2,
+            _ => at += 1,
+        }
+    }
+    rest.len()
+}
+
+fn number(token: &[u8]) -> Option<(u8, u64)> {
+    let text = std::str::from_utf8(token).ok()?;
+    if token.iter().any(|b| matches!(b, b'.' | b'e' | b'E')) {
+        return text.parse::<f64>().ok().filter(|value| value.is_finite()).map(|value| (FLOAT, value.to_bits()));
+    }
+    match text.parse::<i64>() {
+        Ok(value) => Some((INT, value.cast_unsigned())),
+        Err(_) => text.parse::<u64>().ok().map(|value| (BIG, value)),
+    }
+}
+
+fn write_number(json: &mut Vec<u8>, kind: u8, bits: u64) {
+    let written = match kind {
+        FLOAT => serde_json::to_writer(&mut *json, &f64::from_bits(bits)),
+        INT => serde_json::to_writer(&mut *json, &bits.cast_signed()),
+        _ => serde_json::to_writer(&mut *json, &bits),
+    };
+    // Writing a number into memory cannot fail.
+    debug_assert!(written.is_ok(), "a number was not written");
+}
+
+/// Where each number of a skeleton stands, as a hash of the keys and indices that lead to it. Two places with the same
+/// hash would only cost space: both sides look up the same number.
+fn paths(skeleton: &[u8]) -> Vec<u64> {
+    let mut found = Vec::new();
+    // Of each open object or list: the path to it, and the key or index within.
+    let mut open: Vec<(u64, u64, bool)> = Vec::new();
+    let mut key_next = false;
+    let mut at = 0;
+    while let Some(&byte) = skeleton.get(at) {
+        let end = token_end(skeleton, at);
+        let here = open.last().map_or(0, |&(path, step, _)| mix(path, step));
+        match byte {
+            b'{' | b'[' => {
+                key_next = byte == b'{';
+                open.push((here, 0, key_next));
+            }
+            b'}' | b']' => {
+                open.pop();
+            }
+            b',' => {
+                key_next = open.last().is_some_and(|&(_, _, is_object)| is_object);
+                if let Some((_, step, false)) = open.last_mut() {
+                    *step += 1;
+                }
+            }
+            b'"' if key_next => {
+                key_next = false;
+                if let Some((_, step, _)) = open.last_mut() {
+                    *step = skeleton[at..end].iter().fold(0, |hash, &byte| mix(hash, u64::from(byte)));
+                }
+            }
+            _ if is_placeholder(byte) => found.push(here),
+            _ => {}
+        }
+        at = end;
+    }
+    found
+}
+
+/// One step of FNV-1a over whole words, stirred.
+const fn mix(hash: u64, word: u64) -> u64 {
+    let mixed = (hash ^ word.wrapping_add(0x9E37_79B9_7F4A_7C15)).wrapping_mul(0x0000_0100_0000_01B3);
+    mixed ^ (mixed >> 29)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_document_comes_together_as_it_was() {
+        let json = br#"{"a":[1,-2,1.5,-0.0,1e-300],"b":{"c\"9.0":null,"d":true,"e":"0.9"},"f":18446744073709551615}"#;
+        let parts = Parts::of(json).unwrap();
+        assert_eq!(parts.kinds, b"00...9");
+        assert_eq!(parts.join(), json);
+        assert_eq!(Parts::of_skeleton(parts.skeleton.clone()).kinds, parts.kinds);
+    }
+
+    #[test]
+    fn numbers_are_found_at_their_place_when_others_came_and_went() {
+        let before = Parts::of(br#"{"a":null,"b":[{"x":1,"y":2},{"x":3,"y":4}],"c":5}"#).unwrap();
+        let after = Parts::of(br#"{"a":{"z":9},"b":[{"x":7,"y":7},{"y":7},{"x":7}],"c":7}"#).unwrap();
+        assert_eq!(before.aligned_to(&after.skeleton), [0, 1, 2, 4, 0, 5]);
+    }
+
+    #[test]
+    fn a_number_that_is_none_is_refused() {
+        assert_eq!(Parts::of(b"[1-2]"), None);
+        assert_eq!(Parts::of(b"[1e999]"), None);
+    }
+}

@@ -1,0 +1,376 @@
+//! The rows of the history and how they are made from the core's events.
+
+use std::collections::BTreeMap;
+
+use rusqlite::types::Value;
+use serde::Serialize;
+
+use super::stamp::Stamp;
+use crate::alarm::Change;
+use crate::monitor::{Event, EventKind};
+use crate::quantity::CellIndex;
+
+/// One row to write.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Row {
+    /// A half-cycle, a capacity, an alarm, a filter that started again, another pack: as the core told it.
+    Event(EventKind),
+    /// Something that happened to the store itself.
+    Own {
+        /// A word for what: `damaged`, `rows_lost`.
+        reason: &'static str,
+        /// The rest, for people.
+        detail: String,
+    },
+}
+
+/// Rows of one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Batch {
+    /// When.
+    pub(crate) stamp: Stamp,
+    /// What, in the order in which it was told.
+    pub(crate) rows: Vec<Row>,
+}
+
+/// A table of the history.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Table {
+    /// Charges and discharges; the oldest are thinned.
+    HalfCycle,
+    /// Capacities learned; chained, never thinned.
+    Capacity,
+    /// Alarms; chained, never thinned.
+    Alarm,
+    /// Resets, other packs, damages; chained, never thinned.
+    Reset,
+}
+
+impl Table {
+    /// All, in the order in which they are shown.
+    pub(crate) const ALL: [Self; 4] = [Self::HalfCycle, Self::Capacity, Self::Alarm, Self::Reset];
+    /// Those whose rows are chained by hash.
+    pub(crate) const CHAINED: [Self; 3] = [Self::Capacity, Self::Alarm, Self::Reset];
+
+    /// Its name in the database.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::HalfCycle => "half_cycle",
+            Self::Capacity => "capacity",
+            Self::Alarm => "alarm",
+            Self::Reset => "reset",
+        }
+    }
+
+    /// Its columns besides the moment, the sequence number and the hash.
+    pub(crate) const fn columns(self) -> &'static [&'static str] {
+        match self {
+            Self::HalfCycle => &[
+                "cell",
+                "mode",
+                "charge_ah",
+                "swing",
+                "swing_std",
+                "duration_s",
+                "mean_current_a",
+                "mean_temperature_c",
+            ],
+            Self::Capacity => &[
+                "cell",
+                "measured_ah",
+                "measured_std_ah",
+                "capacity_ah",
+                "capacity_std_ah",
+                "usable_capacity_ah",
+                "usable_capacity_std_ah",
+                "resistance_ratio",
+                "resistance_ratio_std",
+            ],
+            Self::Alarm => &[
+                "cell",
+                "rule",
+                "severity",
+                "change",
+                "state",
+                "active",
+                "value",
+                "probability",
+                "threshold",
+                "occurrences",
+                "acknowledged",
+            ],
+            Self::Reset => &["cell", "reason", "capacity_ah", "capacity_std_ah", "detail"],
+        }
+    }
+}
+
+impl Row {
+    /// Its table and the values of the table's columns; `None` = the history has no row for it. Cells count from 0.
+    pub(super) fn values(&self) -> Option<(Table, Vec<Value>)> {
+        let row = match self {
+            Self::Own { reason, detail } => (
+                Table::Reset,
+                vec![Value::Null, Value::Text((*reason).to_owned()), Value::Null, Value::Null, detail.clone().into()],
+            ),
+            Self::Event(kind) => event_values(kind)?,
+        };
+        Some(row)
+    }
+
+    /// Detail that may go first when there is no room for all.
+    pub(super) const fn is_detail(&self) -> bool {
+        matches!(self, Self::Event(EventKind::HalfCycle { .. }))
+    }
+
+    /// Whether another pack begins after it.
+    pub(super) const fn replaces_pack(&self) -> bool {
+        matches!(self, Self::Event(EventKind::PackReplaced { .. }))
+    }
+}
+
+fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
+    Some(match *kind {
+        EventKind::HalfCycle {
+            cell,
+            mode,
+            charge_ah,
+            swing,
+            swing_std,
+            duration_s,
+            mean_current_a,
+            mean_temperature_c,
+        } => (
+            Table::HalfCycle,
+            vec![
+                whole(cell.0),
+                word(&mode),
+                real(charge_ah),
+                maybe(swing),
+                maybe(swing_std),
+                real(duration_s),
+                real(mean_current_a),
+                maybe(mean_temperature_c),
+            ],
+        ),
+        EventKind::Capacity {
+            cell,
+            measured_ah,
+            measured_std_ah,
+            capacity_ah,
+            capacity_std_ah,
+            usable_capacity_ah,
+            usable_capacity_std_ah,
+            resistance_ratio,
+            resistance_ratio_std,
+        } => (
+            Table::Capacity,
+            vec![
+                whole(cell.0),
+                maybe(measured_ah),
+                maybe(measured_std_ah),
+                real(capacity_ah),
+                real(capacity_std_ah),
+                maybe(usable_capacity_ah),
+                maybe(usable_capacity_std_ah),
+                real(resistance_ratio),
+                real(resistance_ratio_std),
+            ],
+        ),
+        EventKind::Alarm {
+            rule,
+            cell,
+            change,
+            state,
+            active,
+            severity,
+            value,
+            probability,
+            threshold,
+            occurrences,
+            acknowledged,
+        } => (
+            Table::Alarm,
+            vec![
+                cell.map_or(Value::Null, |cell| whole(cell.0)),
+                Value::Text(rule.name().to_owned()),
+                word(&severity),
+                word(&change),
+                word(&state),
+                whole(u8::from(active)),
+                maybe(value),
+                maybe(probability),
+                real(threshold),
+                whole(occurrences),
+                whole(u8::from(acknowledged)),
+            ],
+        ),
+        EventKind::FilterReset { cell } => {
+            (Table::Reset, vec![whole(cell.0), word(&"filter_reset"), Value::Null, Value::Null, Value::Null])
+        }
+        EventKind::PackReplaced { capacity_ah, capacity_std_ah } => (
+            Table::Reset,
+            vec![Value::Null, word(&"pack_replaced"), maybe(capacity_ah), maybe(capacity_std_ah), Value::Null],
+        ),
+        _ => return None,
+    })
+}
+
+fn whole(value: impl Into<i64>) -> Value {
+    Value::Integer(value.into())
+}
+
+fn real(value: f64) -> Value {
+    // SQLite has no NaN: it would store NULL, and the hash would differ.
+    if value.is_nan() { Value::Null } else { Value::Real(value) }
+}
+
+fn maybe(value: Option<f64>) -> Value {
+    value.map_or(Value::Null, real)
+}
+
+/// A choice as events and configurations write it.
+fn word(value: &impl Serialize) -> Value {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => Value::Text(word),
+        _ => Value::Null,
+    }
+}
+
+/// Picks from the core's events what the history keeps.
+#[derive(Debug, Default)]
+pub(crate) struct Gatherer {
+    /// Usable capacity of each cell as last written.
+    usable: BTreeMap<CellIndex, Option<f64>>,
+}
+
+impl Gatherer {
+    /// Rows of one input's events; `None` = nothing in them was learned, and nothing became of an alarm. The list may be
+    /// empty: then only the state is worth keeping.
+    pub(crate) fn rows(&mut self, events: &[Event]) -> Option<Vec<Row>> {
+        let mut learned = false;
+        let mut rows = Vec::new();
+        for Event { kind, .. } in events {
+            learned |= is_learned(kind);
+            if is_learned(kind) && self.is_news(kind) {
+                rows.push(Row::Event(*kind));
+            }
+        }
+        learned.then_some(rows)
+    }
+
+    /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news.
+    fn is_news(&mut self, kind: &EventKind) -> bool {
+        match *kind {
+            EventKind::Capacity { cell, measured_ah, usable_capacity_ah, .. } => {
+                let before = self.usable.insert(cell, usable_capacity_ah);
+                measured_ah.is_some() || before.is_some_and(|before| before != usable_capacity_ah)
+            }
+            EventKind::RechargePeriod { .. } => false,
+            _ => true,
+        }
+    }
+}
+
+/// What is made durable before it is announced. An alarm whose value went missing or came back is no change of what was
+/// announced, and a flickering input makes many of them.
+fn is_learned(kind: &EventKind) -> bool {
+    match kind {
+        EventKind::HalfCycle { .. }
+        | EventKind::Capacity { .. }
+        | EventKind::RechargePeriod { .. }
+        | EventKind::FilterReset { .. }
+        | EventKind::PackReplaced { .. } => true,
+        EventKind::Alarm { change, .. } => !matches!(change, Change::Suppressed | Change::Resumed),
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::alarm::{Rule, Severity, State};
+    use crate::quantity::{Mode, Timestamp};
+
+    /// A capacity of a cell, with or without information.
+    pub(in crate::daemon::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
+        EventKind::Capacity {
+            cell: CellIndex(cell),
+            measured_ah,
+            measured_std_ah: measured_ah.map(|_| 0.1),
+            capacity_ah: 2.5,
+            capacity_std_ah: 0.05,
+            usable_capacity_ah: Some(usable_ah),
+            usable_capacity_std_ah: Some(0.06),
+            resistance_ratio: 1.1,
+            resistance_ratio_std: 0.02,
+        }
+    }
+
+    /// A half-cycle of a cell.
+    pub(in crate::daemon::store) fn half_cycle(cell: u16) -> EventKind {
+        EventKind::HalfCycle {
+            cell: CellIndex(cell),
+            mode: Mode::Charge,
+            charge_ah: 1.5,
+            swing: Some(0.6),
+            swing_std: None,
+            duration_s: 3600.0,
+            mean_current_a: -1.5,
+            mean_temperature_c: Some(25.0),
+        }
+    }
+
+    /// An alarm of the pack.
+    pub(in crate::daemon::store) fn alarm(change: Change) -> EventKind {
+        EventKind::Alarm {
+            rule: Rule::SocLow,
+            cell: None,
+            change,
+            state: State::Active,
+            active: true,
+            severity: Severity::Warning,
+            value: Some(0.05),
+            probability: None,
+            threshold: 0.1,
+            occurrences: 1,
+            acknowledged: false,
+        }
+    }
+
+    fn rows(gatherer: &mut Gatherer, kinds: &[EventKind]) -> Option<usize> {
+        let events: Vec<Event> = kinds.iter().map(|&kind| Event { time: Timestamp::ZERO, kind }).collect();
+        gatherer.rows(&events).map(|rows| rows.len())
+    }
+
+    #[test]
+    fn every_row_has_a_value_per_column() {
+        let own = Row::Own { reason: "damaged", detail: "x".to_owned() };
+        let kinds = [
+            half_cycle(3),
+            capacity(3, None, 2.4),
+            alarm(Change::Raised),
+            EventKind::FilterReset { cell: CellIndex(1) },
+            EventKind::PackReplaced { capacity_ah: Some(2.0), capacity_std_ah: None },
+        ];
+        for row in kinds.into_iter().map(Row::Event).chain([own]) {
+            let (table, values) = row.values().unwrap();
+            assert_eq!(values.len(), table.columns().len(), "{row:?}");
+        }
+    }
+
+    #[test]
+    fn a_capacity_is_written_when_there_is_something_new_in_it() {
+        let mut gatherer = Gatherer::default();
+        assert_eq!(rows(&mut gatherer, &[capacity(0, Some(2.4), 2.3)]), Some(1));
+        assert_eq!(rows(&mut gatherer, &[capacity(0, None, 2.3)]), Some(0));
+        assert_eq!(rows(&mut gatherer, &[capacity(0, None, 2.2)]), Some(1));
+        assert_eq!(rows(&mut gatherer, &[half_cycle(0), capacity(0, Some(2.4), 2.2)]), Some(2));
+    }
+
+    #[test]
+    fn a_flickering_input_writes_nothing() {
+        let mut gatherer = Gatherer::default();
+        assert_eq!(rows(&mut gatherer, &[alarm(Change::Suppressed), alarm(Change::Resumed)]), None);
+        assert_eq!(rows(&mut gatherer, &[alarm(Change::Raised)]), Some(1));
+    }
+}

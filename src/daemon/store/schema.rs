@@ -1,0 +1,130 @@
+//! The layout of the database, and how an older one becomes the present one.
+//!
+//! | table | a row is | kept |
+//! | --- | --- | --- |
+//! | `pack` | a pack that was or is connected | always |
+//! | `moment` | when rows were written: wall clock, inputs' clock, boot clock, boot, pack | always |
+//! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
+//! | `capacity`, `alarm`, `reset` | something learned, raised, begun anew; numbered through and chained by hash | always |
+//! | `state` | the core's state: slot 0 in full, slot 1 what has changed since | the latest |
+//! | `meta` | one row: the chain's end, counts | |
+//!
+//! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the layout's version.
+
+use rusqlite::{Connection, TransactionBehavior};
+
+/// "pkwt": files of ours, for file(1).
+const APPLICATION_ID: i32 = 0x706B_7774;
+
+/// What makes each version from the one before; the first makes it from an empty file.
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1];
+
+const VERSION_1: &str = "
+CREATE TABLE meta (
+    id INTEGER PRIMARY KEY CHECK (id = 1),
+    chained INTEGER NOT NULL,
+    head BLOB NOT NULL,
+    half_cycles INTEGER NOT NULL,
+    thinned INTEGER NOT NULL,
+    thinned_to INTEGER NOT NULL
+) STRICT;
+INSERT INTO meta VALUES (1, 0, zeroblob(32), 0, 0, 0);
+CREATE TABLE pack (
+    id INTEGER PRIMARY KEY,
+    opened_ns INTEGER NOT NULL,
+    closed_ns INTEGER,
+    reason TEXT,
+    identity TEXT
+) STRICT;
+CREATE TABLE moment (
+    id INTEGER PRIMARY KEY,
+    wall_ns INTEGER NOT NULL,
+    time_ns INTEGER NOT NULL,
+    boottime_ns INTEGER NOT NULL,
+    boot BLOB NOT NULL,
+    pack INTEGER NOT NULL
+) STRICT;
+CREATE TABLE half_cycle (
+    moment INTEGER NOT NULL,
+    cell INTEGER NOT NULL,
+    mode TEXT NOT NULL,
+    charge_ah REAL NOT NULL,
+    swing REAL,
+    swing_std REAL,
+    duration_s REAL NOT NULL,
+    mean_current_a REAL NOT NULL,
+    mean_temperature_c REAL,
+    PRIMARY KEY (moment, cell)
+) STRICT, WITHOUT ROWID;
+CREATE TABLE capacity (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER NOT NULL,
+    measured_ah REAL,
+    measured_std_ah REAL,
+    capacity_ah REAL,
+    capacity_std_ah REAL,
+    usable_capacity_ah REAL,
+    usable_capacity_std_ah REAL,
+    resistance_ratio REAL,
+    resistance_ratio_std REAL,
+    hash BLOB NOT NULL
+) STRICT;
+CREATE TABLE alarm (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER,
+    rule TEXT NOT NULL,
+    severity TEXT NOT NULL,
+    change TEXT NOT NULL,
+    state TEXT NOT NULL,
+    active INTEGER NOT NULL,
+    value REAL,
+    probability REAL,
+    threshold REAL,
+    occurrences INTEGER NOT NULL,
+    acknowledged INTEGER NOT NULL,
+    hash BLOB NOT NULL
+) STRICT;
+CREATE TABLE reset (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER,
+    reason TEXT NOT NULL,
+    capacity_ah REAL,
+    capacity_std_ah REAL,
+    detail TEXT,
+    hash BLOB NOT NULL
+) STRICT;
+CREATE TABLE state (
+    slot INTEGER PRIMARY KEY,
+    serial INTEGER NOT NULL,
+    length INTEGER NOT NULL,
+    bytes BLOB NOT NULL
+) STRICT;
+";
+
+/// The version of an open database; 0 = an empty file.
+pub(super) fn version(connection: &Connection) -> rusqlite::Result<i32> {
+    connection.query_row("PRAGMA user_version", [], |row| row.get(0))
+}
+
+/// The version this program writes.
+pub(super) fn known(migrations: &[&str]) -> i32 {
+    i32::try_from(migrations.len()).unwrap_or(i32::MAX)
+}
+
+/// Brings the layout from `version` to the latest, all or nothing.
+pub(super) fn migrate(connection: &mut Connection, version: i32, migrations: &[&str]) -> rusqlite::Result<()> {
+    let done = usize::try_from(version).unwrap_or(0);
+    if done >= migrations.len() {
+        return Ok(());
+    }
+    let transaction = connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    for migration in &migrations[done..] {
+        transaction.execute_batch(migration)?;
+    }
+    transaction.pragma_update(None, "application_id", APPLICATION_ID)?;
+    transaction.pragma_update(None, "user_version", known(migrations))?;
+    transaction.commit()
+}

@@ -1,0 +1,226 @@
+//! The thread that writes the database, and what it shares with the loop.
+//!
+//! The loop leaves rows and the latest state and goes on. The thread takes all there is, commits it in one transaction
+//! and says up to which ticket everything is on the disk. A disk that fails is tried again with a growing pause; until
+//! then every ticket is answered at once, as failed.
+
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use tokio::sync::watch;
+
+use super::backlog::Backlog;
+use super::database::{Database, StateRecord, is_damage};
+use super::document::Document;
+use super::folder::{Folder, Opening};
+use super::parts::Parts;
+use super::rows::Batch;
+
+/// First pause after a failure; it doubles up to the last.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// A disk that is back is found within this.
+const LAST_PAUSE: Duration = Duration::from_secs(15);
+
+/// How far the writer is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Progress {
+    /// Everything up to this ticket was written, or cannot be now.
+    pub(crate) ticket: u64,
+    /// The last attempt succeeded.
+    pub(crate) works: bool,
+}
+
+/// What the loop leaves for the writer.
+#[derive(Debug, Default)]
+pub(super) struct Desk {
+    queue: Mutex<Queue>,
+    wake: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Queue {
+    backlog: Backlog,
+    state: Option<Document>,
+    exact: bool,
+    ticket: u64,
+    /// Something is to be done now.
+    wanted: bool,
+    stop: bool,
+}
+
+/// What the writer takes from the desk.
+struct Work {
+    state: Option<Document>,
+    exact: bool,
+    ticket: u64,
+    stop: bool,
+}
+
+impl Desk {
+    fn lock(&self) -> MutexGuard<'_, Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Leaves rows and the state they were learned in; returns the ticket of the commit that will hold both.
+    pub(super) fn leave(&self, rows: Option<Batch>, state: Option<Document>, exact: bool) -> u64 {
+        let mut queue = self.lock();
+        rows.into_iter().for_each(|batch| queue.backlog.push(batch));
+        // A later state has all an earlier one has.
+        queue.state = state.or_else(|| queue.state.take());
+        queue.exact |= exact;
+        queue.ticket += 1;
+        queue.wanted = true;
+        self.wake.notify_one();
+        queue.ticket
+    }
+
+    /// The last thing the writer will be asked.
+    pub(super) fn stop(&self) {
+        let mut queue = self.lock();
+        (queue.stop, queue.wanted) = (true, true);
+        self.wake.notify_one();
+    }
+
+    /// Rows lost for want of room and not yet told in the history.
+    pub(super) fn lost_rows(&self) -> u64 {
+        self.lock().backlog.lost()
+    }
+
+    /// Waits until something is to be done, or it is time to try again.
+    fn take(&self, retry_at: Option<Instant>) -> Work {
+        let mut queue = self.lock();
+        while !queue.wanted {
+            match retry_at.map(|at| at.saturating_duration_since(Instant::now())) {
+                Some(Duration::ZERO) => break,
+                Some(pause) => queue = self.wake.wait_timeout(queue, pause).unwrap_or_else(PoisonError::into_inner).0,
+                None => queue = self.wake.wait(queue).unwrap_or_else(PoisonError::into_inner),
+            }
+        }
+        queue.wanted = false;
+        Work {
+            state: queue.state.take(),
+            exact: std::mem::take(&mut queue.exact),
+            ticket: queue.ticket,
+            stop: queue.stop,
+        }
+    }
+
+    fn put_back(&self, batches: Vec<Batch>, state: Option<Document>) {
+        let mut queue = self.lock();
+        queue.backlog.put_back(batches);
+        queue.state = queue.state.take().or(state);
+    }
+}
+
+/// The thread's side.
+#[derive(Debug)]
+pub(super) struct Writer {
+    pub(super) desk: Arc<Desk>,
+    pub(super) folder: Folder,
+    /// `None` = not reachable so far.
+    pub(super) database: Option<Database>,
+    pub(super) progress: watch::Sender<Progress>,
+    pub(super) retry: Retry,
+}
+
+/// When a failed disk is tried again.
+#[derive(Debug, Default)]
+pub(super) struct Retry {
+    pause: Option<Duration>,
+    at: Option<Instant>,
+}
+
+impl Retry {
+    /// After a failure now.
+    pub(super) fn after_failure(&mut self) {
+        let pause = self.pause.map_or(FIRST_PAUSE, |pause| (2 * pause).min(LAST_PAUSE));
+        (self.pause, self.at) = (Some(pause), Some(Instant::now() + pause));
+    }
+
+    fn is_due(&self) -> bool {
+        self.at.is_none_or(|at| Instant::now() >= at)
+    }
+}
+
+impl Writer {
+    /// Writes until told to stop.
+    pub(super) fn run(mut self) {
+        loop {
+            let work = self.desk.take(self.retry.at);
+            let Work { state, exact, ticket, stop } = work;
+            // The last attempt before the end is made whenever it is.
+            let works = if self.retry.is_due() || stop {
+                self.write(state, exact)
+            } else {
+                self.desk.put_back(Vec::new(), state);
+                false
+            };
+            self.progress.send_replace(Progress { ticket, works });
+            if stop {
+                return;
+            }
+        }
+    }
+
+    /// One transaction; on failure everything waits for the next.
+    fn write(&mut self, state: Option<Document>, exact: bool) -> bool {
+        let batches = match &state {
+            Some(document) => self.desk.lock().backlog.take(&document.stamp),
+            // Nothing but a look whether the disk is back.
+            None => Vec::new(),
+        };
+        match self.commit(&batches, state.as_ref(), exact) {
+            Ok(()) => {
+                if self.retry.pause.is_some() {
+                    tracing::info!(folder = %self.folder, "state and history are written again");
+                }
+                self.retry = Retry::default();
+                self.desk.lock().backlog.told();
+                true
+            }
+            Err(why) => {
+                if self.retry.pause.is_none() {
+                    tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
+                }
+                self.retry.after_failure();
+                self.desk.put_back(batches, state);
+                false
+            }
+        }
+    }
+
+    fn commit(&mut self, batches: &[Batch], state: Option<&Document>, exact: bool) -> Result<(), String> {
+        let Some(document) = state else { return Ok(()) }; // nothing to write, nothing learned of the disk
+        let json = document.to_json().map_err(|error| error.to_string())?;
+        let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
+        drop(json);
+        let mut database = match self.database.take() {
+            Some(database) => database,
+            None => self.reopen(document)?,
+        };
+        match database.commit(batches, Some(StateRecord { parts, exact })) {
+            Ok(()) => {
+                self.database = Some(database);
+                Ok(())
+            }
+            Err(error) if is_damage(&error) => {
+                drop(database);
+                // The next attempt, soon, finds the folder free of it.
+                self.folder.set_aside(&error.to_string(), &document.stamp);
+                Err(format!("database damaged: {error}"))
+            }
+            // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
+            Err(error) => Err(error.to_string()),
+        }
+    }
+
+    fn reopen(&mut self, document: &Document) -> Result<Database, String> {
+        let Opening { mut database, rows, .. } =
+            self.folder.open(&document.stamp).map_err(|error| error.to_string())?;
+        if !rows.is_empty() {
+            let batch = Batch { stamp: document.stamp, rows };
+            database.commit(&[batch], None).map_err(|error| error.to_string())?;
+        }
+        Ok(database)
+    }
+}

@@ -1,0 +1,305 @@
+#!/usr/bin/env python3
+"""What tests of faults share: a player that nothing stops, floods, and comparisons of what was announced, stored and true.
+
+    fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
+                                                           dropped and time goes on, as a pack does
+    fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers nobody configured
+    fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is nothing that was told missing?
+    fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
+    fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
+    fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    status frames of two daemons: are they within so many points of SOC?
+    fault_tools.py covers FOLDER DUMP [--after SAMPLE]     estimates on the bus against the truth, both from fast_pack's FOLDER
+"""
+
+import argparse
+import errno
+import json
+import random
+import socket
+import sqlite3
+import struct
+import sys
+import time
+from pathlib import Path
+
+AWAY = {errno.ENETDOWN, errno.ENXIO, errno.ENODEV, errno.ENOBUFS}
+
+
+def frames(lines, interface="vcan0"):
+    """Identifier and payload of candump's lines of an interface."""
+    for line in lines:
+        words = line.split()
+        if len(words) == 3 and words[0].startswith("(") and words[1] == interface and words[2].count("#") == 1:
+            name, data = words[2].split("#")
+            if not data.startswith("R"):
+                yield int(name, 16), bytes.fromhex(data)
+
+
+# ---- this program's frames, as its built-in DBC lays them out -----------------------------------------------------------------------
+
+STATUS, HEALTH, ALARM, SAMPLE = 0x6B0, 0x6B1, 0x6B2, 0x7F0
+VALID, ACTIVE, CLEARED = 1, 1, 2
+MOVING = (1, 3)  # charge, discharge
+
+
+def bits(data: bytes, start: int, length: int) -> int:
+    return int.from_bytes(data, "little") >> start & ((1 << length) - 1)
+
+
+class Status:
+    """A status frame."""
+
+    def __init__(self, data: bytes):
+        self.soc, self.soc_std = bits(data, 16, 12) * 0.00025, bits(data, 28, 8) * 0.001
+        self.mode, self.valid = bits(data, 36, 3), bits(data, 39, 3) == VALID and bits(data, 28, 8) != 255
+        self.cell = bits(data, 51, 11)
+
+
+class Alarm:
+    """An alarm frame."""
+
+    def __init__(self, data: bytes):
+        self.rule, self.severity, self.cell = bits(data, 16, 5), bits(data, 24, 2), bits(data, 27, 11)
+        self.state = bits(data, 21, 3)
+        self.key = (self.rule, self.severity, self.cell)
+
+
+class Truth:
+    """The true SOC of each cell at each sample, from fast_pack."""
+
+    def __init__(self, folder: Path):
+        self.samples: list[list[float]] = []
+        with open(folder / "truth.csv") as file:
+            column = next(file).rstrip().split(",").index("soc")
+            for row in file:
+                words = row.split(",")
+                if words[1] == "0":
+                    self.samples.append([])
+                self.samples[-1].append(float(words[column]))
+
+    def errors(self, frames, after: int = -1) -> list[tuple[float, float]]:
+        """Error and stated deviation of the estimates on the bus, once the sample `after` was on it."""
+        sample, found = -1, []
+        for name, data in frames:
+            if name == SAMPLE:
+                sample = int.from_bytes(data, "big")
+            elif name == STATUS and 0 <= sample < len(self.samples) and sample > after:
+                status = Status(data)
+                if status.valid:
+                    found.append((status.soc - self.samples[sample][status.cell], status.soc_std))
+        return found
+
+
+def covers(args) -> None:
+    errors = Truth(args.folder).errors(frames(open(args.dump)), args.after)
+    if not errors:
+        sys.exit("no valid estimate on the bus")
+    within = sum(abs(error) <= 2 * std + 0.01 for error, std in errors) / len(errors)
+    worst = max(abs(error) for error, _ in errors)
+    print(f"{len(errors)} estimates, at most {100 * worst:.1f} points off, {100 * within:.0f} % within two deviations")
+    sys.exit(0 if within > 0.9 else "the estimates do not cover the truth")
+
+
+def last_alarm(args) -> None:
+    """State of the last alarm frame of a rule, or -."""
+    found = [alarm.state for name, data in frames(open(args.dump)) if name == ALARM and (alarm := Alarm(data)).rule == args.rule]
+    print(found[-1] if found else "-")
+
+
+# ---- the store -----------------------------------------------------------------------------------------------------------------------
+
+RULES = (
+    "capacity_low usable_capacity_low recharge_period_low input_missing input_implausible estimate_untrusted resistance_high soc_low "
+    "temperature_high cell_imbalance remaining_life_low bms_disagrees store_failed bus_fault"
+).split()
+SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
+UNTOLD = ("suppressed", "resumed")  # changes that say nothing new of an alarm: no rows
+
+
+class Store:
+    """The rows of a state folder's database, read beside the daemon or after it."""
+
+    def __init__(self, folder: Path):
+        database = sqlite3.connect(f"file:{folder / 'packwatch.db'}?mode=ro", uri=True, timeout=10)
+        self.integrity = database.execute("PRAGMA integrity_check").fetchone()[0]
+        self.half_cycles = database.execute("SELECT moment, cell, mode, charge_ah FROM half_cycle ORDER BY moment, cell").fetchall()
+        self.capacities = database.execute("SELECT seq, cell, capacity_ah, hash FROM capacity ORDER BY seq").fetchall()
+        rows = database.execute("SELECT seq, rule, severity, cell, change, hash FROM alarm ORDER BY seq").fetchall()
+        self.alarms = [(seq, RULES.index(rule) + 1, SEVERITIES[severity], 2047 if cell is None else cell, change, hash)
+                       for seq, rule, severity, cell, change, hash in rows]
+        database.close()
+
+    def counts(self) -> tuple[int, int, int]:
+        return len(self.capacities), len(self.half_cycles), len(self.alarms)
+
+    def begins_with(self, earlier: "Store") -> bool:
+        """Is all of an earlier state still there, unchanged?"""
+        pairs = [(self.half_cycles, earlier.half_cycles), (self.capacities, earlier.capacities), (self.alarms, earlier.alarms)]
+        return all(now[: len(before)] == before for now, before in pairs)
+
+
+def told_of(files: list[Path]) -> tuple[int, int, int]:
+    """Capacities something was learned about, half-cycles and changes of alarms in files of events."""
+    counts = [0, 0, 0]
+    for line in (line for file in files for line in open(file)):
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue  # the last line of a daemon that was killed
+        counts[0] += event["event"] == "capacity" and event["measured_ah"] is not None
+        counts[1] += event["event"] == "half_cycle"
+        counts[2] += event["event"] == "alarm" and event["change"] not in UNTOLD
+    return tuple(counts)
+
+
+def learned(args) -> None:
+    """Told first: what is told while the store is read may be stored already."""
+    told, stored = told_of(args.events), Store(args.state).counts()
+    print(" ".join(map(str, stored)))
+    if any(of_store < of_events for of_store, of_events in zip(stored, told)):
+        sys.exit(f"told {told}, stored only {stored} (capacities, half-cycles, alarms)")
+    if args.exactly and told != stored:
+        sys.exit(f"told {told}, stored {stored} (capacities, half-cycles, alarms)")
+
+
+# ---- snapshots -----------------------------------------------------------------------------------------------------------------------
+
+
+def learned_of(snapshot: dict) -> tuple[list, list]:
+    """Capacities and alarms: what must come back after a restart."""
+    capacities = [round(cell["mean"], 9) for cell in snapshot["learner"]["capacity"]]
+    alarms = [[a["rule"], a["severity"], a["cell"], a["machine"]["state"]] for a in snapshot["alarms"]["alarms"]]
+    return capacities, sorted(alarms, key=str)
+
+
+def same(args) -> None:
+    before, after = (json.loads(path.read_text()) for path in (args.before, args.after))
+    if learned_of(before) != learned_of(after):
+        sys.exit(f"not what was learned:\n{learned_of(before)}\n{learned_of(after)}")
+    socs = [f"{100 * s['pack']['soc']:.1f} +/- {100 * s['pack']['soc_std']:.1f} %" if s["pack"] else "unknown" for s in (before, after)]
+    print(f"{len(learned_of(after)[0])} capacities and {len(learned_of(after)[1])} alarms as before, SOC {socs[0]} before, {socs[1]} after")
+
+
+def apart(args) -> None:
+    """Status frames of two daemons on one bus."""
+    latest, worst, pairs, unsure = {}, 0.0, 0, 0
+    names = [int(args.whole, 16), int(args.other, 16)]
+    for name, data in frames(open(args.dump), args.interface):
+        if name not in names:
+            continue
+        status = latest[name] = Status(data)
+        if name == names[1] and names[0] in latest and latest[names[0]].valid:
+            if status.valid:
+                worst, pairs = max(worst, abs(status.soc - latest[names[0]].soc)), pairs + 1
+            else:
+                unsure += 1
+    print(f"{pairs} estimates at most {100 * worst:.3f} points from those of the one not killed, {unsure} without a value")
+    sys.exit(0 if pairs > 100 and 100 * worst <= args.points else "too far apart")
+
+
+# ---- onto the bus ------------------------------------------------------------------------------------------------------------------
+
+
+class Bus:
+    """A raw socket on an interface that may come and go."""
+
+    def __init__(self, interface: str):
+        self.interface, self.socket, self.dropped = interface, None, 0
+
+    def send(self, name: int, data: bytes) -> None:
+        packet = struct.pack("=IB3x8s", name | (socket.CAN_EFF_FLAG if name > 0x7FF else 0), len(data), data.ljust(8, b"\0"))
+        try:
+            if self.socket is None:
+                self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+                self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+                self.socket.bind((self.interface,))
+            self.socket.send(packet)
+        except OSError as error:
+            if error.errno not in AWAY:
+                raise
+            self.dropped += 1
+            if error.errno in (errno.ENXIO, errno.ENODEV) and self.socket:
+                self.socket.close()
+                self.socket = None
+
+
+def play(args) -> None:
+    bus = Bus(args.interface)
+    first = started = None
+    wanted = args.start == 0
+    with open(args.log) as log:
+        for line in log:
+            stamp, _, frame = line.split()
+            if not wanted:
+                wanted = frame == f"7F0#{args.start:08X}"
+                continue
+            at = float(stamp[1:-1])
+            if first is None:
+                first, started = at, time.monotonic()
+            wait_s = (at - first) - (time.monotonic() - started)
+            if wait_s > 0.001:
+                time.sleep(wait_s)
+            name, data = frame.split("#")
+            bus.send(int(name, 16), bytes.fromhex(data))
+    print(f"played to its end, {bus.dropped} frames while the interface was away")
+
+
+def flood(args) -> None:
+    """In bursts of 10 ms: a shorter sleep is none in the user-mode kernel."""
+    bus, rng = Bus(args.interface), random.Random(1)
+    ids = [0x200 + n for n in range(min(args.ids, 0x480))] + [0x18000000 + 977 * n for n in range(args.ids - 0x480)]
+    data = [rng.randbytes(8) for _ in range(64)]
+    started, sent = time.monotonic(), 0
+    while (past := time.monotonic() - started) < args.seconds:
+        while sent < past * args.rate:
+            bus.send(ids[sent % len(ids)], data[sent % 64])
+            sent += 1
+        time.sleep(0.01)
+    print(f"{sent} frames of {len(ids)} identifiers in {past:.1f} s, {bus.dropped} not taken")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    command = commands.add_parser("play")
+    command.add_argument("log")
+    command.add_argument("interface")
+    command.add_argument("--from", dest="start", type=int, default=0)
+    command.set_defaults(run=play)
+    command = commands.add_parser("flood")
+    command.add_argument("interface")
+    command.add_argument("--seconds", type=float, required=True)
+    command.add_argument("--rate", type=float, default=8000)
+    command.add_argument("--ids", type=int, default=1)
+    command.set_defaults(run=flood)
+    command = commands.add_parser("covers")
+    command.add_argument("folder", type=Path)
+    command.add_argument("dump", type=Path)
+    command.add_argument("--after", type=int, default=-1)
+    command.set_defaults(run=covers)
+    command = commands.add_parser("alarm")
+    command.add_argument("dump", type=Path)
+    command.add_argument("rule", type=int)
+    command.set_defaults(run=last_alarm)
+    command = commands.add_parser("same")
+    command.add_argument("before", type=Path)
+    command.add_argument("after", type=Path)
+    command.set_defaults(run=same)
+    command = commands.add_parser("apart")
+    command.add_argument("dump", type=Path)
+    command.add_argument("whole")
+    command.add_argument("other")
+    command.add_argument("points", type=float)
+    command.add_argument("interface")
+    command.set_defaults(run=apart)
+    command = commands.add_parser("learned")
+    command.add_argument("state", type=Path)
+    command.add_argument("events", type=Path, nargs="*")
+    command.add_argument("--exactly", action="store_true")
+    command.set_defaults(run=learned)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+# shellcheck shell=bash
+# Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
+# A daemon with its state on disk learns from fast_pack's pack while something happens to it. Each test tells, a line per fault,
+# what happened and what was learned, and in the end holds the store against what was told.
+
+# Where `main` keeps its state; a test on a disk of its own says another.
+state=$tmp/state
+here=$(dirname "${BASH_SOURCE[0]}")
+fast=$tmp/fast
+tools() { python3 "$here/fault_tools.py" "$@"; }
+
+# pack SECONDS: fast_pack's files in $fast; $fast/fast.toml is the daemon's.
+pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
+
+# feed: the pack on vcan0 from where it was, whatever becomes of the interface. dump.log has its samples and our frames, of all feeds.
+feed() {
+    if [[ -z ${pids[dump]-} ]]; then
+        start dump candump -L any,6B0:7F0,7F0:7FF
+        wait_for 5 "receiver" receiving any 1
+    fi
+    start feed python3 "$here/fault_tools.py" play "$fast/pack.log" vcan0 --from "$(sample)"
+}
+unfed() { stop feed; }
+# The number of the sample that was last on the bus.
+sample() {
+    local last
+    last=$(grep -oE ' 7F0#[0-9A-F]{8}$' "$tmp/dump.log" | tail -n 1) || true
+    last=${last#*#}
+    echo $((16#${last:-0}))
+}
+
+# again WHAT...: the daemon `main` once more, after `stop main` or the like; what it told before counts on.
+runs=0
+again() {
+    local file
+    for file in "$tmp"/main.*; do [[ ! -e $file ]] || mv "$file" "$tmp/main-$runs.${file##*.}"; done
+    runs=$((runs + 1))
+    daemon main "$@"
+}
+
+# ---- what was learned ----------------------------------------------------------------------------------------------------------------
+
+# told EVENT: how many the daemon `main` has told, in all its runs.
+told() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
+# Capacities, half-cycles, alarms raised or cleared: told.
+told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
+# told_more EVENT COUNT: COUNT or more?
+told_more() { (($(told "$1") >= $2)); }
+learned_more() { told_more capacity "$1"; }
+
+# fault NAME: from here on it happens.
+fault() {
+    fault_name=$1 fault_before=$(told_all)
+    running main || fail "$fault_name: the daemon is not running before"
+}
+
+# survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored all it told.
+survived() {
+    local stored
+    running main || fail "$fault_name: the daemon ended"
+    wait_for 15 "learning after $fault_name" learned_more $(($(told capacity) + 4))
+    stored=$(tools learned "$state" "$tmp"/main*.events 2>"$tmp/learned.err") || fail "$fault_name: $(cat "$tmp/learned.err")"
+    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $(told_all), stored $stored"
+}
+
+# all_stored: at the end, with the daemon stopped: the store has what was told, no more and no less, and its chain holds.
+all_stored() {
+    local stored
+    stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "in the end: $(cat "$tmp/learned.err")"
+    "$packwatch" history verify --state "$state" >"$tmp/verify.log" 2>&1 || fail "history verify: $(cat "$tmp/verify.log")"
+    echo "in the end: told (capacities, half-cycles, alarms) $(told_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
+}
