@@ -25,12 +25,14 @@ mod reference;
 mod resolve;
 mod schema;
 mod setting;
+mod survey;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
 pub use manual::manual;
 pub use reference::reference;
 use resolve::Databases;
+pub use survey::{Survey, survey};
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]

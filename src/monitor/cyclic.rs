@@ -121,7 +121,7 @@ impl Monitor {
         out.frames.extend(output.buses.iter().map(|&bus| Transmit { time: self.now, bus, frame }));
     }
 
-    fn validity(&self) -> Validity {
+    pub(super) fn validity(&self) -> Validity {
         if self.pack.is_none() {
             Validity::Unavailable
         } else if self.cells.iter().any(|cell| !cell.trusted) {
@@ -155,7 +155,7 @@ impl Monitor {
     }
 
     /// Health of the pack: its weakest cell's, once half-cycles have taught something about every cell.
-    fn health_fields(&self) -> HealthFields {
+    pub(super) fn health_fields(&self) -> HealthFields {
         let recharge_period_s = self.recharge_period_s;
         if !self.learner.has_learned_all() {
             return HealthFields { recharge_period_s, ..HealthFields::default() };

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
 use super::intake::IntakeState;
-use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs};
+use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
@@ -38,6 +38,8 @@ pub struct Snapshot {
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
+    #[serde(default)]
+    statistics: Statistics,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -115,6 +117,7 @@ impl Monitor {
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
             intake: self.intake.snapshot(),
+            statistics: self.statistics.clone(),
         }
     }
 
@@ -172,6 +175,8 @@ impl Monitor {
         self.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.intake.restore(&snapshot.intake);
+        self.statistics = snapshot.statistics;
+        self.statistics.restores += 1;
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
         outcome

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::charge::{ChargeCounter, Totals};
 use super::config::{Limits, SampleConfig, VoltageSource};
+use super::counts::ReadingCounts;
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp};
 
@@ -55,6 +56,8 @@ pub struct SamplerState {
     began: Option<Timestamp>,
     latest: Timestamp,
     unused_readings: u64,
+    #[serde(default)]
+    counts: ReadingCounts,
 }
 
 impl SamplerState {
@@ -108,6 +111,7 @@ impl Sampler {
             began: None,
             latest: Timestamp::ZERO,
             unused_readings: 0,
+            counts: ReadingCounts::default(),
         };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
         Self { config, channels, sensors, voltages, flow_a, state, next_stale: None }
@@ -139,6 +143,8 @@ impl Sampler {
         let limits = self.limits(channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
         let judged = self.state.signals[slot].handle(time, value, &limits, should_move_s(channel, &totals));
+        self.state.counts.note(judged.value.err());
+        self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
             self.next_stale = None;
@@ -168,6 +174,7 @@ impl Sampler {
             let limits = self.limits(channel);
             let signal = &mut self.state.signals[slot];
             if let Some(state) = signal.poll(now, began, &limits) {
+                self.state.counts.note(Some(Fault::Stale));
                 changes.push(SignalChange { channel, state });
             }
             if !signal.is_bad() {
@@ -294,6 +301,11 @@ impl Sampler {
     /// Readings that came for channels that feed nothing.
     pub fn unused_readings(&self) -> u64 {
         self.state.unused_readings
+    }
+
+    /// Readings by what became of them.
+    pub fn reading_counts(&self) -> ReadingCounts {
+        ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
     }
 
     /// What is to be stored.

@@ -4,7 +4,7 @@
     fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
                                                            dropped and time goes on, as a pack does
     fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers nobody configured
-    fault_tools.py learned STATE [EVENTS]                  counts of the store's rows; of the events told
+    fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is nothing that was told missing?
     fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
     fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
     fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    status frames of two daemons: are they within so many points of SOC?
@@ -104,6 +104,62 @@ def last_alarm(args) -> None:
     """State of the last alarm frame of a rule, or -."""
     found = [alarm.state for name, data in frames(open(args.dump)) if name == ALARM and (alarm := Alarm(data)).rule == args.rule]
     print(found[-1] if found else "-")
+
+
+# ---- the store -----------------------------------------------------------------------------------------------------------------------
+
+RULES = (
+    "capacity_low usable_capacity_low recharge_period_low input_missing input_implausible estimate_untrusted resistance_high soc_low "
+    "temperature_high cell_imbalance remaining_life_low bms_disagrees store_failed bus_fault"
+).split()
+SEVERITIES = {"info": 1, "warning": 2, "severe": 3}
+UNTOLD = ("suppressed", "resumed")  # changes that say nothing new of an alarm: no rows
+
+
+class Store:
+    """The rows of a state folder's database, read beside the daemon or after it."""
+
+    def __init__(self, folder: Path):
+        database = sqlite3.connect(f"file:{folder / 'packwatch.db'}?mode=ro", uri=True, timeout=10)
+        self.integrity = database.execute("PRAGMA integrity_check").fetchone()[0]
+        self.half_cycles = database.execute("SELECT moment, cell, mode, charge_ah FROM half_cycle ORDER BY moment, cell").fetchall()
+        self.capacities = database.execute("SELECT seq, cell, capacity_ah, hash FROM capacity ORDER BY seq").fetchall()
+        rows = database.execute("SELECT seq, rule, severity, cell, change, hash FROM alarm ORDER BY seq").fetchall()
+        self.alarms = [(seq, RULES.index(rule) + 1, SEVERITIES[severity], 2047 if cell is None else cell, change, hash)
+                       for seq, rule, severity, cell, change, hash in rows]
+        database.close()
+
+    def counts(self) -> tuple[int, int, int]:
+        return len(self.capacities), len(self.half_cycles), len(self.alarms)
+
+    def begins_with(self, earlier: "Store") -> bool:
+        """Is all of an earlier state still there, unchanged?"""
+        pairs = [(self.half_cycles, earlier.half_cycles), (self.capacities, earlier.capacities), (self.alarms, earlier.alarms)]
+        return all(now[: len(before)] == before for now, before in pairs)
+
+
+def told_of(files: list[Path]) -> tuple[int, int, int]:
+    """Capacities something was learned about, half-cycles and changes of alarms in files of events."""
+    counts = [0, 0, 0]
+    for line in (line for file in files for line in open(file)):
+        try:
+            event = json.loads(line)
+        except ValueError:
+            continue  # the last line of a daemon that was killed
+        counts[0] += event["event"] == "capacity" and event["measured_ah"] is not None
+        counts[1] += event["event"] == "half_cycle"
+        counts[2] += event["event"] == "alarm" and event["change"] not in UNTOLD
+    return tuple(counts)
+
+
+def learned(args) -> None:
+    """Told first: what is told while the store is read may be stored already."""
+    told, stored = told_of(args.events), Store(args.state).counts()
+    print(" ".join(map(str, stored)))
+    if any(of_store < of_events for of_store, of_events in zip(stored, told)):
+        sys.exit(f"told {told}, stored only {stored} (capacities, half-cycles, alarms)")
+    if args.exactly and told != stored:
+        sys.exit(f"told {told}, stored {stored} (capacities, half-cycles, alarms)")
 
 
 # ---- snapshots -----------------------------------------------------------------------------------------------------------------------
@@ -236,6 +292,11 @@ def main() -> None:
     command.add_argument("points", type=float)
     command.add_argument("interface")
     command.set_defaults(run=apart)
+    command = commands.add_parser("learned")
+    command.add_argument("state", type=Path)
+    command.add_argument("events", type=Path, nargs="*")
+    command.add_argument("--exactly", action="store_true")
+    command.set_defaults(run=learned)
     args = parser.parse_args()
     args.run(args)
 

@@ -3,6 +3,8 @@
 # A daemon with its state on disk learns from fast_pack's pack while something happens to it. Each test tells, a line per fault,
 # what happened and what was learned, and in the end holds the store against what was told.
 
+# Where `main` keeps its state; a test on a disk of its own says another.
+state=$tmp/state
 here=$(dirname "${BASH_SOURCE[0]}")
 fast=$tmp/fast
 tools() { python3 "$here/fault_tools.py" "$@"; }
@@ -39,7 +41,7 @@ again() {
 # ---- what was learned ----------------------------------------------------------------------------------------------------------------
 
 # told EVENT: how many the daemon `main` has told, in all its runs.
-told() { cat "$tmp"/main*.events | grep -cE "\"event\":\"$1\"" || true; }
+told() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
 # Capacities, half-cycles, alarms raised or cleared: told.
 told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
 # told_more EVENT COUNT: COUNT or more?
@@ -52,11 +54,19 @@ fault() {
     running main || fail "$fault_name: the daemon is not running before"
 }
 
-# survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored what it told.
+# survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored all it told.
 survived() {
+    local stored
     running main || fail "$fault_name: the daemon ended"
     wait_for 15 "learning after $fault_name" learned_more $(($(told capacity) + 4))
-    echo "$fault_name: $*; learned (capacities, half-cycles, alarms) before $fault_before, after $(told_all)$(stored)"
+    stored=$(tools learned "$state" "$tmp"/main*.events 2>"$tmp/learned.err") || fail "$fault_name: $(cat "$tmp/learned.err")"
+    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $(told_all), stored $stored"
 }
-# TODO with the store
-stored() { :; }
+
+# all_stored: at the end, with the daemon stopped: the store has what was told, no more and no less, and its chain holds.
+all_stored() {
+    local stored
+    stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "in the end: $(cat "$tmp/learned.err")"
+    "$packwatch" history verify --state "$state" >"$tmp/verify.log" 2>&1 || fail "history verify: $(cat "$tmp/verify.log")"
+    echo "in the end: told (capacities, half-cycles, alarms) $(told_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
+}

@@ -5,7 +5,9 @@
 //! longer than [`MAX_WAIT`]: an alarm that is not on the disk is worth more than one that is not on the bus.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use crate::monitor::Transmit;
 
@@ -69,7 +71,7 @@ mod tests {
     use crate::can::{CanId, Frame};
     use crate::quantity::{BusIndex, Timestamp};
 
-    fn frame(bus: u8, id: u16, data: u8) -> Transmit {
+    fn frame(bus: u8, id: u32, data: u8) -> Transmit {
         let id = CanId::standard(id).unwrap();
         Transmit { time: Timestamp::ZERO, bus: BusIndex(bus), frame: Frame::classic(id, &[data]).unwrap() }
     }
