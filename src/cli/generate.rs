@@ -15,7 +15,7 @@ const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
 /// What the page about the whole says besides the command line's own definition.
 const MORE: &str = "\
 .SH EXIT STATUS
-0: success. 1: the work failed. 2: the command line is wrong. 78: the configuration is.
+0: success. 1: the work failed. 2: the command line is wrong. 78: the configuration is. A command with others names them.
 .SH FILES
 .TP
 .I /etc/packwatch/packwatch.toml

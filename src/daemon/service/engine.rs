@@ -18,7 +18,7 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Transmit};
+use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
@@ -119,14 +119,15 @@ impl Engine {
         config: MonitorConfig,
         time: Timestamp,
         links: &[LinkOutput],
-    ) -> Result<(), Vec<String>> {
+    ) -> Result<Reconfigured, Vec<String>> {
         self.outputs.clear();
-        self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
+        let changed =
+            self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
         if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
             self.stop_recording(&error);
         }
         self.hand_on(time, links);
-        Ok(())
+        Ok(changed)
     }
 
     /// What came out of the core: frames to the interfaces, events to the log, both to their files.

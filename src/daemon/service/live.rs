@@ -98,7 +98,8 @@ impl Loop {
         let ready = told.ready.then_some(NotifyState::Ready);
         let status = told.status.as_deref().map(NotifyState::Status);
         if ready.is_some() || status.is_some() {
-            tracing::info!(ready = told.ready, "{}", told.status.as_deref().unwrap_or("ready"));
+            let prefix = if told.ready { "ready; " } else { "" };
+            tracing::info!("{prefix}{}", told.status.as_deref().unwrap_or("as before"));
             notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
         }
     }

@@ -3,7 +3,7 @@
 //! One file is read at a time, and signals that come meanwhile make one more reading when it is done, at least
 //! [`MIN_PERIOD`] after the last one began: a storm of signals neither fills the log nor holds up the loop, and the file
 //! as it was at the last signal is what holds in the end. What the sockets and files are made of needs a restart and is
-//! refused with that word; what the core takes over is [`Monitor::reconfigure`]'s to say.
+//! refused with that word; what the core takes over is [`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)'s to say.
 
 use std::fmt;
 use std::io;
@@ -18,10 +18,8 @@ use tokio::time::{Instant, sleep_until};
 
 use super::live::Loop;
 use super::{Engine, notify};
-use crate::can::CanId;
 use crate::config::{self, Config, InterfaceConfig};
 use crate::monitor::MonitorConfig;
-use crate::quantity::BusIndex;
 
 /// Readings of the file begin at least this far apart.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
@@ -112,42 +110,25 @@ async fn finished(reading: &mut Option<Reading>) -> Result<Box<MonitorConfig>, V
     }
 }
 
-/// Identifiers received on an interface, and patterns of others.
-type Wanted = (Vec<CanId>, Vec<(u32, u32)>);
-
-/// What cannot change while the service runs: the interfaces and what is received on them.
+/// What cannot change while the service runs and the core does not know: the interfaces' names and kinds.
 #[derive(Debug)]
-struct Fixed {
-    interfaces: Vec<InterfaceConfig>,
-    wanted: Vec<Wanted>,
-}
+struct Fixed(Vec<InterfaceConfig>);
 
 impl Fixed {
     fn of(config: &Config) -> Self {
-        let buses = (0_u8..).map(BusIndex).zip(&config.interfaces);
-        let wanted = buses.map(|(bus, _)| (config.monitor.wanted_ids(bus), config.monitor.wanted_patterns(bus)));
-        Self { wanted: wanted.collect(), interfaces: config.interfaces.clone() }
+        Self(config.interfaces.clone())
     }
 
     /// Why `new` cannot be taken over, if it cannot.
     fn check(&self, new: &Config) -> Result<(), String> {
         let new = Self::of(new);
-        if self.interfaces != new.interfaces {
-            return Err(format!("interfaces = {new}, running with {self}: needs a restart"));
-        }
-        let mut pairs = self.wanted.iter().zip(&new.wanted).zip(&self.interfaces);
-        match pairs.find(|((old, new), _)| old != new) {
-            Some((_, interface)) => {
-                Err(format!("other frames are to be received on {}: needs a restart", interface.name))
-            }
-            None => Ok(()),
-        }
+        if self.0 == new.0 { Ok(()) } else { Err(format!("interfaces = {new}, running with {self}: needs a restart")) }
     }
 }
 
 impl fmt::Display for Fixed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, interface) in self.interfaces.iter().enumerate() {
+        for (index, interface) in self.0.iter().enumerate() {
             let (comma, fd) = (if index > 0 { ", " } else { "" }, if interface.fd { " (FD)" } else { "" });
             write!(f, "{comma}{}{fd}", interface.name)?;
         }
@@ -167,7 +148,10 @@ impl Loop {
         let time = self.clock.now();
         let taken = read.and_then(|config| self.engine.reconfigure(*config, time, &self.outputs));
         match &taken {
-            Ok(()) => tracing::info!("configuration taken over"),
+            Ok(changed) => {
+                let (alarms_ended, changed) = (changed.alarms_ended, changed.changed.join(", "));
+                tracing::info!(changed, alarms_ended, "configuration taken over");
+            }
             Err(faults) => {
                 for fault in faults.iter().take(MAX_FAULTS_LOGGED) {
                     tracing::error!(fault, "configuration refused, the old one stays");
@@ -202,7 +186,6 @@ impl Loop {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::can::decode::InputMap;
     use std::path::Path;
 
     fn example() -> Config {
@@ -222,13 +205,5 @@ mod tests {
         new.interfaces[0].name = "can7".to_owned();
         let why = Fixed::of(&old).check(&new).expect_err("another interface");
         assert_eq!(why, format!("interfaces = can7, running with {}: needs a restart", old.interfaces[0].name));
-    }
-
-    #[test]
-    fn other_identifiers_need_a_restart_because_the_sockets_filter() {
-        let (old, mut new) = (example(), example());
-        new.monitor.input = InputMap::new(Vec::new());
-        let why = Fixed::of(&old).check(&new).expect_err("no frame is wanted any more");
-        assert!(why.contains("needs a restart") && why.contains(&old.interfaces[0].name), "{why}");
     }
 }
