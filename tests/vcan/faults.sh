@@ -56,11 +56,12 @@ fault() {
 
 # survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored all it told.
 survived() {
-    local stored
+    local stored after
     running main || fail "$fault_name: the daemon ended"
     wait_for 15 "learning after $fault_name" learned_more $(($(told capacity) + 4))
+    after=$(told_all)
     stored=$(tools learned "$state" "$tmp"/main*.events 2>"$tmp/learned.err") || fail "$fault_name: $(cat "$tmp/learned.err")"
-    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $(told_all), stored $stored"
+    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $after, stored $stored"
 }
 
 # all_stored: at the end, with the daemon stopped: the store has what was told, no more and no less, and its chain holds.
