@@ -14,6 +14,7 @@ use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::daemon::replay::{self, ReplayError, Settings, Sinks, Summary};
 use crate::daemon::snapshot_file;
+use crate::daemon::store::Recorder;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
@@ -101,6 +102,12 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
         snapshot_at: args.snapshot_at,
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
         away: args.away,
+        store: args
+            .state
+            .as_deref()
+            .map(|path| Recorder::create(path, &config.store))
+            .transpose()
+            .map_err(Failure::new)?,
         interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
     })
 }

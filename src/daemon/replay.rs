@@ -15,6 +15,7 @@ mod intake;
 mod rows;
 
 use super::event_log;
+use super::store::Recorder;
 use crate::alarm::Change;
 use crate::can::Frame;
 use crate::io::log::{LogCounts, LogError, LogSource, Record};
@@ -70,6 +71,8 @@ pub struct Settings {
     pub restore: Option<Snapshot>,
     /// How old it is; `None` = as the journal says, or else its stamp.
     pub away: Option<Away>,
+    /// Where state and history are kept, as the daemon keeps them.
+    pub store: Option<Recorder>,
     /// Names of the interfaces, for the frames that would be sent.
     pub interfaces: Vec<String>,
 }
@@ -97,6 +100,9 @@ pub enum ReplayError {
     /// The snapshot does not fit.
     #[error(transparent)]
     Restore(#[from] RestoreError),
+    /// State or history cannot be written.
+    #[error("{0}")]
+    Store(String),
     /// The moment of the snapshot lies beyond the log.
     #[error("no snapshot taken: the log ends at {end_s} s, before the moment asked for")]
     SnapshotNotReached {
@@ -345,6 +351,9 @@ impl Replay {
         self.pace.wait(input.time());
         self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
         self.monitor.handle(input, &mut self.out);
+        if let Some(store) = &mut self.settings.store {
+            store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
+        }
         self.write_out()?;
         Ok(())
     }
@@ -376,6 +385,9 @@ impl Replay {
     fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
         self.ticks.sleep();
         self.make_ticks()?;
+        if let (Some(store), Some(end)) = (self.settings.store.take(), self.span.latest) {
+            store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
+        }
         if self.settings.snapshot && self.snapshot.is_none() {
             // A moment within the last record's tick period was reached as well.
             let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;

@@ -16,6 +16,8 @@ mod folder;
 pub(crate) mod hold;
 mod packed;
 mod parts;
+mod reader;
+mod recorder;
 mod retention;
 mod rows;
 mod runtime;
@@ -23,6 +25,7 @@ mod salvage;
 mod schema;
 mod shelf;
 mod stamp;
+mod verify;
 mod writer;
 
 use std::path::{Path, PathBuf};
@@ -43,6 +46,9 @@ use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp};
 use writer::{Desk, Retry, Writer};
 
+pub use reader::{Entry, Filter, Kind, Reader};
+pub use recorder::Recorder;
+pub use verify::{Broken, Verdict};
 pub(crate) use writer::Progress;
 
 /// The state folder of a daemon that systemd did not start.

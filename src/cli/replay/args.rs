@@ -33,7 +33,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "X", value_parser = positive)]
     pub(crate) speed: Option<f64>,
     /// Play the frames onto this CAN interface instead of through the core
-    #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore"])]
+    #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore", "state"])]
     pub(crate) to: Option<String>,
     /// Write every estimate, as CSV
     #[arg(long, value_name = "FILE.csv")]
@@ -54,6 +54,9 @@ pub(crate) struct Args {
     /// 2008-04-02T13:08:17 (UTC); the end when not given
     #[arg(long, value_name = "WHEN", requires = "snapshot", value_parser = when, allow_hyphen_values = true)]
     pub(crate) snapshot_at: Option<When>,
+    /// Keep state and history in this new folder, as `packwatch run` does, with the log's clock as wall clock
+    #[arg(long, value_name = "DIR")]
+    pub(crate) state: Option<PathBuf>,
     /// Start from a written state
     #[arg(long, value_name = "FILE")]
     pub(crate) restore: Option<PathBuf>,

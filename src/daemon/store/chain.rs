@@ -22,9 +22,6 @@ pub(super) struct Head {
 }
 
 impl Head {
-    /// Of an empty chain.
-    pub(super) const EMPTY: Self = Self { count: 0, hash: [0; 32] };
-
     /// Appends a row; its number is then `count`, its hash `hash`.
     pub(super) fn append(&mut self, table: Table, values: &[Value]) {
         self.count += 1;

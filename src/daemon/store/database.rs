@@ -329,6 +329,20 @@ pub(super) fn write_ledger(connection: &Connection, ledger: &Ledger) -> rusqlite
         .map(drop)
 }
 
+/// Columns of a moment in a chained row.
+pub(super) const MOMENT_COLUMNS: usize = 6;
+
+/// The number, the hash and the chained values of a table's rows, in the order of the chain.
+pub(super) fn chained_sql(table: Table) -> String {
+    let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
+    format!(
+        "SELECT r.seq, r.hash, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, {} FROM {} r LEFT JOIN moment m \
+         ON m.id = r.moment ORDER BY r.seq",
+        columns.join(", "),
+        table.name()
+    )
+}
+
 /// Values of a moment as a chained row has them: its number, the clocks, the pack.
 fn moment_values(id: i64, stamp: &Stamp, pack: i64) -> Vec<Value> {
     vec![
@@ -430,3 +444,6 @@ fn slot(connection: &Connection, slot: i64) -> rusqlite::Result<Option<Slot>> {
         })
         .optional()
 }
+
+#[cfg(test)]
+mod tests;

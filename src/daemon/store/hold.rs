@@ -69,7 +69,7 @@ mod tests {
     use crate::can::{CanId, Frame};
     use crate::quantity::{BusIndex, Timestamp};
 
-    fn frame(bus: u8, id: u16, data: u8) -> Transmit {
+    fn frame(bus: u8, id: u32, data: u8) -> Transmit {
         let id = CanId::standard(id).unwrap();
         Transmit { time: Timestamp::ZERO, bus: BusIndex(bus), frame: Frame::classic(id, &[data]).unwrap() }
     }

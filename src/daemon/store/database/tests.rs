@@ -1,0 +1,280 @@
+use super::super::folder::{DATABASE, Folder};
+use super::super::reader::{Filter, Kind, Reader};
+use super::super::rows::Row;
+use super::super::rows::tests::{alarm, capacity, half_cycle};
+use super::super::verify;
+use super::*;
+use crate::alarm::Change;
+use crate::monitor::EventKind;
+use crate::quantity::Timestamp;
+
+fn stamp(seconds: f64) -> Stamp {
+    Stamp::replayed(Timestamp::from_secs(seconds))
+}
+
+fn batch(seconds: f64, kinds: &[EventKind]) -> Batch {
+    Batch { stamp: stamp(seconds), rows: kinds.iter().map(|kind| Row::Event(*kind)).collect() }
+}
+
+fn state(numbers: &[f64]) -> StateRecord {
+    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false }
+}
+
+fn open(folder: &Path) -> Database {
+    Database::open(&folder.join(DATABASE), &stamp(0.0), 1000).unwrap()
+}
+
+/// A history of every kind of row, with a state.
+fn filled(folder: &Path) -> Database {
+    let mut database = open(folder);
+    for day in 0..40_u32 {
+        let seconds = f64::from(day) * 86_400.0;
+        let learned: Vec<EventKind> =
+            (0..4).flat_map(|cell| [half_cycle(cell), capacity(cell, Some(2.0 + seconds * 1e-9), 1.9)]).collect();
+        let numbers: Vec<f64> = (0..300).map(|n| f64::from(n) + seconds).collect();
+        database
+            .commit(&[batch(seconds, &learned), batch(seconds, &[alarm(Change::Raised)])], Some(state(&numbers)))
+            .unwrap();
+    }
+    database
+}
+
+fn broken_row(folder: &Path) -> (String, i64) {
+    let verdict = Reader::open(folder).unwrap().verify().unwrap();
+    verdict.broken.map(|broken| (broken.table, broken.row)).unwrap_or_default()
+}
+
+#[test]
+fn what_was_committed_is_there_after_opening_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = filled(folder.path());
+    database.commit(&[], Some(state(&[1.5; 300]))).unwrap();
+    let counts = database.counts();
+    assert_eq!(counts, Counts { chained: 200, half_cycles: 160, packs: 1 });
+    drop(database);
+    let database = open(folder.path());
+    assert_eq!(database.counts(), counts);
+    let stored = database.state().unwrap().unwrap().unwrap();
+    assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![1.5; 300]).unwrap(), None));
+    assert_eq!(broken_row(folder.path()), (String::new(), 0));
+}
+
+#[test]
+fn every_change_of_a_chained_row_is_found_and_named() {
+    let changes = [
+        ("UPDATE capacity SET capacity_ah = 9 WHERE seq = 5 * 10 + 2", ("capacity", 52)),
+        ("UPDATE alarm SET acknowledged = 1 WHERE seq = 15", ("alarm", 15)),
+        ("UPDATE capacity SET hash = zeroblob(32) WHERE seq = 7", ("capacity", 7)),
+        ("DELETE FROM capacity WHERE seq = 8", ("", 8)),
+        ("DELETE FROM alarm WHERE seq = 200", ("", 200)),
+        ("UPDATE moment SET wall_ns = wall_ns + 1 WHERE id = 3", ("capacity", 6)),
+        ("DELETE FROM moment WHERE id = 4", ("alarm", 10)),
+        ("UPDATE meta SET chained = 199", ("", 200)),
+        (
+            "INSERT INTO alarm SELECT 201, moment, cell, rule, severity, change, state, active, value, probability, threshold, \
+          occurrences, acknowledged, hash FROM alarm WHERE seq = 200",
+            ("alarm", 201),
+        ),
+    ];
+    for (sql, (table, row)) in changes {
+        let folder = tempfile::tempdir().unwrap();
+        drop(filled(folder.path()));
+        let connection = Connection::open(folder.path().join(DATABASE)).unwrap();
+        assert_eq!(connection.execute(sql, []).unwrap(), 1, "{sql}");
+        drop(connection);
+        assert_eq!(broken_row(folder.path()), (table.to_owned(), row), "{sql}");
+    }
+}
+
+#[test]
+fn half_cycles_are_thinned_and_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    for day in 0..400_u32 {
+        let learned: Vec<EventKind> =
+            (0..4).flat_map(|cell| [half_cycle(cell), capacity(cell, Some(2.0), 1.9)]).collect();
+        database.commit(&[batch(f64::from(day), &learned)], None).unwrap();
+        database.commit(&[], None).unwrap();
+    }
+    let counts = database.counts();
+    assert_eq!(counts.chained, 1600);
+    assert_eq!(counts.half_cycles, 1000);
+    let rows: i64 = database.connection().query_row("SELECT count(*) FROM half_cycle", [], |row| row.get(0)).unwrap();
+    assert_eq!(rows, 1000);
+    let latest: i64 = database
+        .connection()
+        .query_row("SELECT count(*) FROM half_cycle WHERE moment > 300", [], |row| row.get(0))
+        .unwrap();
+    assert_eq!(latest, 400, "of the latest hundred transitions all are there");
+    assert_eq!(verify::verify(database.connection()).unwrap().broken, None);
+}
+
+#[test]
+fn another_pack_closes_one_history_and_opens_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = filled(folder.path());
+    let replaced = EventKind::PackReplaced { capacity_ah: Some(2.1), capacity_std_ah: Some(0.1) };
+    database.commit(&[batch(9e6, &[replaced])], None).unwrap();
+    database.commit(&[batch(9.1e6, &[capacity(0, Some(2.5), 2.4)])], None).unwrap();
+    let packs: Vec<(i64, Option<i64>)> = database
+        .connection()
+        .prepare("SELECT id, closed_ns FROM pack")
+        .unwrap()
+        .query_map([], |row| Ok((row.get(0)?, row.get(1)?)))
+        .unwrap()
+        .map(Result::unwrap)
+        .collect();
+    assert_eq!(packs, [(1, Some(9_000_000_000_000_000)), (2, None)]);
+    drop(database);
+    let entries =
+        Reader::open(folder.path()).unwrap().entries(&Filter { limit: Some(2), ..Filter::default() }).unwrap();
+    assert_eq!(
+        entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
+        [(Kind::Reset, 1), (Kind::Capacity, 2)]
+    );
+}
+
+#[test]
+fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    drop(filled(folder.path()));
+    let added = "CREATE TABLE added (id INTEGER PRIMARY KEY) STRICT; INSERT INTO added SELECT count(*) FROM alarm;";
+    let migrations: Vec<&str> = MIGRATIONS.iter().copied().chain([added]).collect();
+    let database = Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap();
+    assert_eq!(database.counts().chained, 200);
+    assert_eq!(database.connection().query_row("SELECT id FROM added", [], |row| row.get::<_, i64>(0)).unwrap(), 40);
+    drop(database);
+    // And now it is a newer one: for the present program not to touch.
+    let before = std::fs::read(&path).unwrap();
+    let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
+    assert_eq!(newer, OpenError::Newer { found: 2, known: 1 });
+    assert_eq!(std::fs::read(&path).unwrap(), before);
+}
+
+#[test]
+fn a_failed_migration_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    drop(filled(folder.path()));
+    let migrations: Vec<&str> =
+        MIGRATIONS.iter().copied().chain(["CREATE TABLE added (id); INSERT INTO nowhere VALUES (1);"]).collect();
+    Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap_err();
+    let database = open(folder.path());
+    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (1, 200));
+}
+
+#[test]
+fn a_commit_that_fails_leaves_no_trace() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = filled(folder.path());
+    let counts = database.counts();
+    database.connection().execute_batch("ALTER TABLE state RENAME TO elsewhere").unwrap();
+    database.commit(&[batch(9e6, &[capacity(0, Some(2.5), 2.4)])], Some(state(&[1.0]))).unwrap_err();
+    database.connection().execute_batch("ALTER TABLE elsewhere RENAME TO state").unwrap();
+    assert_eq!(database.counts(), counts);
+    database.commit(&[batch(9e6, &[capacity(0, Some(2.5), 2.4)])], Some(state(&[1.0]))).unwrap();
+    assert_eq!(verify::verify(database.connection()).unwrap().broken, None);
+}
+
+/// Overwrites pages in the middle of the file.
+fn damage(path: &Path, from: f64, bytes: usize) {
+    use std::os::unix::fs::FileExt as _;
+    let file = std::fs::File::options().write(true).open(path).unwrap();
+    let at = (file.metadata().unwrap().len() as f64 * from) as u64;
+    file.write_all_at(&vec![0xA5; bytes], at).unwrap();
+}
+
+#[test]
+fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
+    for from in [0.3, 0.5, 0.7, 0.9] {
+        let place = tempfile::tempdir().unwrap();
+        drop(filled(place.path()));
+        damage(&place.path().join(DATABASE), from, 3000);
+        let mut folder = Folder::new(place.path().to_owned(), 1000);
+        let mut opening = folder.open(&stamp(1.0)).unwrap();
+        assert!(!opening.is_sound, "{from}");
+        assert!(place.path().join("packwatch.db.damaged-1").exists(), "{from}");
+        let saved = opening.database.counts();
+        assert!(saved.chained > 100 && saved.chained < 200, "{from}: {saved:?}");
+        let rows = std::mem::take(&mut opening.rows);
+        assert!(matches!(&rows[..], [Row::Own { reason: "damaged", .. }]), "{rows:?}");
+        opening.database.commit(&[Batch { stamp: stamp(1.0), rows }], None).unwrap();
+        assert_eq!(verify::verify(opening.database.connection()).unwrap().broken, None, "{from}");
+        // Nothing that was changed has come over.
+        let odd: i64 = opening
+            .database
+            .connection()
+            .query_row("SELECT count(*) FROM capacity WHERE capacity_ah <> 2.5", [], |row| row.get(0))
+            .unwrap();
+        assert_eq!(odd, 0, "{from}");
+    }
+}
+
+#[test]
+fn what_is_no_database_is_set_aside() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join(DATABASE);
+    let makers: [&dyn Fn(); 3] = [
+        &|| std::fs::write(&path, "this is no database\n".repeat(500)).unwrap(),
+        &|| std::fs::create_dir(&path).unwrap(),
+        &|| Connection::open(&path).unwrap().execute_batch("CREATE TABLE other (x)").unwrap(),
+    ];
+    for (number, make) in (1..).zip(makers) {
+        make();
+        let mut opening = Folder::new(place.path().to_owned(), 1000).open(&stamp(1.0)).unwrap();
+        assert!(!opening.is_sound);
+        assert!(place.path().join(format!("packwatch.db.damaged-{number}")).exists());
+        opening.database.commit(&[], Some(state(&[1.0]))).unwrap();
+        drop(opening);
+        std::fs::remove_file(&path).unwrap();
+    }
+}
+
+#[test]
+fn a_folder_belongs_to_one_process() {
+    let place = tempfile::tempdir().unwrap();
+    let mut first = Folder::new(place.path().join("made/on the way"), 1000);
+    first.take().unwrap();
+    let mut second = Folder::new(place.path().join("made/on the way"), 1000);
+    assert_eq!(second.take().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
+    drop(first);
+    second.take().unwrap();
+}
+
+#[test]
+fn a_checkpoint_overwrites_its_pages_in_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = filled(folder.path());
+    let pages = |database: &Database| -> i64 {
+        database.connection().query_row("PRAGMA page_count", [], |row| row.get(0)).unwrap()
+    };
+    database.commit(&[], Some(state(&[1.0; 300]))).unwrap();
+    let before = pages(&database);
+    for minute in 0..200 {
+        let numbers: Vec<f64> = (0..300).map(|n| 1.0 + f64::from(n % 60) * f64::from(minute) * 1e-6).collect();
+        database.commit(&[], Some(state(&numbers))).unwrap();
+    }
+    assert!(pages(&database) <= before + 4, "{} pages, then {}", before, pages(&database));
+}
+
+#[test]
+fn a_history_can_be_read_while_it_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = filled(folder.path());
+    let reader = Reader::open(folder.path()).unwrap();
+    let all = reader.entries(&Filter::default()).unwrap();
+    assert_eq!(all.len(), 360);
+    database.commit(&[batch(9e6, &[alarm(Change::Cleared)])], None).unwrap();
+    let filter = Filter { kinds: vec![Kind::Alarm], limit: Some(1), ..Filter::default() };
+    let last = &reader.entries(&filter).unwrap()[0];
+    assert_eq!((last.seq, last.wall_ns), (Some(201), 9_000_000_000_000_000));
+    assert_eq!(last.values[3], "cleared");
+    let of_cell = Filter {
+        cell: Some(2),
+        since_ns: Some(86_400_000_000_000),
+        until_ns: Some(2 * 86_400_000_000_000),
+        ..Filter::default()
+    };
+    assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
+}

@@ -1,0 +1,263 @@
+//! Looking at a store without changing it: while a daemon runs, after one died, on a disk that cannot be written.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use rusqlite::types::Value;
+use rusqlite::{Connection, OpenFlags};
+
+use super::chain::hex;
+use super::database;
+use super::document::Document;
+use super::folder::{DATABASE, with_suffix};
+use super::rows::Table;
+use super::schema;
+use super::verify::{self, Verdict};
+
+/// Largest database that is copied to be read, bytes: what a temporary folder can be asked for.
+const MAX_COPY_BYTES: u64 = 256 << 20;
+
+/// A store open for looking.
+#[derive(Debug)]
+pub struct Reader {
+    connection: Connection,
+    path: PathBuf,
+    /// The copy it reads, when the original cannot be read where it is.
+    copy: Option<PathBuf>,
+}
+
+/// Which rows are wanted.
+#[derive(Debug, Clone, Default)]
+pub struct Filter {
+    /// Of these kinds; empty = all. Names of the tables.
+    pub kinds: Vec<Kind>,
+    /// Of this cell, from 0; `None` = all.
+    pub cell: Option<u16>,
+    /// Wall clock from here on, ns since 1970.
+    pub since_ns: Option<i64>,
+    /// Wall clock up to here.
+    pub until_ns: Option<i64>,
+    /// At most so many, the latest; `None` = all.
+    pub limit: Option<u32>,
+}
+
+/// A kind of row.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// Charges and discharges.
+    HalfCycle,
+    /// Capacities learned.
+    Capacity,
+    /// Alarms.
+    Alarm,
+    /// Resets, packs, damages.
+    Reset,
+}
+
+impl Kind {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::HalfCycle, Self::Capacity, Self::Alarm, Self::Reset];
+
+    const fn table(self) -> Table {
+        match self {
+            Self::HalfCycle => Table::HalfCycle,
+            Self::Capacity => Table::Capacity,
+            Self::Alarm => Table::Alarm,
+            Self::Reset => Table::Reset,
+        }
+    }
+
+    /// As people and JSON name it.
+    pub const fn name(self) -> &'static str {
+        self.table().name()
+    }
+
+    /// Names of the values of its rows, the cell (from 0) first.
+    pub const fn columns(self) -> &'static [&'static str] {
+        self.table().columns()
+    }
+}
+
+/// One row of the history.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// What it is.
+    pub kind: Kind,
+    /// Number in the chain; half-cycles are not in it.
+    pub seq: Option<i64>,
+    /// The moment it was written at: rows are in its order.
+    pub moment: i64,
+    /// Wall clock, ns since 1970, as it was set then.
+    pub wall_ns: i64,
+    /// The inputs' clock, ns.
+    pub time_ns: i64,
+    /// Which boot.
+    pub boot: String,
+    /// Which pack, from 1.
+    pub pack: i64,
+    /// Values of [`Kind::columns`].
+    pub values: Vec<serde_json::Value>,
+}
+
+impl Reader {
+    /// Opens the store in a folder.
+    ///
+    /// # Errors
+    /// When there is none, or it cannot be read; names the file.
+    pub fn open(folder: &Path) -> Result<Self, String> {
+        let path = folder.join(DATABASE);
+        let named = |error: String| format!("{}: {error}", path.display());
+        if !path.exists() {
+            return Err(named("no history there; --state says where the daemon keeps it".to_owned()));
+        }
+        let (connection, copy) = open_read_only(&path).map_err(named)?;
+        let reader = Self { connection, path: path.clone(), copy };
+        let version = schema::version(&reader.connection).map_err(|error| named(error.to_string()))?;
+        let known = schema::known(schema::MIGRATIONS);
+        if version > known || version == 0 {
+            return Err(named(format!("layout version {version}, this program reads 1 to {known}")));
+        }
+        Ok(reader)
+    }
+
+    fn named(&self, error: &rusqlite::Error) -> String {
+        format!("{}: {error}", self.path.display())
+    }
+
+    /// Goes through the chain.
+    ///
+    /// # Errors
+    /// When the file cannot be read to the end.
+    pub fn verify(&self) -> Result<Verdict, String> {
+        verify::verify(&self.connection).map_err(|error| self.named(&error))
+    }
+
+    /// The stored state, if it is good.
+    pub(super) fn state(&self) -> Option<Document> {
+        let shelf = database::read_shelf(&self.connection).ok()?;
+        let stored = database::read_state(&self.connection, &shelf).ok()?.ok()??;
+        Document::parse(&stored.json).ok()
+    }
+
+    /// The wanted rows in the order in which they were written.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn entries(&self, filter: &Filter) -> Result<Vec<Entry>, String> {
+        let mut entries = Vec::new();
+        for kind in Kind::ALL.into_iter().filter(|kind| filter.kinds.is_empty() || filter.kinds.contains(kind)) {
+            self.read(kind, filter, &mut entries).map_err(|error| self.named(&error))?;
+        }
+        entries.sort_by_key(|entry| (entry.moment, entry.seq.unwrap_or(0)));
+        if let Some(limit) = filter.limit {
+            let surplus = entries.len().saturating_sub(usize::try_from(limit).unwrap_or(usize::MAX));
+            entries.drain(..surplus);
+        }
+        Ok(entries)
+    }
+
+    fn read(&self, kind: Kind, filter: &Filter, entries: &mut Vec<Entry>) -> rusqlite::Result<()> {
+        let table = kind.table();
+        let (seq, order) = match kind {
+            Kind::HalfCycle => ("NULL", "r.moment DESC, r.cell DESC"),
+            _ => ("r.seq", "r.seq DESC"),
+        };
+        let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
+        let sql = format!(
+            "SELECT {seq}, r.moment, m.wall_ns, m.time_ns, m.boot, m.pack, {} FROM {} r JOIN moment m ON m.id = r.moment \
+             WHERE (?1 IS NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) \
+             ORDER BY {order} LIMIT ?4",
+            columns.join(", "),
+            table.name()
+        );
+        let limit = filter.limit.map_or(-1, i64::from);
+        let mut statement = self.connection.prepare(&sql)?;
+        let mut rows = statement.query((filter.cell, filter.since_ns, filter.until_ns, limit))?;
+        while let Some(row) = rows.next()? {
+            let boot: Vec<u8> = row.get(4)?;
+            entries.push(Entry {
+                kind,
+                seq: row.get(0)?,
+                moment: row.get(1)?,
+                wall_ns: row.get(2)?,
+                time_ns: row.get(3)?,
+                boot: hex(&boot),
+                pack: row.get(5)?,
+                values: (6..6 + columns.len())
+                    .map(|index| row.get(index).map(json))
+                    .collect::<rusqlite::Result<_>>()?,
+            });
+        }
+        Ok(())
+    }
+}
+
+impl Drop for Reader {
+    fn drop(&mut self) {
+        if let Some(folder) = &self.copy {
+            let _ = fs::remove_dir_all(folder);
+        }
+    }
+}
+
+fn json(value: Value) -> serde_json::Value {
+    match value {
+        Value::Null => serde_json::Value::Null,
+        Value::Integer(whole) => whole.into(),
+        Value::Real(real) => real.into(),
+        Value::Text(text) => text.into(),
+        Value::Blob(blob) => hex(&blob).into(),
+    }
+}
+
+/// Opens for reading: as it is, beside a daemon that writes; else, on a disk that cannot be written, where SQLite
+/// cannot make its index of the log, a copy.
+fn open_read_only(path: &Path) -> Result<(Connection, Option<PathBuf>), String> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let readable = |connection: &Connection| -> rusqlite::Result<()> {
+        connection.busy_timeout(std::time::Duration::from_secs(1))?;
+        connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
+    };
+    let first = Connection::open_with_flags(path, flags).and_then(|connection| {
+        readable(&connection)?;
+        Ok(connection)
+    });
+    let error = match first {
+        Ok(connection) => return Ok((connection, None)),
+        Err(error) => error,
+    };
+    let code = error.sqlite_error_code();
+    if !matches!(code, Some(rusqlite::ErrorCode::CannotOpen | rusqlite::ErrorCode::ReadOnly)) {
+        return Err(error.to_string());
+    }
+    let folder = copy_beside_nothing(path).map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
+    // A copy may be written: SQLite makes its index there.
+    let opened = Connection::open(folder.join(DATABASE)).and_then(|connection| {
+        readable(&connection)?;
+        Ok(connection)
+    });
+    opened.map(|connection| (connection, Some(folder))).map_err(|error| error.to_string())
+}
+
+/// Copies a database and its log into a folder of its own in the temporary folder.
+fn copy_beside_nothing(path: &Path) -> std::io::Result<PathBuf> {
+    let bytes = fs::metadata(path)?.len();
+    if bytes > MAX_COPY_BYTES {
+        return Err(std::io::Error::other(format!("{bytes} bytes, at most {MAX_COPY_BYTES} are copied")));
+    }
+    let folder = std::env::temp_dir().join(format!("packwatch-history-{}", std::process::id()));
+    fs::create_dir(&folder)?;
+    let copied = fs::copy(path, folder.join(DATABASE)).and_then(|_| {
+        match fs::copy(with_suffix(path, "-wal"), with_suffix(&folder.join(DATABASE), "-wal")) {
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
+            result => result.map(drop),
+        }
+    });
+    match copied {
+        Ok(()) => Ok(folder),
+        Err(error) => {
+            let _ = fs::remove_dir_all(&folder);
+            Err(error)
+        }
+    }
+}
