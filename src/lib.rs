@@ -14,6 +14,7 @@
 //! | 2 | [`alarm`] | rules over named values, the life of an alarm |
 //! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |
 //! | 3 | [`sim`] | truth model, sensor errors, scenarios |
+//! | 3 | [`doctor`] | what is probably wrong with the wiring or the configuration, from what comes over the bus |
 //! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
 //! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, control socket |
@@ -31,6 +32,7 @@ pub mod cell;
 pub mod cli;
 pub mod config;
 pub mod daemon;
+pub mod doctor;
 pub mod filter;
 pub mod health;
 #[cfg(feature = "lab")]

@@ -19,6 +19,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("alarm", &["quantity"], Core::Pure),
     ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
+    ("doctor", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "cell"], Core::Pure),
     ("config", BELOW_CONFIG, Core::Shell),
     ("io", BELOW_IO, Core::Shell),
@@ -29,14 +30,14 @@ const TABLE: &[(&str, &[&str], Core)] = &[
 ];
 
 /// Every module below `cli`, lowest first.
-const LAYERS: [&str; 14] = [
-    "quantity", "filter", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "ident", "config", "io",
-    "daemon", "lab",
+const LAYERS: [&str; 15] = [
+    "quantity", "filter", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "doctor", "ident", "config",
+    "io", "daemon", "lab",
 ];
-const BELOW_CONFIG: &[&str] = LAYERS.split_at(10).0;
-const BELOW_IO: &[&str] = LAYERS.split_at(11).0;
-const BELOW_DAEMON: &[&str] = LAYERS.split_at(12).0;
-const BELOW_LAB: &[&str] = LAYERS.split_at(13).0;
+const BELOW_CONFIG: &[&str] = LAYERS.split_at(11).0;
+const BELOW_IO: &[&str] = LAYERS.split_at(12).0;
+const BELOW_DAEMON: &[&str] = LAYERS.split_at(13).0;
+const BELOW_LAB: &[&str] = LAYERS.split_at(14).0;
 const BELOW_CLI: &[&str] = &LAYERS;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -217,6 +217,64 @@ fn a_restored_pack_sends_as_if_it_had_never_stopped() {
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Away::AsStamped), true));
 }
 
+/// The whole run against one that goes on with an `edit`ed configuration from one split to the next: a line for the first
+/// difference of each kind. (The event that says so is not among them: it comes between two inputs.)
+fn reload_differences(
+    config: &MonitorConfig,
+    records: &[Record],
+    splits: &[usize],
+    edit: impl Fn(&mut MonitorConfig),
+) -> Vec<String> {
+    let (mut whole, mut reloaded) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
+    let (mut out_whole, mut out_reloaded) = (wanting_estimates(), wanting_estimates());
+    let (mut found, mut told, mut is_edited) = (Vec::new(), [false; 3], false);
+    for (nth, record) in records.iter().enumerate() {
+        if splits.contains(&nth) {
+            let mut other = config.clone();
+            is_edited = !is_edited;
+            if is_edited {
+                edit(&mut other);
+            }
+            let done = reloaded.reconfigure(other, record.time(), &mut out_reloaded).expect("taken over");
+            assert_eq!(done.alarms_ended, 0);
+        }
+        let expected = outputs(&mut whole, record, &mut out_whole);
+        let got = outputs(&mut reloaded, record, &mut out_reloaded);
+        for kind in 0..3 {
+            if expected[kind] != got[kind] && !told[kind] {
+                told[kind] = true;
+                let (what, at_s) = (WHAT[kind], record.time().secs());
+                found.push(format!("{what} differ at {at_s} s\n  {:.300}\n  {:.300}", expected[kind], got[kind]));
+            }
+        }
+    }
+    let end = |monitor: &Monitor| serde_json::to_value(monitor.snapshot()).expect("a document");
+    if end(&whole) != end(&reloaded) {
+        found.push("the states at the end differ".to_owned());
+    }
+    found
+}
+
+#[test]
+fn a_reload_of_the_same_configuration_changes_nothing() {
+    for (config, records) in [paper(), pack()] {
+        assert_same(&reload_differences(&config, &records, &splits(&records, 20, false), |_| {}));
+    }
+}
+
+#[test]
+fn other_thresholds_and_periods_change_no_estimate() {
+    for (config, records) in [paper(), pack()] {
+        let found = reload_differences(&config, &records, &splits(&records, 20, false), |config| {
+            config.rules.iter_mut().for_each(|rule| rule.threshold = rule.clear);
+            config.flood.max_frames_per_s = config.flood.max_frames_per_s.saturating_add(2000);
+            config.output.as_mut().expect("sends").status_period_s *= 10.0;
+        });
+        assert!(found.iter().any(|line| line.starts_with("frames")), "the edit does something");
+        assert_same(&found.into_iter().filter(|line| line.starts_with("estimates")).collect::<Vec<_>>());
+    }
+}
+
 /// All ticks against only those at `next_due`: every frame and event must be the same, in order.
 fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
     let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));

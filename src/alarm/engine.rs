@@ -66,11 +66,26 @@ pub struct ThresholdState {
 
 /// One alarm of a stored state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct StoredAlarm {
-    rule: Rule,
-    severity: Severity,
-    cell: Option<CellIndex>,
+pub struct StoredAlarm {
+    /// Which rule.
+    pub rule: Rule,
+    /// Its severity.
+    pub severity: Severity,
+    /// Which cell; `None` = the pack.
+    pub cell: Option<CellIndex>,
     machine: Machine,
+}
+
+impl StoredAlarm {
+    /// Whether it was raised.
+    pub fn is_raised(&self) -> bool {
+        self.machine.state.is_raised()
+    }
+
+    /// Times it was raised.
+    pub fn occurrences(&self) -> u32 {
+        self.machine.occurrences
+    }
 }
 
 /// What an engine remembers: every alarm that was raised or is about to be.
@@ -327,18 +342,15 @@ impl AlarmEngine {
         AlarmState { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Takes up a stored state (rebased by the caller); returns how many of its alarms no configured threshold watches
-    /// any more: they are gone, and the caller says so.
-    pub fn restore(&mut self, state: &AlarmState) -> usize {
+    /// Takes up a stored state (rebased by the caller); returns those of its alarms that no configured threshold
+    /// watches any more: they are gone, and the caller says so.
+    pub fn restore(&mut self, state: &AlarmState) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
-        let mut orphans = 0;
+        let mut orphans = Vec::new();
         for alarm in &state.alarms {
-            let same = |rule: &RuleSlots| (rule.config.rule, rule.config.severity) == (alarm.rule, alarm.severity);
-            let index = self.rules.iter().position(same);
-            let slot = index.and_then(|index| Some((index, self.rules[index].slot(alarm.cell)?)));
-            let Some((index, slot)) = slot else {
-                orphans += 1;
+            let Some((index, slot)) = self.place(alarm.rule, alarm.severity, alarm.cell) else {
+                orphans.push(alarm.clone());
                 continue;
             };
             // Its value comes with the next look.
@@ -346,6 +358,55 @@ impl AlarmEngine {
             self.file(index, slot, false);
         }
         orphans
+    }
+
+    /// Goes on with other rules: an alarm whose rule, severity and cell are still watched is as it was, and judged anew when
+    /// its threshold is another one; any other that is raised or has been is forgotten. Returns how many those are.
+    pub fn reconfigure(
+        &mut self,
+        now: Timestamp,
+        rules: Vec<RuleConfig>,
+        cells: u16,
+        changes: &mut Vec<AlarmChange>,
+    ) -> usize {
+        let mut old = std::mem::replace(self, Self::new(rules, cells));
+        let mut ended = 0;
+        for before in 0..old.rules.len() {
+            for slot in old.rules[before].slots() {
+                let rule = &old.rules[before];
+                if let Some((index, place)) = self.place(rule.config.rule, rule.config.severity, rule.cell(slot)) {
+                    self.machines[place] = old.machines[slot];
+                    self.file(index, place, false);
+                } else if std::mem::take(&mut old.machines[slot]).is_worth_storing() {
+                    ended += 1;
+                    changes.push(AlarmChange { change: Change::Forgotten, alarm: old.alarm(before, slot) });
+                }
+            }
+        }
+        for index in 0..self.rules.len() {
+            if !old.rules.iter().any(|before| before.config == self.rules[index].config) {
+                self.retarget(now, index, changes);
+            }
+        }
+        ended
+    }
+
+    fn retarget(&mut self, now: Timestamp, index: usize, changes: &mut Vec<AlarmChange>) {
+        for slot in self.rules[index].slots() {
+            let was_known = self.machines[slot].is_known;
+            let change = self.machines[slot].retarget(now, &self.rules[index].config);
+            self.file(index, slot, was_known);
+            if let Some(change) = change {
+                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+            }
+        }
+    }
+
+    /// Where an alarm is, if it is watched: the index of its threshold, and its slot.
+    fn place(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<(usize, usize)> {
+        let same = |slots: &RuleSlots| (slots.config.rule, slots.config.severity) == (rule, severity);
+        let index = self.rules.iter().position(same)?;
+        Some((index, self.rules[index].slot(cell)?))
     }
 
     fn cells(&self) -> u16 {

@@ -227,6 +227,17 @@ impl Machine {
         self.counted_to = None;
     }
 
+    /// Its threshold is another one: what was counted towards the old one does not count, and a value that is known is
+    /// new to it.
+    pub(super) fn retarget(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
+        (self.held_nanos, self.events, self.counted_to) = (0, 0, None);
+        if !self.is_known {
+            return None;
+        }
+        self.seen.is_new = true;
+        self.judge(now, rule)
+    }
+
     /// Somebody has seen the alarm.
     pub(super) fn acknowledge(&mut self) -> Result<Change, Refusal> {
         match step(self.state, Told::Acknowledge) {

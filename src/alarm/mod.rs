@@ -15,7 +15,7 @@ pub mod machine;
 pub mod rule;
 pub mod selector;
 
-pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmState, ThresholdState};
+pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmState, StoredAlarm, ThresholdState};
 pub use judge::{Observation, RuleConfig, When};
 pub use machine::{Change, Refusal, State};
 pub use rule::{Direction, Rule, Scope, Severity, Unit};

@@ -97,6 +97,17 @@ impl FloodGate {
         Self { frame_ns, changes: Vec::with_capacity(buckets.len() + 1), buckets }
     }
 
+    /// With the counts, the spent budget and the floods of another gate for the messages that are in both.
+    #[must_use]
+    pub fn going_on_from(mut self, old: &Self) -> Self {
+        for bucket in &mut self.buckets {
+            if let Some(old) = old.buckets.iter().find(|old| (old.bus, old.id) == (bucket.bus, bucket.id)) {
+                (bucket.spent_until, bucket.dropped, bucket.flood) = (old.spent_until, old.dropped, old.flood);
+            }
+        }
+        self
+    }
+
     /// Whether a frame is taken in; time never runs backwards except after [`Self::restart`].
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
         let Ok(found) = self.buckets.binary_search_by_key(&(bus, id), |bucket| (bucket.bus, bucket.id)) else {

@@ -94,6 +94,21 @@ impl Guards {
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
+    /// With the counts of other guards for the messages that are in both; where a message is checked as before, with its
+    /// receiver as well, so that no frame is lost to a new beginning.
+    #[must_use]
+    pub fn going_on_from(mut self, old: &Self) -> Self {
+        for guard in &mut self.guards {
+            let same = |old: &&Guard| (old.config.bus, old.config.id) == (guard.config.bus, guard.config.id);
+            match old.guards.iter().find(same) {
+                Some(old) if old.config == guard.config => guard.clone_from(old),
+                Some(old) => guard.receiver = Receiver::with_counts(*old.receiver.counts()),
+                None => {}
+            }
+        }
+        self
+    }
+
     /// Checks a frame; `None` = its message is not protected, or it is a remote request, which carries no data.
     pub fn check(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
         if self.guards.is_empty() || frame.kind() == FrameKind::Remote {

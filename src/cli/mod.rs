@@ -7,13 +7,17 @@ mod command;
 mod control_args;
 mod dbc;
 mod demo;
+mod doctor;
+mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+mod generate;
 mod replay;
 mod run;
 #[cfg(feature = "lab")]
 mod score;
 mod simulate;
+mod status;
 mod test_alarm;
 
 use std::process::ExitCode;
@@ -35,6 +39,10 @@ pub struct Cli {
 enum Command {
     /// Run the service on live CAN interfaces
     Run(run::Args),
+    /// Show what the running daemon knows: pack, cells, alarms, interfaces
+    Status(status::Args),
+    /// Serve the status of the running daemon as metrics for Prometheus
+    Exporter(exporter::Args),
     /// Show the alarms of the running daemon
     Alarms(alarms::Args),
     /// Tell the running daemon that alarms were seen
@@ -53,8 +61,13 @@ enum Command {
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
+    /// Listen to a pack, or replay a log, and tell what is probably wrong with wiring or configuration
+    Doctor(Box<doctor::Args>),
     /// Write the DBC of the frames as they are configured, for those who receive them
     Dbc(dbc::Args),
+    /// Write manual pages and shell completions
+    #[command(hide = true)]
+    Generate(generate::Args),
     /// Fit a cell model to measured data
     #[cfg(feature = "lab")]
     Fit(Box<fit::Args>),
@@ -66,7 +79,7 @@ enum Command {
 /// Why a command ended without success: what to print and the exit code.
 #[derive(Debug)]
 pub struct Failure {
-    /// For the terminal, without the program's name.
+    /// For the terminal, without the program's name; empty = the output has said it.
     pub message: String,
     /// Exit code.
     pub code: u8,
@@ -89,6 +102,8 @@ impl From<crate::config::ConfigFaults> for Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Run(args) => run::run(&args),
+        Command::Status(args) => status::run(&args),
+        Command::Exporter(args) => exporter::run(&args),
         Command::Alarms(args) => alarms::run(&args),
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
@@ -98,7 +113,9 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Check(args) => check::run(&args),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Dbc(args) => dbc::run(&args),
+        Command::Generate(args) => generate::run(&args),
         #[cfg(feature = "lab")]
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
@@ -107,7 +124,9 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{}", failure.message);
+            if !failure.message.is_empty() {
+                eprintln!("{}", failure.message);
+            }
             ExitCode::from(failure.code)
         }
     }

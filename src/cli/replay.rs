@@ -6,8 +6,8 @@ mod report;
 use std::io;
 use std::path::Path;
 
-pub(crate) use args::Args;
-use report::Bar;
+pub(crate) use args::{Args, CsvSign, column};
+pub(crate) use report::Bar;
 
 use super::Failure;
 use crate::can::encode::{InputEncoder, InputProtector};

@@ -1,12 +1,16 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
+
+use sha2::{Digest, Sha256};
 
 use super::Failure;
 use crate::config;
 use crate::daemon::control::ControlSetting;
+use crate::daemon::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::daemon::snapshot_file;
+use crate::daemon::status::document::ConfigFile;
 use crate::daemon::store::StateSetting;
 use crate::daemon::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
@@ -43,6 +47,9 @@ pub(crate) struct Args {
     /// Stop after this time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
     duration: Option<f64>,
+    /// Wait this long for the first usable frame before the service manager is told that the service is ready
+    #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = ready_seconds)]
+    ready_timeout: f64,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
@@ -53,6 +60,10 @@ pub(crate) struct Args {
     /// systemd, else /run/packwatch/control.sock where that can be made)
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
+    /// Socket for `packwatch status` and the exporter, or none for no socket; the stream of `--watch` is beside it
+    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else /run/packwatch/status.sock where that can be made)
+    #[arg(long, value_name = "PATH")]
+    status: Option<PathBuf>,
 }
 
 /// Longest time an option takes, s: ten years.
@@ -64,6 +75,13 @@ fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if (0.0..=MAX_SECONDS).contains(&value) => Ok(value),
         _ => Err(format!("must be seconds, 0 to {MAX_SECONDS}")),
+    }
+}
+
+fn ready_seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=MAX_READY_TIMEOUT_S).contains(&value) => Ok(value),
+        _ => Err(format!("must be seconds, 0 to {MAX_READY_TIMEOUT_S}")),
     }
 }
 
@@ -82,6 +100,13 @@ fn buffer_bytes(text: &str) -> Result<usize, String> {
     }
 }
 
+/// The configuration's name and fingerprint; `None` when it has become unreadable since it was read.
+fn config_file(path: &Path) -> Option<ConfigFile> {
+    let text = std::fs::read(path).ok()?;
+    let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
+    Some(ConfigFile { path: path.display().to_string(), sha256 })
+}
+
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
@@ -94,9 +119,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         away: args.away.unwrap_or_default(),
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
+        ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
         state: StateSetting::from_path(args.state.clone()),
         control: ControlSetting::from_path(args.control.clone()),
+        status: ControlSetting::from_path(args.status.clone()),
+        config_file: config_file(&args.config),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))
 }

@@ -266,7 +266,7 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
     }
 }
 
-fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
+pub(crate) fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
     let dead_band_a = keys.dead_band_a.unwrap_or(pack_ah / 50.0);
     TransitionConfig {
         dead_band_a,

@@ -159,6 +159,11 @@ impl Place {
         self.spots.contains_key(key)
     }
 
+    /// What is written at a key, cut to one short line.
+    pub(crate) fn found(&self, key: &str) -> Option<&str> {
+        self.spots.get(key).map(|spot| spot.found.as_str())
+    }
+
     /// Line of a key; of the table when the key is not written.
     pub(crate) fn line_of(&self, key: &str) -> usize {
         self.spots.get(key).map_or(self.line, |spot| spot.line)

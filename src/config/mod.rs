@@ -17,6 +17,7 @@ mod describe;
 mod document;
 mod j1939;
 mod keys;
+mod manual;
 mod output;
 mod pattern;
 mod protect;
@@ -24,11 +25,14 @@ mod reference;
 mod resolve;
 mod schema;
 mod setting;
+mod survey;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
 use document::{Document, Faults};
+pub use manual::manual;
 pub use reference::reference;
 use resolve::Databases;
+pub use survey::{Survey, survey};
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]

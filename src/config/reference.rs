@@ -21,11 +21,7 @@ pub fn reference() -> String {
 
 fn sections(page: &mut String, sections: &[SectionInfo]) {
     for info in sections {
-        let heading = match (info.path, info.many) {
-            ("", _) => "Top of the file".to_owned(),
-            (path, true) => format!("`[[{path}]]`, any number of times"),
-            (path, false) => format!("`[{path}]`"),
-        };
+        let heading = heading(info);
         // Writing to a String cannot fail.
         let _ = write!(page, "\n## {heading}\n\n{}\n", info.about.trim());
         if let Some(keys) = info.keys {
@@ -38,15 +34,33 @@ fn sections(page: &mut String, sections: &[SectionInfo]) {
 }
 
 fn row(key: &Key) -> String {
-    let value = match (key.choices.is_empty(), key.range()) {
+    let (value, without) = (value(key), without(key));
+    format!("| `{}` | {value} | {} | {without} | {} |\n", key.name, key.unit, key.about.trim())
+}
+
+/// What may be written.
+pub(super) fn value(key: &Key) -> String {
+    match (key.choices.is_empty(), key.range()) {
         (false, choices) => choices.replace(" | ", ", "),
         (true, range) if range.is_empty() => key.kind.to_owned(),
         (true, range) => format!("{}, {range}", key.kind),
-    };
-    let without = match key.presence {
+    }
+}
+
+/// What holds where it is not written.
+pub(super) fn without(key: &Key) -> String {
+    match key.presence {
         Presence::Required => "required".to_owned(),
         Presence::Optional => "see meaning".to_owned(),
         Presence::Default(value) => format!("`{value}`"),
-    };
-    format!("| `{}` | {value} | {} | {without} | {} |\n", key.name, key.unit, key.about.trim())
+    }
+}
+
+/// How a table is written.
+pub(super) fn heading(info: &SectionInfo) -> String {
+    match (info.path, info.many) {
+        ("", _) => "Top of the file".to_owned(),
+        (path, true) => format!("`[[{path}]]`, any number of times"),
+        (path, false) => format!("`[{path}]`"),
+    }
 }

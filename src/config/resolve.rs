@@ -59,7 +59,8 @@ impl Databases {
         (!files.is_empty()).then_some(Self { files })
     }
 
-    fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
+    /// Every signal with its file and message.
+    pub(crate) fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
         let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
         messages.flat_map(|(file, message)| message.signals.iter().map(move |signal| (file, message, signal)))
     }
@@ -247,7 +248,7 @@ fn list(numbers: &[u32]) -> String {
 
 impl Resolved<'_> {
     /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
-    fn binding(&self) -> Result<Binding, LayoutFault> {
+    pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
         binding.offset = self.offset;

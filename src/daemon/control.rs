@@ -16,13 +16,15 @@
 
 pub(crate) mod answer;
 pub(crate) mod client;
-mod listener;
 pub(crate) mod protocol;
 mod server;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
+use super::unix_socket::runtime_folder;
+
+pub use super::unix_socket::SocketSetting as ControlSetting;
 pub(crate) use server::{Asked, ControlServer};
 
 /// Connections at once: a person, a display and a script, with room; each is a task and a few kilobytes.
@@ -35,38 +37,12 @@ pub(crate) const MAX_SILENCE: Duration = Duration::from_secs(10);
 /// Alarms listed in an answer: a line of a few hundred kilobytes, made in a few milliseconds; the rest is counted.
 pub(crate) const MAX_LISTED: usize = 1024;
 
-/// The socket of a daemon that systemd did not start.
-const STANDARD_PATH: &str = "/run/packwatch/control.sock";
-/// Its name in the folder systemd made.
+/// Its name in the folder of the daemon.
 const FILE_NAME: &str = "control.sock";
-
-/// Where the control socket is to be.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum ControlSetting {
-    /// `$RUNTIME_DIRECTORY/control.sock` under systemd, else `/run/packwatch/control.sock`; where that cannot be made,
-    /// the daemon goes without.
-    Standard,
-    /// There is none.
-    Off,
-    /// There, or the daemon does not start.
-    At(PathBuf),
-}
-
-impl ControlSetting {
-    /// As written on the command line: a path, or `none`.
-    pub fn from_path(path: Option<PathBuf>) -> Self {
-        match path {
-            None => Self::Standard,
-            Some(path) if path.as_os_str() == "none" => Self::Off,
-            Some(path) => Self::At(path),
-        }
-    }
-}
+/// Owner and group may connect.
+const MODE: u32 = 0o660;
 
 /// Where the socket is when nobody says where.
 pub(crate) fn standard_path() -> PathBuf {
-    let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
-    // systemd puts a colon between several; the first is the unit's own.
-    let folder = folders.and_then(|folders| std::env::split_paths(&folders).next());
-    folder.map_or_else(|| PathBuf::from(STANDARD_PATH), |folder| folder.join(FILE_NAME))
+    runtime_folder().join(FILE_NAME)
 }

@@ -1,5 +1,5 @@
-//! Core events as log lines: on change, with fields, by severity. Error frames are told once, then as a count: a
-//! bus without a partner makes thousands a second. And as JSON lines, all of them.
+//! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are told
+//! once, then as a count: a bus without a partner makes thousands a second, for as long as it has none. And as JSON lines, all of them.
 
 use std::io::{self, Write};
 
@@ -9,8 +9,10 @@ use crate::can::e2e::Status;
 use crate::monitor::{BusEvent, Event, EventKind};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
-/// Error frames of one interface are summed up this often, s.
-const ERROR_SUMMARY_S: f64 = 10.0;
+/// What one interface does again and again is told as a sum after this long, s; then after twice that, and so on.
+const SUMMARY_S: f64 = 10.0;
+/// At least this often, s.
+const LONGEST_SUMMARY_S: f64 = 3600.0;
 
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
 pub(crate) fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
@@ -18,25 +20,51 @@ pub(crate) fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> 
     out.write_all(b"\n")
 }
 
-/// Error frames of one interface.
+/// Frames of one kind on one interface that are told of as a sum.
 #[derive(Debug, Clone, Copy, Default)]
-struct ErrorFrames {
+struct Sum {
     told: Option<Timestamp>,
     untold: u64,
+    /// Until the next sum, s.
+    period_s: f64,
+}
+
+impl Sum {
+    /// Adds frames; gives how many there are to be told, when it is time to.
+    fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
+        self.untold += frames;
+        let since_s = self.told.map_or(f64::INFINITY, |told| time.since(told));
+        if since_s < self.period_s {
+            return None;
+        }
+        // After a pause it is news again.
+        let goes_on = since_s < 2.0 * self.period_s;
+        self.period_s = if goes_on { (2.0 * self.period_s).min(LONGEST_SUMMARY_S) } else { SUMMARY_S };
+        self.told = Some(time);
+        Some(std::mem::take(&mut self.untold))
+    }
+}
+
+/// The sums of one interface.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    errors: Sum,
+    dropped: Sum,
+    unsent: Sum,
 }
 
 /// Logs events.
 #[derive(Debug)]
 pub(crate) struct EventLog {
     interfaces: Vec<String>,
-    errors: Vec<ErrorFrames>,
+    sums: Vec<Sums>,
 }
 
 impl EventLog {
     /// For these interfaces, in the order of the configuration.
     pub(crate) fn new(interfaces: Vec<String>) -> Self {
-        let errors = vec![ErrorFrames::default(); interfaces.len()];
-        Self { interfaces, errors }
+        let sums = vec![Sums::default(); interfaces.len()];
+        Self { interfaces, sums }
     }
 
     /// Logs one event.
@@ -85,6 +113,18 @@ impl EventLog {
                     "another pack: what was learned of the old one is forgotten"
                 );
             }
+            EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),
+            EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
+                let cell = cell.map(number);
+                tracing::warn!(
+                    ?rule,
+                    ?severity,
+                    cell,
+                    active,
+                    occurrences,
+                    "stored alarm dropped, nothing watches it now"
+                );
+            }
             EventKind::Store { works: true } => tracing::info!("files can be written"),
             EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
             EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
@@ -106,18 +146,23 @@ impl EventLog {
 
     fn log_bus(&mut self, time: Timestamp, bus: usize, what: BusEvent) {
         let interface = self.interfaces.get(bus).map_or("?", String::as_str);
+        let Some(sums) = self.sums.get_mut(bus) else { return };
         match what {
             BusEvent::Up => tracing::info!(interface, "interface up"),
             BusEvent::Down => tracing::warn!(interface, "interface down"),
             BusEvent::Missing => tracing::warn!(interface, "interface missing"),
-            BusEvent::Dropped { frames } => tracing::warn!(interface, frames, "frames lost on receiving"),
-            BusEvent::SendFailed { frames } => tracing::warn!(interface, frames, "frames not sent"),
+            BusEvent::Dropped { frames } => {
+                if let Some(frames) = sums.dropped.add(time, frames) {
+                    tracing::warn!(interface, frames, "frames lost on receiving");
+                }
+            }
+            BusEvent::SendFailed { frames } => {
+                if let Some(frames) = sums.unsent.add(time, frames) {
+                    tracing::warn!(interface, frames, "frames not sent");
+                }
+            }
             BusEvent::ErrorFrame { class } => {
-                let Some(errors) = self.errors.get_mut(bus) else { return };
-                errors.untold += 1;
-                if errors.told.is_none_or(|told| time.since(told) >= ERROR_SUMMARY_S) {
-                    let frames = std::mem::take(&mut errors.untold);
-                    errors.told = Some(time);
+                if let Some(frames) = sums.errors.add(time, 1) {
                     tracing::warn!(interface, frames, class = format_args!("{class:#x}"), "error frames");
                 }
             }
@@ -180,5 +225,28 @@ fn log_learned(kind: &EventKind) {
             tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");
         }
         _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
+        let mut sum = Sum::default();
+        let told: Vec<u64> =
+            (0..86_400 * 4).filter_map(|n| sum.add(Timestamp::from_secs(f64::from(n) * 0.25), 2)).collect();
+        assert!((20..=45).contains(&told.len()), "{} lines", told.len());
+        assert_eq!(told[0], 2, "the first is told at once");
+        assert_eq!(told.iter().sum::<u64>() + sum.untold, 86_400 * 4 * 2);
+    }
+
+    #[test]
+    fn after_a_pause_it_is_told_at_once_again() {
+        let mut sum = Sum::default();
+        let mut add = |at_s: f64| sum.add(Timestamp::from_secs(at_s), 1);
+        assert_eq!([add(0.0), add(1.0), add(10.0), add(11.0)], [Some(1), None, Some(2), None]);
+        assert_eq!([add(1000.0), add(1001.0), add(1010.0)], [Some(2), None, Some(2)]);
     }
 }

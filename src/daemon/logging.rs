@@ -1,14 +1,40 @@
 //! Where the log goes: journald with its fields when systemd connected standard error to it, else standard error.
+//! Either way no more than a burst and a trickle of it ([`limit`]).
+
+mod journald;
+mod limit;
 
 use std::io::IsTerminal;
 use std::os::linux::fs::MetadataExt;
+use std::sync::atomic::{AtomicU64, Ordering};
 
-use tracing_subscriber::EnvFilter;
-use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, fmt};
+
+use journald::Journal;
+use limit::Limit;
 
 /// Environment variable with the filter, where `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
+
+/// Lines that are in no log: over the limit, or not taken by journald.
+static LEFT_OUT: Count = Count(AtomicU64::new(0));
+
+/// A number that only grows until it is taken.
+#[derive(Debug)]
+struct Count(AtomicU64);
+
+impl Count {
+    fn add(&self, lines: u64) {
+        self.0.fetch_add(lines, Ordering::Relaxed);
+    }
+}
+
+/// Lines left out of the log since the last call.
+pub(crate) fn take_left_out() -> u64 {
+    LEFT_OUT.0.swap(0, Ordering::Relaxed)
+}
 
 /// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
 ///
@@ -19,13 +45,14 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     let filter = EnvFilter::try_new(&text).map_err(|error| format!("log filter '{text}': {error}"))?;
     let registry = tracing_subscriber::registry().with(filter);
     // A second start (tests) keeps the first logger: nothing is lost by that.
-    let _ = match stderr_is_journal().then(tracing_journald::layer) {
-        Some(Ok(journal)) => registry.with(journal).try_init(),
+    let _ = match stderr_is_journal().then(Journal::new) {
+        Some(Ok(journal)) => registry.with(journal.with_filter(Limit::new())).try_init(),
         // Colours for a person at a terminal; in a file they are rubbish. An empty NO_COLOR counts as none.
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
-            registry.with(tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_ansi(ansi)).try_init()
+            let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi);
+            registry.with(lines.with_filter(Limit::new())).try_init()
         }
     };
     Ok(())

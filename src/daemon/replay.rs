@@ -260,6 +260,8 @@ struct Replay {
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
     summary: Summary,
+    /// A reload of the recorded run was noted.
+    reloaded: bool,
     usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
 }
 
@@ -281,6 +283,7 @@ impl Replay {
             snapshot_at: None,
             snapshot: None,
             summary: Summary::default(),
+            reloaded: false,
             usable: BTreeMap::new(),
         })
     }
@@ -309,10 +312,23 @@ impl Replay {
             self.ticks.advance(time);
         }
         self.make_ticks()?;
+        if let Record::Reload { time } = record {
+            self.note_reload(*time);
+        }
         if let Some(input) = record.input() {
             self.feed(input)?;
         }
         Ok(true)
+    }
+
+    /// The first of the recorded run's reloads is noted: from there this replay may differ from it.
+    fn note_reload(&mut self, time: Timestamp) {
+        if !std::mem::replace(&mut self.reloaded, true) {
+            let at_s = time.secs();
+            self.summary.notes.push(format!(
+                "the recorded run took another configuration over at {at_s:.3} s: from there its results may differ"
+            ));
+        }
     }
 
     /// The first record of all.
@@ -488,6 +504,8 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::Reconfigured { .. } => "reconfigured",
+        EventKind::AlarmDropped { .. } => "alarm_dropped",
         EventKind::Store { .. } => "store",
     };
     *summary.events.entry(name).or_default() += 1;

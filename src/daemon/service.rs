@@ -6,6 +6,9 @@
 
 mod engine;
 mod live;
+pub(crate) mod readiness;
+mod reload;
+mod seeing;
 mod stop;
 
 use std::io;
@@ -15,10 +18,15 @@ use std::time::Duration;
 use sd_notify::NotifyState;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
+use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
 use super::j1939_carrier;
+use super::status::StatusServer;
+use super::status::collect::Identity;
+use super::status::document::ConfigFile;
 use super::store::StateSetting;
+use super::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
@@ -27,10 +35,15 @@ use crate::quantity::BusIndex;
 
 use engine::Engine;
 use live::Loop;
-use stop::Stop;
+use reload::Reload;
+use seeing::Seeing;
+pub(super) use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
+
+/// Threads for what would hold up the loop: reading a configuration, long answers. More would only wait for the disk.
+const BLOCKING_THREADS: usize = 4;
 
 /// What to run.
 #[derive(Debug)]
@@ -51,12 +64,18 @@ pub struct Service {
     pub snapshot: Option<PathBuf>,
     /// Stop after this long; `None` = when told to.
     pub duration: Option<Duration>,
+    /// How long the first usable reading is waited for before the service calls itself ready.
+    pub ready_timeout: Duration,
     /// Receive buffer asked for per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
     /// Where state and history are kept.
     pub state: StateSetting,
+    /// The status sockets.
+    pub status: SocketSetting,
+    /// Where the configuration came from, for those who look.
+    pub config_file: Option<ConfigFile>,
 }
 
 /// Why the service could not start, or not end as it should.
@@ -76,9 +95,9 @@ pub enum ServiceError {
     /// The state folder is another daemon's.
     #[error("{0}")]
     Store(String),
-    /// The control socket is another daemon's, or cannot be made.
+    /// The control or status socket is another daemon's, or cannot be made.
     #[error("{0}")]
-    Control(String),
+    Socket(String),
     /// The runtime or a signal handler could not be set up.
     #[error("cannot start: {0}")]
     Start(#[from] io::Error),
@@ -90,26 +109,39 @@ impl Service {
     /// # Errors
     /// When it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let mut builder = tokio::runtime::Builder::new_current_thread();
+        let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
         runtime.block_on(self.serve())
     }
 
     async fn serve(mut self) -> Result<(), ServiceError> {
         let stop = Stop::new(self.duration)?;
+        let reload = Reload::new(&self.config)?;
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
         // Before any file is opened: a second daemon must not take those of the first.
         let (asked, requests) = mpsc::channel(MAX_CONNECTIONS);
-        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Control)?;
+        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Socket)?;
+        let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
         let mut engine = Engine::new(&mut self, clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
         drop(sender);
         // The first input is the time of the start; what it sends waits for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
         engine.tell_works(clock.now(), &outputs);
-        let mut service = Loop { engine, inbox, requests, clock, outputs, batch: Vec::new() };
-        notify(&[NotifyState::Ready, NotifyState::Status("running")]);
+        let seeing = Seeing::new(status, self.identity(clock));
+        let mut service = Loop {
+            engine,
+            inbox,
+            requests,
+            reload,
+            clock,
+            outputs,
+            batch: Vec::new(),
+            left_out_told: Instant::now(),
+            seeing,
+        };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
             j1939_carrier::tell();
@@ -118,6 +150,11 @@ impl Service {
         notify(&[NotifyState::Stopping]);
         drop(control);
         service.finish(links, snapshot.as_deref()).await
+    }
+
+    fn identity(&self, clock: MappedClock) -> Identity {
+        let interfaces = self.config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+        Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {

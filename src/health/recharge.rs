@@ -80,6 +80,12 @@ impl RechargeTimer {
         *self = Self::default();
     }
 
+    /// The window is another one: what the charge has said of the old one does not count, how far it went does.
+    pub fn change_window(&mut self) {
+        self.interrupt();
+        self.raw_s = None;
+    }
+
     /// The charge is over.
     pub fn finish(&mut self, config: &RechargeConfig) -> Charged {
         let ended = std::mem::take(self);

@@ -11,8 +11,10 @@
 //! RESTORE (1700000000.000000000) AWAY_SECONDS|-|unknown
 //! COMMAND (1700000000.400000000) {"command":"acknowledge",...}
 //! STORE (1700000000.500000000) works|fails
+//! RELOAD (1700000000.600000000)
 //! ```
 //!
+//! `RELOAD`: from here on another configuration held, which the journal does not carry.
 //! `RESTORE` stands first in the journal of a run that took up a stored state, and says how long it was away (`-`: as
 //! the stamps say).
 //! A last line without line feed was torn by a power cut and is a bad line, even where it could be read.
@@ -35,6 +37,7 @@ pub(crate) enum Mark<'a> {
     Restore { time: Timestamp, away: Away },
     Command { time: Timestamp, command: Command },
     Store { time: Timestamp, works: bool },
+    Reload { time: Timestamp },
 }
 
 /// Reads a journal line that does not begin with `(`; `None` = none of the journal's.
@@ -45,7 +48,7 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
     let Some(space) = memchr::memchr(b' ', line) else { return Ok(None) };
     let keyword = &line[..space];
-    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE"].contains(&keyword) {
+    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"].contains(&keyword) {
         return Ok(None);
     }
     let shifted = |e: LineError| LineError { column: e.column + space + 1, ..e };
@@ -53,9 +56,10 @@ pub(crate) fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let fail = |expected| Err(LineError { column: line.len() - rest.len() + 1, expected });
     let rest_text = rest.strip_prefix(b" ").unwrap_or_default();
     match keyword {
-        b"TICK" | b"GAP" if !rest.is_empty() => fail("the line's end after the stamp"),
+        b"TICK" | b"GAP" | b"RELOAD" if !rest.is_empty() => fail("the line's end after the stamp"),
         b"TICK" => Ok(Some(Mark::Tick { time })),
         b"GAP" => Ok(Some(Mark::Gap { time })),
+        b"RELOAD" => Ok(Some(Mark::Reload { time })),
         b"RESTORE" => match parse_away(rest_text) {
             Some(away) => Ok(Some(Mark::Restore { time, away })),
             None => fail("seconds away, - or unknown"),
@@ -122,6 +126,15 @@ impl<W: Write> JournalWriter<W> {
     pub fn restored(&mut self, now: Timestamp, away: Away) -> io::Result<()> {
         self.mark("RESTORE", now)?;
         writeln!(self.out, " {away}")
+    }
+
+    /// Notes that another configuration was taken over.
+    ///
+    /// # Errors
+    /// Those of the file.
+    pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
+        self.mark("RELOAD", time)?;
+        self.out.write_all(b"\n")
     }
 
     /// Appends one input, as it is handed to the core.

@@ -25,6 +25,9 @@ const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Names of unconfigured interfaces counted apart; more are counted together under "...".
 const MAX_FOREIGN_NAMES: usize = 64;
 
+/// Most interfaces, configured and adopted: a log has a handful.
+pub const MAX_ADOPTED: usize = 64;
+
 /// Why reading cannot go on, with file and line.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
@@ -96,6 +99,11 @@ pub enum Record {
         /// They could.
         works: bool,
     },
+    /// The recorded run took another configuration over here.
+    Reload {
+        /// When.
+        time: Timestamp,
+    },
     /// The recorded run took up a stored state here.
     Restore {
         /// When.
@@ -115,7 +123,7 @@ impl Record {
             Self::UnknownGap { time } => Input::UnknownGap { time: *time },
             Self::Command { time, command } => Input::Command { time: *time, command: *command },
             Self::Store { time, works } => Input::Store { time: *time, works: *works },
-            Self::Restore { .. } => return None,
+            Self::Restore { .. } | Self::Reload { .. } => return None,
         })
     }
 
@@ -128,6 +136,7 @@ impl Record {
             | Self::UnknownGap { time }
             | Self::Command { time, .. }
             | Self::Store { time, .. }
+            | Self::Reload { time }
             | Self::Restore { time, .. } => time,
         }
     }
@@ -140,6 +149,7 @@ impl Record {
             | Self::UnknownGap { time }
             | Self::Command { time, .. }
             | Self::Store { time, .. }
+            | Self::Reload { time }
             | Self::Restore { time, .. } => *time = placed,
         }
         self
@@ -208,6 +218,8 @@ struct State {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
+    /// Interfaces that are not configured get a number too.
+    adopt: bool,
     shift_ns: i64,
     latest: Option<Timestamp>,
     /// The next record begins a file or a section.
@@ -230,6 +242,7 @@ impl LogSource {
                 counts: LogCounts::default(),
                 strict: options.strict,
                 interfaces: options.interfaces,
+                adopt: false,
                 shift_ns: 0,
                 latest: None,
                 fresh: true,
@@ -237,6 +250,17 @@ impl LogSource {
             },
             read_bytes: Arc::default(),
         }
+    }
+
+    /// From here on interfaces that are not configured are handed on too: each gets the next number, up to
+    /// [`MAX_ADOPTED`] of them.
+    pub fn adopt_foreign(&mut self) {
+        self.state.adopt = true;
+    }
+
+    /// Names of the interfaces by their numbers, adopted ones last.
+    pub fn interfaces(&self) -> &[String] {
+        &self.state.interfaces
     }
 
     /// What was read so far.
@@ -412,6 +436,7 @@ impl State {
             Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
             Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
             Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
+            Some(Mark::Reload { time }) => Some(Record::Reload { time }),
             Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
             Some(Mark::Bus { time, interface, event }) => {
                 let bus = self.bus(interface)?;
@@ -430,6 +455,10 @@ impl State {
             return u8::try_from(index).ok().map(BusIndex);
         }
         let name = String::from_utf8_lossy(interface);
+        if self.adopt && self.interfaces.len() < MAX_ADOPTED {
+            self.interfaces.push(name.into_owned());
+            return u8::try_from(self.interfaces.len() - 1).ok().map(BusIndex);
+        }
         let foreign = &mut self.counts.foreign;
         let full = foreign.len() >= MAX_FOREIGN_NAMES && !foreign.contains_key(name.as_ref());
         *foreign.entry(if full { "...".to_owned() } else { name.into_owned() }).or_default() += 1;

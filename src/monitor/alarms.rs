@@ -140,7 +140,7 @@ impl Monitor {
     }
 
     /// The channel a cell's voltage comes on.
-    fn voltage_channel(&self, cell: CellIndex) -> Channel {
+    pub(super) fn voltage_channel(&self, cell: CellIndex) -> Channel {
         match self.config.sample.voltage_source {
             crate::sample::VoltageSource::Cells => Channel::CellVoltage(cell),
             crate::sample::VoltageSource::PackTotal { .. } => Channel::PackVoltage,
@@ -242,13 +242,17 @@ impl Monitor {
                 self.observe_alarm(Rule::UsableCapacityLow, cell, old(usable), out);
             }
         }
-        let period = match self.config.health.recharge.alarm_on {
-            RechargeAlarm::Raw => self.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
-            RechargeAlarm::Normalised => self.normalised_recharge.map(learned),
-        };
-        if let Some(period) = period {
+        if let Some(period) = self.known_recharge_period() {
             let period = Observation { is_new: false, ..period };
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
+        }
+    }
+
+    /// The last recharge period, of the kind the rule about it compares.
+    pub(super) fn known_recharge_period(&self) -> Option<Observation> {
+        match self.config.health.recharge.alarm_on {
+            RechargeAlarm::Raw => self.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
+            RechargeAlarm::Normalised => self.normalised_recharge.map(learned),
         }
     }
 
@@ -277,14 +281,15 @@ impl Monitor {
     pub(super) fn handle_command_frame(&mut self, bus: BusIndex, frame: &Frame, is_intact: bool, out: &mut Outputs) {
         let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
         match fields.and_then(|fields| command_of(&fields)) {
-            Some(command) if is_intact => self.handle_command(Source::Bus(bus), command, out),
-            // Told once a second: the guard counts them all.
+            Some(command) if is_intact => return self.handle_command(Source::Bus(bus), command, out),
+            // Told once a second, counted always.
             Some(_) | None if self.bad_command_told.is_some_and(|told| self.now.since(told) < BAD_COMMAND_S) => {}
             Some(_) | None => {
                 self.bad_command_told = Some(self.now);
                 out.events.push(Event { time: self.now, kind: EventKind::BadCommand { bus, intact: is_intact } })
             }
         }
+        self.statistics.bad_commands += 1;
     }
 
     /// Does what somebody asks for.

@@ -4,10 +4,10 @@ use serde::{Deserialize, Serialize};
 
 use super::alarms::HOUSEKEEPING_S;
 use super::{Event, EventKind, Monitor, Outputs, Transmit, Validity};
-use crate::alarm::{Alarm, Rule, State};
+use crate::alarm::{Alarm, Rule, Severity, State};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, SendCounters, StatusFields};
-use crate::quantity::Timestamp;
+use crate::quantity::{CellIndex, Timestamp};
 
 /// Period of a test's frames, s: a consumer that looks once a second sees several.
 const TEST_PERIOD_S: f64 = 0.1;
@@ -41,6 +41,16 @@ impl Schedule {
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         for due in [&mut self.housekeeping, &mut self.status, &mut self.health, &mut self.alarm] {
             *due = due.plus_nanos(by_nanos);
+        }
+    }
+
+    /// Other periods, from here on: status, health, alarm.
+    pub(super) fn take_over(&mut self, now: Timestamp, before_s: [f64; 3], after_s: [f64; 3]) {
+        let dues = [&mut self.status, &mut self.health, &mut self.alarm];
+        for (due, (before_s, after_s)) in dues.into_iter().zip(before_s.into_iter().zip(after_s)) {
+            if before_s != after_s {
+                *due = (*due).min(now.plus_secs(after_s));
+            }
         }
     }
 
@@ -111,7 +121,7 @@ impl Monitor {
         out.frames.extend(output.buses.iter().map(|&bus| Transmit { time: self.now, bus, frame }));
     }
 
-    fn validity(&self) -> Validity {
+    pub(super) fn validity(&self) -> Validity {
         if self.pack.is_none() {
             Validity::Unavailable
         } else if self.cells.iter().any(|cell| !cell.trusted) {
@@ -145,7 +155,7 @@ impl Monitor {
     }
 
     /// Health of the pack: its weakest cell's, once half-cycles have taught something about every cell.
-    fn health_fields(&self) -> HealthFields {
+    pub(super) fn health_fields(&self) -> HealthFields {
         let recharge_period_s = self.recharge_period_s;
         if !self.learner.has_learned_all() {
             return HealthFields { recharge_period_s, ..HealthFields::default() };
@@ -190,6 +200,18 @@ impl Monitor {
     /// Sends an alarm as it stands.
     pub(super) fn send_alarm(&mut self, alarm: &Alarm, out: &mut Outputs) {
         self.send_alarm_fields(alarm_fields(alarm), out);
+    }
+
+    /// Sends that nothing watches an alarm any more: its state is not known.
+    pub(super) fn send_alarm_end(
+        &mut self,
+        rule: Rule,
+        severity: Severity,
+        cell: Option<CellIndex>,
+        out: &mut Outputs,
+    ) {
+        let (rule, state, severity) = (rule as u8, Some(State::Unknown.wire_code()), Some(severity as u8));
+        self.send_alarm_fields(AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
     }
 
     fn send_alarm_fields(&mut self, fields: AlarmFields, out: &mut Outputs) {

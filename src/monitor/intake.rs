@@ -33,6 +33,13 @@ impl Intake {
         Self { gate, guards: Guards::new(config.guards.clone()) }
     }
 
+    /// Other bounds and checks for the same messages: what is counted and under way goes on.
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
+        let new = Self::new(config);
+        self.gate = new.gate.going_on_from(&self.gate);
+        self.guards = new.guards.going_on_from(&self.guards);
+    }
+
     /// `None` = the frame is dropped; otherwise whether its readings may be used.
     pub(super) fn judge(
         &mut self,

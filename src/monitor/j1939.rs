@@ -57,6 +57,15 @@ impl J1939 {
         }
     }
 
+    /// Other codes for the same node; `false` = it is another node.
+    pub(super) fn take_over(&mut self, config: &J1939Config) -> bool {
+        let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
+        if is_same {
+            self.config.clone_from(config);
+        }
+        is_same
+    }
+
     pub(super) fn next_due(&self) -> Option<Timestamp> {
         self.node.next_due()
     }

@@ -8,18 +8,25 @@
 mod alarms;
 mod buses;
 mod cyclic;
+mod heard;
 mod intake;
 mod j1939;
 mod learning;
 mod output;
+mod reconfigure;
 mod snapshot;
+mod statistics;
 mod types;
+mod view;
 
 pub use cyclic::MAX_TEST_S;
 pub use j1939::{AlarmCode, J1939Config};
 pub use output::{CommandConfig, OutputConfig};
+pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use snapshot::{RestoreError, Snapshot};
+pub use statistics::{AlarmCounts, BusStatistics, Statistics};
 pub use types::*;
+pub use view::{CellView, PackView};
 
 use alarms::StoreState;
 use buses::Buses;
@@ -127,6 +134,8 @@ pub struct Monitor {
     config: MonitorConfig,
     /// Whether an input has come.
     started: bool,
+    /// Whether a usable reading has come since then.
+    heard: bool,
     /// Time of the latest input that did something.
     now: Timestamp,
     /// Inputs that came with a time before `now`.
@@ -152,6 +161,7 @@ pub struct Monitor {
     schedule: Schedule,
     j1939: Option<j1939::J1939>,
     pending: Option<PendingRestore>,
+    statistics: Statistics,
     scratch: Scratch,
 }
 
@@ -192,6 +202,7 @@ impl Monitor {
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             cells: vec![slot; cells],
             started: false,
+            heard: false,
             now: Timestamp::ZERO,
             time_backwards: 0,
             detector: TransitionDetector::default(),
@@ -207,6 +218,7 @@ impl Monitor {
             schedule: Schedule::default(),
             j1939: config.j1939.clone().map(j1939::J1939::new),
             pending: None,
+            statistics: Statistics::default(),
             scratch: Scratch::default(),
             config,
         }
@@ -215,6 +227,12 @@ impl Monitor {
     /// Takes one input; appends what comes of it to `out`. A tick before [`Monitor::next_due`] does nothing at all,
     /// so a driver may leave it out.
     pub fn handle(&mut self, input: Input<'_>, out: &mut Outputs) {
+        let told = out.events.len();
+        self.take(input, out);
+        self.statistics.note(&input, &out.events[told..]);
+    }
+
+    fn take(&mut self, input: Input<'_>, out: &mut Outputs) {
         let time = input.time();
         if !self.started {
             self.start(time, out);
@@ -311,7 +329,7 @@ impl Monitor {
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
         (self.started, self.now) = (true, time);
         self.schedule.restart(time);
-        let taken = self.apply_pending(time);
+        let taken = self.apply_pending(time, out);
         let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
         if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
@@ -407,6 +425,7 @@ impl Monitor {
         });
         for reading in readings.drain(..) {
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
+            self.note_heard(&reading);
             self.report_signals(out);
             if reading.channel == Channel::Current {
                 self.observe_current(self.sampler.pack_current_a(self.now), out);
@@ -456,6 +475,7 @@ impl Monitor {
             voltage_v: sample.voltage_v,
         };
         let result = slot.estimator.step(&self.config.model, &self.config.estimator, &step);
+        self.statistics.note_voltage(&result);
         let Some(soc) = slot.estimator.soc() else { return };
         if result.reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });

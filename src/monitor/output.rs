@@ -4,7 +4,7 @@ use crate::can::encode::{CommandPlan, OutputPlan};
 use crate::quantity::BusIndex;
 
 /// The daemon's outgoing frames.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct OutputConfig {
     /// Layouts and identifiers.
     pub plan: OutputPlan,
@@ -19,7 +19,7 @@ pub struct OutputConfig {
 }
 
 /// Commands that come from the bus.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct CommandConfig {
     /// Interface they come on.
     pub bus: BusIndex,

@@ -4,8 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::cyclic::Schedule;
 use super::intake::IntakeState;
-use super::{Away, CellSlot, Consumed, MERGE_TOLERANCE_NS, Monitor};
-use crate::alarm::AlarmState;
+use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
+use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
 use crate::health::{Learner, PackState, RechargeTimer, TransitionDetector};
@@ -38,6 +38,8 @@ pub struct Snapshot {
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
+    #[serde(default)]
+    statistics: Statistics,
 }
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -115,6 +117,7 @@ impl Monitor {
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
             intake: self.intake.snapshot(),
+            statistics: self.statistics.clone(),
         }
     }
 
@@ -144,7 +147,7 @@ impl Monitor {
     }
 
     /// Takes the waiting snapshot up, if there is one; `self.now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp) -> Taken {
+    pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Taken {
         let Some(PendingRestore { mut snapshot, away }) = self.pending.take() else { return Taken::Nothing };
         let taken = match away {
             Away::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
@@ -169,12 +172,27 @@ impl Monitor {
         self.pack = snapshot.pack;
         self.updated_cells = snapshot.updated_cells;
         self.time_backwards = snapshot.time_backwards;
-        self.alarms.restore(&snapshot.alarms);
         self.schedule = snapshot.schedule;
+        self.restore_alarms(now, &snapshot.alarms, out);
         self.intake.restore(&snapshot.intake);
+        self.statistics = snapshot.statistics;
+        self.statistics.restores += 1;
         // From here the time away is a gap like any other.
         self.now = snapshot.time;
         outcome
+    }
+}
+
+impl Monitor {
+    /// Takes the stored alarms up. Those that nothing watches any more end, here and for whoever saw them on the bus.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmState, out: &mut Outputs) {
+        for orphan in self.alarms.restore(state) {
+            let StoredAlarm { rule, severity, cell, .. } = orphan;
+            let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
+            out.events
+                .push(Event { time, kind: EventKind::AlarmDropped { rule, severity, cell, active, occurrences } });
+            self.send_alarm_end(rule, severity, cell, out);
+        }
     }
 }
 

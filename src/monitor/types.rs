@@ -321,6 +321,24 @@ pub enum EventKind {
         /// Its standard deviation, Ah.
         capacity_std_ah: Option<f64>,
     },
+    /// The configuration is another one from here on.
+    Reconfigured {
+        /// Alarms, raised or past, that ended because no threshold watches them any more.
+        alarms_ended: u32,
+    },
+    /// A stored state has an alarm that no configured threshold watches any more: it is over.
+    AlarmDropped {
+        /// Which rule.
+        rule: Rule,
+        /// Its severity.
+        severity: Severity,
+        /// Which cell; `None` = the pack.
+        cell: Option<CellIndex>,
+        /// Whether it was raised.
+        active: bool,
+        /// Times it was raised.
+        occurrences: u32,
+    },
     /// Whether files can be written has changed.
     Store {
         /// They can.

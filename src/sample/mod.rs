@@ -8,8 +8,10 @@
 
 pub mod charge;
 pub mod config;
+pub mod counts;
 pub mod sampler;
 pub mod signal;
 
 pub use config::{Limits, SampleConfig, VoltageSource};
+pub use counts::ReadingCounts;
 pub use sampler::{CellSample, Sampler, SamplerShape, SamplerState, SignalChange};

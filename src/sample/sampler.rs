@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::charge::{ChargeCounter, Totals};
 use super::config::{Limits, SampleConfig, VoltageSource};
+use super::counts::ReadingCounts;
 use super::signal::Signal;
 use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp};
 
@@ -55,6 +56,8 @@ pub struct SamplerState {
     began: Option<Timestamp>,
     latest: Timestamp,
     unused_readings: u64,
+    #[serde(default)]
+    counts: ReadingCounts,
 }
 
 impl SamplerState {
@@ -108,9 +111,19 @@ impl Sampler {
             began: None,
             latest: Timestamp::ZERO,
             unused_readings: 0,
+            counts: ReadingCounts::default(),
         };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
         Self { config, channels, sensors, voltages, flow_a, state, next_stale: None }
+    }
+
+    /// Other limits for the same signals.
+    ///
+    /// # Panics
+    /// When the signals are others: the caller has checked.
+    pub fn reconfigure(&mut self, config: &SampleConfig) {
+        let state = std::mem::replace(self, Self::new(config.clone())).state;
+        assert!(self.restore(&state).is_ok(), "the same signals");
     }
 
     /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
@@ -130,6 +143,8 @@ impl Sampler {
         let limits = self.limits(channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
         let judged = self.state.signals[slot].handle(time, value, &limits, should_move_s(channel, &totals));
+        self.state.counts.note(judged.value.err());
+        self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
             self.next_stale = None;
@@ -159,6 +174,7 @@ impl Sampler {
             let limits = self.limits(channel);
             let signal = &mut self.state.signals[slot];
             if let Some(state) = signal.poll(now, began, &limits) {
+                self.state.counts.note(Some(Fault::Stale));
                 changes.push(SignalChange { channel, state });
             }
             if !signal.is_bad() {
@@ -285,6 +301,11 @@ impl Sampler {
     /// Readings that came for channels that feed nothing.
     pub fn unused_readings(&self) -> u64 {
         self.state.unused_readings
+    }
+
+    /// Readings by what became of them.
+    pub fn reading_counts(&self) -> ReadingCounts {
+        ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
     }
 
     /// What is to be stored.

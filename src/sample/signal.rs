@@ -58,6 +58,8 @@ pub(super) struct Signal {
 pub(super) struct Judged {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
+    /// A step to another level that was refused before is believed now.
+    pub(super) is_new_level: bool,
 }
 
 impl Signal {
@@ -72,11 +74,12 @@ impl Signal {
         self.heard = Some(time);
         let value = self.judge(time, value, limits, should_move_s);
         self.count(value.is_err());
+        let is_new_level = value.is_ok() && self.refused_count >= ACCEPT_AFTER;
         if let Ok(value) = value {
             self.good = Some(Stamped { value, time });
             self.refused_count = 0;
         }
-        Judged { value, change: self.turn(value.err(), 1) }
+        Judged { value, change: self.turn(value.err(), 1), is_new_level }
     }
 
     /// Judges the age; the change to tell when the signal has just become stale.

@@ -9,7 +9,9 @@ use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::Config;
-use packwatch::monitor::{Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{
+    Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
+};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
 pub(crate) const DBC: &str = r#"VERSION ""
@@ -123,6 +125,10 @@ impl Rig {
 
     pub(crate) fn give(&mut self, input: Input<'_>) {
         self.monitor.handle(input, &mut self.out);
+        self.collect();
+    }
+
+    fn collect(&mut self) {
         self.events.append(&mut self.out.events);
         self.frames.extend(self.out.frames.drain(..).map(|sent| sent.frame));
     }
@@ -149,6 +155,18 @@ impl Rig {
         }
     }
 
+    /// Another configuration, while it runs.
+    pub(crate) fn reload(&mut self, edit: impl FnOnce(&mut MonitorConfig)) -> Result<Reconfigured, ReconfigureError> {
+        let (mut config, now) = (self.config.clone(), self.now());
+        edit(&mut config);
+        let result = self.monitor.reconfigure(config.clone(), now, &mut self.out);
+        self.collect();
+        if result.is_ok() {
+            self.config = config;
+        }
+        result
+    }
+
     /// The process ended `away` ago and starts again; the clock goes on by that, if it is known.
     pub(crate) fn restart(&mut self, away: Away) {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
@@ -158,6 +176,19 @@ impl Rig {
         if let Away::Seconds(seconds) = away {
             self.deci += Timestamp::from_secs(seconds).nanos() / 100_000_000;
         }
+    }
+
+    /// A discharge deep enough for every cell's capacity to be learned.
+    pub(crate) fn discharge(&mut self) {
+        self.seconds(20);
+        self.current_a = Some(5.0);
+        for step in 0..60 {
+            let voltage_v = 3.65 - 0.006 * f64::from(step);
+            self.voltages_v = [Some(voltage_v), Some(voltage_v)];
+            self.seconds(10);
+        }
+        self.current_a = Some(0.0);
+        self.seconds(30);
     }
 
     pub(crate) fn changes(&self, rule: Rule) -> Vec<Change> {
@@ -213,15 +244,7 @@ pub(crate) fn command_frame(code: u64, rule: u64, cell: u64, counter: u8) -> Fra
 /// A rig whose pack was discharged enough for every cell's capacity to be learned and be below the threshold.
 pub(crate) fn learned() -> Rig {
     let mut rig = Rig::new("[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n[estimator]\ngate_sigma = 1000\n");
-    rig.seconds(20);
-    rig.current_a = Some(5.0);
-    for step in 0..60 {
-        let voltage_v = 3.65 - 0.006 * f64::from(step);
-        rig.voltages_v = [Some(voltage_v), Some(voltage_v)];
-        rig.seconds(10);
-    }
-    rig.current_a = Some(0.0);
-    rig.seconds(30);
+    rig.discharge();
     assert_eq!(rig.changes(Rule::CapacityLow), [Change::Raised, Change::Raised], "both cells");
     rig
 }

@@ -92,4 +92,4 @@ journal_has() { journal | grep -qE -- "$1"; }
 
 # Shown when a test fails (lib.sh shows $tmp/*.log).
 keep_journal() { [[ -z ${pids[systemd]-} ]] || journal >"$tmp/journal.log" 2>&1 || true; }
-trap 'status=$?; keep_journal; (exit $status); at_exit' EXIT
+trap 'status=$?; set +e; keep_journal; (exit $status); at_exit' EXIT

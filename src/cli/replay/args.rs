@@ -125,7 +125,7 @@ fn when(text: &str) -> Result<When, String> {
         .ok_or_else(|| "must be seconds, +seconds or like 2008-04-02T13:08:17.921".to_owned())
 }
 
-fn column(text: &str) -> Result<(String, String), String> {
+pub(crate) fn column(text: &str) -> Result<(String, String), String> {
     const ROLES: [&str; 7] = ["time", "current", "voltage", "voltage{n}", "temperature", "temperature{n}", "section"];
     let (role, name) = text.split_once('=').ok_or("must be ROLE=NAME")?;
     if !ROLES.contains(&role) {

@@ -17,11 +17,11 @@ const MAX_SHOWN_CELLS: usize = 16;
 
 /// Progress on standard error, when that is a terminal.
 #[derive(Debug)]
-pub(super) struct Bar(ProgressBar);
+pub(crate) struct Bar(ProgressBar);
 
 impl Bar {
     /// For logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
-    pub(super) fn new(logs: &[PathBuf]) -> Self {
+    pub(crate) fn new(logs: &[PathBuf]) -> Self {
         let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
         let total: Option<u64> = logs.iter().map(size).sum();
         let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(5));
@@ -34,7 +34,7 @@ impl Bar {
     }
 
     /// The present state.
-    pub(super) fn show(&self, progress: Progress) {
+    pub(crate) fn show(&self, progress: Progress) {
         let seconds = self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64();
         if self.0.is_hidden() {
             return;
@@ -44,8 +44,13 @@ impl Bar {
         self.0.set_position(progress.bytes);
     }
 
+    /// Seconds since it was made, above 0.
+    pub(crate) fn seconds(&self) -> f64 {
+        self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64()
+    }
+
     /// Takes the bar away.
-    pub(super) fn clear(&self) {
+    pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }
 }

@@ -8,11 +8,16 @@ use crate::quantity::Timestamp;
 
 /// The alarms; without `all` those that need eyes: raised, about to be, or not yet acknowledged.
 pub(crate) fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
+    Answer::Alarms(alarm_list(engine, time, all))
+}
+
+/// The same without the envelope.
+pub(crate) fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList {
     let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_eyes(alarm)).collect();
     let omitted = shorten(&mut alarms);
     let unknown = engine.unknown_thresholds().map(|(rule, severity, alarms)| UnknownAlarms { rule, severity, alarms });
     let (thresholds, _) = engine.unknown();
-    Answer::Alarms(AlarmList { time, thresholds, unknown: unknown.collect(), alarms, omitted })
+    AlarmList { time, thresholds, unknown: unknown.collect(), alarms, omitted }
 }
 
 fn needs_eyes(alarm: &Alarm) -> bool {

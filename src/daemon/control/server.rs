@@ -10,9 +10,9 @@ use tokio::sync::{Semaphore, mpsc, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::listener::{BindError, Bound, SocketFile, bind};
 use super::protocol::{Answer, Request};
-use super::{ControlSetting, MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, standard_path};
+use super::{ControlSetting, MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
+use crate::daemon::unix_socket::{BindError, Bound, SocketFile, bind};
 
 /// Pause after a connection could not be taken (no descriptor left): trying at once would find the same.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -45,7 +45,7 @@ impl ControlServer {
             ControlSetting::Standard => (standard_path(), false),
         };
         let shown = path.display();
-        match bind(&path).await {
+        match bind(&path, MODE).await {
             Ok(bound) => {
                 Ok(Some(Self::serve(bound, requests, MAX_SILENCE).map_err(|error| format!("{shown}: {error}"))?))
             }

@@ -2,21 +2,23 @@
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use tokio::sync::watch;
+use tokio::time::Instant;
 
+use super::readiness::{Readiness, restored_words};
 use super::{Service, ServiceError};
 use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
 use crate::daemon::snapshot_file;
+use crate::daemon::status::collect::RecentEvents;
 use crate::daemon::store::hold::Hold;
 use crate::daemon::store::{Candidate, Progress, Store};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
 use crate::io::socket::LinkOutput;
-use crate::monitor::{Away, Input, Monitor, Outputs, Transmit};
+use crate::monitor::{Away, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
@@ -40,6 +42,9 @@ pub(super) struct Engine {
     hold: Hold,
     /// Frames have come since the last checkpoint.
     is_fresh: bool,
+    pub(super) readiness: Readiness,
+    /// For those who look.
+    pub(super) recent: RecentEvents,
 }
 
 impl Engine {
@@ -49,17 +54,16 @@ impl Engine {
         let names: Vec<String> = service.config.interfaces.iter().map(|i| i.name.clone()).collect();
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
-        let mut away = None;
+        let mut stamped_s = 0.0;
         // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-        if let Some(snapshot) = service.restore.take() {
-            let stamped_s = now.since(snapshot.time);
+        let away = if let Some(snapshot) = service.restore.take() {
+            stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.away)?;
-            away = Some(service.away);
             tracing::info!(away = %service.away, stamped_s, "state taken up");
+            Some(service.away)
         } else {
-            let beside = service.record.as_deref();
-            away = away.or_else(|| take_up(&mut monitor, found.states, beside));
-        }
+            take_up(&mut monitor, found.states, service.record.as_deref())
+        };
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
         let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
@@ -70,6 +74,12 @@ impl Engine {
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
+        let restored = away.map(|away| match away {
+            Away::Seconds(age_s) => restored_words(Some(age_s)),
+            Away::AsStamped => restored_words(Some(stamped_s).filter(|age_s| *age_s >= 0.0)),
+            Away::Unknown => restored_words(None),
+        });
+        let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
@@ -78,12 +88,14 @@ impl Engine {
             events,
             names,
             log,
+            readiness,
             lost_file,
             store,
             store_works: found.works,
             told_works: None,
             hold: Hold::default(),
             is_fresh: false,
+            recent: RecentEvents::default(),
         })
     }
 
@@ -95,7 +107,32 @@ impl Engine {
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
         self.is_fresh |= matches!(input, Input::Frame { .. });
-        let ticket = self.keep(input.time());
+        self.hand_on(input.time(), links);
+    }
+
+    /// Gives the core another configuration; the journal says that it did.
+    ///
+    /// # Errors
+    /// Why the core does not take it; then nothing has changed.
+    pub(super) fn reconfigure(
+        &mut self,
+        config: MonitorConfig,
+        time: Timestamp,
+        links: &[LinkOutput],
+    ) -> Result<Reconfigured, Vec<String>> {
+        self.outputs.clear();
+        let changed =
+            self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
+        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
+            self.stop_recording(&error);
+        }
+        self.hand_on(time, links);
+        Ok(changed)
+    }
+
+    /// What came out of the core: frames to the interfaces, events to the log, both to their files.
+    fn hand_on(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        let ticket = self.keep(time);
         for transmit in &self.outputs.frames {
             match ticket.or_else(|| self.hold.behind(transmit)) {
                 Some(ticket) => self.hold.push(ticket, *transmit),
@@ -108,6 +145,8 @@ impl Engine {
         }
         for event in &self.outputs.events {
             self.log.log(event);
+            self.readiness.note(event);
+            self.recent.note(event);
             self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }

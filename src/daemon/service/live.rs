@@ -9,12 +9,14 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 
 use super::engine::Engine;
+use super::reload::Reload;
+use super::seeing::Seeing;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::daemon::control::protocol::{Answer, Request};
 use crate::daemon::control::{Asked, answer};
-use crate::daemon::snapshot_file;
 use crate::daemon::store::Progress;
+use crate::daemon::{logging, snapshot_file};
 use crate::io::clock::MappedClock;
 use crate::io::socket::{LinkOutput, Received, What};
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
@@ -23,6 +25,8 @@ use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 const BATCH: usize = 256;
 /// Time the interfaces have to send what is queued when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
+/// How often it is told how many lines were left out of the log.
+const LEFT_OUT_PERIOD: Duration = Duration::from_secs(60);
 /// How often files are handed to the operating system: what a crash of the daemon can lose.
 const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 
@@ -32,9 +36,12 @@ pub(super) struct Loop {
     pub(super) engine: Engine,
     pub(super) inbox: mpsc::Receiver<Received>,
     pub(super) requests: mpsc::Receiver<Asked>,
+    pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Received>,
+    pub(super) left_out_told: Instant,
+    pub(super) seeing: Seeing,
 }
 
 impl Loop {
@@ -50,7 +57,10 @@ impl Loop {
                 biased;
                 () = stop.wait() => return,
                 now = ticks.tick() => {
+                    self.seeing.note_tick(now);
                     self.tick().await;
+                    self.tell_manager(now);
+                    self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -65,10 +75,32 @@ impl Loop {
                 }
                 // Each is taken between two ticks, and there are never more than connections.
                 Some(asked) = self.requests.recv() => self.answer(asked).await,
+                // At most one a second is read.
+                step = self.reload.next() => self.handle_reload(step).await,
                 received = self.inbox.recv_many(&mut self.batch, BATCH) => {
                     if received > 0 { self.handle_batch() }
                 }
             }
+        }
+    }
+
+    /// Says when the service is ready, and how it is when that has changed.
+    fn tell_manager(&mut self, now: Instant) {
+        if now.duration_since(self.left_out_told) >= LEFT_OUT_PERIOD {
+            self.left_out_told = now;
+            let lines = logging::take_left_out();
+            if lines > 0 {
+                tracing::warn!(left_out = lines, "lines left out of the log");
+            }
+        }
+        let Engine { readiness, monitor, .. } = &mut self.engine;
+        let told = readiness.poll(monitor, now);
+        let ready = told.ready.then_some(NotifyState::Ready);
+        let status = told.status.as_deref().map(NotifyState::Status);
+        if ready.is_some() || status.is_some() {
+            let prefix = if told.ready { "ready; " } else { "" };
+            tracing::info!("{prefix}{}", told.status.as_deref().unwrap_or("as before"));
+            notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
         }
     }
 
@@ -103,7 +135,7 @@ impl Loop {
     }
 
     /// Hands over what the interfaces have received so far.
-    async fn drain(&mut self) {
+    pub(super) async fn drain(&mut self) {
         for _ in 0..INBOX / BATCH {
             // Lets the interfaces' tasks take what is in their sockets, and send.
             tokio::task::yield_now().await;
@@ -129,6 +161,9 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
+            if matches!(what, What::Frame(_)) {
+                self.seeing.note_frame(time, self.clock.now());
+            }
         }
         self.batch.clear();
     }

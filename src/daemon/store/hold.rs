@@ -5,7 +5,9 @@
 //! longer than [`MAX_WAIT`]: an alarm that is not on the disk is worth more than one that is not on the bus.
 
 use std::collections::VecDeque;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use crate::monitor::Transmit;
 

@@ -16,6 +16,7 @@ use tokio::io::{Interest, Ready};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
+use super::counters::{LinkCounters, LinkState};
 use super::raw::{RawConfig, RawReceived, RawSocket, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
@@ -78,6 +79,7 @@ pub(crate) enum What {
 pub(crate) struct LinkOutput {
     queue: mpsc::Sender<Outgoing>,
     unsent: Arc<AtomicU64>,
+    counters: Arc<LinkCounters>,
 }
 
 #[derive(Debug)]
@@ -91,7 +93,13 @@ impl LinkOutput {
     pub(crate) fn send(&self, frame: Frame) {
         if self.queue.try_send(Outgoing { since: Instant::now(), frame }).is_err() {
             self.unsent.fetch_add(1, Ordering::Relaxed);
+            LinkCounters::add(&self.counters.send_queue_full, 1);
         }
+    }
+
+    /// What the link has counted.
+    pub(crate) fn counters(&self) -> &LinkCounters {
+        &self.counters
     }
 }
 
@@ -120,6 +128,7 @@ pub(crate) struct Link {
     inbox: mpsc::Sender<Received>,
     outgoing: mpsc::Receiver<Outgoing>,
     unsent: Arc<AtomicU64>,
+    counters: Arc<LinkCounters>,
     state: Option<State>,
     /// When that was noted.
     state_since: Timestamp,
@@ -155,13 +164,15 @@ impl Link {
         let unsent = Arc::new(AtomicU64::new(0));
         let mut report = interval(REPORT_PERIOD);
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let output = LinkOutput { queue, unsent: Arc::clone(&unsent) };
+        let counters = Arc::new(LinkCounters::default());
+        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), counters: Arc::clone(&counters) };
         let link = Self {
             config,
             clock,
             inbox,
             outgoing,
             unsent,
+            counters,
             state: None,
             state_since: clock.now(),
             lost: 0,
@@ -293,7 +304,9 @@ impl Link {
             self.enter_at(State::Up, time).await;
         }
         if let Some(total) = received.dropped_total {
-            self.lost += u64::from(total.wrapping_sub(open.dropped_total));
+            let dropped = u64::from(total.wrapping_sub(open.dropped_total));
+            self.lost += dropped;
+            LinkCounters::add(&self.counters.kernel_dropped, dropped);
             open.dropped_total = total;
         }
         let what = match received.what {
@@ -302,11 +315,13 @@ impl Link {
             Wire::Error(class) => What::Event(BusEvent::ErrorFrame { class }),
             Wire::Malformed => {
                 self.lost += 1;
+                LinkCounters::add(&self.counters.malformed, 1);
                 return reading;
             }
         };
         if self.inbox.try_send(Received { time, bus: self.config.bus, what }).is_err() {
             self.lost += 1;
+            LinkCounters::add(&self.counters.inbox_full, 1);
         }
         reading
     }
@@ -317,13 +332,16 @@ impl Link {
         let useless = self.state != Some(State::Up) || outgoing.since.elapsed() > SEND_MAX_AGE;
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
-            Ok(()) => None,
+            Ok(()) => {
+                LinkCounters::add(&self.counters.sent, 1);
+                None
+            }
             Err(Errno::EAGAIN | Errno::EINTR) => {
                 open.pending = Some(outgoing);
                 None
             }
             Err(error) => {
-                self.unsent.fetch_add(1, Ordering::Relaxed);
+                self.count_unsent();
                 if useless || error == Errno::ENOBUFS { None } else { self.failed(error).await }
             }
         }
@@ -378,12 +396,17 @@ impl Link {
             tokio::select! {
                 () = sleep_until(until) => return End::Dead,
                 next = self.outgoing.recv() => match next {
-                    Some(_) => { self.unsent.fetch_add(1, Ordering::Relaxed); }
+                    Some(_) => self.count_unsent(),
                     None => return End::Stopped,
                 },
                 _ = self.report.tick() => self.report_losses(self.clock.now()).await,
             }
         }
+    }
+
+    fn count_unsent(&self) {
+        self.unsent.fetch_add(1, Ordering::Relaxed);
+        LinkCounters::add(&self.counters.send_failed, 1);
     }
 
     fn lengthen_pause(&mut self) -> Duration {
@@ -407,11 +430,12 @@ impl Link {
         if state == State::Up {
             self.pause = FIRST_PAUSE;
         }
-        let event = match state {
-            State::Up => BusEvent::Up,
-            State::Down => BusEvent::Down,
-            State::Missing => BusEvent::Missing,
+        let (event, told) = match state {
+            State::Up => (BusEvent::Up, LinkState::Up),
+            State::Down => (BusEvent::Down, LinkState::Down),
+            State::Missing => (BusEvent::Missing, LinkState::Missing),
         };
+        self.counters.enter(told);
         self.tell(time, event).await;
     }
 

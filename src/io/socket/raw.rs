@@ -64,6 +64,20 @@ impl RawSocket {
     /// `ENODEV` when there is no such interface; an interface that is down opens, and says so in
     /// [`RawSocket::take_error`].
     pub(super) fn open(config: &RawConfig<'_>) -> io::Result<Self> {
+        Self::open_filtered(config, &filters(config.ids, config.patterns))
+    }
+
+    /// As [`RawSocket::open`], for every identifier there is.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn open_all(interface: &str) -> io::Result<Self> {
+        let receive_buffer_bytes = DEFAULT_RECEIVE_BUFFER_BYTES;
+        let config = RawConfig { interface, fd: true, ids: &[], patterns: &[], receive_buffer_bytes };
+        Self::open_filtered(&config, &[CanFilter::new(0, 0)])
+    }
+
+    fn open_filtered(config: &RawConfig<'_>, filters: &[CanFilter]) -> io::Result<Self> {
         let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
         let fd = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
         setsockopt(&fd, sockopt::RxqOvfl, &1)?;
@@ -75,7 +89,7 @@ impl RawSocket {
             socketcan::socket::CAN_RAW_FD_FRAMES,
             i32::from(config.fd),
         )?;
-        socket.set_filters(&filters(config.ids, config.patterns))?;
+        socket.set_filters(filters)?;
         socket.set_error_filter_accept_all()?;
         socket.as_raw_socket().set_recv_buffer_size(config.receive_buffer_bytes)?;
         let index = index_of(config.interface)?;

@@ -34,7 +34,7 @@ async fn serve_patiently(folder: &TempDir, max_silence: Duration) -> (ControlSer
             let _ = asked.answer.send(done(count));
         }
     });
-    let bound = bind(&path).await.map_err(|error| format!("{error:?}")).unwrap();
+    let bound = bind(&path, MODE).await.map_err(|error| format!("{error:?}")).unwrap();
     (ControlServer::serve(bound, sender, max_silence).unwrap(), path)
 }
 

@@ -1,4 +1,4 @@
-//! The socket's file: made so that a dead daemon's is replaced and a live daemon's is not.
+//! A Unix socket's file: made so that a dead daemon's is replaced and a live daemon's is not.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -9,28 +9,60 @@ use std::time::Duration;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::time::timeout;
 
-/// Owner and group may connect.
-const MODE: u32 = 0o660;
 /// How long a look at an earlier daemon's socket may take; one that is stopped has a full queue and lets us wait.
 const LOOK: Duration = Duration::from_secs(1);
 
+/// The folder of a daemon that systemd did not start.
+const STANDARD_FOLDER: &str = "/run/packwatch";
+
+/// Where the sockets are when nobody says where: the folder systemd made, else `/run/packwatch`.
+pub(crate) fn runtime_folder() -> PathBuf {
+    let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
+    // systemd puts a colon between several; the first is the unit's own.
+    let folder = folders.and_then(|folders| std::env::split_paths(&folders).next());
+    folder.unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+}
+
+/// Where a socket of the daemon is to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SocketSetting {
+    /// In `$RUNTIME_DIRECTORY` under systemd, else in `/run/packwatch`; where that cannot be made, the daemon goes
+    /// without.
+    Standard,
+    /// There is none.
+    Off,
+    /// There, or the daemon does not start.
+    At(PathBuf),
+}
+
+impl SocketSetting {
+    /// As written on the command line: a path, or `none`.
+    pub fn from_path(path: Option<PathBuf>) -> Self {
+        match path {
+            None => Self::Standard,
+            Some(path) if path.as_os_str() == "none" => Self::Off,
+            Some(path) => Self::At(path),
+        }
+    }
+}
+
 /// A bound socket and its file, which goes when this is dropped.
 #[derive(Debug)]
-pub(super) struct Bound {
-    pub(super) listener: UnixListener,
-    pub(super) file: SocketFile,
+pub(crate) struct Bound {
+    pub(crate) listener: UnixListener,
+    pub(crate) file: SocketFile,
 }
 
 /// The file of a bound socket.
 #[derive(Debug)]
-pub(super) struct SocketFile {
-    pub(super) path: PathBuf,
+pub(crate) struct SocketFile {
+    pub(crate) path: PathBuf,
     inode: (u64, u64),
 }
 
 /// Why there is no socket.
 #[derive(Debug)]
-pub(super) enum BindError {
+pub(crate) enum BindError {
     /// Another daemon has it.
     Taken(String),
     /// It cannot be made.
@@ -43,11 +75,11 @@ impl From<io::Error> for BindError {
     }
 }
 
-/// Binds a socket there.
-pub(super) async fn bind(path: &Path) -> Result<Bound, BindError> {
+/// Binds a socket there; `mode` says who may connect.
+pub(crate) async fn bind(path: &Path, mode: u32) -> Result<Bound, BindError> {
     remove_stale(path).await?;
     let listener = UnixListener::bind(path)?;
-    std::fs::set_permissions(path, Permissions::from_mode(MODE))?;
+    std::fs::set_permissions(path, Permissions::from_mode(mode))?;
     let file = SocketFile { path: path.to_owned(), inode: inode(path)? };
     Ok(Bound { listener, file })
 }
@@ -92,7 +124,7 @@ impl Drop for SocketFile {
         if inode(&self.path).is_ok_and(|found| found == self.inode)
             && let Err(error) = std::fs::remove_file(&self.path)
         {
-            tracing::warn!(path = %self.path.display(), %error, "control socket not removed");
+            tracing::warn!(path = %self.path.display(), %error, "socket not removed");
         }
     }
 }

@@ -1,0 +1,188 @@
+//! `packwatch doctor`: listens to a pack, or replays what was recorded of one, and tells what is probably wrong.
+//!
+//! Exit code: 0 nothing is wrong, 1 something is, 78 the configuration itself is bad (what can be diagnosed all the same
+//! is told).
+
+mod page;
+
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::replay::{Bar, CsvSign, column};
+use super::{EXIT_CONFIG, Failure};
+use crate::config::{self, Survey};
+use crate::daemon::doctor::{self, Interrupt};
+use crate::daemon::replay::Progress;
+use crate::doctor::{Finding, Report, Severity, Topic};
+use crate::io::csv_log::CsvOptions;
+
+/// Longest time anybody may listen, s: a day.
+const MAX_SECONDS: f64 = 86_400.0;
+/// How long is listened when nothing is said, s.
+const USUAL_SECONDS: f64 = 60.0;
+
+/// Arguments of `doctor`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Configuration; it may be wrong
+    #[arg(short, long, value_name = "FILE")]
+    config: PathBuf,
+    /// Interface in place of the configured one; several for several, in their order. Other CAN interfaces of this computer
+    /// are listened to as well
+    #[arg(short, long = "interface", value_name = "IFACE")]
+    interfaces: Vec<String>,
+    /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - is standard input
+    #[arg(value_name = "LOG")]
+    logs: Vec<PathBuf>,
+    /// How long to listen, s [default: 60; logs: all of them]
+    #[arg(long = "for", value_name = "S", value_parser = seconds)]
+    seconds: Option<f64>,
+    /// Print the report as JSON
+    #[arg(long)]
+    json: bool,
+    /// CSV column, as for `replay`
+    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
+    columns: Vec<(String, String)>,
+    /// Sign of a CSV's current
+    #[arg(long, value_enum, default_value = "discharge")]
+    csv_sign: CsvSign,
+    /// CSV table with the section's column and `start`
+    #[arg(long, value_name = "TABLE.csv")]
+    start_times: Option<PathBuf>,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= MAX_SECONDS => Ok(value),
+        _ => Err(format!("must be seconds, above 0 and at most {MAX_SECONDS}")),
+    }
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let mut survey = config::survey(&args.config)?;
+    rename(args, &mut survey)?;
+    survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
+    let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;
+    let mut report =
+        if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
+    complete(&mut report, &survey);
+    let source = source_words(args, &survey);
+    if args.json {
+        json(&report, &args.config, &source)?
+    } else {
+        page::print(&report, &args.config, &source)?
+    }
+    match (survey.faults.is_empty(), report.has_findings()) {
+        (false, _) => Err(Failure { message: String::new(), code: EXIT_CONFIG }),
+        (true, true) => Err(Failure::new("")),
+        (true, false) => Ok(()),
+    }
+}
+
+/// Other names for the configured interfaces.
+fn rename(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
+    let configured = survey.plan.interfaces.len();
+    if args.interfaces.len() > configured {
+        let found = args.interfaces.len();
+        return Err(Failure::new(format!(
+            "--interface given {found} times, {} has {configured}",
+            args.config.display()
+        )));
+    }
+    for (interface, name) in survey.plan.interfaces.iter_mut().zip(&args.interfaces) {
+        interface.name.clone_from(name);
+    }
+    Ok(())
+}
+
+fn is_csv(log: &Path) -> bool {
+    let name = log.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
+}
+
+fn source_words(args: &Args, survey: &Survey) -> String {
+    if args.logs.is_empty() {
+        let names: Vec<&str> = survey.plan.interfaces.iter().map(|interface| interface.name.as_str()).collect();
+        return names.join(", ");
+    }
+    let names: Vec<String> = args.logs.iter().map(|log| log.display().to_string()).collect();
+    names.join(", ")
+}
+
+fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
+    let csv = CsvOptions {
+        columns: args.columns.clone(),
+        charge_positive: args.csv_sign == CsvSign::Charge,
+        start_times: args.start_times.clone(),
+        cells: if survey.plan.is_pack_total { 1 } else { survey.plan.cells },
+        pack_total: survey.plan.is_pack_total,
+    };
+    let bar = Bar::new(&args.logs);
+    let result = doctor::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
+        let times_real_time = progress.seconds / bar.seconds();
+        bar.show(Progress { bytes: progress.bytes, frames: progress.frames, times_real_time });
+    });
+    bar.clear();
+    let (mut report, counts) = result.map_err(|error| Failure::new(error.to_string()))?;
+    if counts.bad_lines > 0 {
+        let first = counts.first_bad_line.unwrap_or_default();
+        let mut finding = Finding::new(Severity::Note, Topic::Interface, "the log has bad lines");
+        finding.seen = format!("{} of {} lines cannot be read, first {first}", counts.bad_lines, counts.lines);
+        report.add(finding);
+    }
+    Ok(report)
+}
+
+fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
+    let wanted_s = args.seconds.unwrap_or(USUAL_SECONDS);
+    let bar = ProgressBar::with_draw_target(Some((1000.0 * wanted_s) as u64), ProgressDrawTarget::stderr_with_hz(5));
+    let template = "listening {bar:32} {msg} (Ctrl-C ends early)";
+    bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    let result = doctor::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
+        bar.set_position((1000.0 * progress.seconds) as u64);
+        bar.set_message(format!("{:.0} of {wanted_s:.0} s, {} frames", progress.seconds, progress.frames));
+    });
+    bar.finish_and_clear();
+    result.map_err(|error| Failure::new(error.to_string()))
+}
+
+/// Adds the configuration's own faults, and to every change the line it is about.
+fn complete(report: &mut Report, survey: &Survey) {
+    for fault in &survey.faults {
+        let mut finding = Finding::new(Severity::Error, Topic::Configuration, "the configuration is not good");
+        finding.seen.clone_from(fault);
+        finding.why = "packwatch run does not start with it; what can be judged all the same is told below".to_owned();
+        report.add(finding);
+    }
+    for change in report.findings.iter_mut().flat_map(|finding| &mut finding.changes) {
+        if let Some((place, now)) = survey.locate(&change.table, &change.key) {
+            (change.place, change.now) = (Some(place), now);
+        }
+    }
+}
+
+fn json(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
+    let document = serde_json::json!({
+        "config": config.display().to_string(),
+        "source": source,
+        "ok": !report.has_findings(),
+        "report": report,
+    });
+    let text = serde_json::to_string_pretty(&document)
+        .map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?;
+    write_out(&(text + "\n"))
+}
+
+/// Writes to standard output; a reader that has seen enough is no failure.
+fn write_out(text: &str) -> Result<(), Failure> {
+    match std::io::stdout().lock().write_all(text.as_bytes()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Failure::new(format!("standard output cannot be written: {error}")))
+        }
+        Ok(()) | Err(_) => Ok(()),
+    }
+}

@@ -1,0 +1,150 @@
+//! The doctor's report for people: findings worst first, what was fine, what could not be judged.
+
+use std::io::IsTerminal as _;
+use std::path::Path;
+
+use super::super::Failure;
+use super::write_out;
+use crate::doctor::{Change, Finding, Report, Severity};
+
+/// Width of the text where no terminal says one.
+const USUAL_WIDTH: usize = 100;
+/// Narrowest and widest the text is set.
+const WIDTHS: (usize, usize) = (50, 120);
+/// Where the text of a finding begins.
+const INDENT: usize = 10;
+
+/// Colours, where a person looks.
+#[derive(Debug, Clone, Copy)]
+struct Paint(bool);
+
+impl Paint {
+    fn with(self, code: &str, text: &str) -> String {
+        if self.0 { format!("\u{1b}[{code}m{text}\u{1b}[0m") } else { text.to_owned() }
+    }
+
+    fn bold(self, text: &str) -> String {
+        self.with("1", text)
+    }
+
+    fn dim(self, text: &str) -> String {
+        self.with("2", text)
+    }
+}
+
+/// Prints the report.
+pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
+    let is_terminal = std::io::stdout().is_terminal();
+    let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
+    let width = if is_terminal {
+        ratatui::crossterm::terminal::size().map_or(USUAL_WIDTH, |(w, _)| usize::from(w))
+    } else {
+        USUAL_WIDTH
+    };
+    write_out(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
+}
+
+fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Paint) -> String {
+    let mut page = String::new();
+    page.push_str(&format!(
+        "{} with {}: {:.0} s, {} frames\n\n",
+        source,
+        config.display(),
+        report.seconds,
+        report.frames
+    ));
+    page.push_str(&format!("{}\n", paint.bold(&verdict(report))));
+    for finding in &report.findings {
+        page.push('\n');
+        show(finding, width, paint, &mut page);
+    }
+    list("fine", &report.fine, width, paint, &mut page);
+    list("not judged", &report.unjudged, width, paint, &mut page);
+    page
+}
+
+/// The whole in a sentence.
+fn verdict(report: &Report) -> String {
+    let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
+    let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
+    match (count(Severity::Error), count(Severity::Warning)) {
+        (0, 0) if report.frames == 0 => "Nothing was heard.".to_owned(),
+        (0, 0) => "Nothing is wrong as far as this can be told.".to_owned(),
+        (errors, 0) => format!("{}. Begin with the first: others may follow from it.", many(errors, "error")),
+        (0, warnings) => format!("{}.", many(warnings, "warning")),
+        (errors, warnings) => {
+            format!(
+                "{} and {}. Begin with the first: others may follow from it.",
+                many(errors, "error"),
+                many(warnings, "warning")
+            )
+        }
+    }
+}
+
+fn show(finding: &Finding, width: usize, paint: Paint, page: &mut String) {
+    let (label, colour) = match finding.severity {
+        Severity::Error => ("ERROR", "1;31"),
+        Severity::Warning => ("WARNING", "1;33"),
+        Severity::Note => ("note", "1;36"),
+    };
+    let title = wrapped(&finding.title, width, INDENT);
+    page.push_str(&format!("{}{}\n", paint.with(colour, &format!("{label:INDENT$}")), paint.bold(&title)));
+    for (label, text) in
+        [("seen", Some(&finding.seen)), ("because", Some(&finding.why)), ("do", finding.advice.as_ref())]
+    {
+        if let Some(text) = text.filter(|text| !text.is_empty()) {
+            page.push_str(&format!("{}{}\n", paint.dim(&format!("  {label:8}")), wrapped(text, width, INDENT)));
+        }
+    }
+    changes(&finding.changes, paint, page);
+}
+
+/// Lines to change; of many alike the first few.
+fn changes(changes: &[Change], paint: Paint, page: &mut String) {
+    const SHOWN: usize = 4;
+    for change in changes.iter().take(SHOWN) {
+        let place = change.place.as_deref().unwrap_or("");
+        let now = match &change.now {
+            Some(now) => format!("{} = {now}", change.key),
+            None => format!("{} is not set", change.key),
+        };
+        page.push_str(&format!("{}{}  [{}]\n", paint.dim(&format!("  {:8}", "change")), place, change.table));
+        page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("31", &format!("- {now}"))));
+        page.push_str(&format!(
+            "{:INDENT$}{}\n",
+            "",
+            paint.with("32", &format!("+ {} = {}", change.key, change.proposed))
+        ));
+    }
+    if changes.len() > SHOWN {
+        page.push_str(&format!("{:INDENT$}and {} lines like it\n", "", changes.len() - SHOWN));
+    }
+}
+
+fn list(heading: &str, lines: &[String], width: usize, paint: Paint, page: &mut String) {
+    if lines.is_empty() {
+        return;
+    }
+    page.push_str(&format!("\n{}\n", paint.bold(heading)));
+    for line in lines {
+        page.push_str(&format!("  {}\n", wrapped(line, width, 2)));
+    }
+}
+
+/// The text in lines of at most `width`, all but the first indented.
+fn wrapped(text: &str, width: usize, indent: usize) -> String {
+    let mut lines: Vec<String> = vec![String::new()];
+    for word in text.split_whitespace() {
+        let line = lines.last_mut().map_or(0, |line| line.chars().count());
+        if line > 0 && indent + line + 1 + word.chars().count() > width {
+            lines.push(word.to_owned());
+        } else if let Some(last) = lines.last_mut() {
+            if line > 0 {
+                last.push(' ');
+            }
+            last.push_str(word);
+        }
+    }
+    lines.join(&format!("\n{:indent$}", ""))
+}

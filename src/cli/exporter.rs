@@ -1,0 +1,28 @@
+//! `packwatch exporter`: the status of the running daemon as metrics over HTTP.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use super::Failure;
+use crate::daemon::status::standard_path;
+use crate::daemon::{exporter, logging};
+
+/// Arguments of `exporter`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Where to listen; only this computer can reach the default
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9843")]
+    listen: SocketAddr,
+    /// Status socket of the daemon (default: where `packwatch run` makes it)
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+    /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
+    #[arg(long, value_name = "LEVEL")]
+    log: Option<String>,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    logging::start(args.log.as_deref()).map_err(Failure::new)?;
+    exporter::run(args.listen, args.socket.clone().unwrap_or_else(standard_path)).map_err(Failure::new)
+}

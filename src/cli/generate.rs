@@ -1,0 +1,137 @@
+//! `packwatch generate`: manual pages and shell completions, from the command line's own definition. Hidden: it serves
+//! those who build a package.
+
+use std::path::{Path, PathBuf};
+
+use clap::{CommandFactory, Subcommand};
+use clap_mangen::Man;
+
+use super::control_args::print;
+use super::{Cli, Failure};
+
+/// Name of the manual page about configurations.
+const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
+
+/// Arguments of `generate`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Write the manual pages of every command and of the configuration into a folder, which is made
+    Man {
+        /// The folder
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
+    /// Print the completions of a shell
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.what {
+        What::Man { folder } => write_all(folder, &manual_pages()),
+        What::Completions { shell } => print(&String::from_utf8_lossy(&completions(*shell))),
+    }
+}
+
+/// The command line without what is hidden.
+fn visible() -> clap::Command {
+    let all = Cli::command();
+    let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
+    let mut command = clap::Command::new("packwatch").propagate_version(true).subcommands(shown);
+    command = command.args(all.get_arguments().cloned());
+    command = command.version(env!("CARGO_PKG_VERSION")).disable_help_subcommand(true);
+    if let Some(about) = all.get_about() {
+        command = command.about(about.clone());
+    }
+    command.build();
+    command
+}
+
+/// File name and text of each page.
+fn manual_pages() -> Vec<(String, Vec<u8>)> {
+    let command = visible();
+    let mut pages = vec![(CONFIGURATION_PAGE.to_owned(), crate::config::manual().into_bytes())];
+    pages.push(page(&command));
+    pages.extend(command.get_subcommands().map(page));
+    pages
+}
+
+fn page(command: &clap::Command) -> (String, Vec<u8>) {
+    let man = Man::new(command.clone()).manual("packwatch").source(concat!("packwatch ", env!("CARGO_PKG_VERSION")));
+    let (name, mut text) = (man.get_filename(), Vec::new());
+    // Writing to a Vec cannot fail.
+    let _ = man.render(&mut text);
+    text.extend_from_slice(b".SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch.toml (5)\n");
+    (name, text)
+}
+
+fn completions(shell: clap_complete::Shell) -> Vec<u8> {
+    let mut text = Vec::new();
+    clap_complete::generate(shell, &mut visible(), "packwatch", &mut text);
+    text
+}
+
+fn write_all(folder: &Path, pages: &[(String, Vec<u8>)]) -> Result<(), Failure> {
+    let fault = |path: &Path, error| Failure::new(format!("{}: cannot be written: {error}", path.display()));
+    std::fs::create_dir_all(folder).map_err(|error| fault(folder, error))?;
+    for (name, text) in pages {
+        let path = folder.join(name);
+        std::fs::write(&path, text).map_err(|error| fault(&path, error))?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use clap_complete::Shell;
+
+    use super::*;
+
+    fn commands() -> Vec<String> {
+        let command = Cli::command();
+        let shown = command.get_subcommands().filter(|command| !command.is_hide_set());
+        shown.map(|command| command.get_name().to_owned()).collect()
+    }
+
+    #[test]
+    fn every_command_has_a_page_and_hidden_ones_have_none() {
+        let names: Vec<String> = manual_pages().into_iter().map(|(name, _)| name).collect();
+        let mut wanted = vec!["packwatch.toml.5".to_owned(), "packwatch.1".to_owned()];
+        wanted.extend(commands().iter().map(|name| format!("packwatch-{name}.1")));
+        assert_eq!(names, wanted);
+        assert!(names.contains(&"packwatch-run.1".to_owned()) && !names.contains(&"packwatch-generate.1".to_owned()));
+    }
+
+    #[test]
+    fn pages_say_how_a_command_is_called_and_name_the_others() {
+        let pages = manual_pages();
+        let text = |name: &str| {
+            let page = pages.iter().find(|(of, _)| of == name).map(|(_, text)| text.clone());
+            String::from_utf8(page.unwrap_or_default()).unwrap_or_default()
+        };
+        let run = text("packwatch-run.1");
+        assert!(run.contains("\\fBpackwatch run\\fR") && run.contains("\\-\\-config"), "{run}");
+        let whole = text("packwatch.1");
+        assert!(whole.contains("packwatch\\-alarms(1)") && !whole.contains("generate"), "{whole}");
+    }
+
+    #[test]
+    fn completions_know_every_command_and_nothing_hidden() {
+        for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
+            let text = String::from_utf8(completions(shell)).unwrap_or_default();
+            for name in commands() {
+                assert!(text.contains(&name), "{shell}: {name}");
+            }
+            assert!(!text.contains("generate"), "{shell}");
+        }
+    }
+}

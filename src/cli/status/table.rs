@@ -1,0 +1,221 @@
+//! The table of `packwatch status`. Pure: document in, text out.
+
+use std::fmt::Write as _;
+
+use super::{config, duration, number, percent, shown, with_std, word};
+use crate::alarm::Alarm;
+use crate::cli::alarms::{cell as cell_name, severity, state_name, with_unit};
+use crate::daemon::status::document::{Cell, Document};
+use crate::io::stamp;
+
+/// Up to so many cells all are listed: more do not fit a screen beside the rest.
+const MAX_LISTED: usize = 16;
+/// Of more cells, so many are listed because they stand out.
+const MAX_OUTLIERS: usize = 8;
+
+/// The document for people; `all` = every cell.
+pub(super) fn table(document: &Document, all: bool) -> String {
+    let mut text = String::new();
+    head(&mut text, document);
+    pack(&mut text, document);
+    interfaces(&mut text, document);
+    alarms(&mut text, document);
+    cells(&mut text, &document.cells, all);
+    text
+}
+
+fn head(text: &mut String, document: &Document) {
+    let _ = writeln!(
+        text,
+        "packwatch {}, process {}, up {}, {}, configuration {}",
+        document.program_version,
+        document.pid,
+        duration(document.uptime_s),
+        stamp::format_utc(document.wall_time),
+        config(document),
+    );
+}
+
+fn pack(text: &mut String, document: &Document) {
+    let pack = &document.pack;
+    let band = match (pack.soc_low, pack.soc_high) {
+        (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),
+        _ => String::new(),
+    };
+    let _ = writeln!(
+        text,
+        "pack       {}: SOC {}{band}, {}, {}, {}, at most {}",
+        word(pack.validity),
+        percent(pack.soc),
+        word(pack.mode),
+        shown(pack.voltage_v, 2, " V"),
+        shown(pack.current_a, 2, " A"),
+        shown(pack.temperature_max_c, 1, " °C"),
+    );
+    let weakest = pack.weakest_cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)));
+    let _ = writeln!(
+        text,
+        "health     capacity {}{weakest}, SOH {}, usable {}, recharge period {}, with the reference charger {}",
+        with_std(pack.capacity_ah, pack.capacity_std_ah, 3, " Ah"),
+        percent(pack.soh),
+        with_std(pack.usable_capacity_ah, pack.usable_capacity_std_ah, 3, " Ah"),
+        shown(pack.recharge_period_s, 0, " s"),
+        with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
+    );
+}
+
+fn interfaces(text: &mut String, document: &Document) {
+    for it in &document.interfaces {
+        let lost = it.kernel_dropped + it.queue_dropped + it.malformed;
+        let unsent = it.send_queue_full + it.send_failed;
+        let _ = writeln!(
+            text,
+            "interface  {} {}: {} frames in, {lost} lost, {} out, {unsent} not sent, {} errors, {} bus-off, back {} times",
+            it.name,
+            word(it.state),
+            it.frames,
+            it.sent,
+            it.error_frames,
+            it.bus_offs,
+            it.reconnects,
+        );
+    }
+    let (readings, service) = (&document.counters.readings, &document.counters.service);
+    let rejected: u64 = readings.rejected().iter().map(|(_, count)| count).sum();
+    let slowest = document.latency.quantile_s(0.99);
+    let _ = writeln!(
+        text,
+        "counted    {} readings used, {rejected} not; {} late ticks; 99 % of estimates within {}",
+        readings.accepted,
+        service.missed_deadlines,
+        shown(slowest.map(|seconds| 1e3 * seconds), 2, " ms"),
+    );
+}
+
+fn alarms(text: &mut String, document: &Document) {
+    let alarms = &document.alarms;
+    let unknown = match alarms.unknown.len() {
+        0 => String::new(),
+        count => format!(", not known for {count}"),
+    };
+    let _ = writeln!(text, "alarms     {} raised of {} thresholds{unknown}", alarms.raised, alarms.thresholds);
+    for alarm in &alarms.list {
+        let _ = writeln!(text, "           {}", alarm_line(alarm));
+    }
+    if alarms.omitted > 0 {
+        let _ = writeln!(text, "           and {} more", alarms.omitted);
+    }
+}
+
+/// An alarm in a line.
+pub(super) fn alarm_line(alarm: &Alarm) -> String {
+    let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value));
+    let probability =
+        alarm.probability.map_or_else(String::new, |probability| format!(", {:.0} % sure", 100.0 * probability));
+    let whose = alarm.cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell_name(Some(cell))));
+    format!(
+        "{} {} {whose} {}: {value}, threshold {}{probability}{}",
+        severity(alarm.severity),
+        alarm.rule.name(),
+        state_name(alarm.state),
+        with_unit(alarm.rule, alarm.threshold),
+        if alarm.is_acknowledged { ", acknowledged" } else { "" },
+    )
+}
+
+const HEAD: [&str; 7] = ["cell", "voltage", "temp.", "SOC", "capacity", "resistance", "trusted"];
+
+fn cells(text: &mut String, cells: &[Cell], all: bool) {
+    let is_short = cells.len() > MAX_LISTED && !all;
+    let listed: Vec<&Cell> = if is_short { outliers(cells) } else { cells.iter().collect() };
+    if is_short {
+        spread(text, cells);
+        let _ = writeln!(text, "those that stand out (--cells lists all):");
+    }
+    let rows: Vec<[String; 7]> = listed.into_iter().map(row).collect();
+    let width = |column: usize| {
+        let widest = rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+        widest.max(HEAD[column].chars().count())
+    };
+    let widths: [usize; 7] = std::array::from_fn(width);
+    for row in std::iter::once(&HEAD.map(str::to_owned)).chain(&rows) {
+        let padded: Vec<String> = row.iter().zip(widths).map(|(field, width)| format!("{field:>width$}")).collect();
+        text.push_str(&padded.join("  "));
+        text.push('\n');
+    }
+}
+
+fn row(cell: &Cell) -> [String; 7] {
+    let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
+    [
+        number(cell.cell).to_string(),
+        shown(cell.voltage_v, 3, " V"),
+        shown(cell.temperature_c, 1, " °C"),
+        soc,
+        with_std(cell.capacity_ah, cell.capacity_std_ah, 3, " Ah"),
+        with_std(cell.resistance_ratio, cell.resistance_ratio_std, 2, ""),
+        match cell.trusted {
+            None => "-",
+            Some(true) => "yes",
+            Some(false) => "NO",
+        }
+        .to_owned(),
+    ]
+}
+
+/// What is compared over the cells.
+type Quantity = (&'static str, &'static str, usize, fn(&Cell) -> Option<f64>);
+
+const QUANTITIES: [Quantity; 5] = [
+    ("voltage", " V", 3, |cell| cell.voltage_v),
+    ("SOC", " %", 1, |cell| cell.soc.map(|soc| 100.0 * soc)),
+    ("temp.", " °C", 1, |cell| cell.temperature_c),
+    ("capacity", " Ah", 3, |cell| cell.capacity_ah),
+    ("resistance", "", 2, |cell| cell.resistance_ratio),
+];
+
+/// Least and greatest of every quantity, with their cells.
+fn spread(text: &mut String, cells: &[Cell]) {
+    for (name, unit, decimals, of) in QUANTITIES {
+        let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
+        let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
+        let greatest = known().max_by(|a, b| a.1.total_cmp(&b.1));
+        let count = known().count();
+        let _ = match (least, greatest) {
+            (Some((low, least)), Some((high, greatest))) => writeln!(
+                text,
+                "{name:<10} {least:.decimals$}{unit} (cell {low}) to {greatest:.decimals$}{unit} (cell {high}), known \
+                 of {count} of {}",
+                cells.len()
+            ),
+            _ => writeln!(text, "{name:<10} not known of any of {}", cells.len()),
+        };
+    }
+}
+
+/// The cells that stand out: not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
+fn outliers(cells: &[Cell]) -> Vec<&Cell> {
+    let mut ranked: Vec<(f64, &Cell)> = cells.iter().map(|cell| (0.0, cell)).collect();
+    for (_, _, _, of) in QUANTITIES {
+        let mut known: Vec<f64> = cells.iter().filter_map(of).collect();
+        known.sort_by(f64::total_cmp);
+        let Some(&median) = known.get(known.len() / 2) else { continue };
+        let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
+        distances.sort_by(f64::total_cmp);
+        // Compared with the usual distance; of equal cells none stands out.
+        let usual = distances[distances.len() / 2].max(1e-9);
+        for (rank, cell) in &mut ranked {
+            // One of which less is known than of others stands out most.
+            *rank = rank.max(of(cell).map_or(f64::MAX, |value| (value - median).abs() / usual));
+        }
+    }
+    for (rank, cell) in &mut ranked {
+        *rank = if cell.trusted == Some(false) { f64::MAX } else { *rank };
+    }
+    // Stable: of equal ranks the first cells.
+    ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let mut found: Vec<&Cell> =
+        ranked.into_iter().filter(|(rank, _)| *rank > 3.0).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();
+    found.sort_by_key(|cell| cell.cell);
+    found
+}

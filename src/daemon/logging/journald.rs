@@ -1,0 +1,201 @@
+//! Log lines as journal entries with fields, over journald's native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
+//!
+//! An entry has `MESSAGE` (the text, and the fields as `name=value`, so that `systemctl status` tells them), `PRIORITY`,
+//! `SYSLOG_IDENTIFIER`, `TARGET`, where it is in the source, each field as `PACKWATCH_NAME`, and for what programs look for a
+//! `MESSAGE_ID`. Nothing here waits: an entry that a stalled journald does not take is dropped and counted, so that the
+//! estimation loop, which logs, goes on.
+
+use std::fmt::{self, Write as _};
+use std::io::{self, ErrorKind};
+use std::os::unix::net::UnixDatagram;
+
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::layer::{Context, Layer};
+
+use super::LEFT_OUT;
+
+/// Where journald listens.
+const SOCKET: &str = "/run/systemd/journal/socket";
+/// Longest value, bytes; an entry of a few of them fits a datagram.
+const MAX_VALUE: usize = 8 * 1024;
+/// What programs look for, by its text; one id each for ever (`journalctl MESSAGE_ID=...`).
+const MESSAGE_IDS: [(&str, &str); 3] = [
+    ("alarm raised", "7a9c9a5d3bc5449eb08f6ca450cbf382"),
+    ("alarm cleared", "15d731239a594556adf6d13cc7b79ac2"),
+    ("configuration refused, the old one stays", "870d888fffdd45d08f0fbc3c3a1489e9"),
+];
+
+/// See the module.
+#[derive(Debug)]
+pub(super) struct Journal {
+    socket: UnixDatagram,
+}
+
+impl Journal {
+    /// Of the journald that runs here.
+    ///
+    /// # Errors
+    /// When there is none, or its socket is not to be seen.
+    pub(super) fn new() -> io::Result<Self> {
+        let socket = UnixDatagram::unbound()?;
+        socket.set_nonblocking(true)?;
+        // An empty datagram is nothing to journald, and an error to us when nobody listens. A full queue is somebody.
+        match socket.send_to(&[], SOCKET) {
+            Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
+            Ok(_) | Err(_) => Ok(Self { socket }),
+        }
+    }
+}
+
+impl<S: Subscriber> Layer<S> for Journal {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        // Not connected: journald may have been started again.
+        if self.socket.send_to(&entry(event), SOCKET).is_err() {
+            LEFT_OUT.add(1);
+        }
+    }
+}
+
+/// One event as journald wants it.
+fn entry(event: &Event<'_>) -> Vec<u8> {
+    let mut words = Words::default();
+    event.record(&mut words);
+    let meta = event.metadata();
+    let mut entry = Vec::with_capacity(512);
+    put(&mut entry, "MESSAGE", &format!("{}{}", words.message, words.told));
+    put(&mut entry, "PRIORITY", priority(*meta.level()));
+    put(&mut entry, "SYSLOG_IDENTIFIER", "packwatch");
+    put(&mut entry, "TARGET", meta.target());
+    if let (Some(file), Some(line)) = (meta.file(), meta.line()) {
+        put(&mut entry, "CODE_FILE", file);
+        put(&mut entry, "CODE_LINE", &line.to_string());
+    }
+    if let Some((_, id)) = MESSAGE_IDS.iter().find(|(text, _)| *text == words.message) {
+        put(&mut entry, "MESSAGE_ID", id);
+    }
+    for (name, value) in &words.fields {
+        put(&mut entry, &field_name(name), value);
+    }
+    entry
+}
+
+/// Syslog's numbers.
+fn priority(level: Level) -> &'static str {
+    match level {
+        Level::ERROR => "3",
+        Level::WARN => "4",
+        Level::INFO => "6",
+        Level::DEBUG | Level::TRACE => "7",
+    }
+}
+
+/// `cell` becomes `PACKWATCH_CELL`; journald takes capital letters, digits and underscores.
+fn field_name(name: &str) -> String {
+    let allowed = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
+    format!("PACKWATCH_{}", name.chars().map(allowed).collect::<String>())
+}
+
+/// Appends one field; a value with line feeds goes with its length before it.
+fn put(entry: &mut Vec<u8>, name: &str, value: &str) {
+    let end = (0..=value.len().min(MAX_VALUE)).rev().find(|&end| value.is_char_boundary(end)).unwrap_or(0);
+    let value = &value[..end];
+    entry.extend_from_slice(name.as_bytes());
+    if value.contains('\n') {
+        entry.push(b'\n');
+        entry.extend_from_slice(&(value.len() as u64).to_le_bytes());
+    } else {
+        entry.push(b'=');
+    }
+    entry.extend_from_slice(value.as_bytes());
+    entry.push(b'\n');
+}
+
+/// An event's text and fields.
+#[derive(Debug, Default)]
+struct Words {
+    message: String,
+    /// The fields as ` name=value`.
+    told: String,
+    fields: Vec<(&'static str, String)>,
+}
+
+impl Words {
+    fn take(&mut self, field: &Field, value: String) {
+        if field.name() == "message" {
+            self.message = value;
+            return;
+        }
+        // Writing to a string cannot fail.
+        let _ = write!(self.told, " {}={value}", field.name());
+        self.fields.push((field.name(), value));
+    }
+}
+
+impl Visit for Words {
+    fn record_str(&mut self, field: &Field, value: &str) {
+        self.take(field, value.to_owned());
+    }
+
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        self.take(field, format!("{value:?}"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::{Arc, Mutex};
+    use tracing_subscriber::layer::SubscriberExt;
+
+    /// Keeps entries as journald would get them.
+    #[derive(Clone, Default)]
+    struct Kept(Arc<Mutex<Vec<Vec<u8>>>>);
+
+    impl<S: Subscriber> Layer<S> for Kept {
+        fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+            self.0.lock().expect("one thread").push(entry(event));
+        }
+    }
+
+    fn entry_of(log: impl FnOnce()) -> String {
+        let kept = Kept::default();
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(kept.clone()), log);
+        let entries = kept.0.lock().expect("one thread");
+        assert_eq!(entries.len(), 1);
+        String::from_utf8_lossy(&entries[0]).into_owned()
+    }
+
+    #[test]
+    fn an_alarm_has_its_fields_its_priority_and_its_id() {
+        let cell = Some(3_u32);
+        let entry = entry_of(|| tracing::warn!(rule = ?"capacity_low", cell, value = 1.5, "{}", "alarm raised"));
+        let has = |line: &str| assert!(entry.lines().any(|found| found == line), "no {line} in {entry}");
+        has("MESSAGE=alarm raised rule=\"capacity_low\" cell=3 value=1.5");
+        has("PRIORITY=4");
+        has("SYSLOG_IDENTIFIER=packwatch");
+        has("MESSAGE_ID=7a9c9a5d3bc5449eb08f6ca450cbf382");
+        has("PACKWATCH_CELL=3");
+        has("PACKWATCH_VALUE=1.5");
+    }
+
+    #[test]
+    fn what_is_told_once_as_a_text_has_no_id() {
+        let entry = entry_of(|| tracing::info!("alarm raised earlier, its value is not known now"));
+        assert!(!entry.contains("MESSAGE_ID") && entry.contains("PRIORITY=6"), "{entry}");
+    }
+
+    #[test]
+    fn a_value_with_line_feeds_cannot_make_fields_of_its_own() {
+        let entry = entry_of(|| tracing::error!(error = "a\nPRIORITY=0", "bad"));
+        let wanted = "PACKWATCH_ERROR\n\u{c}\0\0\0\0\0\0\0a\nPRIORITY=0\n";
+        assert!(entry.contains(wanted), "{entry:?}");
+    }
+
+    #[test]
+    fn a_long_value_is_cut_between_characters() {
+        let mut entry = Vec::new();
+        put(&mut entry, "X", &"\u{20ac}".repeat(MAX_VALUE));
+        assert!(entry.len() <= MAX_VALUE + 3 && String::from_utf8(entry).is_ok());
+    }
+}

@@ -1,0 +1,58 @@
+//! The loop's side of the status sockets: counts what the loop does, and once a second hands over what is to be told.
+
+use tokio::time::Instant;
+
+use super::engine::Engine;
+use crate::daemon::status::PERIOD;
+use crate::daemon::status::StatusServer;
+use crate::daemon::status::collect::{Identity, Sources};
+use crate::daemon::status::counters::LoopCounters;
+use crate::io::socket::LinkOutput;
+use crate::monitor::TICK_PERIOD_MS;
+use crate::quantity::Timestamp;
+
+/// What the loop tells of itself.
+#[derive(Debug)]
+pub(super) struct Seeing {
+    pub(super) server: Option<StatusServer>,
+    pub(super) identity: Identity,
+    pub(super) counters: LoopCounters,
+    told: Option<Instant>,
+}
+
+impl Seeing {
+    pub(super) fn new(server: Option<StatusServer>, identity: Identity) -> Self {
+        Self { server, identity, counters: LoopCounters::default(), told: None }
+    }
+
+    /// A tick that was due then comes now.
+    pub(super) fn note_tick(&mut self, due: Instant) {
+        self.counters.note_tick(due.elapsed().as_secs_f64(), f64::from(TICK_PERIOD_MS) / 1e3);
+    }
+
+    /// A frame of that time has its estimate.
+    #[inline]
+    pub(super) fn note_frame(&mut self, received: Timestamp, now: Timestamp) {
+        self.counters.latency.record(now.since(received));
+    }
+
+    /// Hands a document over when it is time for one.
+    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], now: Timestamp) {
+        let Some(server) = &self.server else { return };
+        if self.told.is_some_and(|told| told.elapsed() < PERIOD) {
+            return;
+        }
+        self.told = Some(Instant::now());
+        let sources = Sources {
+            identity: &self.identity,
+            monitor: &engine.monitor,
+            links,
+            counters: &self.counters,
+            clients: server.clients(),
+            events: &engine.recent,
+            store: None,
+        };
+        let is_taken = server.offer(sources.draft(now));
+        self.counters.documents_skipped += u64::from(!is_taken);
+    }
+}

@@ -1,0 +1,293 @@
+//! The status document: what the status sockets tell, as JSON. This file is its description.
+//!
+//! * Version 1. New keys may come within a version, so a reader ignores what it does not know; a key that changes its
+//!   meaning or goes makes a new version.
+//! * What is not known is `null`, never 0 or 100 %.
+//! * Units are in the names: `_v`, `_a` (positive = discharge), `_c` (degrees C), `_ah`, `_s`; SOC and SOH are fractions.
+//!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's
+//!   clock, which never steps; `wall_time` is the computer's clock.
+
+use serde::{Deserialize, Serialize};
+
+use super::counters::Latency;
+use crate::alarm::{Alarm, Severity};
+use crate::daemon::control::protocol::UnknownAlarms;
+use crate::io::socket::LinkState;
+use crate::monitor::{Statistics, Validity};
+use crate::quantity::{Mode, Timestamp};
+use crate::sample::ReadingCounts;
+
+/// Version of [`Document`].
+pub(crate) const VERSION: u32 = 1;
+
+/// Everything that is told.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Document {
+    /// [`VERSION`].
+    pub(crate) version: u32,
+    /// The program's version.
+    pub(crate) program_version: String,
+    /// The daemon's process.
+    pub(crate) pid: u32,
+    /// When this was true, on the daemon's clock.
+    pub(crate) time: Timestamp,
+    /// The same on the computer's clock.
+    pub(crate) wall_time: Timestamp,
+    /// When the daemon started.
+    pub(crate) started: Timestamp,
+    /// Since then, s.
+    pub(crate) uptime_s: f64,
+    /// The configuration it runs with.
+    pub(crate) config: Option<ConfigFile>,
+    /// How far the estimates are to be trusted.
+    pub(crate) state: Validity,
+    /// The interfaces, in the order of the configuration.
+    pub(crate) interfaces: Vec<Interface>,
+    /// The pack.
+    pub(crate) pack: Pack,
+    /// Its cells.
+    pub(crate) cells: Vec<Cell>,
+    /// Alarms that need eyes.
+    pub(crate) alarms: Alarms,
+    /// Counts.
+    pub(crate) counters: Counters,
+    /// Protected input messages.
+    pub(crate) protection: Vec<Protected>,
+    /// Input messages of which frames were dropped, because more came than are taken in.
+    pub(crate) floods: Vec<Flooded>,
+    /// From the kernel's receive stamp of a frame to its estimate.
+    pub(crate) latency: Latency,
+    /// The store of what is learned; `None` = there is none.
+    pub(crate) store: Option<Store>,
+    /// The latest events but those of single cells' half-cycles, oldest first, as `--events` writes them.
+    pub(crate) events: Vec<serde_json::Value>,
+}
+
+/// Where the configuration came from.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ConfigFile {
+    /// The file.
+    pub path: String,
+    /// SHA-256 of what was read from it, in hexadecimal digits (its own text, not that of the files it names).
+    pub sha256: String,
+}
+
+/// One interface. Its counts are since the program's start, but those of frames and error frames, which go on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Interface {
+    /// Kernel name.
+    pub(crate) name: String,
+    /// What is known of it.
+    pub(crate) state: LinkState,
+    /// Times it came up again.
+    pub(crate) reconnects: u64,
+    /// Frames taken in.
+    pub(crate) frames: u64,
+    /// Error frames.
+    pub(crate) error_frames: u64,
+    /// Those of them that say bus-off.
+    pub(crate) bus_offs: u64,
+    /// Frames the kernel had no room to keep.
+    pub(crate) kernel_dropped: u64,
+    /// Frames that found the daemon's own queue full.
+    pub(crate) queue_dropped: u64,
+    /// Things read that are no frame.
+    pub(crate) malformed: u64,
+    /// Frames sent.
+    pub(crate) sent: u64,
+    /// Frames not sent: the queue to the interface was full.
+    pub(crate) send_queue_full: u64,
+    /// Frames not sent: the kernel did not take them, or they had waited too long.
+    pub(crate) send_failed: u64,
+}
+
+/// The pack, as its limiting cells make it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Pack {
+    /// Validity of the estimates.
+    pub(crate) validity: Validity,
+    /// Charge, rest or discharge.
+    pub(crate) mode: Mode,
+    /// State of charge.
+    pub(crate) soc: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) soc_std: Option<f64>,
+    /// The interval that holds the truth with 95 %, lower end.
+    pub(crate) soc_low: Option<f64>,
+    /// Upper end.
+    pub(crate) soc_high: Option<f64>,
+    /// Which cell ends a discharge.
+    pub(crate) limiting_cell: Option<u16>,
+    /// Sum of the cells' voltages.
+    pub(crate) voltage_v: Option<f64>,
+    /// Current, positive = discharge.
+    pub(crate) current_a: Option<f64>,
+    /// Highest temperature.
+    pub(crate) temperature_max_c: Option<f64>,
+    /// The cell with the least capacity, once every cell was learned.
+    pub(crate) weakest_cell: Option<u16>,
+    /// Its capacity.
+    pub(crate) capacity_ah: Option<f64>,
+    /// Standard deviation of that.
+    pub(crate) capacity_std_ah: Option<f64>,
+    /// Capacity relative to rated.
+    pub(crate) soh: Option<f64>,
+    /// Least usable capacity at the configured load.
+    pub(crate) usable_capacity_ah: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) usable_capacity_std_ah: Option<f64>,
+    /// Last recorded recharge period.
+    pub(crate) recharge_period_s: Option<f64>,
+    /// What the reference charger would need.
+    pub(crate) normalised_recharge_period_s: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) normalised_recharge_period_std_s: Option<f64>,
+    /// SOC as the pack itself reports it.
+    pub(crate) reported_soc: Option<f64>,
+    /// SOH as the pack itself reports it.
+    pub(crate) reported_soh: Option<f64>,
+}
+
+/// One cell.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Cell {
+    /// Which, from 0.
+    pub(crate) cell: u16,
+    /// Voltage.
+    pub(crate) voltage_v: Option<f64>,
+    /// Current, positive = discharge.
+    pub(crate) current_a: Option<f64>,
+    /// Temperature of its sensor.
+    pub(crate) temperature_c: Option<f64>,
+    /// State of charge.
+    pub(crate) soc: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) soc_std: Option<f64>,
+    /// Learned capacity.
+    pub(crate) capacity_ah: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) capacity_std_ah: Option<f64>,
+    /// Usable capacity at the configured load.
+    pub(crate) usable_capacity_ah: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) usable_capacity_std_ah: Option<f64>,
+    /// Resistance relative to new.
+    pub(crate) resistance_ratio: Option<f64>,
+    /// Its standard deviation.
+    pub(crate) resistance_ratio_std: Option<f64>,
+    /// Whether the filter agrees with itself.
+    pub(crate) trusted: Option<bool>,
+}
+
+/// The alarms.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Alarms {
+    /// Thresholds configured.
+    pub(crate) thresholds: usize,
+    /// Alarms raised now.
+    pub(crate) raised: usize,
+    /// The highest severity among them.
+    pub(crate) highest_severity: Option<Severity>,
+    /// Thresholds with alarms that cannot be judged, because their value is not known.
+    pub(crate) unknown: Vec<UnknownAlarms>,
+    /// Alarms that are raised, about to be, or not yet acknowledged.
+    pub(crate) list: Vec<Alarm>,
+    /// Further ones, for which there was no room.
+    pub(crate) omitted: usize,
+}
+
+/// Counts. `core` and `readings` go on after a restart with a stored state, the others begin with the program.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Counters {
+    /// What the core has done.
+    pub(crate) core: Statistics,
+    /// Readings by what became of them.
+    pub(crate) readings: ReadingCounts,
+    /// Inputs whose time was before that of an earlier one.
+    pub(crate) time_backwards: u64,
+    /// The loop.
+    pub(crate) service: ServiceCounters,
+    /// Clients of the status sockets.
+    pub(crate) clients: Clients,
+}
+
+/// Counts of the loop.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct ServiceCounters {
+    /// Ticks.
+    pub(crate) ticks: u64,
+    /// Ticks that came more than a period late.
+    pub(crate) missed_deadlines: u64,
+    /// The latest a tick ever came, s.
+    pub(crate) worst_lateness_s: f64,
+    /// Configurations taken up while running.
+    pub(crate) reloads: u64,
+    /// Configurations refused while running.
+    pub(crate) reloads_refused: u64,
+    /// Status documents that were not written down, because the one before was not yet.
+    pub(crate) documents_skipped: u64,
+}
+
+/// Clients of the status sockets.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Clients {
+    /// Connected now.
+    pub(crate) connected: u64,
+    /// Served or being served.
+    pub(crate) served: u64,
+    /// Turned away: too many at once.
+    pub(crate) refused: u64,
+    /// Dropped: they did not take what they were sent.
+    pub(crate) dropped: u64,
+}
+
+/// Checks of one protected input message.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Protected {
+    /// Interface it comes on.
+    pub(crate) interface: String,
+    /// Its identifier: 3 hexadecimal digits, or 8 when it is extended.
+    pub(crate) id: String,
+    /// How often each status was given.
+    pub(crate) checks: Vec<StatusCount>,
+}
+
+/// How often a check gave a status.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct StatusCount {
+    /// The status' name.
+    pub(crate) status: String,
+    /// How often.
+    pub(crate) count: u64,
+}
+
+/// Frames dropped of one input message.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Flooded {
+    /// Interface.
+    pub(crate) interface: String,
+    /// Identifier, as in [`Protected`].
+    pub(crate) id: String,
+    /// Frames.
+    pub(crate) dropped: u64,
+}
+
+/// The store of what is learned.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub(crate) struct Store {
+    /// Its file.
+    pub(crate) path: String,
+    /// Whether it can be written; `None` = not tried yet.
+    pub(crate) works: Option<bool>,
+    /// Commits done.
+    pub(crate) commits: u64,
+    /// Commits that failed.
+    pub(crate) failures: u64,
+    /// Events that went out before they were stored, because that took too long.
+    pub(crate) late: u64,
+    /// Bytes written.
+    pub(crate) bytes_written: Option<u64>,
+    /// Size of its files, bytes.
+    pub(crate) file_bytes: Option<u64>,
+}

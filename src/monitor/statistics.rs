@@ -1,0 +1,184 @@
+//! What the core has done so far, as plain counts for the status socket and its metrics.
+//!
+//! Part of the stored state: they go on after a restart of the program. What others count is not counted again:
+//! readings ([`crate::sample::ReadingCounts`]), checks of protected messages ([`Monitor::protected`](super::Monitor)),
+//! floods ([`Monitor::dropped`](super::Monitor)), steps back in time ([`Monitor::time_backwards`](super::Monitor)).
+
+use serde::{Deserialize, Serialize};
+
+use super::{BusEvent, Event, EventKind, Input};
+use crate::alarm::{Change, Severity};
+use crate::cell::StepResult;
+use crate::quantity::BusIndex;
+
+/// Error class bits of an error frame (linux/can/error.h).
+const CAN_ERR_BUSOFF: u32 = 0x40;
+
+/// Counts since the first start.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Statistics {
+    /// Per interface, in the order of the configuration; interfaces nothing came from may be missing at the end.
+    pub buses: Vec<BusStatistics>,
+    /// Voltage readings that moved an estimate.
+    pub voltages_used: u64,
+    /// Voltage readings beyond the filter's gate: they moved nothing.
+    pub voltages_gated: u64,
+    /// Voltage readings without a current to compare them with.
+    pub voltages_without_current: u64,
+    /// Filters that started again from their voltage.
+    pub filter_resets: u64,
+    /// Times an estimate lost its trust.
+    pub trust_lost: u64,
+    /// Times nobody measured for a while: asleep, away, or a hole in the record.
+    pub gaps: u64,
+    /// Changes of mode.
+    pub mode_changes: u64,
+    /// Half-cycles, per cell.
+    pub half_cycles: u64,
+    /// Runs of a capacity filter, per cell.
+    pub capacity_updates: u64,
+    /// Those of them with a measurement.
+    pub capacity_measurements: u64,
+    /// Recharge periods recorded, raw or normalised.
+    pub recharge_periods: u64,
+    /// Alarms raised.
+    pub alarms_raised: AlarmCounts,
+    /// Commands done, from the bus and from this computer.
+    pub commands: u64,
+    /// Command frames not obeyed.
+    pub bad_commands: u64,
+    /// Times the pack was replaced.
+    pub packs_replaced: u64,
+    /// Times a stored state was taken up.
+    pub restores: u64,
+    /// Times the files could not be written (any more).
+    pub store_failures: u64,
+}
+
+/// Counts of one interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct BusStatistics {
+    /// Frames taken in.
+    pub frames: u64,
+    /// Error frames.
+    pub error_frames: u64,
+    /// Those of them that say bus-off.
+    pub bus_offs: u64,
+}
+
+/// Alarms by severity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct AlarmCounts {
+    /// Worth knowing.
+    pub info: u64,
+    /// Plan a visit.
+    pub warning: u64,
+    /// Act now.
+    pub severe: u64,
+}
+
+impl AlarmCounts {
+    /// Of one severity.
+    pub const fn get(&self, severity: Severity) -> u64 {
+        match severity {
+            Severity::Info => self.info,
+            Severity::Warning => self.warning,
+            Severity::Severe => self.severe,
+        }
+    }
+
+    fn add(&mut self, severity: Severity) {
+        match severity {
+            Severity::Info => self.info += 1,
+            Severity::Warning => self.warning += 1,
+            Severity::Severe => self.severe += 1,
+        }
+    }
+}
+
+impl Statistics {
+    /// Takes an input and what came of it.
+    pub(super) fn note(&mut self, input: &Input<'_>, told: &[Event]) {
+        match *input {
+            Input::Frame { bus, .. } => self.bus(bus).frames += 1,
+            Input::Bus { bus, event: BusEvent::ErrorFrame { class }, .. } => {
+                let counts = self.bus(bus);
+                counts.error_frames += 1;
+                counts.bus_offs += u64::from(class & CAN_ERR_BUSOFF != 0);
+            }
+            Input::Bus { .. }
+            | Input::Tick { .. }
+            | Input::UnknownGap { .. }
+            | Input::Command { .. }
+            | Input::Store { .. } => {}
+        }
+        told.iter().for_each(|event| self.note_event(&event.kind));
+    }
+
+    fn note_event(&mut self, kind: &EventKind) {
+        match *kind {
+            EventKind::FilterReset { .. } => self.filter_resets += 1,
+            EventKind::Trust { trusted: false, .. } => self.trust_lost += 1,
+            EventKind::Gap { .. } => self.gaps += 1,
+            EventKind::Mode { .. } => self.mode_changes += 1,
+            EventKind::HalfCycle { .. } => self.half_cycles += 1,
+            EventKind::Capacity { measured_ah, .. } => {
+                self.capacity_updates += 1;
+                self.capacity_measurements += u64::from(measured_ah.is_some());
+            }
+            EventKind::RechargePeriod { .. } => self.recharge_periods += 1,
+            EventKind::Alarm { change: Change::Raised, severity, .. } => self.alarms_raised.add(severity),
+            EventKind::Command { .. } => self.commands += 1,
+            EventKind::PackReplaced { .. } => self.packs_replaced += 1,
+            EventKind::Store { works: false } => self.store_failures += 1,
+            _ => {}
+        }
+    }
+
+    /// Counts a voltage reading by what it did to its cell's estimate.
+    pub(super) fn note_voltage(&mut self, result: &StepResult) {
+        let count = match result.update {
+            Some(update) if update.accepted => &mut self.voltages_used,
+            Some(_) => &mut self.voltages_gated,
+            None => &mut self.voltages_without_current,
+        };
+        *count += 1;
+    }
+
+    fn bus(&mut self, bus: BusIndex) -> &mut BusStatistics {
+        if self.buses.len() <= bus.index() {
+            self.buses.resize(bus.index() + 1, BusStatistics::default());
+        }
+        &mut self.buses[bus.index()]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::can::CanId;
+    use crate::can::Frame;
+    use crate::quantity::Timestamp;
+
+    #[test]
+    fn frames_and_bus_offs_are_counted_per_interface() {
+        let mut statistics = Statistics::default();
+        let frame = Frame::classic(CanId::standard(0x123).expect("an id"), &[1]).expect("a frame");
+        let (time, bus) = (Timestamp::ZERO, BusIndex(1));
+        statistics.note(&Input::Frame { time, bus, frame: &frame }, &[]);
+        for class in [0x04, 0x40, 0x44] {
+            statistics.note(&Input::Bus { time, bus, event: BusEvent::ErrorFrame { class } }, &[]);
+        }
+        let counts = BusStatistics { frames: 1, error_frames: 3, bus_offs: 2 };
+        assert_eq!(statistics.buses, [BusStatistics::default(), counts]);
+    }
+
+    #[test]
+    fn a_state_stored_by_an_earlier_program_counts_from_zero() {
+        let statistics: Statistics = serde_json::from_str("{\"gaps\":3}").expect("a document");
+        assert_eq!(statistics, Statistics { gaps: 3, ..Statistics::default() });
+    }
+}

@@ -1,0 +1,64 @@
+//! How many readings were used, and why the others were not.
+
+use serde::{Deserialize, Serialize};
+
+use crate::quantity::Fault;
+
+/// Readings by what became of them, since the first start (they are part of the stored state).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ReadingCounts {
+    /// Used.
+    pub accepted: u64,
+    /// For channels that feed nothing.
+    pub unused: u64,
+    /// Steps to another level that were refused at first and believed when they stayed.
+    pub levels_believed: u64,
+    /// The frame was too short.
+    pub short_frame: u64,
+    /// The frame failed its end-to-end check.
+    pub end_to_end: u64,
+    /// The sender said that there is no value.
+    pub not_available: u64,
+    /// NaN or infinite.
+    pub not_finite: u64,
+    /// Outside its range.
+    pub out_of_range: u64,
+    /// Moved too fast.
+    pub rate_too_high: u64,
+    /// Did not move although it should have.
+    pub stuck: u64,
+    /// No reading at all: times a signal became too old.
+    pub stale: u64,
+}
+
+impl ReadingCounts {
+    /// Counts a reading by its judgement.
+    pub(super) fn note(&mut self, fault: Option<Fault>) {
+        let count = match fault {
+            None => &mut self.accepted,
+            Some(Fault::ShortFrame) => &mut self.short_frame,
+            Some(Fault::EndToEnd) => &mut self.end_to_end,
+            Some(Fault::NotAvailable) => &mut self.not_available,
+            Some(Fault::NotFinite) => &mut self.not_finite,
+            Some(Fault::OutOfRange) => &mut self.out_of_range,
+            Some(Fault::RateTooHigh) => &mut self.rate_too_high,
+            Some(Fault::Stuck) => &mut self.stuck,
+            Some(Fault::Stale) => &mut self.stale,
+        };
+        *count = count.saturating_add(1);
+    }
+
+    /// Readings that were not used, by reason; the reasons' names are those of [`Fault`].
+    pub fn rejected(&self) -> [(&'static str, u64); 7] {
+        [
+            ("short_frame", self.short_frame),
+            ("end_to_end", self.end_to_end),
+            ("not_available", self.not_available),
+            ("not_finite", self.not_finite),
+            ("out_of_range", self.out_of_range),
+            ("rate_too_high", self.rate_too_high),
+            ("stuck", self.stuck),
+        ]
+    }
+}
