@@ -210,7 +210,7 @@ impl Writer {
             Err(error) if is_damage(&error) => {
                 drop(database);
                 // The next attempt, soon, finds the folder free of it.
-                self.folder.set_aside(&error.to_string(), &document.stamp);
+                self.folder.set_aside(&error.to_string());
                 Err(format!("database damaged: {error}"))
             }
             // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
