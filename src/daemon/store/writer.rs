@@ -173,8 +173,10 @@ impl Writer {
         if state.is_none() {
             return self.retry.pause.is_none();
         }
+        let begun = Instant::now();
         match self.commit(&batches, state.as_ref(), exact) {
             Ok(()) => {
+                tracing::debug!(took = ?begun.elapsed(), batches = batches.len(), "state stored");
                 if self.retry.pause.is_some() {
                     tracing::info!(folder = %self.folder, "state and history are written again");
                 }
