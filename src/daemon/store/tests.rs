@@ -19,12 +19,12 @@ fn config() -> Config {
     config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml")).unwrap()
 }
 
-/// The log of a cell that is discharged and charged in turn, an hour each.
+/// The log of a cell that is discharged and charged in turn, a quarter of an hour each.
 fn log(config: &Config, folder: &Path) -> LogSource {
     let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
     let mut soc: f64 = 0.9;
-    for second in 0..20_000_u32 {
-        let current_a = if second / 3600 % 2 == 0 { 2.0 } else { -2.0 };
+    for second in 0..7_200_u32 {
+        let current_a = if second / 900 % 2 == 0 { 2.0 } else { -2.0 };
         soc -= current_a / 3600.0 / 2.6;
         let _ = writeln!(text, "{second},{current_a},{:.4},24.5", 3.3 + 0.8 * soc - 0.05 * current_a);
     }
@@ -58,7 +58,7 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
         snapshot: true,
         snapshot_at: seconds.map(|seconds| When::After(seconds * 1_000_000_000)),
         restore: None,
-        away: Away::AsStamped,
+        away: Some(Away::AsStamped),
         store,
         interfaces: vec!["can0".to_owned()],
     };
@@ -78,7 +78,7 @@ fn restored(snapshot: Snapshot) -> Monitor {
 #[test]
 fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
     let parts = |snapshot: &Snapshot| Parts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
-    let (early, late) = (snapshot(Some(4000), None), snapshot(Some(15_000), None));
+    let (early, late) = (snapshot(Some(1500), None), snapshot(Some(5000), None));
     let full = packed::read_full(&packed::full(&parts(&late))).unwrap();
     assert_eq!(full.join(), serde_json::to_vec(&late).unwrap());
     let delta = packed::delta(&parts(&late), &parts(&early), 1);
@@ -86,7 +86,7 @@ fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
     let near = restored(serde_json::from_slice(&read).unwrap());
     let exact = restored(late);
     let (near, exact) = (near.capacity(CellIndex(0)), exact.capacity(CellIndex(0)));
-    assert!((near.mean - exact.mean).abs() < 1e-6 && (near.std() - exact.std()).abs() < 1e-6, "{near:?} {exact:?}");
+    assert!((near.mean - exact.mean).abs() < 1e-5 && (near.std() - exact.std()).abs() < 1e-5, "{near:?} {exact:?}");
 }
 
 #[test]
@@ -175,7 +175,7 @@ fn a_database_damaged_under_the_running_writer_is_replaced() {
     let (store, _) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
     let mut store = store.unwrap();
     let monitor = Monitor::new(config().monitor);
-    let mut learn = |store: &mut Store, seconds: f64| {
+    let learn = |store: &mut Store, seconds: f64| {
         let time = Timestamp::from_secs(seconds);
         let kind = rows::tests::capacity(0, Some(2.0), 1.9);
         store.learned(&[Event { time, kind }], &monitor, time).unwrap()
