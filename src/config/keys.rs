@@ -458,7 +458,7 @@ section! {
 section! {
     /// State and history on disk (`run --state`). What is learned is stored when it is announced, whatever is set here.
     Store at "store" {
-        /// Period of the checkpoints of the running state, which a power cut may lose (a restart of the service loses a second). Each writes some 7 kB for a pack of 96 cells.
+        /// Period of the checkpoints of the running state, which a power cut may lose (a restart of the service loses a second). Each writes 5 to 9 kB for a pack of 96 cells.
         checkpoint_s: f64, "s", Between(1.0, 3600.0), Default("60.0");
         /// Half-cycles kept, counting one per cell; beyond it every second transition of the older half is taken out, again and again. The default is a year of ten half-cycles a day and 50 cells and some 15 MB. Capacities, alarms and resets are kept for ever.
         max_half_cycles: u32, "", Between(1000.0, 1e8), Default("200000");

@@ -344,3 +344,6 @@ fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) 
     };
     both.into_iter().filter_map(candidate).collect()
 }
+
+#[cfg(test)]
+mod tests;

@@ -89,7 +89,7 @@ impl Folder {
         let path = self.path.join(DATABASE);
         if self.set_aside.is_none() {
             match self.open_good(&path, now) {
-                Err(OpenError::Damaged(why)) => self.set_aside(&why, now),
+                Err(OpenError::Damaged(why)) => self.set_aside(&why),
                 result => return result,
             }
         }
@@ -146,12 +146,12 @@ impl Folder {
     }
 
     /// Gives a damaged database another name, with what SQLite has beside it.
-    pub(crate) fn set_aside(&mut self, why: &str, _now: &Stamp) {
+    pub(crate) fn set_aside(&mut self, why: &str) {
         let path = self.path.join(DATABASE);
-        let free = (1..=MAX_SET_ASIDE).map(|number| self.path.join(format!("{DATABASE}.damaged-{number}")));
-        let place = free.clone().find(|place| !place.exists());
+        let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
+        let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());
         // All taken: the latest makes room, the first is what somebody will want to read.
-        let Some(place) = place.or_else(|| free.last()) else { return };
+        let place = free.unwrap_or_else(|| place(MAX_SET_ASIDE));
         if place.is_dir() {
             let _ = fs::remove_dir_all(&place);
         }

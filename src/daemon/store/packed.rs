@@ -1,7 +1,7 @@
 //! A state in few bytes: what a checkpoint writes to flash every minute, for years.
 //!
-//! A *full* record is the whole state, exact. A *delta* record is what differs from a full one: numbers in single
-//! precision (finer where they are large, see [`rounded`]), each as the difference to the number that stood at its
+//! A *full* record is the whole state, exact. A *delta* record is what differs from a full one: numbers to six
+//! digits (finer where they are large, see [`rounded`]), each as the difference to the number that stood at its
 //! place, the low bytes of all together, the next bytes of all together, and so on, compressed. A number that stands in
 //! the state a second time (a covariance has two equal halves) is a reference to the first. What is not a number (the
 //! skeleton) is written when it differs, compressed against the full one's.
@@ -27,8 +27,8 @@ const HASH_BYTES: usize = 8;
 const MAX_SECTION_BYTES: usize = 128 << 20;
 /// Compression level: the highest before the time doubles.
 const LEVEL: i32 = 3;
-/// Bits of a mantissa that a delta keeps, as a single-precision number does: 6e-8 of the value.
-const KEPT_BITS: i32 = 23;
+/// Bits of a mantissa that a delta keeps: 5e-7 of the value, a thousandth of what any of the numbers is known to.
+const KEPT_BITS: i32 = 20;
 /// It keeps more where that would be coarser than 2^-15 (counted charge, seconds).
 const KEPT_FRACTION_BITS: i32 = 14;
 /// Bits of a mantissa.
@@ -358,7 +358,7 @@ mod tests {
         fn a_rounded_number_is_near(value in any::<f64>().prop_filter("finite", |value| value.is_finite())) {
             let near = f64::from_bits(rounded(value.to_bits()));
             prop_assert!(near.is_finite());
-            prop_assert!((near - value).abs() <= (value.abs() * 6e-8).max(f64::MIN_POSITIVE), "{value} became {near}");
+            prop_assert!((near - value).abs() <= (value.abs() * 5e-7).max(f64::MIN_POSITIVE), "{value} became {near}");
             prop_assert!((near - value).abs() <= 3.1e-5 || value.abs() > 1e9 || value.abs() < 1e3, "{value} became {near}");
         }
     }

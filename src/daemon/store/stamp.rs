@@ -100,7 +100,7 @@ impl Stamp {
 
     /// How long before `now` this was.
     pub(crate) fn age(&self, now: &Self) -> Age {
-        let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 * 1e-9;
+        let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
         if self.same_boot(now) {
             return Age::Seconds(seconds(self.boottime_ns, now.boottime_ns).max(0.0));
         }

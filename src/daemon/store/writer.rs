@@ -173,8 +173,10 @@ impl Writer {
         if state.is_none() {
             return self.retry.pause.is_none();
         }
+        let begun = Instant::now();
         match self.commit(&batches, state.as_ref(), exact) {
             Ok(()) => {
+                tracing::debug!(took = ?begun.elapsed(), batches = batches.len(), "state stored");
                 if self.retry.pause.is_some() {
                     tracing::info!(folder = %self.folder, "state and history are written again");
                 }
@@ -210,7 +212,7 @@ impl Writer {
             Err(error) if is_damage(&error) => {
                 drop(database);
                 // The next attempt, soon, finds the folder free of it.
-                self.folder.set_aside(&error.to_string(), &document.stamp);
+                self.folder.set_aside(&error.to_string());
                 Err(format!("database damaged: {error}"))
             }
             // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
