@@ -5,7 +5,7 @@ mod rig;
 
 use packwatch::alarm::{Change, Rule, Selector, State};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Away, BusEvent, Command, EventKind, Input, Outputs};
+use packwatch::monitor::{Away, BusEvent, Command, EventKind, Input, Outputs, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 use rig::{Rig, learned};
 
@@ -371,4 +371,45 @@ fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
         let waited_s = told.unwrap().since(claimed.unwrap());
         assert!((0.3..0.35).contains(&waited_s), "{away:?}: {waited_s} s");
     }
+}
+
+const IDENTITY: &str = "[input.pack_identity]\nsignal = \"Cells.Serial\"\nreadings = 5\n";
+
+/// Every pack that was connected, and how often one was another.
+fn packs(rig: &Rig) -> (Vec<f64>, usize) {
+    let of = |kind| if let EventKind::PackIdentity { identity } = kind { Some(identity) } else { None };
+    let replaced = rig.events.iter().filter(|event| matches!(event.kind, EventKind::PackReplaced { .. })).count();
+    (rig.events.iter().filter_map(|event| of(event.kind)).collect(), replaced)
+}
+
+#[test]
+fn another_pack_identity_is_another_pack_also_when_it_was_changed_while_off() {
+    let mut rig = Rig::new(&("[[alarm]]\nrule = \"capacity_low\"\nwarning = 5.0\n".to_owned() + IDENTITY));
+    assert_eq!(rig.monitor.pack_identity(), None);
+    rig.identity = Some(1001.0);
+    rig.seconds(2);
+    assert_eq!((rig.monitor.pack_identity(), packs(&rig)), (Some(1001.0), (vec![1001.0], 0)));
+    rig.discharge();
+    let learned = rig.monitor.capacity(CellIndex(0));
+    // Odd readings, and none, say nothing.
+    for odd in [Some(7.0), Some(1001.0), None, Some(8.0), Some(9.0), Some(1001.0)] {
+        rig.identity = odd;
+        rig.tick_with_frames();
+    }
+    rig.restart(Away::Seconds(3600.0));
+    rig.seconds(2);
+    assert_eq!((packs(&rig).1, rig.monitor.capacity(CellIndex(0))), (0, learned));
+    // Changed while the computer was off.
+    rig.restart(Away::Seconds(3600.0));
+    rig.identity = Some(1002.0);
+    (0..4).for_each(|_| rig.tick_with_frames());
+    assert_eq!(packs(&rig).1, 0);
+    rig.tick_with_frames();
+    assert_eq!((rig.monitor.pack_identity(), packs(&rig)), (Some(1002.0), (vec![1001.0, 1002.0], 1)));
+    assert_eq!(rig.monitor.capacity(CellIndex(0)).mean, 2.6);
+    let who = rig.events.iter().find_map(|event| match event.kind {
+        EventKind::Command { source, command: Command::PackReplaced, .. } => Some(source),
+        _ => None,
+    });
+    assert_eq!(who, Some(Source::Bus(BusIndex(0))));
 }

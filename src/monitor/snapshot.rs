@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::buses::Buses;
 use super::cyclic::Schedule;
+use super::identity::Identity;
 use super::intake::IntakeState;
 use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmState, StoredAlarm};
@@ -41,6 +42,8 @@ pub struct Snapshot {
     intake: IntakeState,
     #[serde(default)]
     buses: Buses,
+    #[serde(default)]
+    identity: Identity,
     #[serde(default)]
     statistics: Statistics,
 }
@@ -121,6 +124,7 @@ impl Monitor {
             schedule: self.schedule.clone(),
             intake: self.intake.snapshot(),
             buses: self.buses.clone(),
+            identity: self.identity,
             statistics: self.statistics.clone(),
         }
     }
@@ -179,6 +183,7 @@ impl Monitor {
         self.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.intake.restore(&snapshot.intake);
+        self.identity = snapshot.identity;
         self.buses = snapshot.buses.taken_up(snapshot.time, now);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
