@@ -115,6 +115,8 @@ pub enum Channel {
     ReportedSoc,
     /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with ours, never believed.
     ReportedSoh,
+    /// A number that is another one for another pack (serial number).
+    PackIdentity,
 }
 
 /// Why a reading cannot be used. A bad reading is data, not an error.

@@ -104,6 +104,9 @@ struct Memory {
     /// Standard deviation of the SOC by what may have happened while nobody looked, until a voltage has told.
     #[serde(default)]
     away_std: f64,
+    /// No voltage has been taken in since the record went on after an unknown time.
+    #[serde(default)]
+    is_unseen: bool,
     /// Readings beyond the gate in a row, and since how long, s.
     rejected: u32,
     rejected_s: f64,
@@ -159,6 +162,7 @@ impl CellEstimator {
                 information_s: config.max_information_s,
                 rest_s: 0.0,
                 away_std: 0.0,
+                is_unseen: false,
                 rejected: 0,
                 rejected_s: 0.0,
                 rejected_after_gap: false,
@@ -208,7 +212,7 @@ impl CellEstimator {
             None => each!(filter, x => update(x, model, config, &reading))?,
             Some(std) => each!(filter, x => update_after_away(x, model, config, &reading, std))?,
         };
-        self.memory.away_std = 0.0;
+        (self.memory.away_std, self.memory.is_unseen) = (0.0, false);
         self.watch(config, step, &update);
         Ok(Some(update))
     }
@@ -297,7 +301,7 @@ impl CellEstimator {
     /// The record goes on after a gap of unknown length: branches may or may not have relaxed, and of the SOC
     /// nothing is sure.
     pub fn handle_unknown_gap(&mut self) {
-        (self.memory.rest_s, self.memory.away_std) = (0.0, 0.0);
+        (self.memory.rest_s, self.memory.away_std, self.memory.is_unseen) = (0.0, 0.0, true);
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);

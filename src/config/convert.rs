@@ -7,9 +7,9 @@ use super::alarm::Rated;
 use super::document::{Document, Faults};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
-    Method, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackVoltageInput, ProtectedInput, Recharge,
-    ReportedSocInput, ReportedSohInput, SECTIONS, Store, TemperatureInput, TemperatureLimits, Transition, Usable,
-    VoltageLimits,
+    Method, Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, ProtectedInput,
+    Recharge, ReportedSocInput, ReportedSohInput, SECTIONS, Store, TemperatureInput, TemperatureLimits, Transition,
+    Usable, VoltageLimits,
 };
 use super::schema::{Section as _, Walk};
 use crate::can::decode::InputMap;
@@ -42,6 +42,7 @@ pub(crate) struct Raw {
     pub(crate) temperatures: Vec<TemperatureInput>,
     pub(crate) reported_soc: Option<ReportedSocInput>,
     pub(crate) reported_soh: Option<ReportedSohInput>,
+    pub(crate) pack_identity: Option<PackIdentityInput>,
     /// Whether one of the two is written, faulty or not.
     pub(crate) reported_written: bool,
     pub(crate) protected: Vec<ProtectedInput>,
@@ -87,6 +88,7 @@ impl Raw {
             reported_written: walk.has::<ReportedSocInput>() || walk.has::<ReportedSohInput>(),
             reported_soc: walk.optional(),
             reported_soh: walk.optional(),
+            pack_identity: walk.optional(),
             protected: walk.many(),
             current_limits: walk.one(),
             voltage_limits: walk.one(),
@@ -132,6 +134,7 @@ pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: 
         interfaces: raw.interfaces.len(),
         input: traffic.input,
         guards: traffic.guards,
+        identity_readings: raw.pack_identity.as_ref().map_or(1, |keys| keys.readings),
         flood: FloodConfig { max_frames_per_s: NonZeroU32::new(raw.input.as_ref()?.max_frames_per_s)? },
         output: traffic.output,
         commands: traffic.commands,

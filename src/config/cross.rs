@@ -49,6 +49,7 @@ fn interfaces(raw: &Raw, faults: &mut Faults) {
     let pack = raw.pack_voltage.iter().map(|s| s.source());
     let temperatures = raw.temperatures.iter().map(|s| s.source());
     let reported = raw.reported_soc.iter().map(|s| s.source()).chain(raw.reported_soh.iter().map(|s| s.source()));
+    let reported = reported.chain(raw.pack_identity.iter().map(|s| s.source()));
     if !raw.interfaces_whole {
         return;
     }

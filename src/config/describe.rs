@@ -210,7 +210,8 @@ fn signal(raw: &Raw, config: &Config, resolved: &Resolved<'_>) -> SignalUse {
             | Channel::PackVoltage
             | Channel::CellVoltage(_)
             | Channel::ReportedSoc
-            | Channel::ReportedSoh => None,
+            | Channel::ReportedSoh
+            | Channel::PackIdentity => None,
         },
     }
 }

@@ -237,6 +237,14 @@ signal_section! {
     }
 }
 
+signal_section! {
+    /// A number that tells packs apart, such as a serial number: another value than the known one means that another pack is connected, also when it was changed while the program did not run. What was learned of the old pack is told once more and does not hold for the new one, as with the command `pack-replaced`.
+    PackIdentityInput at "input.pack_identity", "any unit" {
+        /// Readings in a row that must show the same new value.
+        readings: u32, "", Between(1.0, 10000.0), Default("10");
+    }
+}
+
 section! {
     /// What a plausible pack current is. A reading outside moves no estimate and is counted.
     CurrentLimits at "limits.current" {
@@ -476,6 +484,7 @@ pub(crate) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::many::<TemperatureInput>(),
     SectionInfo::one::<ReportedSocInput>(),
     SectionInfo::one::<ReportedSohInput>(),
+    SectionInfo::one::<PackIdentityInput>(),
     SectionInfo::many::<ProtectedInput>(),
     SectionInfo::one::<CurrentLimits>(),
     SectionInfo::one::<VoltageLimits>(),

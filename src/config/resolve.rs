@@ -20,6 +20,9 @@ use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 /// Most cell numbers named in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
+/// Longest identity, bits: what a reading tells apart.
+const MAX_IDENTITY_BITS: u16 = 53;
+
 /// The DBC files of a configuration.
 #[derive(Debug)]
 pub(crate) struct Databases {
@@ -99,6 +102,9 @@ pub(crate) fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faul
     }
     if let Some(soh) = &raw.reported_soh {
         search.one(Channel::ReportedSoh, &soh.source(), 1.0);
+    }
+    if let Some(identity) = &raw.pack_identity {
+        search.one(Channel::PackIdentity, &identity.source(), 1.0);
     }
     if let (Some(voltage), Some(pack)) = (&raw.cell_voltage, &raw.pack) {
         search.cells(voltage, pack.cells);
@@ -197,6 +203,11 @@ impl<'d> Search<'_, 'd> {
             let what = format!("must not be used twice, is also {}", channel_words(other.channel));
             source.place.fault(self.faults, "signal", &what);
         }
+        if channel == Channel::PackIdentity && signal.layout.length_bits > MAX_IDENTITY_BITS {
+            let what =
+                format!("{full_name} has {} bits, must have at most {MAX_IDENTITY_BITS}", signal.layout.length_bits);
+            source.place.fault(self.faults, "signal", &what);
+        }
         let largest = u64::MAX >> (64 - u32::from(signal.layout.length_bits.clamp(1, 64)));
         if source.not_available.iter().any(|&code| code > largest) {
             let what = format!("must be 0 to {largest:#X}, the codes of {full_name}");
@@ -235,6 +246,7 @@ pub(crate) fn channel_words(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
     }
 }
 

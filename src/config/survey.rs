@@ -109,6 +109,7 @@ fn source_of(raw: &Raw, channel: Channel) -> Option<SignalSource<'_>> {
         Channel::CellVoltage(_) => raw.cell_voltage.as_ref().map(|keys| keys.source()),
         Channel::ReportedSoc => raw.reported_soc.as_ref().map(|keys| keys.source()),
         Channel::ReportedSoh => raw.reported_soh.as_ref().map(|keys| keys.source()),
+        Channel::PackIdentity => raw.pack_identity.as_ref().map(|keys| keys.source()),
     }
 }
 
@@ -211,6 +212,7 @@ fn places(raw: &Raw) -> BTreeMap<String, Place> {
     all.extend(raw.temperatures.iter().map(|keys| &keys.place));
     all.extend(raw.reported_soc.as_ref().map(|keys| &keys.place));
     all.extend(raw.reported_soh.as_ref().map(|keys| &keys.place));
+    all.extend(raw.pack_identity.as_ref().map(|keys| &keys.place));
     all.extend(raw.protected.iter().map(|keys| &keys.place));
     all.extend(raw.current_limits.as_ref().map(|keys| &keys.place));
     all.extend(raw.voltage_limits.as_ref().map(|keys| &keys.place));

@@ -113,6 +113,7 @@ impl EventLog {
                     "another pack: what was learned of the old one is forgotten"
                 );
             }
+            EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),
             EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),
             EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
                 let cell = cell.map(number);

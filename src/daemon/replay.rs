@@ -463,6 +463,7 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
         EventKind::BadCommand { .. } => "bad_command",
         EventKind::Test { .. } => "test",
         EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::PackIdentity { .. } => "pack_identity",
         EventKind::Reconfigured { .. } => "reconfigured",
         EventKind::AlarmDropped { .. } => "alarm_dropped",
         EventKind::Store { .. } => "store",

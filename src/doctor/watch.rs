@@ -169,7 +169,7 @@ impl Doctor {
                 Channel::Current => self.link.handle_current(time, value),
                 Channel::PackVoltage => self.link.handle_voltage(time, 0, value / cells),
                 Channel::CellVoltage(cell) => self.link.handle_voltage(time, cell.index(), value),
-                Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh => {}
+                Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => {}
             }
         }
     }

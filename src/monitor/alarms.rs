@@ -168,12 +168,14 @@ impl Monitor {
         self.observe_alarm(Rule::BmsDisagrees, None, disagreement, out);
     }
 
-    /// SOC of the emptiest and the fullest of the cells whose voltage is fresh; `None` = of no cell.
+    /// SOC of the emptiest and the fullest of the cells whose estimate is fresh; `None` = of no cell.
     fn spread(&self) -> Option<Spread> {
         let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
         for (slot, cell) in self.cells.iter().zip((0..).map(CellIndex)) {
             let is_fresh = self.sampler.is_fresh(self.voltage_channel(cell), self.now);
-            let Some(soc) = slot.estimator.soc().filter(|_| is_fresh) else { continue };
+            // A voltage that came before the first current says nothing yet.
+            let is_present = is_fresh && !slot.estimator.is_of_before();
+            let Some(soc) = slot.estimator.soc().filter(|_| is_present) else { continue };
             known += 1;
             spread = Some(match spread {
                 None => Spread { lowest: soc, highest: soc, is_whole: false },

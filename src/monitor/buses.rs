@@ -1,7 +1,10 @@
 //! Whether the interfaces are in order, for the rule about them.
 //!
 //! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame comes, and
-//! while frames of ours cannot be sent. What is not heard of yet is not known.
+//! while frames of ours cannot be sent. What is not heard of yet is not known. Over a restart a fault goes on: it lasts from
+//! when it began, and is over only when the interface is heard of and in order.
+
+use serde::{Deserialize, Serialize};
 
 use super::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
@@ -13,8 +16,9 @@ const CAN_ERR_RESTARTED: u32 = 0x100;
 /// Without another report for this long frames can be sent again, s: four of the drivers' report periods.
 const SEND_RECOVERED_S: f64 = 1.0;
 
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy, Default, Serialize, Deserialize)]
 struct BusState {
+    #[serde(skip)]
     is_known: bool,
     down_since: Option<Timestamp>,
     off_since: Option<Timestamp>,
@@ -23,7 +27,7 @@ struct BusState {
 }
 
 /// All interfaces that something was heard of.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(super) struct Buses {
     states: Vec<BusState>,
 }
@@ -61,6 +65,25 @@ impl Buses {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
         (worst_s, known.count() >= interfaces)
+    }
+
+    /// Moves stored stamps onto another clock.
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        let moved = |stamp: Timestamp| stamp.plus_nanos(by_nanos);
+        for state in &mut self.states {
+            (state.down_since, state.off_since) = (state.down_since.map(moved), state.off_since.map(moved));
+            state.unsent = state.unsent.map(|(first, latest)| (moved(first), moved(latest)));
+        }
+    }
+
+    /// As it was stored at `taken`, taken up at `now`: whether a fault goes on is not known before something is heard, nor
+    /// whether frames can be sent again before a second has passed.
+    pub(super) fn taken_up(mut self, taken: Timestamp, now: Timestamp) -> Self {
+        for state in &mut self.states {
+            let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
+            state.unsent = unsent.map(|(first, _)| (first, now));
+        }
+        self
     }
 
     fn state(&mut self, bus: BusIndex) -> &mut BusState {

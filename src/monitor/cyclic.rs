@@ -220,13 +220,17 @@ impl Monitor {
         self.send(frame, out);
     }
 
-    /// Begins to send a rule's alarm frame marked as a test; `false` = there is no output to send it on.
+    /// Begins to send a rule's alarm frame marked as a test, in place of one that runs; of 0 s, only ends that one.
+    /// `false` = there is no output to send it on.
     pub(super) fn start_test(&mut self, rule: Rule, seconds: f64, out: &mut Outputs) -> bool {
         if self.config.output.is_none() {
             return false;
         }
         self.end_test(out);
-        let seconds = seconds.clamp(0.0, MAX_TEST_S);
+        if seconds.is_nan() || seconds <= 0.0 {
+            return true;
+        }
+        let seconds = seconds.min(MAX_TEST_S);
         self.test = Some(Test { rule, next: self.now, end: self.now.plus_secs(seconds) });
         out.events.push(Event { time: self.now, kind: EventKind::Test { rule, running: true } });
         self.tell_j1939();

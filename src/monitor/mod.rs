@@ -9,6 +9,7 @@ mod alarms;
 mod buses;
 mod cyclic;
 mod heard;
+mod identity;
 mod intake;
 mod j1939;
 mod learning;
@@ -58,6 +59,8 @@ pub struct MonitorConfig {
     pub input: InputMap,
     /// Input messages with end-to-end protection.
     pub guards: Vec<GuardConfig>,
+    /// Readings in a row that must say another pack identity, where such a signal is among `input`.
+    pub identity_readings: u32,
     /// How many frames of one identifier are taken in.
     pub flood: FloodConfig,
     /// Sample stage.
@@ -141,6 +144,7 @@ pub struct Monitor {
     /// Inputs that came with a time before `now`.
     time_backwards: u64,
     intake: Intake,
+    identity: identity::Identity,
     sampler: Sampler,
     cells: Vec<CellSlot>,
     detector: TransitionDetector,
@@ -197,6 +201,7 @@ impl Monitor {
         let slot = CellSlot::new(&config.estimator);
         Self {
             intake: Intake::new(&config),
+            identity: identity::Identity::default(),
             sampler: Sampler::new(config.sample.clone()),
             learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
@@ -424,6 +429,10 @@ impl Monitor {
             readings.push(Reading { channel, value: intact.and(value) });
         });
         for reading in readings.drain(..) {
+            if reading.channel == Channel::PackIdentity {
+                self.observe_identity(bus, reading.value, out);
+                continue;
+            }
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
             self.note_heard(&reading);
             self.report_signals(out);

@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::buses::Buses;
 use super::cyclic::Schedule;
+use super::identity::Identity;
 use super::intake::IntakeState;
 use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
 use crate::alarm::{AlarmState, StoredAlarm};
@@ -38,6 +40,10 @@ pub struct Snapshot {
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
+    #[serde(default)]
+    buses: Buses,
+    #[serde(default)]
+    identity: Identity,
     #[serde(default)]
     statistics: Statistics,
 }
@@ -117,6 +123,8 @@ impl Monitor {
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
             intake: self.intake.snapshot(),
+            buses: self.buses.clone(),
+            identity: self.identity,
             statistics: self.statistics.clone(),
         }
     }
@@ -175,6 +183,8 @@ impl Monitor {
         self.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.intake.restore(&snapshot.intake);
+        self.identity = snapshot.identity;
+        self.buses = snapshot.buses.taken_up(snapshot.time, now);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
         // From here the time away is a gap like any other.
@@ -209,6 +219,7 @@ impl Snapshot {
         self.recharge.rebase(by_nanos);
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
+        self.buses.rebase(by_nanos);
     }
 }
 

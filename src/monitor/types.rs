@@ -339,6 +339,11 @@ pub enum EventKind {
         /// Times it was raised.
         occurrences: u32,
     },
+    /// Which pack is connected is known, for the first time or anew.
+    PackIdentity {
+        /// As the signal says it.
+        identity: f64,
+    },
     /// Whether files can be written has changed.
     Store {
         /// They can.

@@ -155,7 +155,7 @@ impl Sampler {
                 self.state.charge.handle_current(time, value, limits.max_age_s, self.flow_a);
                 None
             }
-            Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh => None,
+            Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
             Channel::PackVoltage => Some(self.sample(time, CellIndex(0), value, totals)),
             Channel::CellVoltage(cell) => Some(self.sample(time, cell, value, totals)),
         }
@@ -369,7 +369,8 @@ impl Sampler {
                 | Channel::Temperature(_)
                 | Channel::CellVoltage(_)
                 | Channel::ReportedSoc
-                | Channel::ReportedSoh,
+                | Channel::ReportedSoh
+                | Channel::PackIdentity,
                 _,
             ) => 1.0,
         }
@@ -379,7 +380,7 @@ impl Sampler {
         match channel {
             Channel::Current => self.config.current,
             Channel::Temperature(_) => self.config.temperature,
-            Channel::PackVoltage | Channel::CellVoltage(_) => self.config.voltage,
+            Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => self.config.voltage,
             Channel::ReportedSoc => self.config.reported_soc.unwrap_or(self.config.voltage),
             Channel::ReportedSoh => self.config.reported_soh.unwrap_or(self.config.voltage),
         }
@@ -395,7 +396,9 @@ impl Sampler {
                 (cell.0 < self.config.cells).then(|| voltage + cell.index())
             }
             (Channel::PackVoltage, VoltageSource::Cells)
-            | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. }) => None,
+            | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
+            // Known by the monitor, not sampled.
+            | (Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh, _) => {
                 let first = voltage + self.voltages;
                 let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
@@ -426,7 +429,7 @@ fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
         // Nothing is known of how they should move.
-        Channel::ReportedSoc | Channel::ReportedSoh => 0.0,
+        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => 0.0,
     }
 }
 

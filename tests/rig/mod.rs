@@ -26,6 +26,7 @@ BO_ 256 Status: 8 A
 BO_ 272 Cells: 8 A
  SG_ Voltage1 : 0|16@1+ (0.0001,0) [0|5] "V" A
  SG_ Voltage2 : 16|16@1+ (0.0001,0) [0|5] "V" A
+ SG_ Serial : 32|32@1+ (1,0) [0|0] "" A
 "#;
 
 pub(crate) const PACK: &str = r#"
@@ -95,6 +96,7 @@ pub(crate) struct Rig {
     pub(crate) voltages_v: [Option<f64>; 2],
     pub(crate) temperatures_c: [Option<f64>; 2],
     pub(crate) reported_soc: Option<f64>,
+    pub(crate) identity: Option<f64>,
 }
 
 impl Rig {
@@ -116,6 +118,7 @@ impl Rig {
             voltages_v: [Some(3.7), Some(3.7)],
             temperatures_c: [Some(25.0), Some(25.0)],
             reported_soc: Some(0.5),
+            identity: None,
         }
     }
 
@@ -142,13 +145,19 @@ impl Rig {
 
     /// Frames ten times a second, ticks as often.
     pub(crate) fn seconds(&mut self, seconds: i64) {
-        for _ in 0..10 * seconds {
+        (0..10 * seconds).for_each(|_| self.tick_with_frames());
+    }
+
+    /// A tenth of a second.
+    pub(crate) fn tick_with_frames(&mut self) {
+        {
             self.deci += 1;
             let values = [
                 (Channel::Current, self.current_a),
                 (Channel::Temperature(SensorIndex(0)), self.temperatures_c[0]),
                 (Channel::Temperature(SensorIndex(1)), self.temperatures_c[1]),
                 (Channel::ReportedSoc, self.reported_soc),
+                (Channel::PackIdentity, self.identity),
                 (Channel::CellVoltage(CellIndex(0)), self.voltages_v[0]),
                 (Channel::CellVoltage(CellIndex(1)), self.voltages_v[1]),
             ];

@@ -32,6 +32,11 @@ impl CellEstimator {
         self.memory.away_std = (self.memory.away_std + most / 3.0_f64.sqrt()).min(1.0);
     }
 
+    /// Whether the SOC is still the one from before time away: no voltage has been taken in since.
+    pub fn is_of_before(&self) -> bool {
+        self.memory.is_unseen || self.away_std().is_some()
+    }
+
     /// Standard deviation of what may have been moved, until a voltage has told; `None` when it is negligible.
     pub(super) fn away_std(&self) -> Option<f64> {
         (self.memory.away_std > NEGLIGIBLE_STD).then_some(self.memory.away_std)

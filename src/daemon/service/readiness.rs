@@ -228,6 +228,7 @@ fn words(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("voltage of cell {}", cell.index() + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
     }
 }
 

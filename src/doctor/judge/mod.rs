@@ -72,7 +72,7 @@ pub(super) fn max_age_s(plan: &Plan, channel: Channel) -> f64 {
         Channel::Current => plan.ages.current_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => plan.ages.voltage_s,
         Channel::Temperature(_) => plan.ages.temperature_s,
-        Channel::ReportedSoc | Channel::ReportedSoh => f64::INFINITY,
+        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => f64::INFINITY,
     }
 }
 
@@ -91,7 +91,7 @@ impl Kind {
             Channel::Current => Self::Current,
             Channel::PackVoltage | Channel::CellVoltage(_) => Self::Voltage,
             Channel::Temperature(_) => Self::Temperature,
-            Channel::ReportedSoc | Channel::ReportedSoh => Self::Reported,
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => Self::Reported,
         }
     }
 }

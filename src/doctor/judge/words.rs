@@ -67,6 +67,7 @@ pub(in crate::doctor) fn channel(channel: Channel) -> String {
         Channel::CellVoltage(cell) => format!("cell {}", cell.0 + 1),
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
     }
 }
 
