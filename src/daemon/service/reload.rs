@@ -19,7 +19,7 @@ use tokio::time::{Instant, sleep_until};
 use super::live::Loop;
 use super::{Engine, notify};
 use crate::config::{self, Config, InterfaceConfig, StoreConfig};
-use crate::monitor::MonitorConfig;
+use crate::monitor::{MonitorConfig, Reconfigured};
 
 /// Readings of the file begin at least this far apart.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
@@ -156,21 +156,9 @@ impl Loop {
         self.drain().await;
         let time = self.clock.now();
         let taken = read.and_then(|config| self.engine.reconfigure(*config, time, &self.outputs));
-        match &taken {
-            Ok(changed) => {
-                let (alarms_ended, changed) = (changed.alarms_ended, changed.changed.join(", "));
-                tracing::info!(changed, alarms_ended, "configuration taken over");
-            }
-            Err(faults) => {
-                for fault in faults.iter().take(MAX_FAULTS_LOGGED) {
-                    tracing::error!(fault, "configuration refused, the old one stays");
-                }
-                let more = faults.len().saturating_sub(MAX_FAULTS_LOGGED);
-                if more > 0 {
-                    tracing::error!(more, "configuration refused: further faults");
-                }
-            }
-        }
+        log_outcome(&taken);
+        let counters = &mut self.seeing.counters;
+        *(if taken.is_ok() { &mut counters.reloads } else { &mut counters.reloads_refused }) += 1;
         let Engine { readiness, monitor, .. } = &mut self.engine;
         readiness.note_reload(taken.err().map(|faults| faults.join("; ")));
         let told = readiness.tell_now(monitor, Instant::now());
@@ -189,6 +177,24 @@ impl Loop {
         // Version 253 and later want to know when; the clock cannot fail.
         states.extend(NotifyState::monotonic_usec_now());
         notify(&states);
+    }
+}
+
+/// Every fault by itself, up to a limit.
+fn log_outcome(taken: &Result<Reconfigured, Vec<String>>) {
+    match taken {
+        Ok(Reconfigured { changed, alarms_ended }) => {
+            tracing::info!(changed = changed.join(", "), alarms_ended, "configuration taken over");
+        }
+        Err(faults) => {
+            for fault in faults.iter().take(MAX_FAULTS_LOGGED) {
+                tracing::error!(fault, "configuration refused, the old one stays");
+            }
+            let more = faults.len().saturating_sub(MAX_FAULTS_LOGGED);
+            if more > 0 {
+                tracing::error!(more, "configuration refused: further faults");
+            }
+        }
     }
 }
 
