@@ -130,7 +130,11 @@ fn cells(text: &mut String, cells: &[Cell], all: bool) {
     let listed: Vec<&Cell> = if is_short { outliers(cells) } else { cells.iter().collect() };
     if is_short {
         spread(text, cells);
-        let _ = writeln!(text, "those that stand out (--cells lists all):");
+        if listed.is_empty() {
+            text.push_str("none stands out (--cells lists all)\n");
+            return;
+        }
+        text.push_str("those that stand out (--cells lists all):\n");
     }
     let rows: Vec<[String; 7]> = listed.into_iter().map(row).collect();
     let width = |column: usize| {
@@ -219,3 +223,6 @@ fn outliers(cells: &[Cell]) -> Vec<&Cell> {
     found.sort_by_key(|cell| cell.cell);
     found
 }
+
+#[cfg(test)]
+mod tests;

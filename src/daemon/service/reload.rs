@@ -19,6 +19,7 @@ use tokio::time::{Instant, sleep_until};
 use super::live::Loop;
 use super::{Engine, notify};
 use crate::config::{self, Config, InterfaceConfig};
+use crate::daemon::status::document::ConfigFile;
 use crate::monitor::MonitorConfig;
 
 /// Readings of the file begin at least this far apart.
@@ -32,11 +33,19 @@ pub(super) enum Step {
     /// A reload was asked for; what follows is [`Step::Read`], sooner or later.
     Asked,
     /// The file was read: what the core is to take over, or every fault.
-    Read(Result<Box<MonitorConfig>, Vec<String>>),
+    Read(Result<Box<Configuration>, Vec<String>>),
+}
+
+/// What was read.
+#[derive(Debug)]
+pub(super) struct Configuration {
+    monitor: MonitorConfig,
+    /// For those who look.
+    file: Option<ConfigFile>,
 }
 
 /// The task that reads.
-type Reading = JoinHandle<Result<Box<MonitorConfig>, Vec<String>>>;
+type Reading = JoinHandle<Result<Box<Configuration>, Vec<String>>>;
 
 /// See the module.
 #[derive(Debug)]
@@ -98,12 +107,12 @@ impl Reload {
         self.reading = Some(tokio::task::spawn_blocking(move || {
             let new = config::load(&path).map_err(|faults| faults.0)?;
             fixed.check(&new).map_err(|why| vec![why])?;
-            Ok(Box::new(new.monitor))
+            Ok(Box::new(Configuration { monitor: new.monitor, file: ConfigFile::of(&path) }))
         }));
     }
 }
 
-async fn finished(reading: &mut Option<Reading>) -> Result<Box<MonitorConfig>, Vec<String>> {
+async fn finished(reading: &mut Option<Reading>) -> Result<Box<Configuration>, Vec<String>> {
     match reading {
         None => std::future::pending().await,
         Some(reading) => reading.await.unwrap_or_else(|error| Err(vec![format!("cannot be read: {error}")])),
@@ -146,9 +155,13 @@ impl Loop {
         // What came before it is judged by the old configuration.
         self.drain().await;
         let time = self.clock.now();
-        let taken = read.and_then(|config| self.engine.reconfigure(*config, time, &self.outputs));
+        let taken = read.and_then(|config| {
+            let Configuration { monitor, file } = *config;
+            self.engine.reconfigure(monitor, time, &self.outputs).map(|changed| (changed, file))
+        });
+        self.seeing.note_reload(taken.as_ref().map(|(_, file)| file.clone()).map_err(drop));
         match &taken {
-            Ok(changed) => {
+            Ok((changed, _)) => {
                 let (alarms_ended, changed) = (changed.alarms_ended, changed.changed.join(", "));
                 tracing::info!(changed, alarms_ended, "configuration taken over");
             }
