@@ -183,7 +183,7 @@ fn spread(text: &mut String, cells: &[Cell]) {
     for (name, unit, decimals, of) in QUANTITIES {
         let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
         let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
-        let greatest = known().max_by(|a, b| a.1.total_cmp(&b.1));
+        let greatest = known().rev().max_by(|a, b| a.1.total_cmp(&b.1));
         let count = known().count();
         let _ = match (least, greatest) {
             (Some((low, least)), Some((high, greatest))) => writeln!(
