@@ -78,7 +78,9 @@ fn what_is_not_known_any_more_is_not_shown() {
 #[test]
 fn nothing_is_known_before_the_first_frame() {
     let rig = Rig::new("");
-    assert!(rig.monitor.cell_views().all(|cell| cell.soc.is_none() && cell.capacity.is_none() && cell.trusted.is_none()));
+    assert!(
+        rig.monitor.cell_views().all(|cell| cell.soc.is_none() && cell.capacity.is_none() && cell.trusted.is_none())
+    );
     let pack = rig.monitor.pack_view();
     assert_eq!((pack.validity, pack.soc, pack.soh, pack.weakest), (Validity::Unavailable, None, None, None));
 }
