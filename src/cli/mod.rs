@@ -40,7 +40,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Run the service on live CAN interfaces
-    Run(run::Args),
+    Run(Box<run::Args>),
     /// Show what the running daemon knows: pack, cells, alarms, interfaces
     Status(status::Args),
     /// Serve the status of the running daemon as metrics for Prometheus

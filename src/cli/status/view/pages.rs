@@ -240,7 +240,7 @@ fn counts(document: &Document) -> Vec<Line<'static>> {
     let counters = &document.counters;
     let mut text = Vec::new();
     // Of the counts every one by its name in the document.
-    for part in [serde_json::to_value(&counters.readings), serde_json::to_value(&counters.core)] {
+    for part in [serde_json::to_value(counters.readings), serde_json::to_value(&counters.core)] {
         let Ok(Value::Object(keys)) = part else { continue };
         text.extend(keys.iter().filter_map(|(name, count)| Some(count_line(&name.replace('_', " "), count.as_u64()?))));
     }
