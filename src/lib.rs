@@ -17,7 +17,7 @@
 //! | 3 | [`doctor`] | what is probably wrong with the wiring or the configuration, from what comes over the bus |
 //! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
-//! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control socket |
+//! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
 //! | 5 | `lab` | measured files against truth, plots (feature `lab`) |
 //! | 6 | [`cli`] | one file per command |
 //!

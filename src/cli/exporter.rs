@@ -11,7 +11,7 @@ use crate::daemon::{exporter, logging};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Where to listen; only this computer can reach the default
-    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9843")]
+    #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9558")]
     listen: SocketAddr,
     /// Status socket of the daemon (default: where `packwatch run` makes it)
     #[arg(long, value_name = "PATH")]

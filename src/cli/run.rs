@@ -1,9 +1,7 @@
 //! `packwatch run`: the service on live CAN interfaces.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
-
-use sha2::{Digest, Sha256};
 
 use super::Failure;
 use crate::config;
@@ -100,13 +98,6 @@ fn buffer_bytes(text: &str) -> Result<usize, String> {
     }
 }
 
-/// The configuration's name and fingerprint; `None` when it has become unreadable since it was read.
-fn config_file(path: &Path) -> Option<ConfigFile> {
-    let text = std::fs::read(path).ok()?;
-    let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
-    Some(ConfigFile { path: path.display().to_string(), sha256 })
-}
-
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     logging::start(args.log.as_deref()).map_err(Failure::new)?;
@@ -124,7 +115,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         state: StateSetting::from_path(args.state.clone()),
         control: ControlSetting::from_path(args.control.clone()),
         status: ControlSetting::from_path(args.status.clone()),
-        config_file: config_file(&args.config),
+        config_file: ConfigFile::of(&args.config),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))
 }

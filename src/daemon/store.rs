@@ -234,6 +234,11 @@ impl Store {
         Ok((Some(store), found))
     }
 
+    /// Where it is.
+    pub(crate) fn folder(&self) -> &Path {
+        &self.folder
+    }
+
     /// Tells how far the writer is, whenever that changes.
     pub(crate) fn progress(&self) -> watch::Receiver<Progress> {
         self.progress.clone()

@@ -49,6 +49,7 @@ impl Monitor {
         out: &mut Outputs,
     ) -> Result<Reconfigured, ReconfigureError> {
         self.config.check_fits(&config)?;
+        let told = out.events.len();
         let changed = self.config.changed_tables(&config);
         let old = std::mem::replace(&mut self.config, config);
         self.intake.reconfigure(&self.config);
@@ -68,6 +69,7 @@ impl Monitor {
         self.tell_j1939();
         let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);
         out.events.push(Event { time: now.max(self.now), kind: EventKind::Reconfigured { alarms_ended: alarms } });
+        self.statistics.note_events(&out.events[told..]);
         Ok(Reconfigured { changed, alarms_ended })
     }
 

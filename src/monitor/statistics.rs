@@ -115,6 +115,11 @@ impl Statistics {
             | Input::Command { .. }
             | Input::Store { .. } => {}
         }
+        self.note_events(told);
+    }
+
+    /// Takes what came of something that was no input.
+    pub(super) fn note_events(&mut self, told: &[Event]) {
         told.iter().for_each(|event| self.note_event(&event.kind));
     }
 

@@ -14,6 +14,7 @@ daemon() {
     shift 2
     [[ " $* " == *" --control "* ]] || set -- --control none "$@"
     [[ " $* " == *" --state "* ]] || set -- --state none "$@"
+    [[ " $* " == *" --status "* ]] || set -- --status none "$@"
     start "$name" "$packwatch" run -c "$file" --record "$base.journal" --frames "$base.sent" --events "$base.events" \
         --snapshot "$base.json" "$@"
 }

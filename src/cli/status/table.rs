@@ -130,7 +130,11 @@ fn cells(text: &mut String, cells: &[Cell], all: bool) {
     let listed: Vec<&Cell> = if is_short { outliers(cells) } else { cells.iter().collect() };
     if is_short {
         spread(text, cells);
-        let _ = writeln!(text, "those that stand out (--cells lists all):");
+        if listed.is_empty() {
+            text.push_str("none stands out (--cells lists all)\n");
+            return;
+        }
+        text.push_str("those that stand out (--cells lists all):\n");
     }
     let rows: Vec<[String; 7]> = listed.into_iter().map(row).collect();
     let width = |column: usize| {
@@ -179,7 +183,7 @@ fn spread(text: &mut String, cells: &[Cell]) {
     for (name, unit, decimals, of) in QUANTITIES {
         let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
         let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
-        let greatest = known().max_by(|a, b| a.1.total_cmp(&b.1));
+        let greatest = known().rev().max_by(|a, b| a.1.total_cmp(&b.1));
         let count = known().count();
         let _ = match (least, greatest) {
             (Some((low, least)), Some((high, greatest))) => writeln!(
@@ -219,3 +223,6 @@ fn outliers(cells: &[Cell]) -> Vec<&Cell> {
     found.sort_by_key(|cell| cell.cell);
     found
 }
+
+#[cfg(test)]
+mod tests;

@@ -12,6 +12,7 @@ use crate::daemon::background_file::BackgroundFile;
 use crate::daemon::event_log::{self, EventLog};
 use crate::daemon::snapshot_file;
 use crate::daemon::status::collect::RecentEvents;
+use crate::daemon::status::document::Store as StoreStatus;
 use crate::daemon::store::hold::Hold;
 use crate::daemon::store::{Candidate, Progress, Store};
 use crate::io::candump::{self, StampDigits};
@@ -45,6 +46,7 @@ pub(super) struct Engine {
     pub(super) readiness: Readiness,
     /// For those who look.
     pub(super) recent: RecentEvents,
+    stored: StoreStatus,
 }
 
 impl Engine {
@@ -96,6 +98,7 @@ impl Engine {
             hold: Hold::default(),
             is_fresh: false,
             recent: RecentEvents::default(),
+            stored: StoreStatus::default(),
         })
     }
 
@@ -170,7 +173,15 @@ impl Engine {
     pub(super) fn settle(&mut self, progress: Progress, time: Timestamp, links: &[LinkOutput]) {
         self.hold.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
+        self.stored.note(progress.works);
         self.tell_works(time, links);
+    }
+
+    /// The store, for those who look.
+    pub(super) fn store_status(&self) -> Option<StoreStatus> {
+        self.store
+            .as_ref()
+            .map(|store| StoreStatus { path: store.folder().display().to_string(), ..self.stored.clone() })
     }
 
     /// Nothing waits any longer: the daemon stops.
@@ -183,6 +194,7 @@ impl Engine {
         if let Some(ticket) = self.hold.overdue(Instant::now()) {
             self.hold.release(ticket, |transmit| send(links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
+            self.stored.late += 1;
             self.store_works = false;
         }
         if let Some(store) = &mut self.store

@@ -19,6 +19,7 @@ use tokio::time::{Instant, sleep_until};
 use super::live::Loop;
 use super::{Engine, notify};
 use crate::config::{self, Config, InterfaceConfig, StoreConfig};
+use crate::daemon::status::document::ConfigFile;
 use crate::monitor::{MonitorConfig, Reconfigured};
 
 /// Readings of the file begin at least this far apart.
@@ -32,11 +33,19 @@ pub(super) enum Step {
     /// A reload was asked for; what follows is [`Step::Read`], sooner or later.
     Asked,
     /// The file was read: what the core is to take over, or every fault.
-    Read(Result<Box<MonitorConfig>, Vec<String>>),
+    Read(Result<Box<Configuration>, Vec<String>>),
+}
+
+/// What was read.
+#[derive(Debug)]
+pub(super) struct Configuration {
+    monitor: MonitorConfig,
+    /// For those who look.
+    file: Option<ConfigFile>,
 }
 
 /// The task that reads.
-type Reading = JoinHandle<Result<Box<MonitorConfig>, Vec<String>>>;
+type Reading = JoinHandle<Result<Box<Configuration>, Vec<String>>>;
 
 /// See the module.
 #[derive(Debug)]
@@ -98,12 +107,12 @@ impl Reload {
         self.reading = Some(tokio::task::spawn_blocking(move || {
             let new = config::load(&path).map_err(|faults| faults.0)?;
             fixed.check(&new).map_err(|why| vec![why])?;
-            Ok(Box::new(new.monitor))
+            Ok(Box::new(Configuration { monitor: new.monitor, file: ConfigFile::of(&path) }))
         }));
     }
 }
 
-async fn finished(reading: &mut Option<Reading>) -> Result<Box<MonitorConfig>, Vec<String>> {
+async fn finished(reading: &mut Option<Reading>) -> Result<Box<Configuration>, Vec<String>> {
     match reading {
         None => std::future::pending().await,
         Some(reading) => reading.await.unwrap_or_else(|error| Err(vec![format!("cannot be read: {error}")])),
@@ -155,10 +164,13 @@ impl Loop {
         // What came before it is judged by the old configuration.
         self.drain().await;
         let time = self.clock.now();
-        let taken = read.and_then(|config| self.engine.reconfigure(*config, time, &self.outputs));
+        let mut file = None;
+        let taken = read.and_then(|config| {
+            file = config.file;
+            self.engine.reconfigure(config.monitor, time, &self.outputs)
+        });
         log_outcome(&taken);
-        let counters = &mut self.seeing.counters;
-        *(if taken.is_ok() { &mut counters.reloads } else { &mut counters.reloads_refused }) += 1;
+        self.seeing.note_reload(if taken.is_ok() { Ok(file) } else { Err(()) });
         let Engine { readiness, monitor, .. } = &mut self.engine;
         readiness.note_reload(taken.err().map(|faults| faults.join("; ")));
         let told = readiness.tell_now(monitor, Instant::now());

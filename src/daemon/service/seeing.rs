@@ -7,6 +7,7 @@ use crate::daemon::status::PERIOD;
 use crate::daemon::status::StatusServer;
 use crate::daemon::status::collect::{Identity, Sources};
 use crate::daemon::status::counters::LoopCounters;
+use crate::daemon::status::document::ConfigFile;
 use crate::io::socket::LinkOutput;
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
@@ -36,6 +37,17 @@ impl Seeing {
         self.counters.latency.record(now.since(received));
     }
 
+    /// The configuration was read again, and taken over (`Ok`) or not.
+    pub(super) fn note_reload(&mut self, taken: Result<Option<ConfigFile>, ()>) {
+        match taken {
+            Ok(file) => {
+                self.counters.reloads += 1;
+                self.identity.config = file;
+            }
+            Err(()) => self.counters.reloads_refused += 1,
+        }
+    }
+
     /// Hands a document over when it is time for one.
     pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], now: Timestamp) {
         let Some(server) = &self.server else { return };
@@ -50,7 +62,7 @@ impl Seeing {
             counters: &self.counters,
             clients: server.clients(),
             events: &engine.recent,
-            store: None,
+            store: engine.store_status(),
         };
         let is_taken = server.offer(sources.draft(now));
         self.counters.documents_skipped += u64::from(!is_taken);

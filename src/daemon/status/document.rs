@@ -7,7 +7,10 @@
 //!   `_std` is a standard deviation. Cells count from 0, as in events. Times are ns since 1970 on the daemon's
 //!   clock, which never steps; `wall_time` is the computer's clock.
 
+use std::path::Path;
+
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::counters::Latency;
 use crate::alarm::{Alarm, Severity};
@@ -276,18 +279,35 @@ pub(crate) struct Flooded {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct Store {
-    /// Its file.
+    /// Its folder.
     pub(crate) path: String,
     /// Whether it can be written; `None` = not tried yet.
     pub(crate) works: Option<bool>,
-    /// Commits done.
+    /// Commits done, as the loop heard of them: two in quick succession may count once.
     pub(crate) commits: u64,
     /// Commits that failed.
     pub(crate) failures: u64,
     /// Events that went out before they were stored, because that took too long.
     pub(crate) late: u64,
-    /// Bytes written.
+    /// Bytes written; `None` = not counted.
     pub(crate) bytes_written: Option<u64>,
-    /// Size of its files, bytes.
+    /// Size of its files, bytes; `None` = not looked at.
     pub(crate) file_bytes: Option<u64>,
+}
+
+impl Store {
+    /// The store answered.
+    pub(crate) fn note(&mut self, works: bool) {
+        self.works = Some(works);
+        *if works { &mut self.commits } else { &mut self.failures } += 1;
+    }
+}
+
+impl ConfigFile {
+    /// The file's name and fingerprint; `None` when it has become unreadable since it was read.
+    pub(crate) fn of(path: &Path) -> Option<Self> {
+        let text = std::fs::read(path).ok()?;
+        let sha256 = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
+        Some(Self { path: path.display().to_string(), sha256 })
+    }
 }

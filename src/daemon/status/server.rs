@@ -37,7 +37,7 @@ pub(crate) struct Draft {
 
 impl Draft {
     /// The line a client gets.
-    pub(crate) fn to_line(self) -> serde_json::Result<Vec<u8>> {
+    pub(crate) fn into_line(self) -> serde_json::Result<Vec<u8>> {
         let mut document = self.document;
         document.events = self.events.iter().map(serde_json::to_value).collect::<Result<_, _>>()?;
         let mut line = serde_json::to_vec(&document)?;
@@ -209,7 +209,7 @@ async fn serve([once, stream]: [Bound; 2], desk: &Desk, mut drafts: mpsc::Receiv
 }
 
 fn publish(draft: Draft, published: &watch::Sender<Option<Published>>) {
-    match draft.to_line() {
+    match draft.into_line() {
         Ok(line) => drop(published.send_replace(Some(Published { line: line.into(), at: Instant::now() }))),
         Err(error) => tracing::error!(%error, "status document not written"),
     }

@@ -139,7 +139,7 @@ fn pack(frame: &mut Frame<'_>, document: &Document, theme: Theme, area: Rect) {
         with_std(pack.capacity_ah, pack.capacity_std_ah, 2, " Ah"),
         percent(pack.soh),
         with_std(pack.usable_capacity_ah, pack.usable_capacity_std_ah, 2, " Ah"),
-        with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
+        shown(pack.normalised_recharge_period_s, 0, " s"),
     );
     frame.render_widget(Paragraph::new(vec![soc, Line::from(now), Line::from(health)]), inner);
 }

@@ -50,7 +50,9 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme
     let grid = Grid::new(document.cells.len(), usize::from(area.width), lines);
     let map_lines = grid.rows.min(lines) + 1;
     let left = height.saturating_sub(map_lines);
-    let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES } else { 0 };
+    // What the list does not need is the plot's.
+    let spare = left.saturating_sub(document.cells.len() + 1);
+    let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES.max(spare) } else { 0 };
     let length = |lines: usize| Constraint::Length(u16::try_from(lines).unwrap_or(u16::MAX));
     let [map_area, list_area, plot_area] =
         Layout::vertical([length(map_lines), Constraint::Min(0), length(plot_lines)]).areas(area);
@@ -238,7 +240,7 @@ fn counts(document: &Document) -> Vec<Line<'static>> {
     let counters = &document.counters;
     let mut text = Vec::new();
     // Of the counts every one by its name in the document.
-    for part in [serde_json::to_value(&counters.readings), serde_json::to_value(&counters.core)] {
+    for part in [serde_json::to_value(counters.readings), serde_json::to_value(&counters.core)] {
         let Ok(Value::Object(keys)) = part else { continue };
         text.extend(keys.iter().filter_map(|(name, count)| Some(count_line(&name.replace('_', " "), count.as_u64()?))));
     }

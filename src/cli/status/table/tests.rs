@@ -1,0 +1,43 @@
+//! The table of sample documents.
+
+use super::*;
+use crate::daemon::status::sample::sample;
+
+#[test]
+fn a_short_pack_is_listed_whole_and_what_is_unknown_is_a_dash() {
+    let text = table(&sample(3), false);
+    let wanted = "\
+packwatch 1.2.3, process 4711, up 3 h 12 min, 2027-01-15T08:00:00Z, configuration pack.toml (01234567)
+pack       valid: SOC 63.2 % (95 %: 60.8 to 65.6 %), discharge, 10.95 V, 12.50 A, at most 31.2 °C
+health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
+reference charger 5432 ± 61 s
+interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
+interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
+counted    123456 readings used, 7 not; 3 late ticks; 99 % of estimates within 5.00 ms
+alarms     1 raised of 4 thresholds, not known for 1
+           severe capacity_low cell 1 active: 2.412 Ah, threshold 2.500 Ah, 97 % sure
+           warning soc_low pack cleared: 63.2 %, threshold 10.0 %, acknowledged
+cell  voltage    temp.           SOC          capacity   resistance  trusted
+   1  3.600 V  25.0 °C  60.0 ± 1.2 %  2.400 ± 0.020 Ah  1.10 ± 0.03      yes
+   2  3.604 V  25.2 °C  60.8 ± 1.2 %  2.402 ± 0.020 Ah  1.11 ± 0.03       NO
+   3        -        -             -                 -            -        -
+";
+    assert_eq!(text, wanted);
+}
+
+#[test]
+fn of_many_cells_those_are_listed_that_stand_out() {
+    let mut document = sample(96);
+    document.cells[40].soc = Some(0.1);
+    let text = table(&document, false);
+    assert!(text.contains("SOC        10.0 % (cell 41) to 79.2 % (cell 24), known of 95 of 96\n"), "{text}");
+    let listed: Vec<&str> = text
+        .lines()
+        .skip_while(|line| !line.starts_with("cell "))
+        .skip(1)
+        .filter_map(|line| line.split_whitespace().next())
+        .collect();
+    // Empty, not trusted, silent.
+    assert_eq!(listed, ["41", "95", "96"]);
+    assert_eq!(table(&document, true).lines().filter(|line| line.contains(" °C  ")).count(), 95);
+}
