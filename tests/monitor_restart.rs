@@ -47,3 +47,31 @@ fn a_state_from_the_future_is_of_unknown_age() {
     assert_eq!(rig.gaps(), []);
     assert!(rig.soc_std(0) < 0.05, "{}", rig.soc_std(0));
 }
+
+/// What was learned, as it is stored: capacities with what drifts beside them, and the filters' resistances.
+fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
+    let document = serde_json::to_value(rig.monitor.snapshot()).unwrap();
+    let learner = &document["learner"];
+    let mut parts = vec![learner["capacity"].clone(), learner["drift"].clone(), learner["learned"].clone()];
+    for cell in document["cells"].as_array().unwrap() {
+        let mean = cell["estimator"]["mean"].as_array().unwrap();
+        // SOC and branches before it, capacity behind it.
+        parts.push(mean[mean.len() - 2].clone());
+        parts.extend([cell["usable"].clone(), cell["discharge_resistance"].clone()]);
+    }
+    parts
+}
+
+#[test]
+fn what_was_learned_survives_every_restart_bit_for_bit() {
+    for away in [Away::Seconds(0.5), Away::Seconds(3.0), Away::Seconds(3e4), Away::Seconds(3e8), Away::Unknown] {
+        let mut rig = learned();
+        let before = learned_parts(&rig);
+        assert!(before[0].to_string().contains("mean") && before[2].to_string().contains("true"));
+        for _ in 0..3 {
+            rig.restart(away);
+            rig.tick();
+            assert_eq!(learned_parts(&rig), before, "{away:?}");
+        }
+    }
+}

@@ -53,6 +53,10 @@ pub struct EstimatorConfig {
     pub log_resistance_noise_per_sqrt_s: f64,
     /// SOC process noise while nobody measures the current, fraction per sqrt(s).
     pub gap_noise_per_sqrt_s: f64,
+    /// What the cell may lose by itself, fraction of SOC per s.
+    pub self_discharge_per_s: f64,
+    /// What may be taken out or charged while nobody measures, fraction of SOC per s.
+    pub away_use_per_s: f64,
     /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. A per cell.
     pub rest_current_a: f64,
     /// White part of a voltage reading's error, V (sensor noise), per sample.

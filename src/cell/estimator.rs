@@ -19,6 +19,8 @@
 //! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model says so. Effect: top
 //! and bottom of an aged cell agree about its capacity.
 //!
+//! What may have happened while nobody looked (deviation 6): [`away`].
+//!
 //! A reading beyond the gate moves nothing. When every reading has been beyond it for `lost_after_s`, the filter
 //! has lost its cell: SOC and branches start again from the voltage, resistance and capacity are kept.
 
@@ -99,6 +101,9 @@ struct Memory {
     /// How long the cell has rested, s.
     #[serde(default)]
     rest_s: f64,
+    /// Standard deviation of the SOC by what may have happened while nobody looked, until a voltage has told.
+    #[serde(default)]
+    away_std: f64,
     /// Readings beyond the gate in a row, and since how long, s.
     rejected: u32,
     rejected_s: f64,
@@ -125,11 +130,13 @@ macro_rules! each {
     };
 }
 
+mod away;
 mod noise;
 mod state;
 
 pub use state::CellState;
 
+use away::update_after_away;
 use noise::Reading;
 
 impl CellEstimator {
@@ -151,6 +158,7 @@ impl CellEstimator {
                 mean_nis: 0.0,
                 information_s: config.max_information_s,
                 rest_s: 0.0,
+                away_std: 0.0,
                 rejected: 0,
                 rejected_s: 0.0,
                 rejected_after_gap: false,
@@ -185,16 +193,22 @@ impl CellEstimator {
         } else if let Some(filter) = &mut self.filter {
             let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
+            self.note_away(config, step.unmeasured_s);
         }
         self.remember_load(model, config, step);
         self.memory.information_s += self.new_information_s(config, step);
         self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
+        let away_std = self.away_std();
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
         let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
         let load_a = self.memory.load_a;
         let row = model.row(temperature_c);
         let reading = Reading { voltage_v: step.voltage_v, current_a, load_a, row, information_s };
-        let update = each!(filter, x => update(x, model, config, &reading))?;
+        let update = match away_std {
+            None => each!(filter, x => update(x, model, config, &reading))?,
+            Some(std) => each!(filter, x => update_after_away(x, model, config, &reading, std))?,
+        };
+        self.memory.away_std = 0.0;
         self.watch(config, step, &update);
         Ok(Some(update))
     }
@@ -251,7 +265,7 @@ impl CellEstimator {
         });
         // Trust comes back through the window, not by starting again.
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency_limit * std::f64::consts::E);
-        self.memory.information_s = config.max_information_s;
+        (self.memory.information_s, self.memory.away_std) = (config.max_information_s, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
     }
 
@@ -283,7 +297,7 @@ impl CellEstimator {
     /// The record goes on after a gap of unknown length: branches may or may not have relaxed, and of the SOC
     /// nothing is sure.
     pub fn handle_unknown_gap(&mut self) {
-        self.memory.rest_s = 0.0;
+        (self.memory.rest_s, self.memory.away_std) = (0.0, 0.0);
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
@@ -296,7 +310,9 @@ impl CellEstimator {
 
     /// State of charge; `None` before the first voltage.
     pub fn soc(&self) -> Option<Belief> {
-        self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, 0)))
+        let soc = self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, 0)))?;
+        let variance = self.away_std().map_or(soc.variance, |std| widened(soc.variance, square(std)));
+        Some(Belief { variance, ..soc })
     }
 
     /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
@@ -431,7 +447,9 @@ fn predict<const N: usize>(
         propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
         let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[N - 1]);
         let load_std = if gap_load_a > config.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
-        let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s + square(load_std) / 3.0;
+        let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s
+            + square(config.self_discharge_per_s * step.unmeasured_s)
+            + square(load_std) / 3.0;
         x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
     }
     Ok(())

@@ -223,7 +223,12 @@ impl CellModel {
 
     /// SOC whose open-circuit voltage is `voltage_v`, by bisection over [-0.5, 1.5]; outside, the nearest end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
-        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.place(soc, temperature_c)))
+        self.soc_of_ocv_in(&self.row(temperature_c), voltage_v)
+    }
+
+    /// The same at a temperature whose place is known.
+    pub fn soc_of_ocv_in(&self, row: &Row, voltage_v: f64) -> f64 {
+        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.place_in(row, soc)))
     }
 }
 

@@ -44,14 +44,19 @@ pub(crate) fn clear(args: &AlarmArgs) -> Result<(), Failure> {
 
 /// Runs `pack-replaced`.
 pub(crate) fn pack_replaced(args: &ReplacedArgs) -> Result<(), Failure> {
-    if !args.yes {
+    replace_pack(args.yes, &args.control.client())
+}
+
+/// Tells the running daemon that another pack is connected.
+pub(super) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Failure> {
+    if !yes {
         return Err(Failure::new(
             "another pack is connected? then say --yes: the daemon forgets the capacity, the resistance and the other \
              values it has learned, and the alarms about them, and starts again from the configuration; what it knew of \
              the old pack goes into its log and events once more",
         ));
     }
-    let done: Done = args.control.client().ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
+    let done: Done = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
     print(&format!("what was learned of the old pack is forgotten; alarms about it that ended: {}\n", done.changed))
 }
 

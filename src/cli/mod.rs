@@ -12,7 +12,9 @@ mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
 mod generate;
+mod history;
 mod replay;
+mod reset;
 mod run;
 #[cfg(feature = "lab")]
 mod score;
@@ -51,6 +53,10 @@ enum Command {
     Clear(command::AlarmArgs),
     /// Tell the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
+    /// Begin anew with what is learned, whether a daemon runs or not
+    Reset(reset::Args),
+    /// Show, export or verify what the store has kept
+    History(Box<history::Args>),
     /// Send a rule's alarm frame, marked as a test, and see what goes out on every interface
     TestAlarm(test_alarm::Args),
     /// Replay journals, candump logs or CSV files through the same core
@@ -108,6 +114,8 @@ pub fn main() -> ExitCode {
         Command::Acknowledge(args) => command::acknowledge(&args),
         Command::Clear(args) => command::clear(&args),
         Command::PackReplaced(args) => command::pack_replaced(&args),
+        Command::Reset(args) => reset::run(&args),
+        Command::History(args) => history::run(&args),
         Command::TestAlarm(args) => test_alarm::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),

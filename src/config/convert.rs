@@ -250,6 +250,8 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
         branch_noise_v_per_sqrt_s: keys.branch_noise_v_per_sqrt_s,
         log_resistance_noise_per_sqrt_s: keys.log_resistance_noise_per_sqrt_s,
         gap_noise_per_sqrt_s: keys.gap_noise_per_sqrt_s,
+        self_discharge_per_s: keys.self_discharge_per_month / SECONDS_PER_MONTH,
+        away_use_per_s: keys.away_use_per_h / 3600.0,
         rest_current_a: keys.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
         voltage_noise_v: keys.voltage_noise_v,
         model_error_v_sqrt_s: keys.model_error_v_sqrt_s,
@@ -265,6 +267,9 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
         consistency_limit: keys.consistency_limit,
     }
 }
+
+/// Of 365.25 / 12 days.
+const SECONDS_PER_MONTH: f64 = 2_629_800.0;
 
 pub(crate) fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
     let dead_band_a = keys.dead_band_a.unwrap_or(pack_ah / 50.0);

@@ -49,6 +49,9 @@ pub struct Config {
     pub store: StoreConfig,
 }
 
+/// Half-cycles kept where nobody says otherwise.
+pub const DEFAULT_MAX_HALF_CYCLES: u32 = 200_000;
+
 /// How state and history are kept.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StoreConfig {

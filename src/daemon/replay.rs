@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde::Serialize;
 
+mod cells;
 mod intake;
 mod rows;
 
@@ -21,11 +22,10 @@ use crate::can::Frame;
 use crate::io::log::{LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{
-    Away, Estimate, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS,
-};
+use crate::monitor::{Away, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
+pub use cells::CellSummary;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
 
@@ -120,29 +120,6 @@ pub struct Progress {
     pub frames: u64,
     /// Times real time so far.
     pub times_real_time: f64,
-}
-
-/// A cell at the end.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CellSummary {
-    /// Counted from 0.
-    pub cell: u16,
-    /// Fraction.
-    pub soc: f64,
-    /// Fraction.
-    pub soc_std: f64,
-    /// Ah.
-    pub capacity_ah: f64,
-    /// Ah.
-    pub capacity_std_ah: f64,
-    /// Ah, after the last capacity update; `None` = unknown.
-    pub usable_capacity_ah: Option<f64>,
-    /// Ah.
-    pub usable_capacity_std_ah: Option<f64>,
-    /// Relative to new.
-    pub resistance_ratio: f64,
-    /// Relative to new.
-    pub resistance_ratio_std: f64,
 }
 
 /// What a replay came to.
@@ -418,7 +395,7 @@ impl Replay {
         }
         let (span, mut summary) = (self.span, self.summary);
         summary.log = counts.clone();
-        summary.cells = cell_summaries(&self.monitor, &self.usable);
+        summary.cells = cells::summaries(&self.monitor, &self.usable);
         (summary.protected, summary.dropped) = intake::summaries(&self.monitor, &self.settings.interfaces);
         summary.first_s = span.first.map(Timestamp::secs);
         summary.last_s = span.latest.map(Timestamp::secs);
@@ -440,24 +417,6 @@ impl Sinks {
     fn flush(&mut self) -> io::Result<()> {
         [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
     }
-}
-
-fn cell_summaries(monitor: &Monitor, usable: &BTreeMap<CellIndex, (Option<f64>, Option<f64>)>) -> Vec<CellSummary> {
-    let of = |estimate: &Estimate| {
-        let (usable_capacity_ah, usable_capacity_std_ah) = usable.get(&estimate.cell).copied().unwrap_or_default();
-        CellSummary {
-            cell: estimate.cell.0,
-            soc: estimate.soc,
-            soc_std: estimate.soc_std,
-            capacity_ah: estimate.capacity_ah,
-            capacity_std_ah: estimate.capacity_std_ah,
-            usable_capacity_ah,
-            usable_capacity_std_ah,
-            resistance_ratio: estimate.resistance_ratio,
-            resistance_ratio_std: estimate.resistance_ratio_std,
-        }
-    };
-    monitor.latest().flatten().map(of).collect()
 }
 
 fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>, event: &Event) {

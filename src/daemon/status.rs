@@ -22,6 +22,8 @@ pub(crate) mod collect;
 pub(crate) mod counters;
 pub mod document;
 pub(crate) mod metrics;
+#[cfg(test)]
+pub(crate) mod sample;
 mod server;
 
 use std::path::{Path, PathBuf};

@@ -8,6 +8,7 @@
 //! * The loop never touches the disk: a thread of its own does ([`writer`]).
 //! * Whatever is wrong with disk, folder or file, the daemon runs on; the core is told (`store_failed`).
 
+mod allowance;
 mod backlog;
 mod chain;
 mod database;
@@ -18,6 +19,7 @@ mod packed;
 mod parts;
 mod reader;
 mod recorder;
+mod replace;
 mod retention;
 mod rows;
 mod runtime;
@@ -41,13 +43,14 @@ use crate::quantity::Timestamp;
 use database::OpenError;
 use document::Document;
 use folder::{Folder, Opening};
-use rows::{Batch, Gatherer};
+use rows::{Batch, Gatherer, Worth};
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp};
 use writer::{Desk, Retry, Writer};
 
 pub use reader::{Entry, Filter, Kind, Reader};
 pub use recorder::Recorder;
+pub use replace::replace_pack;
 pub use verify::{Broken, Verdict};
 pub(crate) use writer::Progress;
 
@@ -198,7 +201,8 @@ impl Store {
             }
             None => {
                 retry.after_failure();
-                (None, Vec::new(), None)
+                // A disk that cannot be written can perhaps be read.
+                (None, Vec::new(), Reader::open(&path).ok().and_then(|reader| reader.state()))
             }
         };
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
@@ -209,9 +213,11 @@ impl Store {
         let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
-            desk.leave(Some(Batch { stamp: *now, rows }), None, false);
+            // They wait for the first state.
+            desk.keep(Batch { stamp: *now, rows });
         }
-        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry };
+        let knows_state = database.is_some() || !found.states.is_empty();
+        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry, knows_state };
         let writer = std::thread::Builder::new().name("store".to_owned()).spawn(move || writer.run())?;
         let store = Self {
             desk,
@@ -236,11 +242,14 @@ impl Store {
     /// After an input: makes what its events have taught durable. The ticket its announcement should wait for; `None` =
     /// it need not wait.
     pub(crate) fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = self.gatherer.rows(events)?;
+        let rows = match self.gatherer.take(events) {
+            Worth::Commit(rows) => rows,
+            Worth::Nothing | Worth::Deferred => return None,
+        };
         let state = self.document(monitor, now);
         let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
         self.checkpointed = Some(now);
-        Some(self.desk.leave(batch, Some(state), false))
+        Some(self.desk.leave(batch, state, false))
     }
 
     /// With every tick: the state of the second, and the checkpoint when it is due. `is_fresh`: frames have come since
@@ -259,13 +268,16 @@ impl Store {
             return false;
         }
         self.checkpointed = Some(now);
-        self.desk.leave(None, Some(self.document(monitor, now)), false);
+        self.desk.leave(None, self.document(monitor, now), false);
         true
     }
 
     /// The last state, to the last bit; waits until it is on the disk, for a while.
     pub(crate) fn finish(mut self, monitor: &Monitor, now: Timestamp) {
-        self.desk.leave(None, Some(self.document(monitor, now)), true);
+        let state = self.document(monitor, now);
+        let rows = self.gatherer.deferred();
+        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
+        self.desk.leave(batch, state, true);
         self.desk.stop();
         let Some(writer) = self.writer.take() else { return };
         let asked = Instant::now();

@@ -128,6 +128,13 @@ impl Rig {
         self.collect();
     }
 
+    /// Only time passes, a tenth of a second.
+    pub(crate) fn tick(&mut self) {
+        self.deci += 1;
+        let time = self.now();
+        self.give(Input::Tick { time });
+    }
+
     fn collect(&mut self) {
         self.events.append(&mut self.out.events);
         self.frames.extend(self.out.frames.drain(..).map(|sent| sent.frame));

@@ -15,7 +15,7 @@ pack() { "$here/fast_pack" "$fast" --seconds "$1"; }
 # feed: the pack on vcan0 from where it was, whatever becomes of the interface. dump.log has its samples and our frames, of all feeds.
 feed() {
     if [[ -z ${pids[dump]-} ]]; then
-        start dump candump -L any,6B0:7F0,7F0:7FF
+        start dump candump -L any,6B0:7F0,7F0:7FE
         wait_for 5 "receiver" receiving any 1
     fi
     start feed python3 "$here/fault_tools.py" play "$fast/pack.log" vcan0 --from "$(sample)"
@@ -46,7 +46,7 @@ told() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"meas
 told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
 # told_more EVENT COUNT: COUNT or more?
 told_more() { (($(told "$1") >= $2)); }
-learned_more() { told_more capacity "$1"; }
+learned_more() { told_more half_cycle "$1"; }
 
 # fault NAME: from here on it happens.
 fault() {
@@ -56,11 +56,12 @@ fault() {
 
 # survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored all it told.
 survived() {
-    local stored
+    local stored after
     running main || fail "$fault_name: the daemon ended"
-    wait_for 15 "learning after $fault_name" learned_more $(($(told capacity) + 4))
+    wait_for 15 "learning after $fault_name" learned_more $(($(told half_cycle) + 4))
+    after=$(told_all)
     stored=$(tools learned "$state" "$tmp"/main*.events 2>"$tmp/learned.err") || fail "$fault_name: $(cat "$tmp/learned.err")"
-    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $(told_all), stored $stored"
+    echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $after, stored $stored"
 }
 
 # all_stored: at the end, with the daemon stopped: the store has what was told, no more and no less, and its chain holds.

@@ -24,6 +24,8 @@ pub(crate) fn config() -> EstimatorConfig {
         branch_noise_v_per_sqrt_s: 1e-3,
         log_resistance_noise_per_sqrt_s: 3e-4,
         gap_noise_per_sqrt_s: 1.5e-5,
+        self_discharge_per_s: 1e-8,
+        away_use_per_s: 0.0,
         rest_current_a: 0.04,
         voltage_noise_v: 0.005,
         model_error_v_sqrt_s: 0.15,

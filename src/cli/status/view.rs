@@ -1,8 +1,144 @@
-//! The full-screen live view.
+//! The full-screen live view of `packwatch status --watch`: the terminal, and the loop round [`App`].
+//!
+//! In: documents of the stream socket, keys, the clock. Out: a screen, drawn anew on each of them. The terminal is put back as
+//! it was when the view is left, on SIGTERM, SIGINT and SIGHUP, and on a panic. A daemon that goes is waited for.
 
+mod app;
+mod draw;
+mod feed;
+mod pages;
+mod plot;
+
+use std::io::{self, IsTerminal};
 use std::path::Path;
+use std::time::Duration;
 
-/// Runs the view until it is left.
-pub(super) fn run(_path: &Path) -> Result<(), String> {
-    Err("not built yet".to_owned())
+use ratatui::DefaultTerminal;
+use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::time::interval;
+
+use app::{App, Key};
+
+use crate::daemon::status::stream_path;
+
+/// The screen is drawn at least this often: it says for how long there was no news.
+const DRAW_PERIOD: Duration = Duration::from_secs(1);
+/// Keys waiting: more than anybody types between two drawings.
+const KEYS: usize = 64;
+
+/// Runs the view until it is left; `socket` is the status socket, beside which the stream is.
+///
+/// # Errors
+/// When there is no terminal, or it fails.
+pub(super) fn run(socket: &Path) -> Result<(), String> {
+    if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
+        return Err(
+            "--watch needs a terminal, and standard input or output is none; without --watch there is a table, \
+                    with --json a document"
+                .to_owned(),
+        );
+    }
+    // https://no-color.org: set and not empty.
+    let has_colour = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+    let app = App::new(stream_path(socket), has_colour);
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    // From here on a panic too puts the terminal back.
+    let terminal = ratatui::try_init().map_err(|error| format!("terminal: {error}"))?;
+    let watched = runtime.block_on(watch(terminal, app));
+    ratatui::restore();
+    // The thread that waits for keys ends with the process.
+    runtime.shutdown_background();
+    watched.map_err(|error| format!("terminal: {error}"))
 }
+
+async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
+    let mut signals = Signals::new()?;
+    let mut keys = read_keys()?;
+    let mut news = feed::start(app.path().to_owned());
+    let mut ticks = interval(DRAW_PERIOD);
+    loop {
+        tokio::select! {
+            () = signals.wait() => return Ok(()),
+            key = keys.recv() => match key {
+                Some(Event::Key(key)) => match meaning(key) {
+                    Some(Key::Quit) => return Ok(()),
+                    Some(key) => app.handle_key(key),
+                    None => continue,
+                },
+                // A new size: drawn anew.
+                Some(_) => {}
+                // The terminal has gone.
+                None => return Ok(()),
+            },
+            Some(update) = news.recv() => app.handle_news(update),
+            _ = ticks.tick() => {}
+        }
+        app.poll(feed::now());
+        terminal.draw(|frame| draw::draw(frame, &mut app))?;
+    }
+}
+
+/// What ends the view from outside.
+struct Signals {
+    all: [Signal; 3],
+}
+
+impl Signals {
+    fn new() -> io::Result<Self> {
+        let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()];
+        let [terminate, interrupt, hangup] = kinds.map(signal);
+        Ok(Self { all: [terminate?, interrupt?, hangup?] })
+    }
+
+    async fn wait(&mut self) {
+        let [terminate, interrupt, hangup] = &mut self.all;
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+            _ = hangup.recv() => {}
+        }
+    }
+}
+
+/// Keys and changes of size, from a thread that waits for them.
+fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
+    let (sender, keys) = mpsc::channel(KEYS);
+    std::thread::Builder::new().name("keys".to_owned()).spawn(move || {
+        while let Ok(event) = event::read() {
+            if sender.blocking_send(event).is_err() {
+                return;
+            }
+        }
+    })?;
+    Ok(keys)
+}
+
+fn meaning(key: KeyEvent) -> Option<Key> {
+    if key.kind == KeyEventKind::Release {
+        return None;
+    }
+    if key.modifiers.contains(KeyModifiers::CONTROL) {
+        return (key.code == KeyCode::Char('c')).then_some(Key::Quit);
+    }
+    match key.code {
+        KeyCode::Char('q') | KeyCode::Esc => Some(Key::Quit),
+        KeyCode::Tab => Some(Key::NextPage),
+        KeyCode::BackTab => Some(Key::PreviousPage),
+        KeyCode::Up => Some(Key::Up),
+        KeyCode::Down => Some(Key::Down),
+        KeyCode::Left => Some(Key::Left),
+        KeyCode::Right => Some(Key::Right),
+        KeyCode::PageUp => Some(Key::PageUp),
+        KeyCode::PageDown => Some(Key::PageDown),
+        KeyCode::Home => Some(Key::First),
+        KeyCode::End => Some(Key::Last),
+        KeyCode::Char('v') => Some(Key::Quantity),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -27,6 +27,12 @@ impl ControlClient {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
+    /// Whether somebody listens there, or may: only a missing or forsaken socket says no.
+    pub(crate) fn is_served(&self) -> bool {
+        let nobody = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
+        UnixStream::connect(&self.path).map_or_else(|error| !nobody.contains(&error.kind()), |_| true)
+    }
+
     /// Asks; returns the answer's line as it came.
     ///
     /// # Errors

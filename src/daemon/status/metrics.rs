@@ -376,3 +376,6 @@ fn store(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     let size = one(store.file_bytes.map(|bytes| bytes as f64));
     families.gauge("store_size", "bytes", "Size of the store's files", size)
 }
+
+#[cfg(test)]
+mod tests;

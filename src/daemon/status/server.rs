@@ -97,7 +97,7 @@ impl StatusServer {
             SocketSetting::Standard => (standard_path(), false),
         };
         let shown = path.display().to_string();
-        match Self::open(path, MAX_SILENCE) {
+        match Self::open(path, Limits { max_silence: MAX_SILENCE, stale: STALE }) {
             Ok(server) => {
                 tracing::info!(path = shown, "status socket open");
                 Ok(Some(server))
@@ -113,12 +113,12 @@ impl StatusServer {
         }
     }
 
-    fn open(path: PathBuf, max_silence: Duration) -> Result<Self, BindError> {
+    fn open(path: PathBuf, limits: Limits) -> Result<Self, BindError> {
         // One waits while another is written down.
         let (drafts, offered) = mpsc::channel(1);
         let (ready, opened) = sync_channel(1);
         let counters = Arc::new(ClientCounters::default());
-        let desk = Desk { counters: Arc::clone(&counters), max_silence };
+        let desk = Desk { counters: Arc::clone(&counters), limits };
         let builder = std::thread::Builder::new().name("status".to_owned()).stack_size(STACK_BYTES);
         let thread = builder.spawn(move || run(path, desk, offered, &ready))?;
         match opened.recv() {
@@ -149,11 +149,18 @@ impl Drop for StatusServer {
     }
 }
 
+/// Time limits; tests have shorter ones.
+#[derive(Debug, Clone, Copy)]
+struct Limits {
+    max_silence: Duration,
+    stale: Duration,
+}
+
 /// What every client needs.
 #[derive(Debug, Clone)]
 struct Desk {
     counters: Arc<ClientCounters>,
-    max_silence: Duration,
+    limits: Limits,
 }
 
 /// The thread.
@@ -252,8 +259,8 @@ async fn admit(
 
 /// One fresh document.
 async fn serve_once(mut client: UnixStream, desk: Desk, mut latest: Latest) {
-    let fresh = latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < STALE));
-    let line = match timeout(desk.max_silence, fresh).await {
+    let fresh = latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < desk.limits.stale));
+    let line = match timeout(desk.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
         // The loop makes none, or has gone.
         Ok(Err(_)) | Err(_) => None,
@@ -266,7 +273,7 @@ async fn serve_once(mut client: UnixStream, desk: Desk, mut latest: Latest) {
 /// Every document from here on; one that is slow misses some.
 async fn serve_stream(mut client: UnixStream, desk: Desk, mut latest: Latest) {
     while latest.changed().await.is_ok() {
-        let fresh = latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < STALE);
+        let fresh = latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < desk.limits.stale);
         let line = fresh.map(|published| published.line);
         if let Some(line) = line
             && !tell(&mut client, &line, &desk).await
@@ -278,7 +285,7 @@ async fn serve_stream(mut client: UnixStream, desk: Desk, mut latest: Latest) {
 
 /// Writes a line; `false` = the client has gone, or was dropped because it did not take it in time.
 async fn tell(client: &mut UnixStream, line: &[u8], desk: &Desk) -> bool {
-    match timeout(desk.max_silence, client.write_all(line)).await {
+    match timeout(desk.limits.max_silence, client.write_all(line)).await {
         Ok(written) => written.is_ok(),
         Err(_) => {
             desk.counters.dropped.fetch_add(1, Ordering::Relaxed);
@@ -286,3 +293,6 @@ async fn tell(client: &mut UnixStream, line: &[u8], desk: &Desk) -> bool {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

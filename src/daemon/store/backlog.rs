@@ -17,8 +17,16 @@ pub(super) const MAX_ROWS: usize = 5_000;
 pub(super) struct Backlog {
     batches: VecDeque<Batch>,
     rows: usize,
-    lost_details: u64,
-    lost_rows: u64,
+    lost: Lost,
+    /// What the rows taken last say of it.
+    telling: Lost,
+}
+
+/// Rows that went for want of room.
+#[derive(Debug, Clone, Copy, Default)]
+struct Lost {
+    details: u64,
+    rows: u64,
 }
 
 impl Backlog {
@@ -33,9 +41,10 @@ impl Backlog {
     pub(super) fn take(&mut self, now: &Stamp) -> Vec<Batch> {
         self.rows = 0;
         let mut batches: Vec<Batch> = self.batches.drain(..).collect();
-        if self.lost_details + self.lost_rows > 0 {
-            let detail =
-                format!("while nothing could be written: {} half-cycles, {} others", self.lost_details, self.lost_rows);
+        self.telling = self.lost;
+        if self.lost() > 0 {
+            let Lost { details, rows } = self.lost;
+            let detail = format!("while nothing could be written: {details} half-cycles, {rows} others");
             let row = Row::Own { reason: "rows_lost", detail };
             batches.push(Batch { stamp: *now, rows: vec![row] });
         }
@@ -44,11 +53,14 @@ impl Backlog {
 
     /// The rows taken last are written: what was lost has been told with them.
     pub(super) fn told(&mut self) {
-        (self.lost_details, self.lost_rows) = (0, 0);
+        let Lost { details, rows } = std::mem::take(&mut self.telling);
+        self.lost.details -= details;
+        self.lost.rows -= rows;
     }
 
     /// Puts rows back that could not be written, before those that came since. What they say of losses is said again.
     pub(super) fn put_back(&mut self, batches: Vec<Batch>) {
+        self.telling = Lost::default();
         let is_loss = |row: &Row| matches!(row, Row::Own { reason: "rows_lost", .. });
         for batch in batches.into_iter().rev().filter(|batch| !batch.rows.iter().any(is_loss)) {
             self.rows += batch.rows.len();
@@ -57,14 +69,9 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Whether nothing waits.
-    pub(super) fn is_empty(&self) -> bool {
-        self.batches.is_empty()
-    }
-
     /// Rows lost so far and not yet told.
     pub(super) fn lost(&self) -> u64 {
-        self.lost_details + self.lost_rows
+        self.lost.details + self.lost.rows
     }
 
     fn shrink(&mut self) {
@@ -79,7 +86,7 @@ impl Backlog {
                 });
                 let gone = before - batch.rows.len();
                 self.rows -= gone;
-                *(if detail { &mut self.lost_details } else { &mut self.lost_rows }) += gone as u64;
+                *(if detail { &mut self.lost.details } else { &mut self.lost.rows }) += gone as u64;
                 if excess == 0 {
                     break;
                 }

@@ -13,11 +13,12 @@ use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Transaction,
 
 use super::chain::Head;
 use super::parts::Parts;
-use super::rows::{Batch, Table};
+use super::rows::{Batch, Row, Table};
 use super::schema::{self, MIGRATIONS};
 use super::shelf::Shelf;
 use super::stamp::{BootId, Stamp};
 use super::{packed, retention};
+use crate::monitor::EventKind;
 
 /// Bytes of a page: a checkpoint changes few bytes, and whole pages are written.
 const PAGE_BYTES: u32 = 1024;
@@ -217,9 +218,33 @@ impl Database {
         )
     }
 
-    /// Forgets the state: what follows starts from the configuration.
-    pub(crate) fn forget_state(&mut self) -> rusqlite::Result<()> {
-        self.connection.execute("DELETE FROM state", [])?;
+    /// Closes the history of the pack, with what was learned last of its weakest cell, opens the next one's and forgets
+    /// the state. The number of the pack that begins.
+    pub(crate) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
+        let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
+        let mut ledger = self.ledger;
+        let learned = transaction
+            .query_row(
+                "SELECT capacity_ah, capacity_std_ah FROM capacity WHERE seq IN (SELECT max(r.seq) FROM capacity r JOIN \
+                 moment m ON m.id = r.moment WHERE m.pack = ?1 GROUP BY r.cell) ORDER BY capacity_ah LIMIT 1",
+                [ledger.pack],
+                |row| Ok((row.get(0)?, row.get(1)?)),
+            )
+            .optional()?;
+        let (capacity_ah, capacity_std_ah) = learned.unwrap_or_default();
+        let row = Row::Event(EventKind::PackReplaced { capacity_ah, capacity_std_ah });
+        write_batch(&transaction, &mut ledger, &Batch { stamp: *now, rows: vec![row] })?;
+        transaction.execute("DELETE FROM state", [])?;
+        write_ledger(&transaction, &ledger)?;
+        transaction.commit()?;
+        self.ledger = ledger;
+        self.shelf = Shelf::default();
+        Ok(ledger.pack)
+    }
+
+    /// Keeps the stored state where the next checkpoint does not overwrite it.
+    pub(super) fn put_state_aside(&mut self) -> rusqlite::Result<()> {
+        self.connection.execute("UPDATE OR REPLACE state SET slot = slot + 10 WHERE slot < 10", [])?;
         self.shelf = Shelf::default();
         Ok(())
     }

@@ -41,6 +41,13 @@ pub struct Filter {
     pub limit: Option<u32>,
 }
 
+impl Filter {
+    /// Kinds that are wanted, in the order in which they are shown.
+    pub fn wanted_kinds(&self) -> impl Iterator<Item = Kind> {
+        Kind::ALL.into_iter().filter(|kind| self.kinds.is_empty() || self.kinds.contains(kind))
+    }
+}
+
 /// A kind of row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
@@ -145,8 +152,8 @@ impl Reader {
     /// When the file cannot be read.
     pub fn entries(&self, filter: &Filter) -> Result<Vec<Entry>, String> {
         let mut entries = Vec::new();
-        for kind in Kind::ALL.into_iter().filter(|kind| filter.kinds.is_empty() || filter.kinds.contains(kind)) {
-            self.read(kind, filter, &mut entries).map_err(|error| self.named(&error))?;
+        for kind in filter.wanted_kinds() {
+            self.read(kind, filter, "DESC", &mut |entry| entries.push(entry)).map_err(|error| self.named(&error))?;
         }
         entries.sort_by_key(|entry| (entry.moment, entry.seq.unwrap_or(0)));
         if let Some(limit) = filter.limit {
@@ -156,17 +163,25 @@ impl Reader {
         Ok(entries)
     }
 
-    fn read(&self, kind: Kind, filter: &Filter, entries: &mut Vec<Entry>) -> rusqlite::Result<()> {
+    /// The wanted rows of one kind, one by one, oldest first.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn for_each(&self, kind: Kind, filter: &Filter, take: &mut dyn FnMut(Entry)) -> Result<(), String> {
+        self.read(kind, filter, "ASC", take).map_err(|error| self.named(&error))
+    }
+
+    fn read(&self, kind: Kind, filter: &Filter, order: &str, take: &mut dyn FnMut(Entry)) -> rusqlite::Result<()> {
         let table = kind.table();
-        let (seq, order) = match kind {
-            Kind::HalfCycle => ("NULL", "r.moment DESC, r.cell DESC"),
-            _ => ("r.seq", "r.seq DESC"),
+        let (seq, by) = match kind {
+            Kind::HalfCycle => ("NULL", format!("r.moment {order}, r.cell {order}")),
+            _ => ("r.seq", format!("r.seq {order}")),
         };
         let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
         let sql = format!(
             "SELECT {seq}, r.moment, m.wall_ns, m.time_ns, m.boot, m.pack, {} FROM {} r JOIN moment m ON m.id = r.moment \
              WHERE (?1 IS NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) \
-             ORDER BY {order} LIMIT ?4",
+             ORDER BY {by} LIMIT ?4",
             columns.join(", "),
             table.name()
         );
@@ -175,7 +190,7 @@ impl Reader {
         let mut rows = statement.query((filter.cell, filter.since_ns, filter.until_ns, limit))?;
         while let Some(row) = rows.next()? {
             let boot: Vec<u8> = row.get(4)?;
-            entries.push(Entry {
+            take(Entry {
                 kind,
                 seq: row.get(0)?,
                 moment: row.get(1)?,

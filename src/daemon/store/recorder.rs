@@ -6,7 +6,7 @@ use super::database::{Database, StateRecord};
 use super::document::Document;
 use super::folder::{DATABASE, Folder};
 use super::parts::Parts;
-use super::rows::{Batch, Gatherer};
+use super::rows::{Batch, Gatherer, Worth};
 use super::stamp::Stamp;
 use crate::config::StoreConfig;
 use crate::monitor::{Event, Monitor};
@@ -44,7 +44,10 @@ impl Recorder {
 
     /// After an input: writes what its events have taught, and the checkpoint when it is due.
     pub(crate) fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
-        let rows = self.gatherer.rows(events);
+        let rows = match self.gatherer.take(events) {
+            Worth::Commit(rows) => Some(rows),
+            Worth::Nothing | Worth::Deferred => None,
+        };
         let is_due = now.since(*self.checkpointed.get_or_insert(now)) >= self.checkpoint_s;
         if rows.is_none() && !is_due {
             return Ok(());
@@ -57,7 +60,9 @@ impl Recorder {
 
     /// The last state, to the last bit.
     pub(crate) fn finish(mut self, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
-        self.write(&[], monitor, now, true)
+        let batch = Batch { stamp: Stamp::replayed(now), rows: self.gatherer.deferred() };
+        let batches = if batch.rows.is_empty() { Vec::new() } else { vec![batch] };
+        self.write(&batches, monitor, now, true)
     }
 
     fn write(&mut self, batches: &[Batch], monitor: &Monitor, now: Timestamp, exact: bool) -> Result<(), String> {

@@ -5,10 +5,11 @@ use std::collections::BTreeMap;
 use rusqlite::types::Value;
 use serde::Serialize;
 
+use super::allowance::{Allowance, Limit};
 use super::stamp::Stamp;
 use crate::alarm::Change;
 use crate::monitor::{Event, EventKind};
-use crate::quantity::CellIndex;
+use crate::quantity::{CellIndex, Timestamp};
 
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
@@ -120,6 +121,16 @@ impl Row {
     /// Detail that may go first when there is no room for all.
     pub(super) const fn is_detail(&self) -> bool {
         matches!(self, Self::Event(EventKind::HalfCycle { .. }))
+    }
+
+    /// Whether both are of one alarm, or of one cell's filter.
+    fn repeats(&self, other: &Self) -> bool {
+        let key = |row: &Self| match row {
+            Self::Event(EventKind::Alarm { rule, cell, severity, .. }) => Some((Some((*rule, *severity)), *cell)),
+            Self::Event(EventKind::FilterReset { cell }) => Some((None, Some(*cell))),
+            _ => None,
+        };
+        key(self).is_some() && key(self) == key(other)
     }
 
     /// Whether another pack begins after it.
@@ -236,38 +247,107 @@ fn word(value: &impl Serialize) -> Value {
     }
 }
 
+/// Capacities of one cell written whatever they say: two days' of an electric car at once, then one an hour. Beyond
+/// (a hybrid that turns every minute) a row must say something: 100 bytes each, for ever.
+const CAPACITIES: Limit = Limit { burst: 64.0, period_s: 3600.0 };
+/// Beyond that, what a capacity must have moved by to be written, in standard deviations.
+const NEWS_STD: f64 = 0.25;
+/// Commits for alarms and filters that start again alone: a thousand at once, then one an hour. Beyond (a threshold in
+/// the noise, a cell model that does not fit) rows wait, and of one alarm's or cell's only the first and the last are
+/// kept; the count of occurrences tells how many went. The state with the alarms in it is checkpointed all the same.
+const ALARM_COMMITS: Limit = Limit { burst: 1000.0, period_s: 3600.0 };
+
+/// A capacity as last written.
+#[derive(Debug, Clone, Copy)]
+struct Written {
+    capacity_ah: f64,
+    usable_ah: Option<f64>,
+    allowance: Allowance,
+}
+
+/// What one input's events are worth.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Worth {
+    /// Nothing was learned, and nothing became of an alarm.
+    Nothing,
+    /// Rows to commit now, perhaps none, with the state they were learned in.
+    Commit(Vec<Row>),
+    /// Alarms that come too often: their rows wait.
+    Deferred,
+}
+
 /// Picks from the core's events what the history keeps.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(crate) struct Gatherer {
-    /// Usable capacity of each cell as last written.
-    usable: BTreeMap<CellIndex, Option<f64>>,
+    written: BTreeMap<CellIndex, Written>,
+    alarm_commits: Allowance,
+    deferred: Vec<Row>,
+}
+
+impl Default for Gatherer {
+    fn default() -> Self {
+        Self { written: BTreeMap::new(), alarm_commits: Allowance::new(ALARM_COMMITS), deferred: Vec::new() }
+    }
 }
 
 impl Gatherer {
-    /// Rows of one input's events; `None` = nothing in them was learned, and nothing became of an alarm. The list may be
-    /// empty: then only the state is worth keeping.
-    pub(crate) fn rows(&mut self, events: &[Event]) -> Option<Vec<Row>> {
-        let mut learned = false;
-        let mut rows = Vec::new();
-        for Event { kind, .. } in events {
-            learned |= is_learned(kind);
-            if is_learned(kind) && self.is_news(kind) {
-                rows.push(Row::Event(*kind));
-            }
+    /// Judges one input's events; rows that waited come with those that do not.
+    pub(crate) fn take(&mut self, events: &[Event]) -> Worth {
+        let Some(now) = events.iter().find(|event| is_learned(&event.kind)).map(|event| event.time) else {
+            return Worth::Nothing;
+        };
+        let learned = || events.iter().map(|event| event.kind).filter(is_learned);
+        let alarms_only = learned().all(|kind| matches!(kind, EventKind::Alarm { .. } | EventKind::FilterReset { .. }));
+        if alarms_only && !self.alarm_commits.take(now) {
+            learned().for_each(|kind| self.defer(kind));
+            return Worth::Deferred;
         }
-        learned.then_some(rows)
+        let mut rows = self.deferred();
+        rows.extend(learned().filter(|kind| self.is_news(kind, now)).map(Row::Event));
+        Worth::Commit(rows)
     }
 
-    /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news.
-    fn is_news(&mut self, kind: &EventKind) -> bool {
-        match *kind {
-            EventKind::Capacity { cell, measured_ah, usable_capacity_ah, .. } => {
-                let before = self.usable.insert(cell, usable_capacity_ah);
-                measured_ah.is_some() || before.is_some_and(|before| before != usable_capacity_ah)
-            }
-            EventKind::RechargePeriod { .. } => false,
-            _ => true,
+    /// Rows that waited.
+    pub(crate) fn deferred(&mut self) -> Vec<Row> {
+        std::mem::take(&mut self.deferred)
+    }
+
+    /// Keeps the first and the last row of each alarm and each cell's filter.
+    fn defer(&mut self, kind: EventKind) {
+        let row = Row::Event(kind);
+        let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at].repeats(&row)).collect();
+        if let [_, .., last] = same[..] {
+            self.deferred.remove(last);
         }
+        self.deferred.push(row);
+    }
+
+    /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news; nor is, when
+    /// there have been many, one that has hardly moved.
+    fn is_news(&mut self, kind: &EventKind, now: Timestamp) -> bool {
+        let EventKind::Capacity {
+            cell, measured_ah, capacity_ah, capacity_std_ah, usable_capacity_ah: usable_ah, ..
+        } = *kind
+        else {
+            return !matches!(kind, EventKind::RechargePeriod { .. });
+        };
+        let new = Written { capacity_ah, usable_ah, allowance: Allowance::new(CAPACITIES) };
+        let before = self.written.get(&cell).copied();
+        if measured_ah.is_none() && before.is_none_or(|before| before.usable_ah == usable_ah) {
+            self.written.entry(cell).or_insert(new);
+            return false;
+        }
+        let written = self.written.entry(cell).or_insert(new);
+        let far = |a: f64, b: f64| (a - b).abs() >= NEWS_STD * capacity_std_ah;
+        let has_moved = before.is_none_or(|before| {
+            far(before.capacity_ah, capacity_ah)
+                || before.usable_ah.zip(usable_ah).is_some_and(|(before, now)| far(before, now))
+        });
+        if written.allowance.take(now) || has_moved {
+            (written.capacity_ah, written.usable_ah) = (capacity_ah, usable_ah);
+            return true;
+        }
+        false
     }
 }
 
@@ -289,7 +369,7 @@ fn is_learned(kind: &EventKind) -> bool {
 pub(super) mod tests {
     use super::*;
     use crate::alarm::{Rule, Severity, State};
-    use crate::quantity::{Mode, Timestamp};
+    use crate::quantity::Mode;
 
     /// A capacity of a cell, with or without information.
     pub(in crate::daemon::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
@@ -337,9 +417,13 @@ pub(super) mod tests {
         }
     }
 
-    fn rows(gatherer: &mut Gatherer, kinds: &[EventKind]) -> Option<usize> {
-        let events: Vec<Event> = kinds.iter().map(|&kind| Event { time: Timestamp::ZERO, kind }).collect();
-        gatherer.rows(&events).map(|rows| rows.len())
+    fn take(gatherer: &mut Gatherer, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
+        let time = Timestamp::from_secs(seconds);
+        let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();
+        match gatherer.take(&events) {
+            Worth::Commit(rows) => Some(rows.len()),
+            Worth::Nothing | Worth::Deferred => None,
+        }
     }
 
     #[test]
@@ -361,16 +445,43 @@ pub(super) mod tests {
     #[test]
     fn a_capacity_is_written_when_there_is_something_new_in_it() {
         let mut gatherer = Gatherer::default();
-        assert_eq!(rows(&mut gatherer, &[capacity(0, Some(2.4), 2.3)]), Some(1));
-        assert_eq!(rows(&mut gatherer, &[capacity(0, None, 2.3)]), Some(0));
-        assert_eq!(rows(&mut gatherer, &[capacity(0, None, 2.2)]), Some(1));
-        assert_eq!(rows(&mut gatherer, &[half_cycle(0), capacity(0, Some(2.4), 2.2)]), Some(2));
+        assert_eq!(take(&mut gatherer, 0.0, &[capacity(0, Some(2.4), 2.3)]), Some(1));
+        assert_eq!(take(&mut gatherer, 0.0, &[capacity(0, None, 2.3)]), Some(0));
+        assert_eq!(take(&mut gatherer, 0.0, &[capacity(0, None, 2.2)]), Some(1));
+        assert_eq!(take(&mut gatherer, 0.0, &[half_cycle(0), capacity(0, Some(2.4), 2.2)]), Some(2));
     }
 
     #[test]
     fn a_flickering_input_writes_nothing() {
         let mut gatherer = Gatherer::default();
-        assert_eq!(rows(&mut gatherer, &[alarm(Change::Suppressed), alarm(Change::Resumed)]), None);
-        assert_eq!(rows(&mut gatherer, &[alarm(Change::Raised)]), Some(1));
+        assert_eq!(take(&mut gatherer, 0.0, &[alarm(Change::Suppressed), alarm(Change::Resumed)]), None);
+        assert_eq!(take(&mut gatherer, 0.0, &[alarm(Change::Raised)]), Some(1));
+    }
+
+    #[test]
+    fn a_pack_that_turns_every_minute_writes_what_moves() {
+        let mut gatherer = Gatherer::default();
+        let mut rows = 0;
+        for minute in 0..1440 {
+            rows += take(&mut gatherer, f64::from(minute) * 60.0, &[capacity(0, Some(2.4), 2.3)]).unwrap();
+        }
+        assert_eq!(rows, 64 + 23);
+        assert_eq!(take(&mut gatherer, 86_400.0, &[capacity(0, Some(2.4), 2.31)]), Some(1), "the hour's");
+        assert_eq!(take(&mut gatherer, 86_401.0, &[capacity(0, Some(2.4), 2.31)]), Some(0));
+        assert_eq!(take(&mut gatherer, 86_402.0, &[capacity(0, Some(2.4), 2.2)]), Some(1), "far");
+    }
+
+    #[test]
+    fn an_alarm_that_flickers_without_end_is_written_now_and_then_with_its_ends() {
+        let mut gatherer = Gatherer::default();
+        let (mut commits, mut rows) = (0, 0);
+        for second in 0..86_400 {
+            let change = if second % 2 == 0 { Change::Raised } else { Change::Cleared };
+            if let Some(written) = take(&mut gatherer, f64::from(second), &[alarm(change)]) {
+                (commits, rows) = (commits + 1, rows + written);
+            }
+        }
+        assert!((1020..1030).contains(&commits) && rows < 1100, "{commits} commits, {rows} rows");
+        assert!(gatherer.deferred().len() <= 2);
     }
 }

@@ -14,7 +14,7 @@ use super::database::{Database, StateRecord, is_damage};
 use super::document::Document;
 use super::folder::{Folder, Opening};
 use super::parts::Parts;
-use super::rows::Batch;
+use super::rows::{Batch, Row};
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -50,6 +50,7 @@ struct Queue {
 
 /// What the writer takes from the desk.
 struct Work {
+    batches: Vec<Batch>,
     state: Option<Document>,
     exact: bool,
     ticket: u64,
@@ -62,16 +63,21 @@ impl Desk {
     }
 
     /// Leaves rows and the state they were learned in; returns the ticket of the commit that will hold both.
-    pub(super) fn leave(&self, rows: Option<Batch>, state: Option<Document>, exact: bool) -> u64 {
+    pub(super) fn leave(&self, rows: Option<Batch>, state: Document, exact: bool) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
         // A later state has all an earlier one has.
-        queue.state = state.or_else(|| queue.state.take());
+        queue.state = Some(state);
         queue.exact |= exact;
         queue.ticket += 1;
         queue.wanted = true;
         self.wake.notify_one();
         queue.ticket
+    }
+
+    /// Keeps rows for the next commit.
+    pub(super) fn keep(&self, rows: Batch) {
+        self.lock().backlog.push(rows);
     }
 
     /// The last thing the writer will be asked.
@@ -97,12 +103,10 @@ impl Desk {
             }
         }
         queue.wanted = false;
-        Work {
-            state: queue.state.take(),
-            exact: std::mem::take(&mut queue.exact),
-            ticket: queue.ticket,
-            stop: queue.stop,
-        }
+        let state = queue.state.take();
+        // Rows go with the state they were learned in.
+        let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
+        Work { batches, state, exact: std::mem::take(&mut queue.exact), ticket: queue.ticket, stop: queue.stop }
     }
 
     fn put_back(&self, batches: Vec<Batch>, state: Option<Document>) {
@@ -121,6 +125,8 @@ pub(super) struct Writer {
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<Progress>,
     pub(super) retry: Retry,
+    /// The daemon began with what the database had, or it had nothing.
+    pub(super) knows_state: bool,
 }
 
 /// When a failed disk is tried again.
@@ -147,12 +153,12 @@ impl Writer {
     pub(super) fn run(mut self) {
         loop {
             let work = self.desk.take(self.retry.at);
-            let Work { state, exact, ticket, stop } = work;
+            let Work { batches, state, exact, ticket, stop } = work;
             // The last attempt before the end is made whenever it is.
             let works = if self.retry.is_due() || stop {
-                self.write(state, exact)
+                self.write(batches, state, exact)
             } else {
-                self.desk.put_back(Vec::new(), state);
+                self.desk.put_back(batches, state);
                 false
             };
             self.progress.send_replace(Progress { ticket, works });
@@ -163,12 +169,10 @@ impl Writer {
     }
 
     /// One transaction; on failure everything waits for the next.
-    fn write(&mut self, state: Option<Document>, exact: bool) -> bool {
-        let batches = match &state {
-            Some(document) => self.desk.lock().backlog.take(&document.stamp),
-            // Nothing but a look whether the disk is back.
-            None => Vec::new(),
-        };
+    fn write(&mut self, batches: Vec<Batch>, state: Option<Document>, exact: bool) -> bool {
+        if state.is_none() {
+            return self.retry.pause.is_none();
+        }
         match self.commit(&batches, state.as_ref(), exact) {
             Ok(()) => {
                 if self.retry.pause.is_some() {
@@ -190,7 +194,7 @@ impl Writer {
     }
 
     fn commit(&mut self, batches: &[Batch], state: Option<&Document>, exact: bool) -> Result<(), String> {
-        let Some(document) = state else { return Ok(()) }; // nothing to write, nothing learned of the disk
+        let Some(document) = state else { return Ok(()) };
         let json = document.to_json().map_err(|error| error.to_string())?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
         drop(json);
@@ -215,8 +219,15 @@ impl Writer {
     }
 
     fn reopen(&mut self, document: &Document) -> Result<Database, String> {
-        let Opening { mut database, rows, .. } =
-            self.folder.open(&document.stamp).map_err(|error| error.to_string())?;
+        let opening = self.folder.open(&document.stamp).map_err(|error| error.to_string())?;
+        let Opening { mut database, mut rows, state, .. } = opening;
+        if !self.knows_state && state.is_some() {
+            // The daemon began without it, because the disk came too late: for people to find.
+            database.put_state_aside().map_err(|error| error.to_string())?;
+            tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
+            rows.push(Row::Own { reason: "state_too_late", detail: "set aside in slots 10 and 11".to_owned() });
+        }
+        self.knows_state = true;
         if !rows.is_empty() {
             let batch = Batch { stamp: document.stamp, rows };
             database.commit(&[batch], None).map_err(|error| error.to_string())?;

@@ -1,0 +1,40 @@
+//! `packwatch reset`: what was learned begins anew, through the running daemon or, without one, in its store.
+
+use std::path::PathBuf;
+
+use super::Failure;
+use super::command;
+use super::control_args::{ControlArgs, print};
+use crate::daemon::store;
+
+/// Arguments of `reset`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Another pack is connected: its history begins, what was learned of the old one is forgotten
+    #[arg(long, required = true)]
+    pack_replaced: bool,
+    /// Really
+    #[arg(long)]
+    yes: bool,
+    /// Folder of state and history, for when no daemon runs (default: $STATE_DIRECTORY, else /var/lib/packwatch)
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
+    #[command(flatten)]
+    control: ControlArgs,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let client = args.control.client();
+    if !args.yes || client.is_served() {
+        return command::replace_pack(args.yes, &client);
+    }
+    let folder = args.state.clone().unwrap_or_else(|| store::standard_folder().0);
+    let pack = store::replace_pack(&folder).map_err(Failure::new)?;
+    print(&format!(
+        "no daemon runs: in {} the history of pack {} is closed, that of pack {pack} begins; the stored state, with its \
+         alarms, is forgotten\n",
+        folder.display(),
+        pack - 1
+    ))
+}

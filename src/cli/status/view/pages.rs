@@ -1,0 +1,294 @@
+//! Draws the pages of the view.
+
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Modifier, Style};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Block, Paragraph, Sparkline};
+use serde_json::Value;
+
+use super::app::{App, Page, Quantity};
+use super::draw::{Theme, clock};
+use super::plot::{Scale, bar, sparkline};
+use crate::cli::status::table::alarm_line;
+use crate::cli::status::{number, shown, with_std, word};
+use crate::daemon::status::document::{Cell, Document};
+use crate::quantity::Timestamp;
+
+/// Width of a row's first cell number in the map.
+const LABEL: usize = 5;
+/// Lines of the list of cells and of the plot below the map that are always there.
+const LIST_LINES: usize = 4;
+/// Height of the chosen cell's plot, its title included.
+const PLOT_LINES: usize = 5;
+
+/// Draws the page that is chosen.
+pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme, area: Rect) {
+    let lines = match app.page {
+        Page::Cells => return cells(frame, app, document, theme, area),
+        Page::Alarms => alarms(document, theme),
+        Page::Interfaces => interfaces(document, theme),
+        Page::Counts => counts(document),
+        Page::Events => events(document),
+    };
+    app.page_lines = usize::from(area.height).max(1);
+    app.scroll = app.scroll.min(lines.len().saturating_sub(app.page_lines));
+    let shown: Vec<Line<'_>> = lines.into_iter().skip(app.scroll).take(app.page_lines).collect();
+    frame.render_widget(Paragraph::new(shown), area);
+}
+
+fn of(cell: &Cell, quantity: Quantity) -> Option<f64> {
+    match quantity {
+        Quantity::Soc => cell.soc,
+        Quantity::Voltage => cell.voltage_v,
+    }
+}
+
+fn cells(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme, area: Rect) {
+    let height = usize::from(area.height);
+    let lines = height.saturating_sub(LIST_LINES + 1).max(1);
+    let grid = Grid::new(document.cells.len(), usize::from(area.width), lines);
+    let map_lines = grid.rows.min(lines) + 1;
+    let left = height.saturating_sub(map_lines);
+    let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES } else { 0 };
+    let length = |lines: usize| Constraint::Length(u16::try_from(lines).unwrap_or(u16::MAX));
+    let [map_area, list_area, plot_area] =
+        Layout::vertical([length(map_lines), Constraint::Min(0), length(plot_lines)]).areas(area);
+    (app.row_cells, app.page_lines) = (grid.per_row, map_lines - 1);
+    frame.render_widget(Paragraph::new(map(app, document, theme, &grid, map_lines)), map_area);
+    frame.render_widget(Paragraph::new(list(app, document, theme, list_area)), list_area);
+    if plot_lines > 0 {
+        plot(frame, app, theme, plot_area);
+    }
+}
+
+/// How the map lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Grid {
+    /// Characters of a cell, its space included.
+    cell_width: usize,
+    per_row: usize,
+    rows: usize,
+}
+
+impl Grid {
+    /// The widest bars with which the cells fit; with the narrowest they may have to be scrolled.
+    fn new(cells: usize, width: usize, lines: usize) -> Self {
+        let with = |cell_width: usize| {
+            let fit = (width.saturating_sub(LABEL) / cell_width).max(1);
+            // Rows of whole dozens are easier to count.
+            let per_row = if fit >= 12 { fit / 12 * 12 } else { fit };
+            Self { cell_width, per_row, rows: cells.div_ceil(per_row) }
+        };
+        [4, 3, 2].into_iter().map(with).find(|grid| grid.rows <= lines.min(4)).unwrap_or_else(|| with(1))
+    }
+}
+
+fn map(app: &App, document: &Document, theme: Theme, grid: &Grid, lines: usize) -> Vec<Line<'static>> {
+    let cells = &document.cells;
+    let known = Scale::of(cells.iter().filter_map(|cell| of(cell, app.quantity)));
+    let (title, scale) = match (app.quantity, known) {
+        (Quantity::Soc, Some(known)) => (
+            format!("SOC {:.1} to {:.1} %, bars from 0 to 100 %", 100.0 * known.least, 100.0 * known.greatest),
+            Some(Scale { least: 0.0, greatest: 1.0 }),
+        ),
+        (Quantity::Voltage, Some(known)) => {
+            (format!("voltage, bars from {:.3} to {:.3} V", known.least, known.greatest), Some(known))
+        }
+        (Quantity::Soc, None) => ("SOC not known".to_owned(), None),
+        (Quantity::Voltage, None) => ("voltage not known".to_owned(), None),
+    };
+    let rows = lines.saturating_sub(1);
+    let first = (app.selected / grid.per_row.max(1)).saturating_sub(rows.saturating_sub(1));
+    let mut text = vec![Line::styled(title, Style::new().add_modifier(Modifier::DIM))];
+    for row in first..grid.rows.min(first + rows) {
+        let from = row * grid.per_row;
+        let mut spans = vec![Span::raw(format!("{:>4} ", from + 1))];
+        for (index, cell) in cells.iter().enumerate().skip(from).take(grid.per_row) {
+            let share = of(cell, app.quantity).and_then(|value| scale?.share(value));
+            let bars = bar(share).to_string().repeat((grid.cell_width - 1).max(1));
+            let mut style = match cell.trusted {
+                Some(false) => theme.colour(Color::Red).add_modifier(Modifier::UNDERLINED),
+                Some(true) | None => theme.colour(Color::Green),
+            };
+            if index == app.selected {
+                style = style.add_modifier(Modifier::REVERSED);
+            }
+            spans.push(Span::styled(bars, style));
+            if grid.cell_width > 1 {
+                spans.push(Span::raw(" "));
+            }
+        }
+        text.push(Line::from(spans));
+    }
+    text
+}
+
+/// The cells round the chosen one, each with a small plot of the quantity.
+fn list(app: &App, document: &Document, theme: Theme, area: Rect) -> Vec<Line<'static>> {
+    let height = usize::from(area.height);
+    let rows = height.saturating_sub(1);
+    let cells = &document.cells;
+    let first = app.selected.saturating_sub(rows / 2).min(cells.len().saturating_sub(rows));
+    let what = match app.quantity {
+        Quantity::Soc => "SOC",
+        Quantity::Voltage => "voltage",
+    };
+    let head = format!("cell   voltage   temp.            SOC         capacity  {what} so far");
+    let mut text = vec![Line::styled(head, Style::new().add_modifier(Modifier::DIM))];
+    for (index, cell) in cells.iter().enumerate().skip(first).take(rows) {
+        let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
+        let row = format!(
+            "{:>4} {:>9} {:>7} {soc:>14} {:>16}  ",
+            number(cell.cell),
+            shown(cell.voltage_v, 3, " V"),
+            shown(cell.temperature_c, 1, " °C"),
+            with_std(cell.capacity_ah, cell.capacity_std_ah, 2, " Ah"),
+        );
+        let width = usize::from(area.width).saturating_sub(row.chars().count());
+        let points = app.history.get(index).map(|points| points.iter().map(|point| point.get(app.quantity)));
+        let plotted = points.map_or_else(String::new, |points| sparkline(points, width.min(super::app::HISTORY)));
+        let style = if index == app.selected { Style::new().add_modifier(Modifier::BOLD) } else { Style::new() };
+        text.push(Line::from(vec![Span::styled(row, style), Span::styled(plotted, theme.colour(Color::Cyan))]));
+    }
+    text
+}
+
+/// The chosen cell's plot.
+fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
+    let Some(points) = app.history.get(app.selected) else { return };
+    let width = usize::from(area.width.saturating_sub(2));
+    let values: Vec<Option<f64>> =
+        points.iter().skip(points.len().saturating_sub(width)).map(|point| point.get(app.quantity)).collect();
+    let Some(scale) = Scale::of(values.iter().copied().flatten()) else { return };
+    let cell = app.selected + 1;
+    let title = match app.quantity {
+        Quantity::Soc => {
+            let (least, greatest) = (100.0 * scale.least, 100.0 * scale.greatest);
+            format!(" SOC of cell {cell}, {least:.2} to {greatest:.2} % in {} s ", values.len())
+        }
+        Quantity::Voltage => {
+            let Scale { least, greatest } = scale;
+            format!(" voltage of cell {cell}, {least:.3} to {greatest:.3} V in {} s ", values.len())
+        }
+    };
+    // At least a dot for what is known; 1 to 1,001.
+    let dots = values.into_iter().map(|value| value.and_then(|value| Some((1000.0 * scale.share(value)?) as u64 + 1)));
+    let dots: Vec<Option<u64>> = dots.collect();
+    let sparkline = Sparkline::default().data(dots).max(1001).style(theme.colour(Color::Cyan));
+    frame.render_widget(sparkline.block(Block::bordered().title(title)), area);
+}
+
+fn alarms(document: &Document, theme: Theme) -> Vec<Line<'static>> {
+    let alarms = &document.alarms;
+    let line = |alarm: &crate::alarm::Alarm| {
+        let style = if alarm.state.is_raised() { theme.severity(alarm.severity) } else { Style::new() };
+        Line::styled(alarm_line(alarm), style)
+    };
+    let mut text: Vec<Line<'_>> = alarms.list.iter().map(line).collect();
+    if alarms.list.is_empty() {
+        text.push(Line::from("no alarm"));
+    }
+    if alarms.omitted > 0 {
+        text.push(Line::from(format!("and {} more", alarms.omitted)));
+    }
+    text.extend(alarms.unknown.iter().map(|unknown| {
+        let (rule, severity) = (unknown.rule.name(), unknown.severity.name());
+        Line::from(format!("cannot be judged: {severity} {rule}, {} of its alarms", unknown.alarms))
+    }));
+    text
+}
+
+fn interfaces(document: &Document, theme: Theme) -> Vec<Line<'static>> {
+    let mut text = Vec::new();
+    for it in &document.interfaces {
+        let style = match it.state {
+            crate::io::socket::LinkState::Up => theme.colour(Color::Green),
+            _ => theme.colour(Color::Red).add_modifier(Modifier::BOLD),
+        };
+        text.push(Line::from(vec![Span::raw(format!("{} ", it.name)), Span::styled(word(it.state), style)]));
+        let rows = [
+            ("frames in", it.frames),
+            ("lost by the kernel", it.kernel_dropped),
+            ("lost by our queue", it.queue_dropped),
+            ("no frames", it.malformed),
+            ("frames out", it.sent),
+            ("not sent, queue full", it.send_queue_full),
+            ("not sent, kernel", it.send_failed),
+            ("error frames", it.error_frames),
+            ("bus-off", it.bus_offs),
+            ("came back", it.reconnects),
+        ];
+        text.extend(rows.map(|(name, count)| count_line(name, count)));
+    }
+    let protected = document.protection.iter().flat_map(|it| {
+        let checks = it.checks.iter().filter(|check| check.count > 0);
+        checks.map(|check| count_line(&format!("{} {} {}", it.interface, it.id, check.status), check.count))
+    });
+    text.extend(protected);
+    text.extend(document.floods.iter().map(|it| count_line(&format!("{} {} flood", it.interface, it.id), it.dropped)));
+    text
+}
+
+fn count_line(name: &str, count: u64) -> Line<'static> {
+    Line::from(format!("  {name:<28}{count:>12}"))
+}
+
+fn counts(document: &Document) -> Vec<Line<'static>> {
+    let counters = &document.counters;
+    let mut text = Vec::new();
+    // Of the counts every one by its name in the document.
+    for part in [serde_json::to_value(&counters.readings), serde_json::to_value(&counters.core)] {
+        let Ok(Value::Object(keys)) = part else { continue };
+        text.extend(keys.iter().filter_map(|(name, count)| Some(count_line(&name.replace('_', " "), count.as_u64()?))));
+    }
+    let (service, clients) = (&counters.service, &counters.clients);
+    let rows = [
+        ("time backwards", counters.time_backwards),
+        ("ticks", service.ticks),
+        ("ticks late", service.missed_deadlines),
+        ("reloads", service.reloads),
+        ("reloads refused", service.reloads_refused),
+        ("status clients", clients.connected),
+        ("status clients refused", clients.refused),
+        ("status clients dropped", clients.dropped),
+    ];
+    text.extend(rows.map(|(name, count)| count_line(name, count)));
+    let latency = &document.latency;
+    text.push(Line::from("frame to estimate"));
+    let most = latency.buckets.iter().map(|bucket| bucket.frames).max().unwrap_or(0).max(1);
+    for bucket in latency.buckets.iter().filter(|bucket| bucket.frames > 0) {
+        let name = bucket.le_s.map_or_else(|| "more".to_owned(), |seconds| format!("up to {} ms", 1e3 * seconds));
+        // 1 to 20 characters.
+        let bar = "█".repeat(((20.0 * bucket.frames as f64 / most as f64).ceil() as usize).clamp(1, 20));
+        text.push(Line::from(format!("  {name:<28}{:>12} {bar}", bucket.frames)));
+    }
+    text
+}
+
+/// Newest first.
+fn events(document: &Document) -> Vec<Line<'static>> {
+    let mut text: Vec<Line<'_>> = document.events.iter().rev().map(|event| Line::from(event_line(event))).collect();
+    if text.is_empty() {
+        text.push(Line::from("no event yet"));
+    }
+    text
+}
+
+fn event_line(event: &Value) -> String {
+    let Value::Object(keys) = event else { return event.to_string() };
+    let time = keys.get("time").and_then(Value::as_i64).map(Timestamp::from_nanos);
+    let name = keys.get("event").and_then(Value::as_str).unwrap_or("?");
+    let mut line = format!("{} {name}", time.map_or_else(|| "?".to_owned(), clock));
+    for (key, value) in keys.iter().filter(|(key, _)| !matches!(key.as_str(), "time" | "event")) {
+        let value = match value {
+            Value::String(word) => word.clone(),
+            // Cells as people count them.
+            Value::Number(cell) if key == "cell" => (cell.as_u64().unwrap_or(0) + 1).to_string(),
+            Value::Number(number) if number.is_f64() => format!("{:.4}", number.as_f64().unwrap_or(f64::NAN)),
+            other => other.to_string(),
+        };
+        line.push_str(&format!(" {key} {value}"));
+    }
+    line
+}

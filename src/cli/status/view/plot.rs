@@ -1,0 +1,81 @@
+//! Bars and small plots made of characters. Pure.
+
+/// Eighths of a character's height.
+const EIGHTHS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
+/// What is not known.
+const UNKNOWN: char = '·';
+
+/// A bar one character high; `share` 0 to 1 of its height.
+pub(super) fn bar(share: Option<f64>) -> char {
+    let Some(share) = share else { return UNKNOWN };
+    // 0 to 7, saturating.
+    EIGHTHS[((share.clamp(0.0, 1.0) * 8.0) as usize).min(7)]
+}
+
+/// The last `width` values as a line of bars between their least and greatest; missing ones in front are spaces.
+pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, width: usize) -> String {
+    let skipped = values.len().saturating_sub(width);
+    let values: Vec<Option<f64>> = values.skip(skipped).collect();
+    let scale = Scale::of(values.iter().copied().flatten());
+    let blank = " ".repeat(width.saturating_sub(values.len()));
+    blank + &values.iter().map(|value| bar(value.and_then(|value| scale?.share(value)))).collect::<String>()
+}
+
+/// From the least to the greatest of some values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Scale {
+    pub(super) least: f64,
+    pub(super) greatest: f64,
+}
+
+impl Scale {
+    /// `None` = there are no values.
+    pub(super) fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
+        values.fold(None, |so_far, value| match so_far {
+            None => Some(Self { least: value, greatest: value }),
+            Some(Self { least, greatest }) => Some(Self { least: least.min(value), greatest: greatest.max(value) }),
+        })
+    }
+
+    /// Where a value is between them, 0 to 1; all alike are in the middle.
+    pub(super) fn share(&self, value: f64) -> Option<f64> {
+        let range = self.greatest - self.least;
+        Some(if range > 0.0 { (value - self.least) / range } else { 0.5 })
+    }
+}
+
+/// A gauge: full up to the lower end of the interval, hatched within it, light beyond; a stroke at the value.
+pub(super) fn gauge(value: Option<f64>, low: Option<f64>, high: Option<f64>, width: usize) -> String {
+    let (Some(value), Some(low), Some(high)) = (value, low, high) else { return UNKNOWN.to_string().repeat(width) };
+    // 0 to width, saturating.
+    let column = |share: f64| (share.clamp(0.0, 1.0) * width as f64).round() as usize;
+    let (low, high, at) = (column(low), column(high), column(value).min(width.saturating_sub(1)));
+    let dot = |index: usize| match index {
+        index if index == at => '┃',
+        index if index < low => '█',
+        index if index < high => '▒',
+        _ => '░',
+    };
+    (0..width).map(dot).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sparkline_shows_the_latest_values_and_where_one_is_missing() {
+        let values = [9.0, 0.0, 1.0, 2.0].map(Some);
+        assert_eq!(sparkline(values.into_iter(), 3), "▁▅█");
+        assert_eq!(sparkline([Some(1.0), None, Some(2.0)].into_iter(), 5), "  ▁·█");
+        assert_eq!(sparkline([Some(1.0), Some(1.0)].into_iter(), 2), "▅▅");
+        assert_eq!(sparkline(std::iter::empty(), 2), "  ");
+    }
+
+    #[test]
+    fn a_gauge_shows_its_interval_and_nothing_when_nothing_is_known() {
+        assert_eq!(gauge(Some(0.5), Some(0.3), Some(0.8), 10), "███▒▒┃▒▒░░");
+        assert_eq!(gauge(Some(1.0), Some(1.0), Some(1.0), 4), "███┃");
+        assert_eq!(gauge(None, Some(0.3), Some(0.8), 3), "···");
+    }
+}

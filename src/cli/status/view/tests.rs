@@ -1,0 +1,169 @@
+//! Screens as they are drawn, against those in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` writes them anew:
+//! look at them before they are committed.
+
+use std::path::PathBuf;
+
+use ratatui::Terminal;
+use ratatui::backend::TestBackend;
+use ratatui::style::Color;
+
+use super::app::{HISTORY, News, Page};
+use super::*;
+use crate::daemon::status::document::Document;
+use crate::daemon::status::sample::sample;
+use crate::quantity::Timestamp;
+
+fn app() -> App {
+    App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)
+}
+
+/// A pack that was watched for so many seconds.
+fn watched(cells: u16, seconds: usize) -> App {
+    let mut app = app();
+    for second in 0..seconds {
+        let mut document = sample(cells);
+        document.wall_time = document.wall_time.plus_secs(second as f64);
+        for cell in &mut document.cells {
+            let wave = (second as f64 / 10.0 + f64::from(cell.cell)).sin();
+            cell.voltage_v = cell.voltage_v.map(|voltage_v| voltage_v + 0.02 * wave);
+            cell.soc = cell.soc.map(|soc| soc - 0.0005 * second as f64);
+        }
+        app.poll(document.wall_time);
+        app.handle_news(News::Document(Box::new(document)));
+    }
+    app
+}
+
+fn drawn(app: &mut App, (width, height): (u16, u16)) -> TestBackend {
+    let mut terminal = Terminal::new(TestBackend::new(width, height)).unwrap();
+    terminal.draw(|frame| draw::draw(frame, app)).unwrap();
+    terminal.backend().clone()
+}
+
+fn check(name: &str, app: &mut App, size: (u16, u16)) {
+    let found = drawn(app, size).to_string();
+    let file =
+        PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("src/cli/status/view/screens").join(format!("{name}.txt"));
+    if std::env::var_os("PACKWATCH_WRITE_SCREENS").is_some() {
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(&file, &found).unwrap();
+    }
+    let wanted = std::fs::read_to_string(&file).unwrap_or_default();
+    assert!(wanted == found, "{name} is drawn otherwise:\n{found}");
+}
+
+const SMALL: (u16, u16) = (80, 24);
+const LARGE: (u16, u16) = (120, 40);
+
+#[test]
+fn screens_of_the_cells() {
+    for (name, cells, size) in [
+        ("cells_1_80x24", 1, SMALL),
+        ("cells_1_120x40", 1, LARGE),
+        ("cells_96_80x24", 96, SMALL),
+        ("cells_96_120x40", 96, LARGE),
+        ("cells_1024_120x40", 1024, LARGE),
+    ] {
+        check(name, &mut watched(cells, 100), size);
+    }
+    let mut app = watched(1024, 3);
+    drawn(&mut app, SMALL);
+    app.handle_key(Key::Quantity);
+    app.handle_key(Key::Last);
+    check("cells_1024_80x24_voltage_last", &mut app, SMALL);
+}
+
+#[test]
+fn screens_of_the_other_pages() {
+    let mut app = watched(96, 3);
+    for page in [Page::Alarms, Page::Interfaces, Page::Counts, Page::Events] {
+        app.handle_key(Key::NextPage);
+        assert_eq!(app.page, page);
+        check(&format!("{}_80x24", page.name()), &mut app, SMALL);
+    }
+    app.handle_key(Key::NextPage);
+    assert_eq!(app.page, Page::Cells);
+}
+
+#[test]
+fn screens_without_a_daemon() {
+    check("waiting_80x24", &mut app(), SMALL);
+    let mut app = watched(96, 3);
+    app.handle_news(News::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
+    app.handle_news(News::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
+    check("lost_80x24", &mut app, SMALL);
+    // Nothing of what was true is on the screen.
+    assert!(!drawn(&mut app, LARGE).to_string().contains("SOC"));
+    app.handle_news(News::Document(Box::new(sample(96))));
+    assert!(drawn(&mut app, LARGE).to_string().contains("SOC"));
+}
+
+#[test]
+fn a_daemon_that_says_nothing_is_lost() {
+    let mut app = watched(1, 1);
+    let heard = sample(1).wall_time;
+    app.poll(heard.plus_secs(2.9));
+    assert!(app.document.is_some());
+    app.poll(heard.plus_secs(3.1));
+    assert!(app.document.is_none());
+    assert_eq!(app.lost.as_ref().map(|(since, _)| *since), Some(Some(heard)));
+}
+
+#[test]
+fn unknown_is_drawn_as_unknown() {
+    let mut document = Document { cells: Vec::new(), ..sample(2) };
+    document.pack.soc = None;
+    (document.pack.soc_low, document.pack.soc_high) = (None, None);
+    let mut app = app();
+    app.handle_news(News::Document(Box::new(document)));
+    let screen = drawn(&mut app, SMALL).to_string();
+    assert!(screen.contains("SOC       - ····") && screen.contains("not known"), "{screen}");
+}
+
+#[test]
+fn every_size_is_drawn_and_every_key_taken_without_a_fault() {
+    for cells in [1, 2, 96, 1024] {
+        let mut app = watched(cells, 2);
+        for size in [(1, 1), (40, 12), (41, 13), (57, 30), (200, 12), (80, 24), (300, 100)] {
+            for _ in Page::ALL {
+                for key in
+                    [Key::Last, Key::PageDown, Key::Down, Key::Right, Key::Up, Key::PageUp, Key::Left, Key::First]
+                {
+                    drawn(&mut app, size);
+                    app.handle_key(key);
+                    assert!(app.selected < usize::from(cells));
+                }
+                app.handle_key(Key::NextPage);
+            }
+        }
+    }
+}
+
+#[test]
+fn history_is_bounded() {
+    let app = watched(2, HISTORY + 5);
+    assert!(app.history.iter().all(|points| points.len() == HISTORY));
+}
+
+#[test]
+fn without_colour_there_is_none() {
+    let mut app = watched(96, 2);
+    let colours =
+        |backend: &TestBackend| backend.buffer().content().iter().filter(|cell| cell.fg != Color::Reset).count();
+    assert!(colours(&drawn(&mut app, SMALL)) > 0);
+    app.has_colour = false;
+    for _ in Page::ALL {
+        assert_eq!(colours(&drawn(&mut app, SMALL)), 0, "{:?}", app.page);
+        app.handle_key(Key::NextPage);
+    }
+    assert!(Timestamp::ZERO < feed::now());
+}
+
+#[test]
+fn keys_mean_what_the_help_says() {
+    let key = |code| meaning(KeyEvent::new(code, KeyModifiers::NONE));
+    assert_eq!(key(KeyCode::Char('q')), Some(Key::Quit));
+    assert_eq!(key(KeyCode::Tab), Some(Key::NextPage));
+    assert_eq!(key(KeyCode::Char('x')), None);
+    assert_eq!(meaning(KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL)), Some(Key::Quit));
+}

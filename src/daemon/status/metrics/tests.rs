@@ -1,0 +1,78 @@
+//! Metrics of a sample document, read as text and by the judge of the Prometheus project.
+
+use std::io::Write as _;
+use std::process::{Command, Stdio};
+
+use super::super::sample::sample;
+use super::*;
+
+/// The samples of a family, as written.
+fn samples<'a>(text: &'a str, name: &str) -> Vec<&'a str> {
+    text.lines().filter(|line| line.split(['{', ' ']).next() == Some(name)).collect()
+}
+
+#[test]
+fn values_have_units_and_cells_count_from_1() {
+    let text = openmetrics(Some(sample(2)));
+    assert_eq!(samples(&text, "packwatch_up"), ["packwatch_up 1.0"]);
+    assert_eq!(samples(&text, "packwatch_cell_voltage_volts"), ["packwatch_cell_voltage_volts{cell=\"1\"} 3.6"]);
+    assert_eq!(samples(&text, "packwatch_pack_soc_ratio"), ["packwatch_pack_soc_ratio 0.632"]);
+    assert_eq!(
+        samples(&text, "packwatch_alarm_active"),
+        ["packwatch_alarm_active{rule=\"capacity_low\",severity=\"severe\",cell=\"1\"} 1.0"]
+    );
+    let dropped = samples(&text, "packwatch_interface_dropped_frames_total");
+    assert_eq!(dropped[0], "packwatch_interface_dropped_frames_total{interface=\"can0\",reason=\"kernel\"} 6");
+    let buckets = samples(&text, "packwatch_frame_to_estimate_seconds_bucket");
+    assert_eq!(buckets.last(), Some(&"packwatch_frame_to_estimate_seconds_bucket{le=\"+Inf\"} 5"));
+    assert!(text.contains("# UNIT packwatch_cell_voltage_volts volts\n") && text.ends_with("# EOF\n"));
+}
+
+#[test]
+fn what_is_not_known_is_left_out() {
+    let mut document = sample(2);
+    document.pack.soc = None;
+    document.cells[0].voltage_v = None;
+    let text = openmetrics(Some(document));
+    assert!(!text.contains("packwatch_pack_soc_ratio") && !text.contains("packwatch_cell_voltage_volts"));
+    assert!(!text.contains("NaN") && !text.contains("inf"));
+    // The second cell is silent, and of the first nothing else is lost.
+    assert_eq!(samples(&text, "packwatch_cell_soc_ratio"), ["packwatch_cell_soc_ratio{cell=\"1\"} 0.6"]);
+    // Without a daemon nothing is known at all.
+    let none = openmetrics(None);
+    assert_eq!(none.lines().filter(|line| !line.starts_with('#')).collect::<Vec<_>>(), ["packwatch_up 0.0"]);
+}
+
+#[test]
+fn the_older_text_names_counters_in_full_and_has_no_units() {
+    let text = prometheus_text(&openmetrics(Some(sample(2))));
+    assert!(text.contains("# TYPE packwatch_half_cycles_total counter\npackwatch_half_cycles_total 12\n"), "{text}");
+    assert!(text.contains("# TYPE packwatch_build_info gauge\npackwatch_build_info{version=\"1.2.3\"} 1\n"));
+    assert!(!text.contains("# UNIT") && !text.contains("# EOF"));
+}
+
+/// `promtool check metrics` of the Debian package `prometheus`; `None` = it is not here.
+fn promtool(text: &str) -> Option<(bool, String)> {
+    let mut child = Command::new("promtool")
+        .args(["check", "metrics"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .ok()?;
+    child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = [output.stdout, output.stderr].concat();
+    Some((output.status.success(), String::from_utf8_lossy(&said).into_owned()))
+}
+
+#[test]
+fn promtool_finds_no_fault() {
+    for cells in [1, 96, 1024] {
+        let text = prometheus_text(&openmetrics(Some(sample(cells))));
+        let Some((is_good, said)) = promtool(&text) else { return println!("SKIPPED: no promtool here") };
+        assert!(is_good && said.is_empty(), "{said}");
+    }
+    let (is_good, said) = promtool("# TYPE bad_total gauge\nbad_total 1\n").unwrap();
+    assert!(!is_good && !said.is_empty(), "promtool says nothing of a bad name");
+}

@@ -1,0 +1,156 @@
+//! Real sockets, real time: a socket knows no other.
+
+use std::io::Read;
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+
+use tempfile::TempDir;
+
+use super::super::client::{StatusClient, parse};
+use super::super::sample::sample;
+use super::*;
+
+const PATIENT: Limits = Limits { max_silence: Duration::from_secs(5), stale: Duration::from_secs(3) };
+
+fn serve(folder: &TempDir, limits: Limits) -> (StatusServer, PathBuf) {
+    let path = folder.path().join("status.sock");
+    let server = StatusServer::open(path.clone(), limits).map_err(|error| format!("{error:?}")).unwrap();
+    (server, path)
+}
+
+fn draft(cells: u16, pid: u32) -> Draft {
+    Draft { document: Document { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
+}
+
+/// Offers until the thread takes it.
+fn offer(server: &StatusServer, cells: u16, pid: u32) {
+    while !server.offer(draft(cells, pid)) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+fn connect(path: &Path) -> UnixStream {
+    let stream = UnixStream::connect(path).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    stream
+}
+
+/// Everything until the end.
+fn rest(mut stream: UnixStream) -> Vec<u8> {
+    let mut all = Vec::new();
+    let _ = stream.read_to_end(&mut all);
+    all
+}
+
+fn until(what: &str, mut is_so: impl FnMut() -> bool) {
+    let begun = std::time::Instant::now();
+    while !is_so() {
+        assert!(begun.elapsed() < Duration::from_secs(10), "never {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn a_client_gets_one_document_and_the_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, path) = serve(&folder, PATIENT);
+    // Asked before there is one: the first is waited for.
+    let early = connect(&path);
+    offer(&server, 96, 1);
+    let told = parse(&rest(early)).unwrap();
+    assert_eq!(told, Document { pid: 1, events: Vec::new(), ..sample(96) });
+    let line = StatusClient::new(Some(&path)).line().unwrap();
+    assert_eq!(parse(&line).unwrap(), told);
+    assert_eq!(server.clients().served, 2);
+    drop(server);
+    assert!(!path.exists() && !stream_path(&path).exists(), "the sockets are still there");
+    assert!(StatusClient::new(Some(&path)).line().unwrap_err().contains("no daemon listens there"));
+}
+
+#[test]
+fn the_stream_has_a_line_per_document() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, path) = serve(&folder, PATIENT);
+    let mut stream = std::io::BufReader::new(connect(&stream_path(&path)));
+    until("connected", || server.clients().connected == 1);
+    for pid in 1..4 {
+        offer(&server, 1, pid);
+        let mut line = String::new();
+        std::io::BufRead::read_line(&mut stream, &mut line).unwrap();
+        assert_eq!(parse(line.as_bytes()).unwrap().pid, pid);
+    }
+    drop(stream);
+    offer(&server, 1, 4);
+    offer(&server, 1, 5);
+    until("the client's end is seen", || server.clients().connected == 0);
+    assert_eq!(server.clients().dropped, 0);
+}
+
+#[test]
+fn clients_beyond_the_limit_are_turned_away_at_once_and_counted() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, path) = serve(&folder, PATIENT);
+    let seated: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect(&stream_path(&path))).collect();
+    until("full", || server.clients().connected == MAX_CLIENTS as u64);
+    for _ in 0..136 {
+        assert_eq!(rest(connect(&path)), b"");
+    }
+    assert_eq!((server.clients().served, server.clients().refused), (MAX_CLIENTS as u64, 136));
+    offer(&server, 1, 7);
+    for mut stream in seated {
+        assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "a client that is seated is not served");
+    }
+    // Those have gone: there is room again.
+    until("room", || {
+        offer(&server, 1, 8);
+        server.clients().connected == 0
+    });
+    assert!(!rest(connect(&path)).is_empty());
+}
+
+#[test]
+fn a_client_that_never_reads_is_dropped_and_holds_up_nobody() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), ..PATIENT });
+    let deaf = [connect(&path), connect(&stream_path(&path))];
+    until("connected", || server.clients().connected == 2);
+    // More than a socket holds.
+    let mut pid = 0;
+    until("both are dropped", || {
+        pid += 1;
+        offer(&server, 1024, pid);
+        assert!(parse(&rest(connect(&path))).is_ok(), "not served beside a deaf one");
+        server.clients().dropped == 2
+    });
+    drop(deaf);
+}
+
+#[test]
+fn an_old_document_is_not_served() {
+    let folder = tempfile::tempdir().unwrap();
+    let stale = Duration::from_millis(100);
+    let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), stale });
+    offer(&server, 1, 1);
+    assert!(!rest(connect(&path)).is_empty());
+    std::thread::sleep(stale);
+    assert_eq!(rest(connect(&path)), b"", "what was true is told as if it were");
+    offer(&server, 1, 2);
+    assert!(!rest(connect(&path)).is_empty());
+}
+
+#[test]
+fn a_second_daemon_does_not_take_the_sockets() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_server, path) = serve(&folder, PATIENT);
+    let error = StatusServer::start(&SocketSetting::At(path)).unwrap_err();
+    assert!(error.contains("listens there already") && error.contains("--status"), "{error}");
+}
+
+#[test]
+fn an_offer_never_waits() {
+    let folder = tempfile::tempdir().unwrap();
+    let (server, _path) = serve(&folder, PATIENT);
+    // A document of 1,024 cells takes the thread milliseconds; offers come faster, and some must be refused.
+    let taken = (0..200).filter(|pid| server.offer(draft(1024, *pid))).count();
+    assert!((1..200).contains(&taken), "{taken} of 200 taken");
+}
