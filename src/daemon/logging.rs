@@ -8,9 +8,10 @@ use std::io::IsTerminal;
 use std::os::linux::fs::MetadataExt;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::fmt;
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, fmt};
 
 use journald::Journal;
 use limit::Limit;
@@ -42,7 +43,7 @@ pub(crate) fn take_left_out() -> u64 {
 /// When the filter cannot be read.
 pub fn start(filter: Option<&str>) -> Result<(), String> {
     let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
-    let filter = EnvFilter::try_new(&text).map_err(|error| format!("log filter '{text}': {error}"))?;
+    let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
     let registry = tracing_subscriber::registry().with(filter);
     // A second start (tests) keeps the first logger: nothing is lost by that.
     let _ = match stderr_is_journal().then(Journal::new) {
