@@ -87,6 +87,7 @@ fn read(path: &Path, config: Option<Config>, told: Vec<String>, faults: &mut Fau
             .as_ref()
             .map_or(pack_ah / 50.0, |keys| convert::transition(keys, pack_ah).dead_band_a),
         voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+        limits: config.as_ref().map(limits).unwrap_or_default(),
         ages: ages(&raw),
         guards,
         outputs: config.as_ref().map(outputs).unwrap_or_default(),
@@ -191,6 +192,11 @@ fn ages(raw: &Raw) -> Ages {
         voltage_s: raw.voltage_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
         temperature_s: raw.temperature_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
     }
+}
+
+fn limits(config: &Config) -> [(f64, f64); 3] {
+    let sample = &config.monitor.sample;
+    [sample.current, sample.voltage, sample.temperature].map(|limits| (limits.min, limits.max))
 }
 
 fn outputs(config: &Config) -> Vec<OutputPlan> {

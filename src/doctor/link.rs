@@ -1,7 +1,7 @@
 //! How the cells' voltages follow the pack's current.
 //!
 //! In: voltage readings (V per cell) with the pack current (A, positive = discharge) that flowed. They are averaged over
-//! blocks of [`BLOCK_S`], so that a sensor's delay of a tenth of a second does not matter. Out:
+//! blocks of [`BLOCKS_S`], so that a sensor's delay of a tenth of a second does not matter. Out:
 //! * the largest steps of the current from block to block and what each cell's voltage did: dV = -R dI;
 //! * runs of steady current and where the voltage drifted: dV = -(dOCV/dSOC) I t / C;
 //! * rests: the voltage a current near zero leaves.
@@ -10,10 +10,13 @@
 
 use crate::quantity::Timestamp;
 
-/// Time over which readings are averaged, s.
-const BLOCK_S: f64 = 1.0;
+/// Times over which readings are averaged, s: the first for a load that changes all the time, the second for one that
+/// holds for a while under voltages that are rough.
+pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
 /// Blocks further apart than this do not belong together, s.
 const MAX_GAP_S: f64 = 40.0;
+/// Steps this many times the usual scatter off the line are left out.
+const FAR: f64 = 8.0;
 /// Most steps kept: a slope from so many is good to a few per cent.
 const MAX_STEPS: usize = 192;
 /// Most runs kept.
@@ -45,8 +48,6 @@ pub(crate) struct Slope {
     pub(crate) r2: f64,
     /// Largest step of the current, A.
     pub(crate) largest_a: f64,
-    /// Root mean square of the steps, A.
-    pub(crate) rms_a: f64,
 }
 
 impl Slope {
@@ -54,26 +55,45 @@ impl Slope {
         self.ohm / self.std_ohm.max(1e-12)
     }
 
+    /// How sure it is that the slope is not zero: 1 = enough. A few points can lie on a line by chance.
+    pub(crate) fn certainty(&self) -> f64 {
+        let needed = match self.points {
+            0..=4 => 15.0,
+            5..=7 => 8.0,
+            _ => 6.0,
+        };
+        self.t().abs() / needed
+    }
+
+    /// Through the points without those far off the rest: a reading gone wrong must not decide.
     fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
-        let (mut n, mut xx, mut xy, mut yy, mut largest) = (0, 0.0, 0.0, 0.0, 0.0_f64);
-        for (x, y) in points.filter(|(_, y)| y.is_finite()) {
-            n += 1;
+        let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
+        let usual = median(all.iter().map(|(x, y)| y / x))?;
+        let scatter = median(all.iter().map(|(x, y)| (y - usual * x).abs()))?;
+        let near = |(x, y): &&(f64, f64)| (y - usual * x).abs() <= FAR * scatter + 1e-3;
+        let kept: Vec<(f64, f64)> = all.iter().filter(near).copied().collect();
+        Self::fit(if 5 * kept.len() >= 4 * all.len() { &kept } else { &all })
+    }
+
+    fn fit(points: &[(f64, f64)]) -> Option<Self> {
+        let (mut xx, mut xy, mut yy, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
+        for (x, y) in points {
             (xx, xy, yy) = (xx + x * x, xy + x * y, yy + y * y);
             largest = largest.max(x.abs());
         }
-        if n < 3 || xx <= 0.0 {
+        if points.len() < 3 || xx <= 0.0 {
             return None;
         }
-        let rest = (yy - xy * xy / xx).max(0.0) / f64::from(n - 1);
+        let n = points.len() as f64;
+        let rest = (yy - xy * xy / xx).max(0.0) / (n - 1.0);
         let r2 = if yy > 0.0 { xy * xy / (xx * yy) } else { 0.0 };
         Some(Self {
-            points: usize::try_from(n).unwrap_or(0),
+            points: points.len(),
             ohm: -xy / xx,
             // Readings have a resolution: a perfect fit of a few steps is not perfect knowledge.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,
-            rms_a: (xx / f64::from(n)).sqrt(),
         })
     }
 }
@@ -130,6 +150,7 @@ struct Steady {
 /// See the module.
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
+    block_s: f64,
     /// Current changes up to this are no change of load, A.
     tolerance_a: f64,
     current: Option<(Timestamp, f64)>,
@@ -139,14 +160,12 @@ pub(crate) struct Link {
     steps: Vec<Step>,
     pub(crate) runs: Vec<Run>,
     pub(crate) rests: Vec<Run>,
-    pub(crate) blocks: u64,
-    /// Readings without a current beside them.
-    pub(crate) without_current: u64,
 }
 
 impl Link {
-    pub(crate) fn new(cells: usize, tolerance_a: f64) -> Self {
+    pub(crate) fn new(cells: usize, tolerance_a: f64, block_s: f64) -> Self {
         Self {
+            block_s,
             tolerance_a,
             current: None,
             block: Block { cells: vec![(0.0, 0); cells], ..Block::default() },
@@ -155,8 +174,6 @@ impl Link {
             steps: Vec::new(),
             runs: Vec::new(),
             rests: Vec::new(),
-            blocks: 0,
-            without_current: 0,
         }
     }
 
@@ -165,12 +182,8 @@ impl Link {
     }
 
     pub(crate) fn handle_voltage(&mut self, time: Timestamp, cell: usize, voltage_v: f64) {
-        let Some((at, current_a)) = self.current.filter(|(at, _)| time.since(*at) <= MAX_GAP_S) else {
-            self.without_current += 1;
-            return;
-        };
-        let _ = at;
-        if self.block.from.is_some_and(|from| time.since(from) >= BLOCK_S - 1e-3 || time < from) {
+        let Some((_, current_a)) = self.current.filter(|(at, _)| time.since(*at) <= MAX_GAP_S) else { return };
+        if self.block.from.is_some_and(|from| time.since(from) >= self.block_s - 1e-3 || time < from) {
             self.close_block();
         }
         let block = &mut self.block;
@@ -197,7 +210,6 @@ impl Link {
         let current_a = std::mem::take(&mut self.block.current_sum) / f64::from(self.block.readings.max(1));
         self.block.readings = 0;
         let Some(voltage_v) = median(cells_v.iter().copied()) else { return };
-        self.blocks += 1;
         let mean = Mean { time: from, current_a, voltage_v, cells_v };
         let near = self.before.take().filter(|before| (0.0..=MAX_GAP_S).contains(&mean.time.since(before.time)));
         match near {

@@ -32,6 +32,8 @@ pub struct Plan {
     pub voltage_noise_v: f64,
     /// Ages from which readings are stale.
     pub ages: Ages,
+    /// Smallest and largest plausible current, cell voltage and temperature; infinite = any.
+    pub limits: [(f64, f64); 3],
     /// Protected messages.
     pub guards: Vec<GuardConfig>,
     /// Frames that are sent.

@@ -46,6 +46,8 @@ pub enum Topic {
     CurrentSign,
     /// Never moves.
     Frozen,
+    /// Outside the configured limits.
+    Range,
     /// One cell unlike the others.
     Cell,
     /// Comes too seldom or too unevenly.

@@ -11,6 +11,8 @@ pub(in crate::doctor) fn number(value: f64) -> String {
     if !value.is_finite() {
         return "unknown".to_owned();
     }
+    // No minus before nothing.
+    let value = if value.abs() < 5e-6 { 0.0 } else { value };
     let size = value.abs();
     let digits = match size {
         _ if size >= 1000.0 || size == 0.0 => 0,
