@@ -343,3 +343,47 @@ pub(crate) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     let (_, found, _) = sorted.select_nth_unstable_by(middle, f64::total_cmp);
     Some(*found)
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    /// A cell of 3.7 V and 50 mOhm whose current follows `current_a`, once a second.
+    fn link(seconds: u32, current_a: impl Fn(u32) -> f64) -> Link {
+        let mut link = Link::new(1, 0.05, BLOCKS_S[0]);
+        for second in 0..seconds {
+            let (time, current_a) = (Timestamp::from_secs(f64::from(second)), current_a(second));
+            link.handle_current(time, current_a);
+            link.handle_voltage(time, 0, 3.7 - 0.05 * current_a);
+        }
+        link.pause();
+        link
+    }
+
+    #[test]
+    fn steps_of_the_current_give_the_resistance_with_its_sign() {
+        let steps = |second: u32| if second / 7 % 2 == 0 { 2.0 } else { -1.0 };
+        let slope = link(60, steps).slope().unwrap();
+        assert!((slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0, "{slope:?}");
+        let turned = Slope::of((0..9).map(|n| (f64::from(n) - 4.0, 0.03 * (f64::from(n) - 4.0)))).unwrap();
+        assert!((turned.ohm + 0.03).abs() < 1e-9, "{turned:?}");
+    }
+
+    #[test]
+    fn a_reading_gone_wrong_does_not_decide_the_slope() {
+        let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
+        assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_current_that_stands_still_gives_a_run_and_no_slope() {
+        let steady = link(120, |_| 2.0);
+        assert!(steady.slope().is_none());
+        assert_eq!((steady.runs.len(), steady.rests.len()), (1, 0));
+        assert!(steady.runs[0].drift_v.abs() < 1e-9 && steady.runs[0].seconds > 90.0);
+        let rest = link(120, |_| 0.01);
+        assert_eq!((rest.runs.len(), rest.rests.len()), (0, 1));
+        assert!((rest.rests[0].end_v - 3.6995).abs() < 1e-6);
+    }
+}

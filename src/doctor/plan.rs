@@ -24,6 +24,8 @@ pub struct Plan {
     pub strings: u16,
     /// The cell model; `None` = it cannot be read.
     pub model: Option<CellModel>,
+    /// Capacity of a cell, Ah: the configured one, else the model's.
+    pub capacity_ah: f64,
     /// Temperature of the surroundings, degrees C.
     pub ambient_c: f64,
     /// Current up to which the pack counts as resting, A.

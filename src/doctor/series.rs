@@ -291,3 +291,42 @@ fn byte_swapped(layout: &SignalLayout) -> Option<SignalLayout> {
         _ => None,
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thinned_sample_keeps_its_quartiles_and_its_size() {
+        let mut sample = Thinned::default();
+        (0..100_000).for_each(|n| sample.push(f64::from(n)));
+        assert!(sample.kept.len() <= KEPT);
+        for q in [0.1, 0.5, 0.9] {
+            let found = sample.quantile(q).unwrap();
+            assert!((found - q * 1e5).abs() < 1000.0, "{q}: {found}");
+        }
+        assert_eq!(Thinned::default().median(), None);
+    }
+
+    #[test]
+    fn whole_bytes_can_be_read_in_the_other_order() {
+        let layout = SignalLayout {
+            start_bit: 16,
+            length_bits: 16,
+            byte_order: ByteOrder::LittleEndian,
+            value_type: ValueType::Unsigned,
+            factor: 1.0,
+            offset: 0.0,
+            minimum: 0.0,
+            maximum: 0.0,
+        };
+        let payload = [0, 0, 0x12, 0x34, 0, 0, 0, 0];
+        let swapped = byte_swapped(&layout).unwrap();
+        assert_eq!(layout.plan().unwrap().raw(&payload), Ok(0x3412));
+        assert_eq!(swapped.plan().unwrap().raw(&payload), Ok(0x1234));
+        assert_eq!(byte_swapped(&swapped), Some(layout));
+        assert_eq!(byte_swapped(&SignalLayout { length_bits: 12, ..layout }), None);
+        assert_eq!(byte_swapped(&SignalLayout { length_bits: 8, ..layout }), None);
+    }
+}

@@ -97,7 +97,7 @@ impl Doctor {
             }
         }
         let cells = if plan.is_pack_total { 1 } else { usize::from(plan.cells) };
-        let pack_ah = plan.model.as_ref().map_or(20.0, |model| model.capacity_ah) * f64::from(plan.strings.max(1));
+        let pack_ah = plan.capacity_ah * f64::from(plan.strings.max(1));
         let bus = |interface: &InterfacePlan| Bus { name: interface.name.clone(), ..Bus::default() };
         Self {
             buses: plan.interfaces.iter().map(bus).collect(),

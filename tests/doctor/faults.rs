@@ -15,8 +15,6 @@ pub(crate) struct Fault {
     pub(crate) proposed: &'static str,
     pub(crate) benches: &'static [Bench],
     pub(crate) seeds: u64,
-    /// A note is all that can be said.
-    pub(crate) is_note: bool,
 }
 
 const fn fault(
@@ -27,7 +25,7 @@ const fn fault(
     benches: &'static [Bench],
     seeds: u64,
 ) -> Fault {
-    Fault { name, breaks, expected, proposed, benches, seeds, is_note: false }
+    Fault { name, breaks, expected, proposed, benches, seeds }
 }
 
 fn invert(broken: &mut Broken) {
@@ -487,20 +485,6 @@ pub(crate) const FAULTS: &[Fault] = &[
         3,
     ),
     fault(
-        "a sensor that is not there",
-        |b| {
-            b.data("120", |d| {
-                if d[0] == 0 {
-                    d[1] = 0
-                }
-            })
-        },
-        &[Topic::Cell, Topic::Silent, Topic::Unit],
-        "",
-        &[],
-        0,
-    ),
-    fault(
         "stale before the next reading",
         |b| b.config("max_age_s = 0.5", "max_age_s = 0.004"),
         &[Topic::Period],
@@ -569,14 +553,6 @@ pub(crate) const FAULTS: &[Fault] = &[
         "data_id",
         &[Protected],
         3,
-    ),
-    fault(
-        "wrong profile",
-        |b| b.config("profile = \"1A\"", "profile = \"5\""),
-        &[Topic::Protection, Topic::Configuration],
-        "",
-        &[],
-        0,
     ),
     fault("damaged checksums", |b| b.data("100", |d| d[0] ^= 0x5A), &[Topic::Protection], "", &[Protected], 3),
     fault(

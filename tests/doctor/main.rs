@@ -2,7 +2,7 @@
 //! simulated, then the configuration, the DBC or the log is broken in one way, and the finding that comes first must be
 //! the right one. On the healthy ones nothing at all may be found.
 //!
-//! The table below is the whole of it: name, how it is broken, what must come first, the line proposed.
+//! `faults` is the whole table: name, how it is broken, what must come first, the line proposed.
 #![allow(clippy::unwrap_used, clippy::print_stderr, reason = "a test")]
 
 mod bench;
@@ -13,17 +13,22 @@ use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
 use packwatch::doctor::{Report, Severity};
 
-/// Healthy packs: configuration, scenario, what else `simulate` is told, seeds.
-const HEALTHY: &[(Bench, &[u64])] = &[
-    (Bench::Pack12, &[1, 2, 3, 4, 5, 6]),
-    (Bench::Pack96, &[1, 2]),
-    (Bench::Protected, &[1, 2, 3]),
-    (Bench::Total, &[1, 2, 3, 4]),
-    (Bench::Pulses, &[1, 2, 3, 4, 5]),
-    (Bench::Steady, &[1, 2, 3, 4]),
-    (Bench::Charge, &[1, 2, 3]),
-    (Bench::Walk, &[1, 2, 3, 4]),
-    (Bench::Day, &[1]),
+/// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs nobody has looked at yet.
+fn first_seed() -> u64 {
+    std::env::var("PACKWATCH_FIRST_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1)
+}
+
+/// Healthy packs, and how many of each.
+const HEALTHY: &[(Bench, u64)] = &[
+    (Bench::Pack12, 6),
+    (Bench::Pack96, 2),
+    (Bench::Protected, 3),
+    (Bench::Total, 4),
+    (Bench::Pulses, 5),
+    (Bench::Steady, 4),
+    (Bench::Charge, 3),
+    (Bench::Walk, 4),
+    (Bench::Day, 1),
 ];
 
 fn findings(report: &Report) -> Vec<String> {
@@ -36,8 +41,8 @@ fn findings(report: &Report) -> Vec<String> {
 fn nothing_is_found_on_healthy_packs() {
     let (mut logs, mut wrong) = (0, Vec::new());
     for (bench, seeds) in HEALTHY {
-        for seed in *seeds {
-            let report = Broken::of(*bench, *seed).report();
+        for seed in first_seed()..first_seed() + seeds {
+            let report = Broken::of(*bench, seed).report();
             assert!(report.frames > 50, "{bench:?} {seed}: only {} frames", report.frames);
             logs += 1;
             let found = findings(&report);
@@ -69,7 +74,7 @@ fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
         let mut changes = report.findings.iter().filter(|f| is_it(f.topic)).flat_map(|f| &f.changes);
         proposed.is_empty() || changes.any(|c| format!("{} = {}", c.key, c.proposed).contains(proposed))
     };
-    let told: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note || fault.is_note).collect();
+    let told: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note).collect();
     let is_first = told.first().is_some_and(|finding| is_it(finding.topic));
     if is_first && says(fault.proposed) {
         tally.first += 1;
@@ -90,7 +95,7 @@ fn each_fault_made_on_purpose_is_found_first() {
     let mut tally = Tally::default();
     for fault in FAULTS {
         for bench in fault.benches {
-            for seed in 1..=fault.seeds {
+            for seed in first_seed()..first_seed() + fault.seeds {
                 try_fault(fault, *bench, seed, &mut tally);
             }
         }

@@ -1,7 +1,9 @@
 //! Sign of the current, resistance, open-circuit voltage, offset and noise: whether voltages follow the current as this cell's do.
 
 use super::super::link::{Run, Slope};
+use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
+use super::places::unit_of;
 use super::{Judge, Kind, words};
 use crate::cell::CellModel;
 use crate::quantity::Channel;
@@ -167,7 +169,7 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
         .advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
         judge.report.add(finding);
     } else if slope.ohm > 0.0 {
-        judge.report.fine.push(format!("the resistance fits: {seen}"));
+        judge.report.fine.push(format!("the resistance is of the right size: {seen}"));
     }
 }
 
@@ -183,21 +185,35 @@ pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
 fn current_unit(judge: &mut Judge<'_>, seen: &str, factor: f64, ratio: f64) {
     let Some((signal, _)) = judge.current() else { return };
     judge.current_factor *= factor;
-    let title = format!("pack current: off by a factor of {}?", words::number(factor.max(1.0 / factor)));
-    let finding = if (0.05..20.0).contains(&factor) {
-        Finding::warning(Topic::Unit, title)
-    } else {
-        Finding::error(Topic::Unit, title)
-    };
-    let finding = finding
-        .seen(seen.to_owned())
-        .why(format!(
-            "{} times off: no cell ages or cools so far; the voltages are plausible, so it is the current",
-            words::number(ratio)
+    let ratio = words::number(ratio);
+    let why = format!("{ratio} times off: no cell ages or cools so far");
+    let finding = slip_or_other_cell(judge, signal, factor, (0.05..20.0).contains(&factor));
+    judge.report.add(finding.seen(seen.to_owned()).why(why));
+}
+
+/// A current that is off by `factor`: in its unit, or because the cell is another. The DBC's own unit decides what is
+/// named first: where it says ampere and nothing is scaled, the reading is probably right.
+pub(super) fn slip_or_other_cell(judge: &Judge<'_>, signal: &SignalPlan, factor: f64, is_warning: bool) -> Finding {
+    let times = words::number(factor.max(1.0 / factor));
+    let size = if factor < 1.0 { "larger" } else { "smaller" };
+    let is_ampere = unit_of(&signal.unit).is_some_and(|(_, unit, _)| unit == 1.0) && signal.scale == 1.0;
+    let finding = |topic, title| if is_warning { Finding::warning(topic, title) } else { Finding::error(topic, title) };
+    let scale = words::toml(signal.scale * factor);
+    if is_ampere {
+        return finding(Topic::CellModel, format!("the cells are about {times} times {size} than the cell model's"))
+            .change("pack", "cell_model", "the model of the cell that is in the pack")
+            .advice(format!(
+                "or {} is off by that factor (scale = {scale}), or pack.strings is not {}",
+                signal.name, judge.plan.strings
+            ));
+    }
+    let mark = if is_warning { "?" } else { "" };
+    finding(Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
+        .change(&signal.table, "scale", scale)
+        .advice(format!(
+            "or the cells are {times} times {size} than the cell model's, or pack.strings is not {}",
+            judge.plan.strings
         ))
-        .change(&signal.table, "scale", words::toml(signal.scale * factor))
-        .advice(format!("or pack.strings is not {}, or the cell model is of another size", judge.plan.strings));
-    judge.report.add(finding);
 }
 
 /// What steady runs say, taken together; per cell, positive = as the configured sign has it.
@@ -249,7 +265,7 @@ fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &Run) -> f64 {
     let cell_a = run.current_a * judge.current_factor / f64::from(judge.plan.strings.max(1));
     let (_, settled) = model_ohm(judge, model);
     let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
-    let moved = -cell_a * run.seconds / 3600.0 / model.capacity_ah;
+    let moved = -cell_a * run.seconds / 3600.0 / judge.plan.capacity_ah;
     let end = model.place((soc + moved).clamp(0.0, 1.0), temperature_c);
     model.ocv_v(&end) - model.ocv_v(&model.place(soc, temperature_c))
 }

@@ -119,7 +119,7 @@ impl<'d> Judge<'d> {
 
     /// Charge of the whole pack, Ah.
     fn pack_ah(&self) -> f64 {
-        self.plan.model.as_ref().map_or(50.0, |model| model.capacity_ah) * f64::from(self.plan.strings.max(1))
+        self.plan.capacity_ah * f64::from(self.plan.strings.max(1))
     }
 
     /// The middle of the cells' middle voltages as configured, V per cell; `None` = no reading.

@@ -126,7 +126,7 @@ fn voltages(judge: &mut Judge<'_>) {
             .change(&signal.table, "scale", words::toml(signal.scale * factor));
         return judge.report.add(finding);
     }
-    if judge.plan.is_pack_total {
+    if judge.plan.is_pack_total && middle > 0.0 {
         return pack_count(judge, middle * cells);
     }
     judge.is_mixed_up = true;
@@ -191,11 +191,13 @@ fn current(judge: &mut Judge<'_>) {
         Some(_) => format!("the DBC's unit is {:?}, and the configuration does not convert it", signal.unit),
         None => format!("that is {} times the pack's capacity in an hour", words::number(c_rate)),
     };
-    let finding = Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", slip(factor)))
-        .seen(format!("{} reads up to {} A", signal.name, words::number(largest)))
-        .why(why)
-        .change(&signal.table, "scale", words::toml(signal.scale * factor));
-    judge.report.add(finding);
+    let finding =
+        match written {
+            Some(_) => Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", slip(factor)))
+                .change(&signal.table, "scale", words::toml(signal.scale * factor)),
+            None => electrical::slip_or_other_cell(judge, signal, factor, false),
+        };
+    judge.report.add(finding.seen(format!("{} reads up to {} A", signal.name, words::number(largest))).why(why));
 }
 
 /// What a temperature could be meant as: factor, offset, in words.
