@@ -17,6 +17,10 @@ pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
 const MAX_GAP_S: f64 = 40.0;
 /// Steps this many times the usual scatter off the line are left out.
 const FAR: f64 = 8.0;
+/// Fewer large steps than this are judged against the noise between them ...
+const FEW_STEPS: usize = 5;
+/// ... when the largest is so many times the tolerance.
+const FEW_TIMES: f64 = 5.0;
 /// Most steps kept: a slope from so many is good to a few per cent.
 const MAX_STEPS: usize = 192;
 /// Most runs kept.
@@ -313,18 +317,27 @@ impl Link {
 
     /// The pack's slope over the largest steps.
     pub(crate) fn slope(&self) -> Option<Slope> {
-        Slope::of(self.large().map(|step| (step.current_a, step.voltage_v)))
+        self.slope_over(|step| Some(step.voltage_v))
     }
 
     /// One cell's.
     pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
-        Slope::of(self.large().filter_map(|s| Some((s.current_a, f64::from(*s.cells_v.get(cell)?)))))
+        self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Steps of at least a fifth of the largest: below, it is mostly noise that moves.
-    fn large(&self) -> impl Iterator<Item = &Step> {
+    /// Over steps of at least a fifth of the largest: below, it is mostly noise that moves. Where these are few, the others
+    /// say how large that noise is.
+    fn slope_over(&self, voltage_v: impl Fn(&Step) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
-        self.steps.iter().filter(move |step| step.current_a.abs() >= 0.2 * largest)
+        let points = |least_a: f64| {
+            let steps = self.steps.iter().filter(move |step| step.current_a.abs() >= least_a);
+            steps.filter_map(|step| Some((step.current_a, voltage_v(step)?))).filter(|(_, v)| v.is_finite())
+        };
+        if points(0.2 * largest).count() >= FEW_STEPS {
+            return Slope::of(points(0.2 * largest));
+        }
+        let all: Vec<(f64, f64)> = points(0.0).collect();
+        if largest < FEW_TIMES * self.tolerance_a { None } else { Slope::fit(&all) }
     }
 
     /// Whether the voltage moves with a load rather than with its noise: changes that are not taken back by the next one.
@@ -379,7 +392,9 @@ mod tests {
     #[test]
     fn a_current_that_stands_still_gives_a_run_and_no_slope() {
         let steady = link(120, |_| 2.0);
-        assert!(steady.slope().is_none());
+        assert!(steady.slope().is_none_or(|slope| slope.certainty() < 1.0));
+        let one_step = link(40, |second| if second < 20 { 0.0 } else { 2.0 }).slope();
+        assert!(one_step.is_some_and(|slope| (slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0));
         assert_eq!((steady.runs.len(), steady.rests.len()), (1, 0));
         assert!(steady.runs[0].drift_v.abs() < 1e-9 && steady.runs[0].seconds > 90.0);
         let rest = link(120, |_| 0.01);

@@ -50,9 +50,9 @@ pub(super) fn judge(judge: &mut Judge<'_>) {
     } else if let Some(drift) = drift.filter(|drift| drift.is_opposite()) {
         inverted_by_drift(judge, &table, &drift);
     } else if drift.is_none_or(|drift| !drift.is_along()) {
-        let is_hidden = slope.is_some_and(|slope| slope.largest_a > SMALLEST_STEP * judge.pack_ah());
-        let hint = if is_hidden {
-            "the voltages' noise hides what the current does; listen longer"
+        let has_moved = series.extent.range() * judge.current_factor > SMALLEST_STEP * judge.pack_ah();
+        let hint = if has_moved {
+            "too few steps of the current for the noise of the voltages; listen longer"
         } else {
             "the current hardly moved; drive or charge for a minute"
         };
