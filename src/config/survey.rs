@@ -13,6 +13,7 @@ use super::pattern::Pattern;
 use super::resolve::{self, Databases, Resolved};
 use super::{Config, ConfigFaults, beside, cell_model, load, protect, read_file, read_text};
 use crate::can::decode::{Binding, InputMap};
+use crate::cell::CellModel;
 use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, Plan, SignalPlan};
 use crate::quantity::{BusIndex, CellIndex, Channel, MAX_CELLS};
 
@@ -80,6 +81,7 @@ fn read(path: &Path, config: Option<Config>, told: Vec<String>, faults: &mut Fau
         cells: raw.pack.as_ref().map_or_else(|| cells_of(&found), |pack| pack.cells),
         is_pack_total: raw.voltages_written.1,
         strings: raw.pack.as_ref().map_or(1, |pack| pack.strings),
+        capacity_ah: capacity_ah(&raw, model.as_ref()),
         model,
         ambient_c: raw.pack.as_ref().map_or(25.0, |pack| pack.ambient_c),
         dead_band_a: raw
@@ -87,6 +89,7 @@ fn read(path: &Path, config: Option<Config>, told: Vec<String>, faults: &mut Fau
             .as_ref()
             .map_or(pack_ah / 50.0, |keys| convert::transition(keys, pack_ah).dead_band_a),
         voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+        limits: config.as_ref().map(limits).unwrap_or_default(),
         ages: ages(&raw),
         guards,
         outputs: config.as_ref().map(outputs).unwrap_or_default(),
@@ -94,6 +97,13 @@ fn read(path: &Path, config: Option<Config>, told: Vec<String>, faults: &mut Fau
     };
     let input = resolve::input_map(&found)?;
     Some(Survey { plan, input, config, faults: told, places: places(&raw) })
+}
+
+fn capacity_ah(raw: &Raw, model: Option<&CellModel>) -> f64 {
+    /// Where nothing says one: a car's cell.
+    const USUAL_AH: f64 = 50.0;
+    let configured = raw.pack.as_ref().and_then(|pack| pack.initial_capacity_ah.or(pack.rated_capacity_ah));
+    configured.or(model.map(|model| model.capacity_ah)).unwrap_or(USUAL_AH)
 }
 
 fn cells_of(found: &[Resolved<'_>]) -> u16 {
@@ -192,6 +202,11 @@ fn ages(raw: &Raw) -> Ages {
         voltage_s: raw.voltage_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
         temperature_s: raw.temperature_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
     }
+}
+
+fn limits(config: &Config) -> [(f64, f64); 3] {
+    let sample = &config.monitor.sample;
+    [sample.current, sample.voltage, sample.temperature].map(|limits| (limits.min, limits.max))
 }
 
 fn outputs(config: &Config) -> Vec<OutputPlan> {

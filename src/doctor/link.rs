@@ -1,7 +1,7 @@
 //! How the cells' voltages follow the pack's current.
 //!
 //! In: voltage readings (V per cell) with the pack current (A, positive = discharge) that flowed. They are averaged over
-//! blocks of [`BLOCK_S`], so that a sensor's delay of a tenth of a second does not matter. Out:
+//! blocks of [`BLOCKS_S`], so that a sensor's delay of a tenth of a second does not matter. Out:
 //! * the largest steps of the current from block to block and what each cell's voltage did: dV = -R dI;
 //! * runs of steady current and where the voltage drifted: dV = -(dOCV/dSOC) I t / C;
 //! * rests: the voltage a current near zero leaves.
@@ -10,10 +10,17 @@
 
 use crate::quantity::Timestamp;
 
-/// Time over which readings are averaged, s.
-const BLOCK_S: f64 = 1.0;
+/// Times over which readings are averaged, s: the first for a load that changes all the time, the second for one that
+/// holds for a while under voltages that are rough.
+pub(crate) const BLOCKS_S: [f64; 2] = [1.0, 10.0];
 /// Blocks further apart than this do not belong together, s.
 const MAX_GAP_S: f64 = 40.0;
+/// Steps this many times the usual scatter off the line are left out.
+const FAR: f64 = 8.0;
+/// Fewer large steps than this are judged against the noise between them ...
+const FEW_STEPS: usize = 5;
+/// ... when the largest is so many times the tolerance.
+const FEW_TIMES: f64 = 5.0;
 /// Most steps kept: a slope from so many is good to a few per cent.
 const MAX_STEPS: usize = 192;
 /// Most runs kept.
@@ -45,8 +52,6 @@ pub(crate) struct Slope {
     pub(crate) r2: f64,
     /// Largest step of the current, A.
     pub(crate) largest_a: f64,
-    /// Root mean square of the steps, A.
-    pub(crate) rms_a: f64,
 }
 
 impl Slope {
@@ -54,26 +59,45 @@ impl Slope {
         self.ohm / self.std_ohm.max(1e-12)
     }
 
+    /// How sure it is that the slope is not zero: 1 = enough. A few points can lie on a line by chance.
+    pub(crate) fn certainty(&self) -> f64 {
+        let needed = match self.points {
+            0..=4 => 15.0,
+            5..=7 => 8.0,
+            _ => 6.0,
+        };
+        self.t().abs() / needed
+    }
+
+    /// Through the points without those far off the rest: a reading gone wrong must not decide.
     fn of(points: impl Iterator<Item = (f64, f64)>) -> Option<Self> {
-        let (mut n, mut xx, mut xy, mut yy, mut largest) = (0, 0.0, 0.0, 0.0, 0.0_f64);
-        for (x, y) in points.filter(|(_, y)| y.is_finite()) {
-            n += 1;
+        let all: Vec<(f64, f64)> = points.filter(|(x, y)| y.is_finite() && *x != 0.0).collect();
+        let usual = median(all.iter().map(|(x, y)| y / x))?;
+        let scatter = median(all.iter().map(|(x, y)| (y - usual * x).abs()))?;
+        let near = |(x, y): &&(f64, f64)| (y - usual * x).abs() <= FAR * scatter + 1e-3;
+        let kept: Vec<(f64, f64)> = all.iter().filter(near).copied().collect();
+        Self::fit(if 5 * kept.len() >= 4 * all.len() { &kept } else { &all })
+    }
+
+    fn fit(points: &[(f64, f64)]) -> Option<Self> {
+        let (mut xx, mut xy, mut yy, mut largest) = (0.0, 0.0, 0.0, 0.0_f64);
+        for (x, y) in points {
             (xx, xy, yy) = (xx + x * x, xy + x * y, yy + y * y);
             largest = largest.max(x.abs());
         }
-        if n < 3 || xx <= 0.0 {
+        if points.len() < 3 || xx <= 0.0 {
             return None;
         }
-        let rest = (yy - xy * xy / xx).max(0.0) / f64::from(n - 1);
+        let n = points.len() as f64;
+        let rest = (yy - xy * xy / xx).max(0.0) / (n - 1.0);
         let r2 = if yy > 0.0 { xy * xy / (xx * yy) } else { 0.0 };
         Some(Self {
-            points: usize::try_from(n).unwrap_or(0),
+            points: points.len(),
             ohm: -xy / xx,
             // Readings have a resolution: a perfect fit of a few steps is not perfect knowledge.
             std_ohm: (rest / xx).sqrt().max(1e-7),
             r2,
             largest_a: largest,
-            rms_a: (xx / f64::from(n)).sqrt(),
         })
     }
 }
@@ -130,6 +154,7 @@ struct Steady {
 /// See the module.
 #[derive(Debug, Clone)]
 pub(crate) struct Link {
+    block_s: f64,
     /// Current changes up to this are no change of load, A.
     tolerance_a: f64,
     current: Option<(Timestamp, f64)>,
@@ -139,14 +164,12 @@ pub(crate) struct Link {
     steps: Vec<Step>,
     pub(crate) runs: Vec<Run>,
     pub(crate) rests: Vec<Run>,
-    pub(crate) blocks: u64,
-    /// Readings without a current beside them.
-    pub(crate) without_current: u64,
 }
 
 impl Link {
-    pub(crate) fn new(cells: usize, tolerance_a: f64) -> Self {
+    pub(crate) fn new(cells: usize, tolerance_a: f64, block_s: f64) -> Self {
         Self {
+            block_s,
             tolerance_a,
             current: None,
             block: Block { cells: vec![(0.0, 0); cells], ..Block::default() },
@@ -155,8 +178,6 @@ impl Link {
             steps: Vec::new(),
             runs: Vec::new(),
             rests: Vec::new(),
-            blocks: 0,
-            without_current: 0,
         }
     }
 
@@ -165,12 +186,8 @@ impl Link {
     }
 
     pub(crate) fn handle_voltage(&mut self, time: Timestamp, cell: usize, voltage_v: f64) {
-        let Some((at, current_a)) = self.current.filter(|(at, _)| time.since(*at) <= MAX_GAP_S) else {
-            self.without_current += 1;
-            return;
-        };
-        let _ = at;
-        if self.block.from.is_some_and(|from| time.since(from) >= BLOCK_S - 1e-3 || time < from) {
+        let Some((_, current_a)) = self.current.filter(|(at, _)| time.since(*at) <= MAX_GAP_S) else { return };
+        if self.block.from.is_some_and(|from| time.since(from) >= self.block_s - 1e-3 || time < from) {
             self.close_block();
         }
         let block = &mut self.block;
@@ -197,7 +214,6 @@ impl Link {
         let current_a = std::mem::take(&mut self.block.current_sum) / f64::from(self.block.readings.max(1));
         self.block.readings = 0;
         let Some(voltage_v) = median(cells_v.iter().copied()) else { return };
-        self.blocks += 1;
         let mean = Mean { time: from, current_a, voltage_v, cells_v };
         let near = self.before.take().filter(|before| (0.0..=MAX_GAP_S).contains(&mean.time.since(before.time)));
         match near {
@@ -301,18 +317,27 @@ impl Link {
 
     /// The pack's slope over the largest steps.
     pub(crate) fn slope(&self) -> Option<Slope> {
-        Slope::of(self.large().map(|step| (step.current_a, step.voltage_v)))
+        self.slope_over(|step| Some(step.voltage_v))
     }
 
     /// One cell's.
     pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
-        Slope::of(self.large().filter_map(|s| Some((s.current_a, f64::from(*s.cells_v.get(cell)?)))))
+        self.slope_over(|step| step.cells_v.get(cell).map(|v| f64::from(*v)))
     }
 
-    /// Steps of at least a fifth of the largest: below, it is mostly noise that moves.
-    fn large(&self) -> impl Iterator<Item = &Step> {
+    /// Over steps of at least a fifth of the largest: below, it is mostly noise that moves. Where these are few, the others
+    /// say how large that noise is.
+    fn slope_over(&self, voltage_v: impl Fn(&Step) -> Option<f64>) -> Option<Slope> {
         let largest = self.steps.iter().map(|step| step.current_a.abs()).fold(0.0, f64::max);
-        self.steps.iter().filter(move |step| step.current_a.abs() >= 0.2 * largest)
+        let points = |least_a: f64| {
+            let steps = self.steps.iter().filter(move |step| step.current_a.abs() >= least_a);
+            steps.filter_map(|step| Some((step.current_a, voltage_v(step)?))).filter(|(_, v)| v.is_finite())
+        };
+        if points(0.2 * largest).count() >= FEW_STEPS {
+            return Slope::of(points(0.2 * largest));
+        }
+        let all: Vec<(f64, f64)> = points(0.0).collect();
+        if largest < FEW_TIMES * self.tolerance_a { None } else { Slope::fit(&all) }
     }
 
     /// Whether the voltage moves with a load rather than with its noise: changes that are not taken back by the next one.
@@ -330,4 +355,50 @@ pub(crate) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     }
     let (_, found, _) = sorted.select_nth_unstable_by(middle, f64::total_cmp);
     Some(*found)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    /// A cell of 3.7 V and 50 mOhm whose current follows `current_a`, once a second.
+    fn link(seconds: u32, current_a: impl Fn(u32) -> f64) -> Link {
+        let mut link = Link::new(1, 0.05, BLOCKS_S[0]);
+        for second in 0..seconds {
+            let (time, current_a) = (Timestamp::from_secs(f64::from(second)), current_a(second));
+            link.handle_current(time, current_a);
+            link.handle_voltage(time, 0, 3.7 - 0.05 * current_a);
+        }
+        link.pause();
+        link
+    }
+
+    #[test]
+    fn steps_of_the_current_give_the_resistance_with_its_sign() {
+        let steps = |second: u32| if second / 7 % 2 == 0 { 2.0 } else { -1.0 };
+        let slope = link(60, steps).slope().unwrap();
+        assert!((slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0, "{slope:?}");
+        let turned = Slope::of((0..9).map(|n| (f64::from(n) - 4.0, 0.03 * (f64::from(n) - 4.0)))).unwrap();
+        assert!((turned.ohm + 0.03).abs() < 1e-9, "{turned:?}");
+    }
+
+    #[test]
+    fn a_reading_gone_wrong_does_not_decide_the_slope() {
+        let points = (1..20).map(|n| (f64::from(n), if n == 19 { 5.0 } else { -0.05 * f64::from(n) }));
+        assert!((Slope::of(points).unwrap().ohm - 0.05).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_current_that_stands_still_gives_a_run_and_no_slope() {
+        let steady = link(120, |_| 2.0);
+        assert!(steady.slope().is_none_or(|slope| slope.certainty() < 1.0));
+        let one_step = link(40, |second| if second < 20 { 0.0 } else { 2.0 }).slope();
+        assert!(one_step.is_some_and(|slope| (slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0));
+        assert_eq!((steady.runs.len(), steady.rests.len()), (1, 0));
+        assert!(steady.runs[0].drift_v.abs() < 1e-9 && steady.runs[0].seconds > 90.0);
+        let rest = link(120, |_| 0.01);
+        assert_eq!((rest.runs.len(), rest.rests.len()), (0, 1));
+        assert!((rest.rests[0].end_v - 3.6995).abs() < 1e-6);
+    }
 }

@@ -24,6 +24,8 @@ pub struct Plan {
     pub strings: u16,
     /// The cell model; `None` = it cannot be read.
     pub model: Option<CellModel>,
+    /// Capacity of a cell, Ah: the configured one, else the model's.
+    pub capacity_ah: f64,
     /// Temperature of the surroundings, degrees C.
     pub ambient_c: f64,
     /// Current up to which the pack counts as resting, A.
@@ -32,6 +34,8 @@ pub struct Plan {
     pub voltage_noise_v: f64,
     /// Ages from which readings are stale.
     pub ages: Ages,
+    /// Smallest and largest plausible current, cell voltage and temperature; infinite = any.
+    pub limits: [(f64, f64); 3],
     /// Protected messages.
     pub guards: Vec<GuardConfig>,
     /// Frames that are sent.

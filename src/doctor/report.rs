@@ -46,6 +46,8 @@ pub enum Topic {
     CurrentSign,
     /// Never moves.
     Frozen,
+    /// Outside the configured limits.
+    Range,
     /// One cell unlike the others.
     Cell,
     /// Comes too seldom or too unevenly.
@@ -168,5 +170,24 @@ impl Report {
 
     pub(super) fn has(&self, topics: &[Topic]) -> bool {
         self.findings.iter().any(|f| f.severity != Severity::Note && topics.contains(&f.topic))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn findings_stand_worst_first_and_causes_before_effects() {
+        let mut report = Report::default();
+        report.add(Finding::note(Topic::Interface, "n"));
+        assert!(!report.has_findings());
+        report.add(Finding::warning(Topic::Silent, "w"));
+        report.add(Finding::error(Topic::CellModel, "late"));
+        report.add(Finding::error(Topic::Unit, "early"));
+        report.add(Finding::error(Topic::Unit, "early, second"));
+        let titles: Vec<&str> = report.findings.iter().map(|finding| finding.title.as_str()).collect();
+        assert_eq!(titles, ["early", "early, second", "late", "w", "n"]);
+        assert!(report.has_findings());
     }
 }

@@ -10,6 +10,10 @@ use crate::quantity::{Fault, Timestamp};
 /// Values kept of each sample: quartiles of some hundred are good to a few per cent.
 const KEPT: usize = 512;
 
+/// A change by more than this within [`JUMP_S`] is none of a temperature, K.
+const JUMP: f64 = 2.0;
+const JUMP_S: f64 = 2.0;
+
 /// A sample of a stream: every value at first, then every second, every fourth, ...
 #[derive(Debug, Clone)]
 pub(crate) struct Thinned {
@@ -126,13 +130,14 @@ pub(crate) struct Alternative {
 pub(crate) struct Series {
     /// Frames that should carry it by their identifier.
     pub(crate) frames: u64,
-    /// Of these, on its multiplexer page.
-    pub(crate) present: u64,
     pub(crate) short: u64,
     pub(crate) not_available: u64,
     pub(crate) not_finite: u64,
     /// Values that the DBC's own range refuses.
     pub(crate) out_of_range: u64,
+    /// Values outside the plausible ones.
+    pub(crate) implausible: u64,
+    band: (f64, f64),
     pub(crate) extent: Extent,
     pub(crate) values: Thinned,
     /// Time between two readings, s.
@@ -142,13 +147,16 @@ pub(crate) struct Series {
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
     pub(crate) changes: Thinned,
+    /// Changes no temperature can make.
+    pub(crate) jumps: u64,
     pub(crate) alternatives: Vec<Alternative>,
     last_time: Option<Timestamp>,
 }
 
 impl Series {
-    pub(crate) fn new(layout: &SignalLayout) -> Self {
-        Self { alternatives: alternatives(layout), ..Self::default() }
+    /// `band`: what is plausible, both ends 0 = anything.
+    pub(crate) fn new(layout: &SignalLayout, band: (f64, f64)) -> Self {
+        Self { alternatives: alternatives(layout), band, ..Self::default() }
     }
 
     /// Takes a frame that may carry the signal; the value when it does.
@@ -162,12 +170,15 @@ impl Series {
                 return None;
             }
         }
-        self.present += 1;
-        self.note_gap(time, max_age_s);
         let value = self.value(payload, binding)?;
+        let gap_s = self.note_gap(time, max_age_s);
         if self.extent.count > 0 {
-            self.changes.push((value - self.extent.last).abs());
+            let change = (value - self.extent.last).abs();
+            self.changes.push(change);
+            self.jumps += u64::from(change > JUMP && gap_s.is_some_and(|gap_s| gap_s <= JUMP_S));
         }
+        let is_open = self.band == (0.0, 0.0);
+        self.implausible += u64::from(!is_open && !(self.band.0..=self.band.1).contains(&value));
         self.extent.push(value);
         self.values.push(value);
         for other in &mut self.alternatives {
@@ -186,7 +197,13 @@ impl Series {
         }
         match binding.plan.physical(payload) {
             Ok(physical) => {
-                self.out_of_range += u64::from(binding.plan.decode(payload).is_err());
+                let is_refused = binding.plan.decode(payload).is_err();
+                self.out_of_range += u64::from(is_refused);
+                // The customary "nothing to say", though no value table says so.
+                if is_refused && raw.is_ok_and(|raw| raw == binding.plan.all_ones()) {
+                    self.not_available += 1;
+                    return None;
+                }
                 Some(physical * binding.scale + binding.offset)
             }
             Err(Fault::NotFinite) => {
@@ -200,14 +217,15 @@ impl Series {
         }
     }
 
-    fn note_gap(&mut self, time: Timestamp, max_age_s: f64) {
-        if let Some(last) = self.last_time {
-            let gap_s = time.since(last).max(0.0);
+    fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
+        let gap_s = self.last_time.map(|last| time.since(last).max(0.0));
+        if let Some(gap_s) = gap_s {
             self.gaps.push(gap_s);
             self.longest_gap_s = self.longest_gap_s.max(gap_s);
             self.stale_gaps += u64::from(gap_s > max_age_s);
         }
         self.last_time = Some(time);
+        gap_s
     }
 
     /// Nobody listened: the next gap says nothing.
@@ -271,5 +289,44 @@ fn byte_swapped(layout: &SignalLayout) -> Option<SignalLayout> {
             Some(SignalLayout { byte_order: ByteOrder::LittleEndian, start_bit: 8 * byte, ..*layout })
         }
         _ => None,
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thinned_sample_keeps_its_quartiles_and_its_size() {
+        let mut sample = Thinned::default();
+        (0..100_000).for_each(|n| sample.push(f64::from(n)));
+        assert!(sample.kept.len() <= KEPT);
+        for q in [0.1, 0.5, 0.9] {
+            let found = sample.quantile(q).unwrap();
+            assert!((found - q * 1e5).abs() < 1000.0, "{q}: {found}");
+        }
+        assert_eq!(Thinned::default().median(), None);
+    }
+
+    #[test]
+    fn whole_bytes_can_be_read_in_the_other_order() {
+        let layout = SignalLayout {
+            start_bit: 16,
+            length_bits: 16,
+            byte_order: ByteOrder::LittleEndian,
+            value_type: ValueType::Unsigned,
+            factor: 1.0,
+            offset: 0.0,
+            minimum: 0.0,
+            maximum: 0.0,
+        };
+        let payload = [0, 0, 0x12, 0x34, 0, 0, 0, 0];
+        let swapped = byte_swapped(&layout).unwrap();
+        assert_eq!(layout.plan().unwrap().raw(&payload), Ok(0x3412));
+        assert_eq!(swapped.plan().unwrap().raw(&payload), Ok(0x1234));
+        assert_eq!(byte_swapped(&swapped), Some(layout));
+        assert_eq!(byte_swapped(&SignalLayout { length_bits: 12, ..layout }), None);
+        assert_eq!(byte_swapped(&SignalLayout { length_bits: 8, ..layout }), None);
     }
 }

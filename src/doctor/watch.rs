@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::judge;
-use super::link::Link;
+use super::link::{BLOCKS_S, Link, Slope};
 use super::plan::{InterfacePlan, Plan};
 use super::report::Report;
 use super::series::Series;
@@ -75,6 +75,8 @@ pub struct Doctor {
     guards: Guards,
     pub(crate) checked: BTreeMap<(BusIndex, CanId), Checked>,
     pub(crate) link: Link,
+    /// The same over longer blocks.
+    pub(crate) slow_link: Link,
     pub(crate) estimated: Estimated,
     pub(crate) first: Option<Timestamp>,
     pub(crate) last: Timestamp,
@@ -95,16 +97,21 @@ impl Doctor {
             }
         }
         let cells = if plan.is_pack_total { 1 } else { usize::from(plan.cells) };
-        let pack_ah = plan.model.as_ref().map_or(20.0, |model| model.capacity_ah) * f64::from(plan.strings.max(1));
+        let pack_ah = plan.capacity_ah * f64::from(plan.strings.max(1));
         let bus = |interface: &InterfacePlan| Bus { name: interface.name.clone(), ..Bus::default() };
         Self {
             buses: plan.interfaces.iter().map(bus).collect(),
-            series: plan.signals.iter().map(|signal| Series::new(&signal.layout)).collect(),
-            more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout)).collect(),
+            series: plan
+                .signals
+                .iter()
+                .map(|signal| Series::new(&signal.layout, band(&plan, signal.binding.channel)))
+                .collect(),
+            more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, (0.0, 0.0))).collect(),
             by_id,
             guards: Guards::new(plan.guards.clone()),
             checked: BTreeMap::new(),
-            link: Link::new(cells, 0.01 * pack_ah),
+            link: Link::new(cells, 0.01 * pack_ah, BLOCKS_S[0]),
+            slow_link: Link::new(cells, 0.01 * pack_ah, BLOCKS_S[1]),
             estimated: Estimated::default(),
             first: None,
             last: Timestamp::ZERO,
@@ -154,9 +161,11 @@ impl Doctor {
     }
 
     fn read(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let Some(found) = self.by_id.get(&(bus, frame.id())) else { return };
+        let key = (bus, frame.id());
+        let count = self.by_id.get(&key).map_or(0, Vec::len);
         let cells = f64::from(self.plan.cells.max(1));
-        for &(is_more, index) in found {
+        for position in 0..count {
+            let Some(&(is_more, index)) = self.by_id.get(&key).and_then(|found| found.get(position)) else { return };
             if is_more {
                 let binding = &self.plan.more_cells[index].binding;
                 self.more_cells[index].handle(time, frame.data(), binding, f64::INFINITY);
@@ -166,12 +175,35 @@ impl Doctor {
             let max_age_s = judge::max_age_s(&self.plan, binding.channel);
             let Some(value) = self.series[index].handle(time, frame.data(), binding, max_age_s) else { continue };
             match binding.channel {
-                Channel::Current => self.link.handle_current(time, value),
-                Channel::PackVoltage => self.link.handle_voltage(time, 0, value / cells),
-                Channel::CellVoltage(cell) => self.link.handle_voltage(time, cell.index(), value),
+                Channel::Current => self.links().for_each(|link| link.handle_current(time, value)),
+                Channel::PackVoltage => self.links().for_each(|link| link.handle_voltage(time, 0, value / cells)),
+                Channel::CellVoltage(cell) => {
+                    self.links().for_each(|link| link.handle_voltage(time, cell.index(), value));
+                }
                 Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => {}
             }
         }
+    }
+
+    fn links(&mut self) -> impl Iterator<Item = &mut Link> {
+        [&mut self.link, &mut self.slow_link].into_iter()
+    }
+
+    /// How the pack's voltage follows its current, from the blocks that tell it best.
+    pub(crate) fn slope(&self) -> Option<Slope> {
+        self.best_link().slope()
+    }
+
+    /// The same for one cell.
+    pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
+        self.best_link().slope_of(cell)
+    }
+
+    fn best_link(&self) -> &Link {
+        let certainty = |link: &Link| link.slope().map_or(0.0, |slope| slope.certainty());
+        // The short blocks where they do: what is seen in them is the load and nothing slower.
+        let fast = certainty(&self.link);
+        if fast >= 1.0 || fast >= certainty(&self.slow_link) { &self.link } else { &self.slow_link }
     }
 
     fn note_time(&mut self, time: Timestamp) {
@@ -190,7 +222,7 @@ impl Doctor {
     /// How long passed between what came and what comes is unknown, or nobody listened.
     pub fn handle_gap(&mut self) {
         self.series.iter_mut().chain(&mut self.more_cells).for_each(Series::pause);
-        self.link.pause();
+        self.links().for_each(Link::pause);
         self.guards.restart();
     }
 
@@ -234,7 +266,19 @@ impl Doctor {
 
     /// Says what it thinks.
     pub fn finish(mut self) -> Report {
-        self.link.pause();
+        self.links().for_each(Link::pause);
         judge::judge(&self)
+    }
+}
+
+/// What is plausible, in the signal's unit.
+fn band(plan: &Plan, channel: Channel) -> (f64, f64) {
+    let [current, voltage, temperature] = plan.limits;
+    match channel {
+        Channel::Current => current,
+        Channel::CellVoltage(_) => voltage,
+        Channel::PackVoltage => (voltage.0 * f64::from(plan.cells), voltage.1 * f64::from(plan.cells)),
+        Channel::Temperature(_) => temperature,
+        Channel::ReportedSoc | Channel::ReportedSoh => (0.0, 0.0),
     }
 }

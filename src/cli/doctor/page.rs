@@ -63,6 +63,16 @@ fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Pai
     page
 }
 
+/// The new line, or where only people can know it, what it must be.
+fn proposal(change: &Change) -> String {
+    let line = format!("{} = {}", change.key, change.proposed);
+    if toml::from_str::<toml::Table>(&line).is_ok() {
+        format!("+ {line}")
+    } else {
+        format!("+ {} = ... ({})", change.key, change.proposed)
+    }
+}
+
 /// The whole in a sentence.
 fn verdict(report: &Report) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
@@ -111,11 +121,7 @@ fn changes(changes: &[Change], paint: Paint, page: &mut String) {
         };
         page.push_str(&format!("{}{}  [{}]\n", paint.dim(&format!("  {:8}", "change")), place, change.table));
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("31", &format!("- {now}"))));
-        page.push_str(&format!(
-            "{:INDENT$}{}\n",
-            "",
-            paint.with("32", &format!("+ {} = {}", change.key, change.proposed))
-        ));
+        page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("32", &proposal(change))));
     }
     if changes.len() > SHOWN {
         page.push_str(&format!("{:INDENT$}and {} lines like it\n", "", changes.len() - SHOWN));
@@ -147,4 +153,42 @@ fn wrapped(text: &str, width: usize, indent: usize) -> String {
         }
     }
     lines.join(&format!("\n{:indent$}", ""))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+mod tests {
+    use super::*;
+    use crate::doctor::Topic;
+
+    fn change(proposed: &str) -> Change {
+        let place = Some("pack.toml:7".to_owned());
+        Change { table: "pack".to_owned(), key: "cells".to_owned(), proposed: proposed.to_owned(), place, now: None }
+    }
+
+    #[test]
+    fn a_line_to_paste_is_told_from_one_only_people_can_write() {
+        assert_eq!(proposal(&change("90")), "+ cells = 90");
+        assert_eq!(proposal(&change("85 to 131")), "+ cells = ... (85 to 131)");
+    }
+
+    #[test]
+    fn text_is_wrapped_under_itself_and_no_word_is_lost() {
+        let text = "one two three four five";
+        let lines = wrapped(text, 14, 4);
+        assert!(lines.lines().all(|line| line.chars().count() <= 14), "{lines}");
+        assert_eq!(lines.split_whitespace().collect::<Vec<_>>().join(" "), text);
+        assert_eq!(wrapped("unbreakablyLong", 5, 2), "unbreakablyLong");
+    }
+
+    #[test]
+    fn of_many_lines_alike_the_first_are_shown_and_the_rest_counted() {
+        let mut report = Report::default();
+        let mut finding = Finding::new(Severity::Error, Topic::Unit, "off");
+        finding.changes = vec![change("1"); 12];
+        report.add(finding);
+        let page = render(&report, Path::new("pack.toml"), "can0", 80, Paint(false));
+        assert_eq!(page.matches("pack.toml:7").count(), 4);
+        assert!(page.contains("and 8 lines like it") && page.contains("1 error."), "{page}");
+    }
 }

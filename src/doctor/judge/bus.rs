@@ -285,9 +285,9 @@ fn traffic(judge: &mut Judge<'_>) {
     for bus in judge.doctor.buses.iter().filter(|bus| bus.frames > 0) {
         let per_s = bus.frames as f64 / judge.doctor.awake_s.max(1e-3);
         judge.report.fine.push(format!(
-            "{}: {} a second under {}{}",
+            "{}: {} frames a second under {}{}",
             bus.name,
-            words::count(per_s.round() as u64, "frame"),
+            words::number(if per_s >= 10.0 { per_s.round() } else { (per_s * 100.0).round() / 100.0 }),
             words::count(bus.ids.len() as u64, "identifier"),
             if bus.error_frames == 0 { ", no error frames" } else { "" },
         ));

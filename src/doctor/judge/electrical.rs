@@ -1,7 +1,9 @@
 //! Sign of the current, resistance, open-circuit voltage, offset and noise: whether voltages follow the current as this cell's do.
 
 use super::super::link::{Run, Slope};
+use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
+use super::places::unit_of;
 use super::{Judge, Kind, words};
 use crate::cell::CellModel;
 use crate::quantity::Channel;
@@ -11,8 +13,8 @@ const SURE: f64 = 6.0;
 /// ... and judged by its size when the current explains this share of the voltage's changes (noise in the current
 /// makes it too small otherwise).
 const EXPLAINED: f64 = 0.8;
-/// Fewest steps.
-const FEWEST_STEPS: usize = 5;
+/// Fewest steps to judge a single cell by.
+const FEWEST_STEPS: usize = 4;
 /// Smallest step that says anything, of the capacity.
 const SMALLEST_STEP: f64 = 0.02;
 /// A resistance this many times the model's is another unit, not another cell.
@@ -31,21 +33,30 @@ pub(super) fn judge(judge: &mut Judge<'_>) {
     if series.count() == 0 || judge.cell_voltage().is_none() {
         return;
     }
-    let slope = judge.doctor.link.slope().map(|slope| scaled(judge, slope));
-    let slope = slope.filter(|slope| slope.points >= FEWEST_STEPS);
+    let slope = judge.doctor.slope().map(|slope| scaled(judge, slope));
     let drift = drift(judge);
-    let is_sure = slope.is_some_and(|slope| slope.t().abs() >= SURE && slope.r2 >= 0.2);
+    let is_sure = slope.is_some_and(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
     let table = signal.table.clone();
     if let Some(slope) = slope.filter(|_| is_sure) {
         if slope.ohm < 0.0 {
             inverted_by_steps(judge, &table, &slope);
+        } else {
+            judge.report.fine.push(format!(
+                "the sign of the current is right: every ampere of discharge lowers a cell's voltage by {} mV",
+                words::number(1000.0 * slope.ohm)
+            ));
         }
         resistance(judge, &slope);
     } else if let Some(drift) = drift.filter(|drift| drift.is_opposite()) {
         inverted_by_drift(judge, &table, &drift);
     } else if drift.is_none_or(|drift| !drift.is_along()) {
-        let hint = "sign of the current, resistance: the current hardly moved; drive or charge for a minute";
-        judge.report.unjudged.push(hint.to_owned());
+        let has_moved = series.extent.range() * judge.current_factor > SMALLEST_STEP * judge.pack_ah();
+        let hint = if has_moved {
+            "too few steps of the current for the noise of the voltages; listen longer"
+        } else {
+            "the current hardly moved; drive or charge for a minute"
+        };
+        judge.report.unjudged.push(format!("sign of the current, resistance: {hint}"));
     } else {
         judge.report.fine.push("the voltage drifts the way the current says".to_owned());
     }
@@ -62,13 +73,7 @@ pub(super) fn judge(judge: &mut Judge<'_>) {
 fn scaled(judge: &Judge<'_>, slope: Slope) -> Slope {
     let by = judge.voltage_factor / judge.current_factor * f64::from(judge.plan.strings.max(1));
     let amperes = judge.current_factor;
-    Slope {
-        ohm: slope.ohm * by,
-        std_ohm: slope.std_ohm * by,
-        largest_a: slope.largest_a * amperes,
-        rms_a: slope.rms_a * amperes,
-        ..slope
-    }
+    Slope { ohm: slope.ohm * by, std_ohm: slope.std_ohm * by, largest_a: slope.largest_a * amperes, ..slope }
 }
 
 /// The model's resistance for a step of about a second and for one that has settled, ohm.
@@ -164,28 +169,51 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
         .advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
         judge.report.add(finding);
     } else if slope.ohm > 0.0 {
-        judge.report.fine.push(format!("voltages follow the current: {seen}"));
+        judge.report.fine.push(format!("the resistance is of the right size: {seen}"));
     }
+}
+
+/// The factor of ten by which the current is off, as the steps say; `None` = they say nothing, or that it is right.
+pub(super) fn factor_by_steps(judge: &Judge<'_>) -> Option<f64> {
+    let model = judge.plan.model.as_ref()?;
+    let slope = judge.doctor.slope().map(|slope| scaled(judge, slope))?;
+    let (fast, settled) = model_ohm(judge, model);
+    let factor = 10_f64.powf((slope.ohm.abs() / (fast * settled).sqrt()).log10().round());
+    (slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED && factor != 1.0).then_some(factor)
 }
 
 fn current_unit(judge: &mut Judge<'_>, seen: &str, factor: f64, ratio: f64) {
     let Some((signal, _)) = judge.current() else { return };
     judge.current_factor *= factor;
-    let title = format!("pack current: off by a factor of {}?", words::number(factor.max(1.0 / factor)));
-    let finding = if (0.05..20.0).contains(&factor) {
-        Finding::warning(Topic::Unit, title)
-    } else {
-        Finding::error(Topic::Unit, title)
-    };
-    let finding = finding
-        .seen(seen.to_owned())
-        .why(format!(
-            "{} times off: no cell ages or cools so far; the voltages are plausible, so it is the current",
-            words::number(ratio)
+    let ratio = words::number(ratio);
+    let why = format!("{ratio} times off: no cell ages or cools so far");
+    let finding = slip_or_other_cell(judge, signal, factor, (0.05..20.0).contains(&factor));
+    judge.report.add(finding.seen(seen.to_owned()).why(why));
+}
+
+/// A current that is off by `factor`: in its unit, or because the cell is another. The DBC's own unit decides what is
+/// named first: where it says ampere and nothing is scaled, the reading is probably right.
+pub(super) fn slip_or_other_cell(judge: &Judge<'_>, signal: &SignalPlan, factor: f64, is_warning: bool) -> Finding {
+    let times = words::number(factor.max(1.0 / factor));
+    let size = if factor < 1.0 { "larger" } else { "smaller" };
+    let is_ampere = unit_of(&signal.unit).is_some_and(|(_, unit, _)| unit == 1.0) && signal.scale == 1.0;
+    let finding = |topic, title| if is_warning { Finding::warning(topic, title) } else { Finding::error(topic, title) };
+    let scale = words::toml(signal.scale * factor);
+    if is_ampere {
+        return finding(Topic::CellModel, format!("the cells are about {times} times {size} than the cell model's"))
+            .change("pack", "cell_model", "the model of the cell that is in the pack")
+            .advice(format!(
+                "or {} is off by that factor (scale = {scale}), or pack.strings is not {}",
+                signal.name, judge.plan.strings
+            ));
+    }
+    let mark = if is_warning { "?" } else { "" };
+    finding(Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
+        .change(&signal.table, "scale", scale)
+        .advice(format!(
+            "or the cells are {times} times {size} than the cell model's, or pack.strings is not {}",
+            judge.plan.strings
         ))
-        .change(&signal.table, "scale", words::toml(signal.scale * factor))
-        .advice(format!("or pack.strings is not {}, or the cell model is of another size", judge.plan.strings));
-    judge.report.add(finding);
 }
 
 /// What steady runs say, taken together; per cell, positive = as the configured sign has it.
@@ -237,7 +265,7 @@ fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &Run) -> f64 {
     let cell_a = run.current_a * judge.current_factor / f64::from(judge.plan.strings.max(1));
     let (_, settled) = model_ohm(judge, model);
     let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
-    let moved = -cell_a * run.seconds / 3600.0 / model.capacity_ah;
+    let moved = -cell_a * run.seconds / 3600.0 / judge.plan.capacity_ah;
     let end = model.place((soc + moved).clamp(0.0, 1.0), temperature_c);
     model.ocv_v(&end) - model.ocv_v(&model.place(soc, temperature_c))
 }
@@ -276,6 +304,20 @@ fn model_fit(judge: &mut Judge<'_>, drift: Option<Drift>) {
             .why("so flat a curve is an iron-phosphate cell's (LFP), or the cells are much larger")
             .change("pack", "cell_model", "the model of the cell that is in the pack");
         judge.report.add(finding);
+    } else if is_like_iron_phosphate(judge, model) {
+        let finding =
+            Finding::note(Topic::CellModel, "either the pack is nearly empty, or its cells are iron phosphate (LFP)")
+                .seen(format!(
+                    "the middle cell has {} V; by {} that is {} %",
+                    words::number(judge.cell_voltage().unwrap_or(f64::NAN)),
+                    model.name,
+                    (100.0 * model.soc_of_ocv(judge.cell_voltage().unwrap_or(f64::NAN), temperature_c).clamp(0.0, 1.0))
+                        .round()
+                ))
+                .why("iron-phosphate cells stay near 3.3 V from full to empty")
+                .change("pack", "cell_model", "the model of the cell that is in the pack")
+                .advice("compare with the SOC the vehicle shows");
+        judge.report.add(finding);
     } else if rests.is_empty() {
         judge
             .report
@@ -289,6 +331,11 @@ fn model_fit(judge: &mut Judge<'_>, drift: Option<Drift>) {
             (100.0 * soc.clamp(0.0, 1.0)).round()
         ));
     }
+}
+
+fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel) -> bool {
+    let half = model.ocv_v(&model.place(0.5, warmth_c(judge)));
+    half > 3.5 && judge.cell_voltage().is_some_and(|v| (3.18..3.38).contains(&v))
 }
 
 fn chemistry(voltage_v: f64) -> &'static str {
@@ -385,7 +432,7 @@ fn frozen(judge: &mut Judge<'_>) {
     let step_v = judge.doctor.link.largest_voltage_step() * judge.voltage_factor;
     if series.count() >= FEWEST
         && series.extent.changes == 0
-        && step_v > (10.0 * noise_v / cells * judge.voltage_factor).max(0.02)
+        && step_v > (10.0 * noise_v / cells * judge.voltage_factor).max(0.008)
     {
         let finding = Finding::error(Topic::Frozen, "the pack current never moves")
             .seen(format!(
@@ -403,13 +450,15 @@ fn frozen(judge: &mut Judge<'_>) {
 
 /// Cells whose voltage does not follow the current as the others do.
 fn cells(judge: &mut Judge<'_>) {
-    let Some(usual) = judge.doctor.link.slope().filter(|slope| slope.t() >= SURE && slope.r2 >= EXPLAINED) else {
+    let Some(usual) =
+        judge.doctor.slope().filter(|slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED)
+    else {
         return;
     };
     let count = if judge.plan.is_pack_total { 0 } else { usize::from(judge.plan.cells) };
     let mut odd: Vec<(usize, f64)> = Vec::new();
     for cell in 0..count.min(judge.of(Kind::Voltage).len()) {
-        let Some(slope) = judge.doctor.link.slope_of(cell) else { continue };
+        let Some(slope) = judge.doctor.slope_of(cell) else { continue };
         let ratio = slope.ohm / usual.ohm;
         let is_clear = (slope.ohm - usual.ohm).abs() > SURE * slope.std_ohm.max(usual.std_ohm);
         if is_clear && !(0.33..=3.0).contains(&ratio) && slope.points >= FEWEST_STEPS {

@@ -55,6 +55,7 @@ pub(super) fn judge(doctor: &Doctor) -> Report {
     presence::judge(&mut judge);
     places::judge(&mut judge);
     values::judge(&mut judge);
+    values::refused(&mut judge);
     electrical::judge(&mut judge);
     timing::judge(&mut judge);
     if doctor.frames > 0 && doctor.awake_s < SHORT_S {
@@ -107,17 +108,18 @@ impl<'d> Judge<'d> {
         self.of(Kind::Current).first().copied()
     }
 
-    /// Smallest and largest voltage a cell may show, V: the model's, with room for another cell of its kind.
+    /// Smallest and largest voltage the middle cell may show, V.
     fn voltage_band(&self) -> (f64, f64) {
         match &self.plan.model {
-            Some(model) => (0.75 * model.voltage_min_v, model.voltage_max_v + 0.35),
+            // The middle one over the time heard: a short peak does not move it.
+            Some(model) => (model.voltage_min_v - 0.15, model.voltage_max_v + 0.08),
             None => (1.2, 4.6),
         }
     }
 
     /// Charge of the whole pack, Ah.
     fn pack_ah(&self) -> f64 {
-        self.plan.model.as_ref().map_or(50.0, |model| model.capacity_ah) * f64::from(self.plan.strings.max(1))
+        self.plan.capacity_ah * f64::from(self.plan.strings.max(1))
     }
 
     /// The middle of the cells' middle voltages as configured, V per cell; `None` = no reading.

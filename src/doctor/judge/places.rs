@@ -129,6 +129,8 @@ struct Fit {
 
 fn fit(judge: &Judge<'_>, series: &Series, divisor: f64) -> Option<Fit> {
     let (low, high) = (series.values.quantile(0.02)?, series.values.quantile(0.98)?);
+    // A voltage in a current's place has the current's sign.
+    let (low, high) = if high <= 0.0 { (-high, -low) } else { (low, high) };
     let band = judge.voltage_band();
     let is_slow = series.changes.median().unwrap_or(0.0) < 1.0 && high - low < 40.0;
     Some(Fit {
@@ -155,11 +157,10 @@ fn by_values(judge: &mut Judge<'_>) {
     {
         Some((*warm, *voltage))
     } else if let (true, Some(warm), Some(t)) = (v.voltage, warm, t.as_ref())
-        && !t.warmth
+        && warm.1.jumps >= 3
         && t.current
         && c.warmth
-        && current.1.extent.range() < 8.0
-        && warm.1.extent.range() > 2.0 * current.1.extent.range()
+        && current.1.jumps == 0
         && (5.0..=60.0).contains(&current.1.values.median().unwrap_or(0.0).abs())
     {
         Some((*warm, current))

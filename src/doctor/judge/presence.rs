@@ -6,6 +6,7 @@ use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
 use super::super::series::Series;
 use super::{Judge, Kind, words};
+use crate::can::CanId;
 use crate::quantity::{BusIndex, Channel};
 
 /// Why there is no value.
@@ -47,9 +48,12 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
         });
     }
     // Packs with fewer cells than their DBC fill the rest with zeros.
-    let lowest = 0.05 * judge.cell_voltage()?.abs();
-    let is_zero = is_cell && judge.plan.cells > 1 && series.extent.changes == 0 && series.extent.last.abs() < lowest;
-    is_zero.then_some(Absence::Zero)
+    let is_still = series.extent.changes == 0 && series.count() > 1;
+    let usual = judge.cell_voltage()?.abs();
+    let is_absent = is_cell && judge.plan.cells > 1 && series.extent.last.abs() < 0.05 * usual;
+    // And a whole pack that is switched off, or another message of that identifier.
+    let is_dead = Kind::of(signal.binding.channel) == Kind::Voltage && usual == 0.0 && series.extent.last == 0.0;
+    (is_still && (is_absent || is_dead)).then_some(Absence::Zero)
 }
 
 /// When exactly the last cells are silent, the pack has fewer.
@@ -113,7 +117,7 @@ fn tell(judge: &mut Judge<'_>, silent: &[(&SignalPlan, Absence)]) {
                 let needed = signals.iter().map(|s| s.binding.plan.bytes_needed()).max().unwrap_or(0);
                 format!("{message} ({id}) has {longest} bytes, {needed} are needed")
             }
-            Absence::Zero => format!("{message} ({id}) always holds the same code near zero there"),
+            Absence::Zero => format!("{message} ({id}) came, and always holds zero there"),
         };
         let (why, advice) = match how {
             Absence::Message => (
@@ -129,11 +133,34 @@ fn tell(judge: &mut Judge<'_>, silent: &[(&SignalPlan, Absence)]) {
             ),
             Absence::NotFinite => ("the bits are no float", "compare the DBC's value type with its makers'"),
             Absence::Short => ("the frame ends before the signal", "the DBC is of another version of this sender"),
+            Absence::Zero if judge.cell_voltage() == Some(0.0) => {
+                judge.is_mixed_up = true;
+                match others_with(judge, bus, id) {
+                    Some(_) => (
+                        "another bus has this identifier too, and the same number may be another message on each",
+                        "try the other interface",
+                    ),
+                    None => (
+                        "the pack is switched off, or this is another message",
+                        "close the contactors; compare with candump",
+                    ),
+                }
+            }
             Absence::Zero => ("no cell is there", "compare with the pack's own list of cells"),
         };
-        let finding = finding.seen(seen).why(why).change(&signals[0].table, "signal", "the signal that is on the bus");
+        let finding = finding.seen(seen).why(why);
+        let finding = match others_with(judge, bus, id).filter(|_| how == Absence::Zero) {
+            Some(other) => finding.change(&signals[0].table, "interface", format!("{other:?}")),
+            None => finding.change(&signals[0].table, "signal", "the signal that is on the bus"),
+        };
         judge.report.add(finding.advice(advice));
     }
+}
+
+/// Another interface on which the identifier came.
+fn others_with(judge: &Judge<'_>, bus: BusIndex, id: CanId) -> Option<String> {
+    let others = judge.doctor.buses.iter().enumerate().filter(|(index, _)| *index != bus.index());
+    others.into_iter().find(|(_, other)| other.ids.contains_key(&id)).map(|(_, other)| other.name.clone())
 }
 
 /// Signals of further cells that carry data.

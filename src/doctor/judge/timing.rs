@@ -85,7 +85,8 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(seen) = judge.doctor.buses.get(message.bus.index()).and_then(|bus| bus.ids.get(&message.id)) else {
             continue;
         };
-        let Some(cycle_s) = message.cycle_time_s else { continue };
+        // The pages of a multiplexed message may come in bursts, and how many there are is the sender's affair.
+        let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
         // Over all its pages: the frames of a multiplexed message may come in bursts.
         let asleep = judge.doctor.awake_s + 1.0 < seen.last.since(seen.first);
         let span_s = if asleep { judge.doctor.awake_s } else { seen.last.since(seen.first) };

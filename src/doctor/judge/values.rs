@@ -4,7 +4,7 @@ use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
 use super::super::series::{Alternative, Otherwise, Series};
 use super::places::unit_of;
-use super::{Judge, Kind, words};
+use super::{Judge, Kind, electrical, words};
 
 /// Factors a unit may slip by.
 const SLIPS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
@@ -126,7 +126,7 @@ fn voltages(judge: &mut Judge<'_>) {
             .change(&signal.table, "scale", words::toml(signal.scale * factor));
         return judge.report.add(finding);
     }
-    if judge.plan.is_pack_total {
+    if judge.plan.is_pack_total && middle > 0.0 {
         return pack_count(judge, middle * cells);
     }
     judge.is_mixed_up = true;
@@ -181,18 +181,23 @@ fn current(judge: &mut Judge<'_>) {
     let c_rate = largest / judge.pack_ah();
     let factor = match written {
         Some((_, factor, _)) => factor,
-        None => SLIPS.into_iter().rev().find(|factor| *factor < 1.0 && c_rate * factor <= 3.0).unwrap_or(1e-3),
+        None => electrical::factor_by_steps(judge).filter(|factor| *factor < 1.0).unwrap_or_else(|| {
+            let mut smaller = SLIPS.into_iter().rev().filter(|factor| *factor < 1.0);
+            smaller.find(|factor| c_rate * factor <= 3.0).unwrap_or(1e-3)
+        }),
     };
     judge.current_factor = factor;
     let why = match written {
         Some(_) => format!("the DBC's unit is {:?}, and the configuration does not convert it", signal.unit),
         None => format!("that is {} times the pack's capacity in an hour", words::number(c_rate)),
     };
-    let finding = Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", slip(factor)))
-        .seen(format!("{} reads up to {} A", signal.name, words::number(largest)))
-        .why(why)
-        .change(&signal.table, "scale", words::toml(signal.scale * factor));
-    judge.report.add(finding);
+    let finding =
+        match written {
+            Some(_) => Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", slip(factor)))
+                .change(&signal.table, "scale", words::toml(signal.scale * factor)),
+            None => electrical::slip_or_other_cell(judge, signal, factor, false),
+        };
+    judge.report.add(finding.seen(format!("{} reads up to {} A", signal.name, words::number(largest))).why(why));
 }
 
 /// What a temperature could be meant as: factor, offset, in words.
@@ -255,4 +260,56 @@ fn temperatures(judge: &mut Judge<'_>) {
         }
     }
     judge.report.add(finding);
+}
+
+/// Share of implausible readings that is more than a disturbance.
+const MANY: f64 = 0.01;
+
+/// Readings the service will refuse although nothing else is wrong: limits too tight, or disturbances.
+pub(super) fn refused(judge: &mut Judge<'_>) {
+    if judge.is_mixed_up || judge.report.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
+        return;
+    }
+    for (kind, table, what) in [
+        (Kind::Current, "limits.current", "currents"),
+        (Kind::Voltage, "limits.voltage", "voltages"),
+        (Kind::Temperature, "limits.temperature", "temperatures"),
+    ] {
+        let all = judge.of(kind);
+        let (implausible, count) = all.iter().fold((0, 0), |(a, b), (_, s)| (a + s.implausible, b + s.count()));
+        if implausible == 0 {
+            continue;
+        }
+        let low = all.iter().map(|(_, s)| s.extent.min).fold(f64::INFINITY, f64::min);
+        let high = all.iter().map(|(_, s)| s.extent.max).fold(f64::NEG_INFINITY, f64::max);
+        let limits = judge.plan.limits[usize::from(kind != Kind::Current) + usize::from(kind == Kind::Temperature)];
+        let cells = if kind == Kind::Voltage && judge.plan.is_pack_total { f64::from(judge.plan.cells) } else { 1.0 };
+        let share = implausible as f64 / count.max(1) as f64;
+        let title = format!("{what} outside the limits");
+        let finding =
+            if share > MANY { Finding::warning(Topic::Range, title) } else { Finding::note(Topic::Range, title) };
+        let mut finding = finding
+            .seen(format!(
+                "{} of {count} readings: {} to {}, allowed {} to {}",
+                implausible,
+                words::number(low / cells),
+                words::number(high / cells),
+                words::number(limits.0),
+                words::number(limits.1)
+            ))
+            .why(if share > MANY {
+                "so many are no disturbance: the limit is too tight, and they move no estimate"
+            } else {
+                "a few are disturbances; they move no estimate"
+            });
+        if kind == Kind::Current && share > MANY {
+            if high > limits.1 {
+                finding = finding.change(table, "max_discharge_a", words::toml((1.2 * high).ceil()));
+            }
+            if low < limits.0 {
+                finding = finding.change(table, "max_charge_a", words::toml((-1.2 * low).ceil()));
+            }
+        }
+        judge.report.add(finding);
+    }
 }

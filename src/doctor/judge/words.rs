@@ -11,6 +11,8 @@ pub(in crate::doctor) fn number(value: f64) -> String {
     if !value.is_finite() {
         return "unknown".to_owned();
     }
+    // No minus before nothing.
+    let value = if value.abs() < 5e-6 { 0.0 } else { value };
     let size = value.abs();
     let digits = match size {
         _ if size >= 1000.0 || size == 0.0 => 0,
@@ -30,12 +32,17 @@ pub(in crate::doctor) fn toml(value: f64) -> String {
     format!("{rounded:?}")
 }
 
+/// Rounded to three digits: a period jitters.
+fn three_digits(value: f64) -> f64 {
+    format!("{value:.2e}").parse().unwrap_or(value)
+}
+
 /// `100 ms`, `2.5 s`.
 pub(in crate::doctor) fn seconds(value: f64) -> String {
-    if value < 1.0 {
-        format!("{} ms", number(1000.0 * value))
+    if value < 0.9995 {
+        format!("{} ms", number(three_digits(1000.0 * value)))
     } else if value < 7200.0 {
-        format!("{} s", number((value * 10.0).round() / 10.0))
+        format!("{} s", number(three_digits(value)))
     } else {
         format!("{} h", number(value / 3600.0))
     }

@@ -27,6 +27,8 @@ pub(crate) struct Tap {
     socket: RawSocket,
     mapper: StampMapper,
     dropped_total: u32,
+    /// The clocks as last read: before what is read next.
+    before: Reading,
 }
 
 impl Tap {
@@ -37,7 +39,8 @@ impl Tap {
     pub(crate) fn open(interface: &str, clock: MappedClock) -> io::Result<(Self, bool)> {
         let socket = RawSocket::open_all(interface)?;
         let is_up = socket.take_error()?.is_none();
-        Ok((Self { socket, mapper: StampMapper::new(clock, Reading::now()), dropped_total: 0 }, is_up))
+        let before = Reading::now();
+        Ok((Self { socket, mapper: StampMapper::new(clock, before), dropped_total: 0, before }, is_up))
     }
 
     /// The next thing that has come, and when; `None` = there is nothing now.
@@ -45,10 +48,10 @@ impl Tap {
     /// # Errors
     /// When the interface went down (`ENETDOWN`: the tap stays good) or away.
     pub(crate) fn next(&mut self, into: &mut Vec<(Timestamp, Tapped)>) -> io::Result<bool> {
-        let before = Reading::now();
         match self.socket.receive() {
             Ok(received) => {
-                let time = self.mapper.arrival(received.stamps, Reading::now());
+                self.before = Reading::now();
+                let time = self.mapper.arrival(received.stamps, self.before);
                 if let Some(total) = received.dropped_total {
                     let lost = total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total));
                     into.extend((lost > 0).then_some((time, Tapped::Dropped(u64::from(lost)))));
@@ -61,7 +64,8 @@ impl Tap {
                 Ok(true)
             }
             Err(Errno::EAGAIN) => {
-                self.mapper.socket_empty(before);
+                self.mapper.socket_empty(self.before);
+                self.before = Reading::now();
                 Ok(false)
             }
             Err(Errno::EINTR) => Ok(true),
