@@ -190,13 +190,15 @@ def learned(args) -> None:
 # ---- snapshots -----------------------------------------------------------------------------------------------------------------------
 
 
+OF_NOW = ("input_missing", "input_implausible", "bus_fault", "store_failed")
 RAISED = ("active", "latched", "suppressed")  # the last without its input
 
 
 def learned_of(snapshot: dict) -> tuple[list, list]:
     """Capacities and raised alarms: what must come back after a restart."""
     capacities = [round(cell["mean"], 9) for cell in snapshot["learner"]["capacity"]]
-    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarms"]["alarms"] if a["machine"]["state"] in RAISED]
+    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarms"]["alarms"]
+              if a["machine"]["state"] in RAISED and a["rule"] not in OF_NOW]
     return capacities, sorted(alarms, key=str)
 
 
