@@ -12,6 +12,25 @@ use super::{Cli, Failure};
 /// Name of the manual page about configurations.
 const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
 
+/// What the page about the whole says besides the command line's own definition.
+const MORE: &str = "\
+.SH EXIT STATUS
+0: success. 1: the work failed. 2: the command line is wrong. 78: the configuration is. A command with others names them.
+.SH FILES
+.TP
+.I /etc/packwatch/packwatch.toml
+What the service reads.
+.TP
+.I /var/lib/packwatch
+What it has learned.
+.TP
+.I /run/packwatch
+Its sockets.
+.TP
+.I /usr/share/packwatch/packwatch.dbc
+The frames it sends, as shipped; \\fBpackwatch dbc\\fR writes them as they are configured.
+";
+
 /// Arguments of `generate`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
@@ -60,9 +79,17 @@ fn visible() -> clap::Command {
 fn manual_pages() -> Vec<(String, Vec<u8>)> {
     let command = visible();
     let mut pages = vec![(CONFIGURATION_PAGE.to_owned(), crate::config::manual().into_bytes())];
-    pages.push(page(&command));
-    pages.extend(command.get_subcommands().map(page));
+    add_pages(&command, &mut pages);
+    pages[1].1.extend_from_slice(MORE.as_bytes());
     pages
+}
+
+/// The page of a command, then those of its own.
+fn add_pages(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) {
+    pages.push(page(command));
+    for own in command.get_subcommands().filter(|own| !own.is_hide_set()) {
+        add_pages(own, pages);
+    }
 }
 
 fn page(command: &clap::Command) -> (String, Vec<u8>) {
@@ -96,10 +123,18 @@ mod tests {
 
     use super::*;
 
+    /// Names of all commands that are shown, those of a command after it: `history`, `history-verify`.
     fn commands() -> Vec<String> {
-        let command = Cli::command();
-        let shown = command.get_subcommands().filter(|command| !command.is_hide_set());
-        shown.map(|command| command.get_name().to_owned()).collect()
+        fn add(of: &clap::Command, before: &str, names: &mut Vec<String>) {
+            for command in of.get_subcommands().filter(|command| !command.is_hide_set()) {
+                let name = format!("{before}{}", command.get_name());
+                names.push(name.clone());
+                add(command, &format!("{name}-"), names);
+            }
+        }
+        let mut names = Vec::new();
+        add(&Cli::command(), "", &mut names);
+        names
     }
 
     #[test]
@@ -128,10 +163,10 @@ mod tests {
     fn completions_know_every_command_and_nothing_hidden() {
         for shell in [Shell::Bash, Shell::Zsh, Shell::Fish] {
             let text = String::from_utf8(completions(shell)).unwrap_or_default();
-            for name in commands() {
-                assert!(text.contains(&name), "{shell}: {name}");
+            for name in Cli::command().get_subcommands().filter(|c| !c.is_hide_set()).map(clap::Command::get_name) {
+                assert!(text.contains(name), "{shell}: {name}");
             }
-            assert!(!text.contains("generate"), "{shell}");
+            assert!(!text.contains("generate "), "{shell}");
         }
     }
 }

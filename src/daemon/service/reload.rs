@@ -18,7 +18,7 @@ use tokio::time::{Instant, sleep_until};
 
 use super::live::Loop;
 use super::{Engine, notify};
-use crate::config::{self, Config, InterfaceConfig};
+use crate::config::{self, Config, InterfaceConfig, StoreConfig};
 use crate::monitor::MonitorConfig;
 
 /// Readings of the file begin at least this far apart.
@@ -110,25 +110,34 @@ async fn finished(reading: &mut Option<Reading>) -> Result<Box<MonitorConfig>, V
     }
 }
 
-/// What cannot change while the service runs and the core does not know: the interfaces' names and kinds.
+/// What cannot change while the service runs and the core does not know: the interfaces' names and kinds, the store.
 #[derive(Debug)]
-struct Fixed(Vec<InterfaceConfig>);
+struct Fixed {
+    interfaces: Vec<InterfaceConfig>,
+    store: StoreConfig,
+}
 
 impl Fixed {
     fn of(config: &Config) -> Self {
-        Self(config.interfaces.clone())
+        Self { interfaces: config.interfaces.clone(), store: config.store }
     }
 
     /// Why `new` cannot be taken over, if it cannot.
     fn check(&self, new: &Config) -> Result<(), String> {
         let new = Self::of(new);
-        if self.0 == new.0 { Ok(()) } else { Err(format!("interfaces = {new}, running with {self}: needs a restart")) }
+        if self.interfaces != new.interfaces {
+            return Err(format!("interfaces = {new}, running with {self}: needs a restart"));
+        }
+        if self.store != new.store {
+            return Err("[store]: other settings than it was started with: needs a restart".to_owned());
+        }
+        Ok(())
     }
 }
 
 impl fmt::Display for Fixed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (index, interface) in self.0.iter().enumerate() {
+        for (index, interface) in self.interfaces.iter().enumerate() {
             let (comma, fd) = (if index > 0 { ", " } else { "" }, if interface.fd { " (FD)" } else { "" });
             write!(f, "{comma}{}{fd}", interface.name)?;
         }
@@ -197,6 +206,15 @@ mod tests {
         let (old, mut new) = (example(), example());
         new.monitor.rules[0].threshold *= 0.5;
         assert_eq!(Fixed::of(&old).check(&new), Ok(()));
+    }
+
+    #[test]
+    fn another_checkpoint_period_needs_a_restart() {
+        let (old, mut new) = (example(), example());
+        new.store.checkpoint_s *= 2.0;
+        assert!(
+            Fixed::of(&old).check(&new).is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
+        );
     }
 
     #[test]
