@@ -28,6 +28,7 @@ mod schema;
 mod shelf;
 mod stamp;
 mod verify;
+mod wal;
 mod writer;
 
 use std::path::{Path, PathBuf};

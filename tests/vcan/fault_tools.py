@@ -4,6 +4,7 @@
     fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
                                                            dropped and time goes on, as a pack does. SIGTERM parks it
     fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers nobody configured
+    fault_tools.py clients SOCKET [--count N] [--seconds S]  clients of the status socket that never read
     fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is nothing that was told missing?
     fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
     fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
@@ -190,13 +191,15 @@ def learned(args) -> None:
 # ---- snapshots -----------------------------------------------------------------------------------------------------------------------
 
 
+OF_NOW = ("input_missing", "input_implausible", "bus_fault", "store_failed")
 RAISED = ("active", "latched", "suppressed")  # the last without its input
 
 
 def learned_of(snapshot: dict) -> tuple[list, list]:
     """Capacities and raised alarms: what must come back after a restart."""
     capacities = [round(cell["mean"], 9) for cell in snapshot["learner"]["capacity"]]
-    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarms"]["alarms"] if a["machine"]["state"] in RAISED]
+    alarms = [[a["rule"], a["severity"], a["cell"]] for a in snapshot["alarms"]["alarms"]
+              if a["machine"]["state"] in RAISED and a["rule"] not in OF_NOW]
     return capacities, sorted(alarms, key=str)
 
 
@@ -306,6 +309,32 @@ def flood(args) -> None:
     print(f"{sent} frames of {len(ids)} identifiers in {past:.1f} s, {bus.dropped} not taken")
 
 
+def clients(args) -> None:
+    """Many at once, of whom none reads; a few come and go meanwhile and are answered, which shows that the others are in nobody's way."""
+    def connected(path):
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        client.settimeout(10)
+        client.connect(path)
+        return client
+
+    idle, refused, answered = [], 0, 0
+    stream = args.socket.replace("status.sock", "status-stream.sock")
+    for number in range(args.count):
+        try:
+            idle.append(connected(stream if number % 4 == 0 else args.socket))
+        except OSError:
+            refused += 1
+    ends = time.monotonic() + args.seconds
+    while time.monotonic() < ends:
+        try:
+            with connected(args.socket) as client:
+                answered += bool(client.recv(65536))
+        except OSError:
+            refused += 1
+        time.sleep(0.2)
+    print(f"{len(idle)} clients that do not read, {answered} answers to others meanwhile, {refused} turned away")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
@@ -320,6 +349,11 @@ def main() -> None:
     command.add_argument("--rate", type=float, default=8000)
     command.add_argument("--ids", type=int, default=1)
     command.set_defaults(run=flood)
+    command = commands.add_parser("clients")
+    command.add_argument("socket")
+    command.add_argument("--count", type=int, default=200)
+    command.add_argument("--seconds", type=float, default=5.0)
+    command.set_defaults(run=clients)
     command = commands.add_parser("covers")
     command.add_argument("folder", type=Path)
     command.add_argument("dump", type=Path)

@@ -13,6 +13,7 @@ use super::document::Document;
 use super::rows::Row;
 use super::salvage;
 use super::stamp::Stamp;
+use super::wal;
 
 /// Name of the database.
 pub(crate) const DATABASE: &str = "packwatch.db";
@@ -122,6 +123,8 @@ impl Folder {
             // A power cut right after it was made leaves this too.
             tracing::warn!(path = %path.display(), "the database was empty: state and history begin anew");
         }
+        // Before SQLite opens it, as it then makes the log anew.
+        let lost = wal::damage(&with_suffix(path, "-wal"));
         let database = Database::open(path, now, self.max_half_cycles)?;
         let (mut rows, mut is_sound, mut state) = (Vec::new(), !was_emptied, None);
         let mut tell = |why: String| {
@@ -129,6 +132,9 @@ impl Folder {
             rows.push(Row::Own { reason: "state_damaged", detail: why });
             is_sound = false;
         };
+        if let Some(why) = lost {
+            tell(why);
+        }
         match database.state()? {
             Ok(None) => {}
             Ok(Some(stored)) => {

@@ -1,0 +1,114 @@
+//! Whether SQLite's write-ahead log holds pages that SQLite will not read.
+//!
+//! SQLite takes a log up to the first page whose checksum is wrong and forgets the rest without a word: after a power cut
+//! that rest is a transaction that was never completed, but after damage it is what was learned last. In: the log as it
+//! lies beside the database, before that is opened. Out: what is wrong, for people. A log that is missing, empty or cannot
+//! be read tells nothing; so does one whose end alone is missing.
+//!
+//! The format is that of <https://www.sqlite.org/fileformat2.html#walformat>.
+
+use std::path::Path;
+
+/// First four bytes but for the last bit, which says how checksums take their words.
+const MAGIC: u32 = 0x377F_0682;
+/// Bytes of the log's header, of a frame's, and of the part of a frame's that its checksum covers.
+const HEADER: usize = 32;
+const FRAME_HEADER: usize = 24;
+const FRAME_COVERED: usize = 8;
+
+/// What is wrong with a log; `None` = nothing that shows.
+pub(super) fn damage(path: &Path) -> Option<String> {
+    let log = std::fs::read(path).ok()?;
+    check(&log)
+}
+
+fn check(log: &[u8]) -> Option<String> {
+    let (header, frames) = log.split_at_checked(HEADER)?;
+    if header.iter().all(|&byte| byte == 0) {
+        return None; // room that was never written
+    }
+    let is_big = word(header, 0) == MAGIC | 1;
+    let mut sum = checksum((0, 0), &header[..24], is_big);
+    if word(header, 0) & !1 != MAGIC || sum != (word(header, 24), word(header, 28)) {
+        return Some("the header of the write-ahead log is damaged: what was stored last is lost".to_owned());
+    }
+    let page_bytes = usize::try_from(word(header, 8)).ok().filter(|&bytes| (512..=65_536).contains(&bytes))?;
+    let mut first_bad = None;
+    let mut later_commits = 0_u32;
+    for (number, frame) in frames.chunks_exact(FRAME_HEADER + page_bytes).enumerate() {
+        if frame[8..16] != header[16..24] {
+            continue; // of an earlier round of the log, or a damaged number of the round
+        }
+        if first_bad.is_some() {
+            later_commits += u32::from(word(frame, 4) != 0);
+            continue;
+        }
+        let next = checksum(checksum(sum, &frame[..FRAME_COVERED], is_big), &frame[FRAME_HEADER..], is_big);
+        if next == (word(frame, 16), word(frame, 20)) {
+            sum = next;
+        } else {
+            first_bad = Some(number + 1);
+        }
+    }
+    // One: the transaction the power was cut in may have reached the disk in any order.
+    first_bad.filter(|_| later_commits > 1).map(|page| {
+        format!("page {page} of the write-ahead log is damaged: what was stored in {later_commits} later steps is lost")
+    })
+}
+
+/// The big-endian word at a place.
+fn word(bytes: &[u8], at: usize) -> u32 {
+    bytes.get(at..at + 4).and_then(|bytes| bytes.try_into().ok()).map_or(0, u32::from_be_bytes)
+}
+
+fn checksum(mut sum: (u32, u32), bytes: &[u8], is_big: bool) -> (u32, u32) {
+    let (words, _) = bytes.as_chunks::<4>();
+    let value = |bytes: [u8; 4]| if is_big { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) };
+    for pair in words.chunks_exact(2) {
+        sum.0 = sum.0.wrapping_add(value(pair[0])).wrapping_add(sum.1);
+        sum.1 = sum.1.wrapping_add(value(pair[1])).wrapping_add(sum.0);
+    }
+    sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A log of several commits, as SQLite leaves it when the process is killed.
+    fn log() -> Vec<u8> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.db");
+        let connection = rusqlite::Connection::open(&path).unwrap();
+        connection.execute_batch("PRAGMA journal_mode = WAL; CREATE TABLE t (x)").unwrap();
+        for number in 0..20 {
+            connection.execute("INSERT INTO t VALUES (?1)", [number]).unwrap();
+        }
+        std::fs::read(folder.path().join("x.db-wal")).unwrap()
+    }
+
+    #[test]
+    fn a_flipped_bit_before_the_last_commits_is_told() {
+        let good = log();
+        assert_eq!(check(&good), None);
+        let frame = FRAME_HEADER + usize::try_from(word(&good, 8)).unwrap();
+        for at in (0..good.len() - 3 * frame).step_by(997) {
+            let mut bad = good.clone();
+            bad[at] ^= 1;
+            let in_salt = at >= HEADER && (8..16).contains(&((at - HEADER) % frame));
+            assert!(check(&bad).is_some() || in_salt, "byte {at}");
+        }
+    }
+
+    #[test]
+    fn a_torn_end_is_no_damage() {
+        let good = log();
+        for length in [0, 10, HEADER, HEADER + 100, good.len() / 2, good.len() - 1] {
+            assert_eq!(check(&good[..length]), None, "{length} bytes");
+        }
+        let mut torn = good;
+        let last = torn.len() - 10;
+        torn[last..].fill(0);
+        assert_eq!(check(&torn), None);
+    }
+}
