@@ -279,6 +279,6 @@ fn band(plan: &Plan, channel: Channel) -> (f64, f64) {
         Channel::CellVoltage(_) => voltage,
         Channel::PackVoltage => (voltage.0 * f64::from(plan.cells), voltage.1 * f64::from(plan.cells)),
         Channel::Temperature(_) => temperature,
-        Channel::ReportedSoc | Channel::ReportedSoh => (0.0, 0.0),
+        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => (0.0, 0.0),
     }
 }
