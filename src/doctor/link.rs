@@ -337,7 +337,8 @@ impl Link {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        if largest < FEW_TIMES * self.tolerance_a { None } else { Slope::fit(&all) }
+        // Small for this pack: of the noise, or in another unit. Only steps that agree among themselves count.
+        if largest < FEW_TIMES * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
     /// Whether the voltage moves with a load rather than with its noise: changes that are not taken back by the next one.
