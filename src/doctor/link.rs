@@ -282,7 +282,7 @@ impl Link {
     fn close_run(&mut self) {
         let Some(run) = self.steady.take() else { return };
         let seconds = run.last.since(run.from) - run.first_s;
-        if run.n < 5.0 || !(seconds >= MIN_RUN_S) {
+        if run.n < 5.0 || seconds < MIN_RUN_S {
             return;
         }
         let (tt, tv, vv) =
