@@ -3,7 +3,7 @@
 //!
 //! Listening is passive: nothing is sent. Both loops end early when told to, with what was seen so far.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -26,8 +26,6 @@ const READ_PERIOD: Duration = Duration::from_millis(10);
 const LOOK_PERIOD: Duration = Duration::from_millis(500);
 /// Records between two looks at the clock.
 const REPORT_EVERY: u64 = 4096;
-/// Type of a CAN interface in /sys/class/net/NAME/type (ARPHRD_CAN).
-const ARPHRD_CAN: &str = "280";
 
 /// How far it is.
 #[derive(Debug, Clone, Copy)]
@@ -182,15 +180,15 @@ pub fn listen(
     interrupt: &Interrupt,
     each: &mut dyn FnMut(Progress),
 ) -> std::io::Result<Report> {
+    let clock = MappedClock::new(Reading::now());
     let mut session = Session::new(survey);
     let mut names: Vec<String> = survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect();
-    for name in can_interfaces(Path::new("/sys/class/net")) {
+    for name in can_interfaces(clock) {
         if !names.contains(&name) && names.len() < usize::from(u8::MAX) {
             session.doctor.add_interface(&name);
             names.push(name);
         }
     }
-    let clock = MappedClock::new(Reading::now());
     let began = Instant::now();
     let ear = |(bus, name)| Ear { bus: BusIndex(bus), name, tap: None, look_at: began };
     let mut ears: Vec<Ear> = (0_u8..).zip(names).map(ear).collect();
@@ -260,15 +258,11 @@ impl Ear {
     }
 }
 
-/// CAN interfaces of this computer, by name.
-fn can_interfaces(folder: &Path) -> Vec<String> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
-    let is_can = |path: &Path| std::fs::read_to_string(path.join("type")).is_ok_and(|kind| kind.trim() == ARPHRD_CAN);
-    let mut names: Vec<String> = entries
-        .filter_map(Result::ok)
-        .filter(|entry| is_can(&entry.path()))
-        .filter_map(|entry| entry.file_name().into_string().ok())
-        .collect();
+/// CAN interfaces of this computer, by name: those a CAN socket can be bound to.
+fn can_interfaces(clock: MappedClock) -> Vec<String> {
+    let Ok(interfaces) = nix::net::if_::if_nameindex() else { return Vec::new() };
+    let names = interfaces.iter().filter_map(|interface| interface.name().to_str().ok());
+    let mut names: Vec<String> = names.filter(|name| Tap::open(name, clock).is_ok()).map(str::to_owned).collect();
     names.sort_unstable();
     names
 }

@@ -282,7 +282,7 @@ impl Link {
     fn close_run(&mut self) {
         let Some(run) = self.steady.take() else { return };
         let seconds = run.last.since(run.from) - run.first_s;
-        if run.n < 5.0 || !(seconds >= MIN_RUN_S) {
+        if run.n < 5.0 || seconds < MIN_RUN_S {
             return;
         }
         let (tt, tv, vv) =
@@ -337,7 +337,8 @@ impl Link {
             return Slope::of(points(0.2 * largest));
         }
         let all: Vec<(f64, f64)> = points(0.0).collect();
-        if largest < FEW_TIMES * self.tolerance_a { None } else { Slope::fit(&all) }
+        // Small for this pack: of the noise, or in another unit. Only steps that agree among themselves count.
+        if largest < FEW_TIMES * self.tolerance_a { Slope::of(points(0.2 * largest)) } else { Slope::fit(&all) }
     }
 
     /// Whether the voltage moves with a load rather than with its noise: changes that are not taken back by the next one.
