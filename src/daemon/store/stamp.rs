@@ -18,6 +18,9 @@ const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 #[serde(into = "String", try_from = "String")]
 pub(crate) struct BootId(pub(super) [u8; 16]);
 
+/// Tells which boot this is, where the kernel's own file cannot be seen.
+const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
+
 impl BootId {
     /// A kernel that does not say which boot this is.
     const UNKNOWN: Self = Self([0; 16]);
@@ -26,10 +29,11 @@ impl BootId {
 
     /// Of this boot.
     pub(crate) fn current() -> Self {
-        std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok().and_then(|text| Self::parse(&text)).unwrap_or(
-            // Two unknown boots are never the same one.
-            Self::UNKNOWN,
-        )
+        let told = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok().and_then(|text| Self::parse(&text));
+        // A sandbox without that file (`ProcSubset=pid`) has it from its unit.
+        let told = told.or_else(|| std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text)));
+        // Two unknown boots are never the same one.
+        told.unwrap_or(Self::UNKNOWN)
     }
 
     /// From the kernel's form or ours.
