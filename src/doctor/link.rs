@@ -377,7 +377,7 @@ mod tests {
 
     #[test]
     fn steps_of_the_current_give_the_resistance_with_its_sign() {
-        let steps = |second: u32| if second / 7 % 2 == 0 { 2.0 } else { -1.0 };
+        let steps = |second: u32| if (second / 7).is_multiple_of(2) { 2.0 } else { -1.0 };
         let slope = link(60, steps).slope().unwrap();
         assert!((slope.ohm - 0.05).abs() < 1e-6 && slope.certainty() > 1.0, "{slope:?}");
         let turned = Slope::of((0..9).map(|n| (f64::from(n) - 4.0, 0.03 * (f64::from(n) - 4.0)))).unwrap();
