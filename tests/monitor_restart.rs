@@ -215,7 +215,7 @@ fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
         (BusEvent::Missing, Away::Seconds(3e4)),
         (BusEvent::SendFailed { frames: 1 }, Away::Seconds(2.0)),
     ] {
-        let mut rig = Rig::new("[[alarm]]\nrule = \"bus_fault\"\nwarning = { set = 5, clear = 4 }\n");
+        let mut rig = Rig::new("[[alarm]]\nrule = \"bus_fault\"\nwarning = 5\n");
         let silent = |rig: &mut Rig| (0..5).for_each(|_| rig.tick());
         for _ in 0..20 {
             fault(event)(&mut rig);
