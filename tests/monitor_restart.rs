@@ -257,7 +257,10 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
         if away_s > 1e3 {
             rig.current_a = Some(0.0);
             rig.seconds(1);
-            assert_eq!(rig.changes(Rule::SocLow), [Change::Raised, Change::Suppressed, Change::Cleared]);
+            let heard = rig.changes(Rule::SocLow);
+            assert_eq!((heard[1], heard.last()), (Change::Suppressed, Some(&Change::Cleared)));
+            // After a sleep the filter is surer than after time off, and lets go of the old SOC a moment later.
+            assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
     }
     // The other way round: full before, empty after.
