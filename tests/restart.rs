@@ -4,6 +4,8 @@
 //! as the daemon does; at random moments a second monitor starts from a state of some age, misses what came meanwhile, and
 //! is then fed the same frames. The figures are printed, and have bars.
 
+#![allow(clippy::print_stdout, reason = "the figures are what this test is for")]
+
 use std::collections::VecDeque;
 use std::path::Path;
 

@@ -55,7 +55,7 @@ pub struct EstimatorConfig {
     pub gap_noise_per_sqrt_s: f64,
     /// What the cell may lose by itself, fraction of SOC per s.
     pub self_discharge_per_s: f64,
-    /// What may be taken out or charged while nobody measures, fraction of SOC per s.
+    /// What may be taken out or charged while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
     /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. A per cell.
     pub rest_current_a: f64,

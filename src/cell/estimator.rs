@@ -104,7 +104,7 @@ struct Memory {
     /// Standard deviation of the SOC by what may have happened while nobody looked, until a voltage has told.
     #[serde(default)]
     away_std: f64,
-    /// No voltage has been taken in since the record went on after an unknown time.
+    /// No voltage has been taken in since nobody listened.
     #[serde(default)]
     is_unseen: bool,
     /// Readings beyond the gate in a row, and since how long, s.
@@ -197,7 +197,6 @@ impl CellEstimator {
         } else if let Some(filter) = &mut self.filter {
             let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
             each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
-            self.note_away(config, step.unmeasured_s);
         }
         self.remember_load(model, config, step);
         self.memory.information_s += self.new_information_s(config, step);

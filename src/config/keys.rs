@@ -326,7 +326,7 @@ section! {
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
         /// What a cell may lose by itself in a month: the deviation of the SOC grows with the time nobody measured (asleep, off).
         self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03");
-        /// What may be taken out or charged in an hour while nobody measures (asleep, off). Whether it was is judged by the first voltage after that time; until it has come, the deviation of the SOC is as large as this makes it. 0: the cells are certainly left alone.
+        /// What may be taken out or charged in an hour while the program does not run. Whether it was is judged by the first voltage after that time; until it has come, the deviation of the SOC is as large as this makes it. 0: the cells are certainly left alone.
         away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// A current up to this is rest; one beyond it beside a gap may have gone on in it. Without it: the rated capacity over 50 h (C/50), per cell.
         rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;

@@ -336,6 +336,10 @@ impl Monitor {
         self.schedule.restart(time);
         let taken = self.apply_pending(time, out);
         let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
+        if taken == Taken::Aged {
+            let away_s = time.since(self.now);
+            self.cells.iter_mut().for_each(|cell| cell.estimator.note_away(&self.config.estimator, away_s));
+        }
         if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
         }
@@ -388,6 +392,7 @@ impl Monitor {
         self.observe_current(None, out);
         self.alarms.handle_gap();
         self.recharge.interrupt();
+        self.cells.iter_mut().for_each(|cell| cell.estimator.note_asleep());
         self.forget_pack();
     }
 

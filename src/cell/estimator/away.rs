@@ -1,15 +1,18 @@
-//! What may have happened to a cell while nobody looked: asleep, off, or its sensors lost.
+//! What may have happened to a cell while the program did not run.
 //!
-//! Deviation 6: over time in which nobody measured, two things may be true. Most likely the cell was left alone: its SOC is
+//! Deviation 6: over such time two things may be true. Most likely the cell was left alone: its SOC is
 //! the one before, less self-discharge, and all that was learned of it still hangs together. Or it was used or
 //! charged: then its SOC is anywhere within what could be moved in that time, and its branches are as uncertain as at a start.
 //! Which it was the first voltage under a known current says. Both beliefs take it in; they are weighed by how well each
 //! foresaw it (Bayes' rule, prior [`USED_PRIOR`]) and merged to one with their common mean and covariance.
-//! Effect: a night without use keeps the accuracy of the counted charge, and the rested voltage of the morning still
+//! Effect: a night off without use keeps the accuracy of the counted charge, and the rested voltage of the morning still
 //! says what it says of the capacity; a day's use behind our back is found at the first reading, and not after the hours
 //! which a filter that is sure takes to be convinced. A single wide belief would lose the first, a single narrow one the second.
 //!
 //! Until that voltage has come the deviation told is that of the second case.
+//!
+//! Time asleep is another matter: a bus that is used wakes who listens to it. There the cells were left alone (self-discharge
+//! and `gap_noise_per_sqrt_s`), and a load beside the gap may have gone on in it.
 
 use nalgebra::SMatrix;
 
@@ -26,9 +29,14 @@ const USED_PRIOR: f64 = 0.2;
 const NEGLIGIBLE_STD: f64 = 0.002;
 
 impl CellEstimator {
-    /// Nobody measured for `unmeasured_s`: what may have been moved in that time, in either direction.
-    pub(super) fn note_away(&mut self, config: &EstimatorConfig, unmeasured_s: f64) {
-        let most = config.away_use_per_s * unmeasured_s;
+    /// Nobody listened: until a voltage has been taken in, the SOC is the one from before.
+    pub fn note_asleep(&mut self) {
+        self.memory.is_unseen = self.filter.is_some();
+    }
+
+    /// The program did not run for `away_s`: what may have been moved in that time, in either direction.
+    pub fn note_away(&mut self, config: &EstimatorConfig, away_s: f64) {
+        let most = config.away_use_per_s * away_s;
         self.memory.away_std = (self.memory.away_std + most / 3.0_f64.sqrt()).min(1.0);
     }
 
