@@ -120,7 +120,7 @@ def covers(args) -> None:
     errors = truth.errors(open(args.dump), args.after)
     worst = max((error for error, _ in errors), default=0.0)
     print(f"{len(errors)} estimates, at most {100 * worst:.1f} points off, {100 * within(errors):.0f} % within two deviations")
-    if within(errors) <= 0.9 and truth.latest_s < TOO_LATE_S:
+    if within(errors) <= LOST and truth.latest_s < TOO_LATE_S:
         sys.exit("the estimates do not cover the truth")
     if truth.latest_s >= TOO_LATE_S:
         print(f"    not judged: this machine is so busy that frames came {truth.latest_s:.2f} s late, minutes of the pack's life")
@@ -384,4 +384,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main()LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/restart.rs
+
