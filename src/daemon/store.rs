@@ -211,7 +211,7 @@ impl Store {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
         found.states = candidates(running, state, now);
-        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works });
+        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
             // They wait for the first state.

@@ -41,10 +41,10 @@ impl Seeing {
     pub(super) fn note_reload(&mut self, taken: Result<Option<ConfigFile>, ()>) {
         match taken {
             Ok(file) => {
-                self.counters.reloads += 1;
+                self.counters.service.reloads += 1;
                 self.identity.config = file;
             }
-            Err(()) => self.counters.reloads_refused += 1,
+            Err(()) => self.counters.service.reloads_refused += 1,
         }
     }
 
@@ -65,6 +65,6 @@ impl Seeing {
             store: engine.store_status(),
         };
         let is_taken = server.offer(sources.draft(now));
-        self.counters.documents_skipped += u64::from(!is_taken);
+        self.counters.service.documents_skipped += u64::from(!is_taken);
     }
 }

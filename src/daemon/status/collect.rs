@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::counters::LoopCounters;
 use super::document::{
-    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
-    StatusCount, Store, VERSION,
+    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, StatusCount, Store,
+    VERSION,
 };
 use super::server::Draft;
 use crate::daemon::control::answer;
@@ -87,7 +87,7 @@ impl Sources<'_> {
                 core: monitor.statistics().clone(),
                 readings: monitor.reading_counts(),
                 time_backwards: monitor.time_backwards(),
-                service: service(counters),
+                service: counters.service,
                 clients: self.clients,
             },
             protection: self.protection(),
@@ -219,16 +219,5 @@ fn alarms(monitor: &Monitor) -> Alarms {
         unknown: list.unknown,
         list: list.alarms,
         omitted: list.omitted,
-    }
-}
-
-fn service(counters: &LoopCounters) -> ServiceCounters {
-    ServiceCounters {
-        ticks: counters.ticks,
-        missed_deadlines: counters.missed_deadlines,
-        worst_lateness_s: counters.worst_lateness_s,
-        reloads: counters.reloads,
-        reloads_refused: counters.reloads_refused,
-        documents_skipped: counters.documents_skipped,
     }
 }

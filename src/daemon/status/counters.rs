@@ -3,6 +3,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::document::ServiceCounters;
+
 /// Upper bounds of the latency's buckets, s.
 pub(crate) const LATENCY_BOUNDS_S: [f64; 14] =
     [50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 0.1, 0.2, 0.5, 1.0];
@@ -71,20 +73,10 @@ impl Latency {
 }
 
 /// What the shell counts since the program's start.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct LoopCounters {
-    /// Ticks of the loop.
-    pub(crate) ticks: u64,
-    /// Ticks that came later than a period after they were due.
-    pub(crate) missed_deadlines: u64,
-    /// The latest a tick ever came, s.
-    pub(crate) worst_lateness_s: f64,
-    /// Configurations taken up while running.
-    pub(crate) reloads: u64,
-    /// Configurations refused while running.
-    pub(crate) reloads_refused: u64,
-    /// Documents that found the serving thread busy.
-    pub(crate) documents_skipped: u64,
+    /// As they are told.
+    pub(crate) service: ServiceCounters,
     /// Frame to estimate.
     pub(crate) latency: LatencyHistogram,
 }
@@ -92,9 +84,10 @@ pub(crate) struct LoopCounters {
 impl LoopCounters {
     /// Takes how late a tick came.
     pub(crate) fn note_tick(&mut self, lateness_s: f64, period_s: f64) {
-        self.ticks += 1;
-        self.missed_deadlines += u64::from(lateness_s > period_s);
-        self.worst_lateness_s = self.worst_lateness_s.max(lateness_s);
+        let service = &mut self.service;
+        service.ticks += 1;
+        service.missed_deadlines += u64::from(lateness_s > period_s);
+        service.worst_lateness_s = service.worst_lateness_s.max(lateness_s);
     }
 }
 
@@ -123,6 +116,7 @@ mod tests {
         for lateness_s in [0.0, 0.01, 0.011, 60.0] {
             counters.note_tick(lateness_s, 0.01);
         }
-        assert_eq!((counters.ticks, counters.missed_deadlines, counters.worst_lateness_s), (4, 2, 60.0));
+        let ServiceCounters { ticks, missed_deadlines, worst_lateness_s, .. } = counters.service;
+        assert_eq!((ticks, missed_deadlines, worst_lateness_s), (4, 2, 60.0));
     }
 }

@@ -215,7 +215,7 @@ pub(crate) struct Counters {
 }
 
 /// Counts of the loop.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct ServiceCounters {
     /// Ticks.
     pub(crate) ticks: u64,
@@ -289,9 +289,7 @@ pub(crate) struct Store {
     pub(crate) failures: u64,
     /// Events that went out before they were stored, because that took too long.
     pub(crate) late: u64,
-    /// Bytes written; `None` = not counted.
-    pub(crate) bytes_written: Option<u64>,
-    /// Size of its files, bytes; `None` = not looked at.
+    /// Size of the database and its log, bytes, as of the last commit; `None` = none yet.
     pub(crate) file_bytes: Option<u64>,
 }
 

@@ -367,12 +367,6 @@ fn store(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     families.counter("store_commits", "", "Commits done", one(store.commits))?;
     families.counter("store_failures", "", "Commits that failed", one(store.failures))?;
     families.counter("store_late", "", "Results told before they were stored", one(store.late))?;
-    families.counter(
-        "store_written",
-        "bytes",
-        "Bytes written",
-        store.bytes_written.map(|bytes| (Labels::new(), bytes)),
-    )?;
     let size = one(store.file_bytes.map(|bytes| bytes as f64));
     families.gauge("store_size", "bytes", "Size of the store's files", size)
 }

@@ -56,7 +56,7 @@ pub(crate) fn sample(cells: u16) -> Document {
             path: "/var/lib/packwatch/packwatch.db".to_owned(),
             works: Some(true),
             commits: 21,
-            bytes_written: Some(65_536),
+            file_bytes: Some(65_536),
             ..Store::default()
         }),
         events: vec![

@@ -388,6 +388,10 @@ fn write_batch(transaction: &Transaction<'_>, ledger: &mut Ledger, batch: &Batch
         if row.replaces_pack() {
             replace_pack(transaction, ledger, &batch.stamp)?;
         }
+        if let Some(identity) = row.pack_identity() {
+            let values = params![ledger.pack, identity.to_string()];
+            transaction.execute("UPDATE pack SET identity = ?2 WHERE id = ?1", values)?;
+        }
     }
     Ok(())
 }

@@ -64,6 +64,13 @@ impl Folder {
         &self.path
     }
 
+    /// Size of the database and its log; `None` = cannot be seen.
+    pub(crate) fn file_bytes(&self) -> Option<u64> {
+        let path = self.path.join(DATABASE);
+        let log = fs::metadata(with_suffix(&path, COMPANIONS[0])).map_or(0, |file| file.len());
+        fs::metadata(path).ok().map(|file| file.len() + log)
+    }
+
     /// Makes the folder where it is missing, and takes it for this process.
     ///
     /// # Errors

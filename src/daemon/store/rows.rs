@@ -133,6 +133,14 @@ impl Row {
         key(self).is_some() && key(self) == key(other)
     }
 
+    /// The number of the pack that is connected, as it is told here.
+    pub(super) const fn pack_identity(&self) -> Option<f64> {
+        match self {
+            Self::Event(EventKind::PackIdentity { identity }) => Some(*identity),
+            _ => None,
+        }
+    }
+
     /// Whether another pack begins after it.
     pub(super) const fn replaces_pack(&self) -> bool {
         matches!(self, Self::Event(EventKind::PackReplaced { .. }))
@@ -221,6 +229,10 @@ fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
         EventKind::PackReplaced { capacity_ah, capacity_std_ah } => (
             Table::Reset,
             vec![Value::Null, word(&"pack_replaced"), maybe(capacity_ah), maybe(capacity_std_ah), Value::Null],
+        ),
+        EventKind::PackIdentity { identity } => (
+            Table::Reset,
+            vec![Value::Null, word(&"pack_identity"), Value::Null, Value::Null, Value::Text(identity.to_string())],
         ),
         _ => return None,
     })
@@ -359,7 +371,8 @@ fn is_learned(kind: &EventKind) -> bool {
         | EventKind::Capacity { .. }
         | EventKind::RechargePeriod { .. }
         | EventKind::FilterReset { .. }
-        | EventKind::PackReplaced { .. } => true,
+        | EventKind::PackReplaced { .. }
+        | EventKind::PackIdentity { .. } => true,
         EventKind::Alarm { change, .. } => !matches!(change, Change::Suppressed | Change::Resumed),
         _ => false,
     }

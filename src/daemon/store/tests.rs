@@ -164,6 +164,7 @@ fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
         assert!(begun.elapsed() < Duration::from_secs(30), "not tried again");
         std::thread::sleep(Duration::from_millis(10));
     }
+    assert!(store.progress().borrow().file_bytes.is_some_and(|bytes| bytes > 0));
     store.finish(&monitor, Timestamp::from_secs(4.0));
     let entries = Reader::open(&state).unwrap().entries(&Filter::default()).unwrap();
     assert_eq!(entries.iter().filter(|entry| entry.kind == Kind::Capacity).count(), 3);

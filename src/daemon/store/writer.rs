@@ -28,6 +28,8 @@ pub(crate) struct Progress {
     pub(crate) ticket: u64,
     /// The last attempt succeeded.
     pub(crate) works: bool,
+    /// Size of the database and its log after the last success, bytes; `None` = none so far.
+    pub(crate) file_bytes: Option<u64>,
 }
 
 /// What the loop leaves for the writer.
@@ -161,7 +163,9 @@ impl Writer {
                 self.desk.put_back(batches, state);
                 false
             };
-            self.progress.send_replace(Progress { ticket, works });
+            let before = self.progress.borrow().file_bytes;
+            let file_bytes = if works { self.folder.file_bytes() } else { before };
+            self.progress.send_replace(Progress { ticket, works, file_bytes });
             if stop {
                 return;
             }

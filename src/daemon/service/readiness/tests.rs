@@ -1,3 +1,5 @@
+//! When the service is said to be ready, and what the status line says of interfaces, lost signals and reloads.
+
 use super::*;
 use crate::can::{CanId, Frame};
 use crate::config;

@@ -1,3 +1,5 @@
+//! Commits, restores, the chain and its faults, thinning, migration and damaged files, on real databases.
+
 use super::super::folder::{DATABASE, Folder};
 use super::super::reader::{Filter, Kind, Reader};
 use super::super::rows::Row;
@@ -84,6 +86,22 @@ fn every_change_of_a_chained_row_is_found_and_named() {
         drop(connection);
         assert_eq!(broken_row(folder.path()), (table.to_owned(), row), "{sql}");
     }
+}
+
+#[test]
+fn the_number_of_a_pack_is_in_its_row_and_in_the_chain() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    let another = EventKind::PackReplaced { capacity_ah: Some(1.9), capacity_std_ah: Some(0.1) };
+    let told = |identity| EventKind::PackIdentity { identity };
+    database.commit(&[batch(1.0, &[told(4711.0)]), batch(2.0, &[another, told(4712.0)])], None).unwrap();
+    let connection = database.connection();
+    let of = |id: i64| -> String {
+        connection.query_row("SELECT identity FROM pack WHERE id = ?1", [id], |row| row.get(0)).unwrap()
+    };
+    assert_eq!((of(1), of(2)), ("4711".to_owned(), "4712".to_owned()));
+    assert_eq!(database.counts(), Counts { chained: 3, half_cycles: 0, packs: 2 });
+    assert_eq!(broken_row(folder.path()), (String::new(), 0));
 }
 
 #[test]
