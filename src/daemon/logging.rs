@@ -47,13 +47,13 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
     let registry = tracing_subscriber::registry().with(filter);
     // A second start (tests) keeps the first logger: nothing is lost by that.
     let _ = match stderr_is_journal().then(Journal::new) {
-        Some(Ok(journal)) => registry.with(journal.with_filter(Limit::new())).try_init(),
+        Some(Ok(journal)) => registry.with(journal.with_filter(Limit::default())).try_init(),
         // Colours for a person at a terminal; in a file they are rubbish. An empty NO_COLOR counts as none.
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
             let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi);
-            registry.with(lines.with_filter(Limit::new())).try_init()
+            registry.with(lines.with_filter(Limit::default())).try_init()
         }
     };
     Ok(())
