@@ -82,6 +82,7 @@ impl Engine {
             Away::Unknown => restored_words(None),
         });
         let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
+        let is_unusable = store.is_none() && !found.works;
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
@@ -98,7 +99,8 @@ impl Engine {
             hold: Hold::default(),
             is_fresh: false,
             recent: RecentEvents::default(),
-            stored: StoreStatus::default(),
+            // One that cannot be opened is told as such, not as "none".
+            stored: StoreStatus { works: is_unusable.then_some(false), ..StoreStatus::default() },
         })
     }
 
@@ -180,9 +182,9 @@ impl Engine {
 
     /// The store, for those who look.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
-        self.store
-            .as_ref()
-            .map(|store| StoreStatus { path: store.folder().display().to_string(), ..self.stored.clone() })
+        let path = self.store.as_ref().map(|store| store.folder().display().to_string());
+        (path.is_some() || self.stored.works.is_some())
+            .then(|| StoreStatus { path: path.unwrap_or_default(), ..self.stored.clone() })
     }
 
     /// Nothing waits any longer: the daemon stops.
@@ -196,6 +198,7 @@ impl Engine {
             self.hold.release(ticket, |transmit| send(links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
             self.stored.late += 1;
+            self.stored.works = Some(false);
             self.store_works = false;
         }
         if let Some(store) = &mut self.store
