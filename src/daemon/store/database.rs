@@ -254,6 +254,15 @@ impl Database {
         (&mut self.connection, &mut self.ledger)
     }
 
+    /// Closes it with everything in the one file.
+    pub(super) fn close(self) -> rusqlite::Result<()> {
+        let is_busy: bool = self.connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |row| row.get(0))?;
+        if is_busy {
+            return Err(rusqlite::Error::SqliteFailure(rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_BUSY), None));
+        }
+        self.connection.close().map_err(|(_, error)| error)
+    }
+
     /// The connection, for looking.
     #[cfg(test)]
     pub(super) fn connection(&self) -> &Connection {
@@ -357,12 +366,14 @@ pub(super) fn write_ledger(connection: &Connection, ledger: &Ledger) -> rusqlite
 /// Columns of a moment in a chained row.
 pub(super) const MOMENT_COLUMNS: usize = 6;
 
-/// The number, the hash and the chained values of a table's rows, in the order of the chain.
-pub(super) fn chained_sql(table: Table) -> String {
+/// Rows of a table: number and hash (of a half-cycle, which has none: moment and cell), the moment's values, the row's own.
+/// `tail` says which and in which order.
+pub(super) fn rows_sql(table: Table, tail: &str) -> String {
     let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
+    let own = if table == Table::HalfCycle { "r.moment, r.cell" } else { "r.seq, r.hash" };
     format!(
-        "SELECT r.seq, r.hash, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, {} FROM {} r LEFT JOIN moment m \
-         ON m.id = r.moment ORDER BY r.seq",
+        "SELECT {own}, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, {} FROM {} r LEFT JOIN moment m ON \
+         m.id = r.moment {tail}",
         columns.join(", "),
         table.name()
     )

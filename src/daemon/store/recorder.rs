@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::database::{Database, StateRecord};
 use super::document::Document;
-use super::folder::{DATABASE, Folder};
+use super::folder::{self, DATABASE, Folder};
 use super::parts::Parts;
 use super::rows::{Batch, Gatherer, Worth};
 use super::stamp::Stamp;
@@ -30,7 +30,7 @@ impl Recorder {
     /// When there is one, or it cannot be made: a replay must never get into the history of a real pack.
     pub fn create(path: &Path, config: &StoreConfig) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
-        if path.join(DATABASE).exists() {
+        if folder::has_history(path) {
             return Err(format!("{shown}: exists; a replay needs a state folder of its own, name a new one"));
         }
         let mut folder = Folder::new(path.to_owned(), config.max_half_cycles);

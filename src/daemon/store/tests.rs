@@ -105,7 +105,7 @@ fn the_database_holds_the_state_in_which_the_replay_ended() {
 }
 
 /// A document of a state taken at `boottime_s` of boot `boot`.
-fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
+pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
     let boot = BootId([boot; 16]);
     let time = Timestamp::from_secs(1.0);
     let stamp = Stamp { wall_ns: wall_s * 1_000_000_000, time, boottime_ns: boottime_s * 1_000_000_000, boot };

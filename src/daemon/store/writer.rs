@@ -215,8 +215,8 @@ impl Writer {
             }
             Err(error) if is_damage(&error) => {
                 drop(database);
-                // The next attempt, soon, finds the folder free of it.
-                self.folder.set_aside(&error.to_string());
+                // The next attempt, soon, replaces it.
+                self.folder.mark_damaged(&error.to_string());
                 Err(format!("database damaged: {error}"))
             }
             // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
