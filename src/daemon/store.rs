@@ -211,14 +211,14 @@ impl Store {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
         found.states = candidates(running, state, now);
-        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None });
+        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
             // They wait for the first state.
             desk.keep(Batch { stamp: *now, rows });
         }
         let knows_state = database.is_some() || !found.states.is_empty();
-        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry, knows_state };
+        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry, failures: 0, knows_state };
         let writer = std::thread::Builder::new().name("store".to_owned()).spawn(move || writer.run())?;
         let store = Self {
             desk,

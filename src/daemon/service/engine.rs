@@ -174,6 +174,7 @@ impl Engine {
         self.hold.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
         self.stored.note(progress.works);
+        self.stored.failures = progress.failures;
         self.stored.file_bytes = progress.file_bytes;
         self.tell_works(time, links);
     }

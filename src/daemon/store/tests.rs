@@ -171,6 +171,34 @@ fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
 }
 
 #[test]
+fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    std::fs::write(&state, "").unwrap();
+    let (store, _) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let store = store.unwrap();
+    let mut progress = store.progress();
+    let (begun, mut changes) = (Instant::now(), 0);
+    while begun.elapsed() < Duration::from_millis(2500) {
+        changes += u32::from(progress.has_changed().unwrap());
+        progress.borrow_and_update();
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    // After 1 s, with 2 s to the next.
+    assert_eq!((changes, progress.borrow().failures), (1, 1));
+    // Tickets answered meanwhile are no attempts.
+    let desk = Arc::clone(&store.desk);
+    for _ in 0..3 {
+        let ticket = desk.leave(None, document(1, 1, 1), false);
+        assert_eq!(answer(&store, ticket).failures, 1);
+    }
+    std::fs::remove_file(&state).unwrap();
+    let monitor = Monitor::new(config().monitor);
+    store.finish(&monitor, Timestamp::from_secs(4.0));
+    assert!(Reader::open(&state).unwrap().state().is_some());
+}
+
+#[test]
 fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the_next_start() {
     let place = tempfile::tempdir().unwrap();
     let (store, _) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();

@@ -15,6 +15,8 @@ use super::document::Document;
 use super::folder::{Folder, Opening};
 use super::parts::Parts;
 use super::rows::{Batch, Row};
+use super::stamp::{BootId, Stamp};
+use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -30,6 +32,8 @@ pub(crate) struct Progress {
     pub(crate) works: bool,
     /// Size of the database and its log after the last success, bytes; `None` = none so far.
     pub(crate) file_bytes: Option<u64>,
+    /// Attempts that failed.
+    pub(crate) failures: u64,
 }
 
 /// What the loop leaves for the writer.
@@ -127,6 +131,8 @@ pub(super) struct Writer {
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<Progress>,
     pub(super) retry: Retry,
+    /// Attempts that failed.
+    pub(super) failures: u64,
     /// The daemon began with what the database had, or it had nothing.
     pub(super) knows_state: bool,
 }
@@ -165,20 +171,26 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            self.progress.send_replace(Progress { ticket, works, file_bytes });
+            let progress = Progress { ticket, works, file_bytes, failures: self.failures };
+            self.progress.send_if_modified(|told| std::mem::replace(told, progress) != progress);
             if stop {
                 return;
             }
         }
     }
 
-    /// One transaction; on failure everything waits for the next.
+    /// One transaction; on failure everything waits for the next. Without a state there is nothing to write, but a
+    /// database that could not be opened is tried again.
     fn write(&mut self, batches: Vec<Batch>, state: Option<Document>, exact: bool) -> bool {
-        if state.is_none() {
-            return self.retry.pause.is_none();
-        }
         let begun = Instant::now();
-        match self.commit(&batches, state.as_ref(), exact) {
+        let written = match &state {
+            Some(document) => self.commit(&batches, document, exact),
+            None if self.retry.pause.is_none() => return true,
+            None => self.reopen(&Stamp::now(Timestamp::ZERO, BootId::current())).map(|database| {
+                self.database = Some(database);
+            }),
+        };
+        match written {
             Ok(()) => {
                 tracing::debug!(took = ?begun.elapsed(), batches = batches.len(), "state stored");
                 if self.retry.pause.is_some() {
@@ -189,9 +201,10 @@ impl Writer {
                 true
             }
             Err(why) => {
-                if self.retry.pause.is_none() {
+                if self.failures == 0 || self.retry.pause.is_none() {
                     tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
                 }
+                self.failures += 1;
                 self.retry.after_failure();
                 self.desk.put_back(batches, state);
                 false
@@ -199,14 +212,13 @@ impl Writer {
         }
     }
 
-    fn commit(&mut self, batches: &[Batch], state: Option<&Document>, exact: bool) -> Result<(), String> {
-        let Some(document) = state else { return Ok(()) };
+    fn commit(&mut self, batches: &[Batch], document: &Document, exact: bool) -> Result<(), String> {
         let json = document.to_json().map_err(|error| error.to_string())?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
         drop(json);
         let mut database = match self.database.take() {
             Some(database) => database,
-            None => self.reopen(document)?,
+            None => self.reopen(&document.stamp)?,
         };
         match database.commit(batches, Some(StateRecord { parts, exact })) {
             Ok(()) => {
@@ -224,8 +236,8 @@ impl Writer {
         }
     }
 
-    fn reopen(&mut self, document: &Document) -> Result<Database, String> {
-        let opening = self.folder.open(&document.stamp).map_err(|error| error.to_string())?;
+    fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
+        let opening = self.folder.open(now).map_err(|error| error.to_string())?;
         let Opening { mut database, mut rows, state, .. } = opening;
         if !self.knows_state && state.is_some() {
             // The daemon began without it, because the disk came too late: for people to find.
@@ -235,7 +247,7 @@ impl Writer {
         }
         self.knows_state = true;
         if !rows.is_empty() {
-            let batch = Batch { stamp: document.stamp, rows };
+            let batch = Batch { stamp: *now, rows };
             database.commit(&[batch], None).map_err(|error| error.to_string())?;
         }
         Ok(database)
