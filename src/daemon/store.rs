@@ -14,6 +14,7 @@ mod chain;
 mod database;
 mod document;
 mod folder;
+mod gatherer;
 pub(crate) mod hold;
 mod packed;
 mod parts;
@@ -44,7 +45,8 @@ use crate::quantity::Timestamp;
 use database::OpenError;
 use document::Document;
 use folder::{Folder, Opening};
-use rows::{Batch, Gatherer, Worth};
+use gatherer::{Gatherer, Worth};
+use rows::{Batch, Row};
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp};
 use writer::{Desk, Retry, Writer};
@@ -252,10 +254,8 @@ impl Store {
             Worth::Commit(rows) => rows,
             Worth::Nothing | Worth::Deferred => return None,
         };
-        let state = self.document(monitor, now);
-        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
         self.checkpointed = Some(now);
-        Some(self.desk.leave(batch, state, false))
+        Some(self.leave(rows, monitor, now, false))
     }
 
     /// With every tick: the state of the second, and the checkpoint when it is due. `is_fresh`: frames have come since
@@ -264,8 +264,9 @@ impl Store {
         let due = |last: Option<Timestamp>, period_s: f64| last.is_none_or(|last| now.since(last) >= period_s);
         if self.runtime.is_some() && due(self.put, RUNTIME_PERIOD_S) {
             self.put = Some(now);
-            let document = self.document(monitor, now);
-            self.runtime.iter().for_each(|runtime| runtime.put(document.clone()));
+            if let Some(runtime) = &self.runtime {
+                runtime.put(self.document(monitor, now));
+            }
         }
         let period_s = if is_fresh { self.checkpoint_s } else { self.checkpoint_s.max(QUIET_PERIOD_S) };
         // The first is a period after the start: what was restored is in the database already.
@@ -274,16 +275,15 @@ impl Store {
             return false;
         }
         self.checkpointed = Some(now);
-        self.desk.leave(None, self.document(monitor, now), false);
+        let waiting = self.gatherer.for_checkpoint(now);
+        self.leave(waiting, monitor, now, false);
         true
     }
 
     /// The last state, to the last bit; waits until it is on the disk, for a while.
     pub(crate) fn finish(mut self, monitor: &Monitor, now: Timestamp) {
-        let state = self.document(monitor, now);
-        let rows = self.gatherer.deferred();
-        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
-        self.desk.leave(batch, state, true);
+        let waiting = self.gatherer.deferred();
+        self.leave(waiting, monitor, now, true);
         self.desk.stop();
         let Some(writer) = self.writer.take() else { return };
         let asked = Instant::now();
@@ -301,6 +301,13 @@ impl Store {
         if lost > 0 || !self.progress.borrow().works {
             tracing::error!(lost_rows = lost, "the last state is not stored");
         }
+    }
+
+    /// Leaves rows and the state for the writer; the ticket.
+    fn leave(&self, rows: Vec<Row>, monitor: &Monitor, now: Timestamp, exact: bool) -> u64 {
+        let state = self.document(monitor, now);
+        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
+        self.desk.leave(batch, state, exact)
     }
 
     fn document(&self, monitor: &Monitor, now: Timestamp) -> Document {

@@ -6,7 +6,8 @@ use super::database::{Database, StateRecord};
 use super::document::Document;
 use super::folder::{self, DATABASE, Folder};
 use super::parts::Parts;
-use super::rows::{Batch, Gatherer, Worth};
+use super::gatherer::{Gatherer, Worth};
+use super::rows::Batch;
 use super::stamp::Stamp;
 use crate::config::StoreConfig;
 use crate::monitor::{Event, Monitor};
@@ -53,7 +54,8 @@ impl Recorder {
             return Ok(());
         }
         self.checkpointed = Some(now);
-        let rows = rows.filter(|rows| !rows.is_empty());
+        let rows = rows.unwrap_or_else(|| self.gatherer.for_checkpoint(now));
+        let rows = Some(rows).filter(|rows| !rows.is_empty());
         let batches: Vec<Batch> = rows.map(|rows| Batch { stamp: Stamp::replayed(now), rows }).into_iter().collect();
         self.write(&batches, monitor, now, false)
     }

@@ -201,7 +201,7 @@ impl Writer {
                 true
             }
             Err(why) => {
-                if self.failures == 0 || self.retry.pause.is_none() {
+                if self.retry.pause.is_none() {
                     tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
                 }
                 self.failures += 1;
