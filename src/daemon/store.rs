@@ -44,7 +44,7 @@ use crate::monitor::{Away, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::Document;
-use folder::{Folder, Opening};
+use folder::{Folder, Opening, SET_ASIDE};
 use gatherer::{Gatherer, Worth};
 use rows::{Batch, Row};
 use runtime::RuntimeState;
@@ -100,6 +100,9 @@ fn first_folder(variable: &str) -> Option<PathBuf> {
     let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
     std::env::split_paths(&folders).next()
 }
+
+/// Where the state is that the next checkpoint overwrites.
+pub(crate) const DATABASE_SOURCE: &str = "database";
 
 /// A stored state that may be taken up.
 #[derive(Debug)]
@@ -189,8 +192,8 @@ impl Store {
         let mut retry = Retry::default();
         let mut found = Found { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
         let mut reset_ns = None;
-        let (database, rows, state) = match opening {
-            Some(Opening { database, rows, state, .. }) => {
+        let (database, rows, state, aside, is_strange) = match opening {
+            Some(Opening { database, rows, state, aside, is_strange, .. }) => {
                 let counts = database.counts();
                 tracing::info!(
                     folder = %path.display(),
@@ -200,12 +203,12 @@ impl Store {
                     "history open"
                 );
                 reset_ns = database.last_reset_ns(now.boot).unwrap_or_default();
-                (Some(database), rows, state)
+                (Some(database), rows, state, aside, is_strange)
             }
             None => {
                 retry.after_failure();
                 // A disk that cannot be written can perhaps be read.
-                (None, Vec::new(), Reader::open(&path).ok().and_then(|reader| reader.state()))
+                (None, Vec::new(), Reader::open(&path).ok().and_then(|reader| reader.state()), None, false)
             }
         };
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
@@ -213,6 +216,7 @@ impl Store {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
         found.states = candidates(running, state, now);
+        found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now)));
         let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
@@ -220,7 +224,16 @@ impl Store {
             desk.keep(Batch { stamp: *now, rows });
         }
         let knows_state = database.is_some() || !found.states.is_empty();
-        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry, failures: 0, knows_state };
+        let writer = Writer {
+            desk: Arc::clone(&desk),
+            folder,
+            database,
+            progress: told,
+            retry,
+            failures: 0,
+            knows_state,
+            sets_aside: is_strange,
+        };
         let writer = std::thread::Builder::new().name("store".to_owned()).spawn(move || writer.run())?;
         let store = Self {
             desk,
@@ -240,6 +253,14 @@ impl Store {
     /// Where it is.
     pub(crate) fn folder(&self) -> &Path {
         &self.folder
+    }
+
+    /// The stored state could not be taken up, and why: it is not overwritten, and used at the first start at which it fits.
+    pub(crate) fn set_state_aside(&self, why: &str, now: Timestamp) {
+        tracing::error!(error = why, "the stored state is {SET_ASIDE}");
+        let row = Row::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
+        self.desk.keep(Batch { stamp: Stamp::now(now, self.boot), rows: vec![row] });
+        self.desk.set_aside();
     }
 
     /// Tells how far the writer is, whenever that changes.
@@ -343,19 +364,19 @@ fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) 
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };
     let stored_first = matches!((&running, &stored), (Some(running), Some(stored)) if is_older(running, stored));
-    let mut both = [(running, "runtime folder"), (stored, "database")];
+    let mut both = [(running, "runtime folder"), (stored, DATABASE_SOURCE)];
     if stored_first {
         both.reverse();
     }
-    let candidate = |(document, source): (Option<Document>, &'static str)| {
-        let document = document?;
-        let away = match document.stamp.age(now) {
-            Age::Seconds(seconds) => Away::Seconds(seconds),
-            Age::Unknown => Away::Unknown,
-        };
-        Some(Candidate { snapshot: *document.snapshot, away, source })
+    both.into_iter().filter_map(|(document, source)| Some(candidate(document?, source, now))).collect()
+}
+
+fn candidate(document: Document, source: &'static str, now: &Stamp) -> Candidate {
+    let away = match document.stamp.age(now) {
+        Age::Seconds(seconds) => Away::Seconds(seconds),
+        Age::Unknown => Away::Unknown,
     };
-    both.into_iter().filter_map(candidate).collect()
+    Candidate { snapshot: *document.snapshot, away, source }
 }
 
 #[cfg(test)]

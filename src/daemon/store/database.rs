@@ -12,6 +12,7 @@ use rusqlite::types::Value;
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Transaction, TransactionBehavior, params};
 
 use super::chain::Head;
+use super::document::Document;
 use super::parts::Parts;
 use super::rows::{Batch, Row, Table};
 use super::schema::{self, MIGRATIONS};
@@ -110,6 +111,8 @@ pub(crate) struct StateRecord {
     pub(crate) parts: Parts,
     /// To the last bit (on stop), not rounded.
     pub(crate) exact: bool,
+    /// The state stored so far is kept beside it: nobody has taken it up.
+    pub(crate) sets_aside: bool,
 }
 
 /// A state as it was stored.
@@ -188,7 +191,11 @@ impl Database {
         }
         let packed = match state {
             None => None,
-            Some(StateRecord { parts, exact }) => {
+            Some(StateRecord { parts, exact, sets_aside }) => {
+                if sets_aside {
+                    set_aside(&transaction)?;
+                    self.shelf = Shelf::default();
+                }
                 let packed = self.shelf.pack(parts, exact);
                 write_state(&transaction, &packed)?;
                 Some(packed)
@@ -205,7 +212,12 @@ impl Database {
 
     /// The latest state; `None` = none was stored. A damaged one is an error in words: the history may still be good.
     pub(crate) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-        read_state(&self.connection, &self.shelf)
+        read_state(&self.connection, &self.shelf, STATE)
+    }
+
+    /// The state that was set aside; `None` = there is none, or it is not good.
+    pub(crate) fn state_aside(&self) -> Option<Document> {
+        read_document(&self.connection, ASIDE)
     }
 
     /// When in this boot another pack was connected last, boot time.
@@ -242,13 +254,6 @@ impl Database {
         Ok(ledger.pack)
     }
 
-    /// Keeps the stored state where the next checkpoint does not overwrite it.
-    pub(super) fn put_state_aside(&mut self) -> rusqlite::Result<()> {
-        self.connection.execute("UPDATE OR REPLACE state SET slot = slot + 10 WHERE slot < 10", [])?;
-        self.shelf = Shelf::default();
-        Ok(())
-    }
-
     /// For rows copied from a damaged database.
     pub(super) fn parts_mut(&mut self) -> (&mut Connection, &mut Ledger) {
         (&mut self.connection, &mut self.ledger)
@@ -271,34 +276,56 @@ impl Database {
 
     fn fill_shelf(&mut self) -> rusqlite::Result<()> {
         // A damaged one is told when the state is asked for.
-        self.shelf = read_shelf(&self.connection)?;
+        self.shelf = read_shelf(&self.connection, STATE)?;
         Ok(())
     }
 }
 
+/// First slot of the state.
+pub(super) const STATE: i64 = 0;
+/// First slot of a state that was set aside.
+pub(super) const ASIDE: i64 = 10;
+
 /// The shelf with the full record that is stored, if it is good.
-pub(super) fn read_shelf(connection: &Connection) -> rusqlite::Result<Shelf> {
-    let Some(full) = slot(connection, 0)? else { return Ok(Shelf::default()) };
-    let room = slot(connection, 1)?.map_or(0, |delta| delta.room);
+fn read_shelf(connection: &Connection, first: i64) -> rusqlite::Result<Shelf> {
+    let Some(full) = slot(connection, first)? else { return Ok(Shelf::default()) };
+    let room = slot(connection, first + 1)?.map_or(0, |delta| delta.room);
     Ok(Shelf::with_base(full.serial, &full.record, room).unwrap_or_default())
 }
 
 /// As [`Database::state`].
-pub(super) fn read_state(
+fn read_state(
     connection: &Connection,
     shelf: &Shelf,
+    first: i64,
 ) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-    if slot(connection, 0)?.is_none() {
+    if slot(connection, first)?.is_none() {
         return Ok(Ok(None));
     }
     let Some((serial, base)) = shelf.base() else { return Ok(Err("the stored state is damaged".to_owned())) };
-    let delta = slot(connection, 1)?.filter(|delta| delta.serial == serial);
+    let delta = slot(connection, first + 1)?.filter(|delta| delta.serial == serial);
     let (parts, lost_later) = match delta.map(|slot| packed::read_delta(&slot.record, base, serial)) {
         None => (base.clone(), None),
         Some(Ok(parts)) => (parts, None),
         Some(Err(damaged)) => (base.clone(), Some(damaged.to_string())),
     };
     Ok(Ok(Some(StoredState { json: parts.join(), lost_later })))
+}
+
+/// The document of a state from this slot on, if it is good.
+pub(super) fn read_document(connection: &Connection, first: i64) -> Option<Document> {
+    let shelf = read_shelf(connection, first).ok()?;
+    let stored = read_state(connection, &shelf, first).ok()?.ok()??;
+    Document::parse(&stored.json).ok()
+}
+
+/// Keeps the stored state where no checkpoint overwrites it, in place of one that was kept before.
+fn set_aside(transaction: &Transaction<'_>) -> rusqlite::Result<()> {
+    transaction.execute(
+        "DELETE FROM state WHERE slot >= ?1 AND EXISTS (SELECT 1 FROM state WHERE slot = ?2)",
+        [ASIDE, STATE],
+    )?;
+    transaction.execute("UPDATE state SET slot = slot + ?1 WHERE slot < ?1", [ASIDE]).map(drop)
 }
 
 fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
@@ -448,6 +475,8 @@ fn replace_pack(connection: &Connection, ledger: &mut Ledger, stamp: &Stamp) -> 
         params![ledger.pack, stamp.wall_ns],
     )?;
     ledger.pack += 1;
+    // A state of the pack that has gone must not come back.
+    connection.execute("DELETE FROM state WHERE slot >= ?1", [ASIDE])?;
     connection
         .execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![ledger.pack, stamp.wall_ns])
         .map(drop)

@@ -42,6 +42,9 @@ const MAX_SET_ASIDE: u32 = 8;
 /// every attempt.
 const REPLACEMENT_PAUSE: Duration = Duration::from_secs(600);
 
+/// What is said of a state that is set aside.
+pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which it fits";
+
 /// See the module.
 #[derive(Debug)]
 pub(crate) struct Folder {
@@ -63,6 +66,10 @@ pub(crate) struct Opening {
     pub(crate) rows: Vec<Row>,
     /// The state it holds, or a damaged one before it held; `None` = none.
     pub(crate) state: Option<Document>,
+    /// A state that was set aside earlier.
+    pub(crate) aside: Option<Document>,
+    /// Whether the database holds a state that this program cannot read: it must not be overwritten.
+    pub(crate) is_strange: bool,
     /// Whether nothing had to be set aside and nothing was lost.
     pub(crate) is_sound: bool,
 }
@@ -178,7 +185,7 @@ impl Folder {
         let rows = vec![Row::Own { reason: "damaged", detail }];
         let json = saved.state.and_then(|state| state.to_json().ok());
         let parts = json.as_deref().and_then(Parts::of);
-        let state = parts.map(|parts| StateRecord { parts, exact: true });
+        let state = parts.map(|parts| StateRecord { parts, exact: true, sets_aside: false });
         database.commit(&[Batch { stamp: *now, rows }], state)?;
         Ok(database.close()?)
     }
@@ -231,28 +238,34 @@ impl Folder {
         let lost = wal::damage(&with_suffix(path, "-wal"));
         let database = Database::open(path, now, self.max_half_cycles)?;
         let (mut rows, mut is_sound, mut state) = (Vec::new(), !was_emptied, None);
-        let mut tell = |why: String| {
-            tracing::error!(error = why, "the stored state is damaged");
-            rows.push(Row::Own { reason: "state_damaged", detail: why });
+        let mut is_strange = false;
+        let mut tell = |reason: &'static str, why: String| {
+            tracing::error!(reason, error = why, "the stored state is not used");
+            rows.push(Row::Own { reason, detail: why });
             is_sound = false;
         };
         if let Some(why) = lost {
-            tell(why);
+            tell("state_damaged", why);
         }
         match database.state()? {
             Ok(None) => {}
             Ok(Some(stored)) => {
                 match Document::parse(&stored.json) {
                     Ok(document) => state = Some(document),
-                    Err(why) => tell(why),
+                    // Its hash is good: another version wrote it.
+                    Err(why) => {
+                        is_strange = true;
+                        tell("state_unfit", format!("{why}; {SET_ASIDE}"));
+                    }
                 }
                 if let Some(why) = stored.lost_later {
-                    tell(format!("{why}; an earlier state is used"));
+                    tell("state_damaged", format!("{why}; an earlier state is used"));
                 }
             }
-            Err(why) => tell(why),
+            Err(why) => tell("state_damaged", why),
         }
-        Ok(Opening { database, rows, state, is_sound })
+        let aside = database.state_aside();
+        Ok(Opening { database, rows, state, aside, is_strange, is_sound })
     }
 }
 

@@ -141,9 +141,7 @@ impl Reader {
 
     /// The stored state, if it is good.
     pub(super) fn state(&self) -> Option<Document> {
-        let shelf = database::read_shelf(&self.connection).ok()?;
-        let stored = database::read_state(&self.connection, &shelf).ok()?.ok()??;
-        Document::parse(&stored.json).ok()
+        database::read_document(&self.connection, database::STATE)
     }
 
     /// The wanted rows in the order in which they were written.

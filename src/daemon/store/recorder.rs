@@ -75,7 +75,7 @@ impl Recorder {
         };
         let json = document.to_json().map_err(|error| error.to_string())?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
-        let written = self.database.commit(batches, Some(StateRecord { parts, exact }));
+        let written = self.database.commit(batches, Some(StateRecord { parts, exact, sets_aside: false }));
         written.map_err(|error| format!("{}: {error}", self.folder))
     }
 }

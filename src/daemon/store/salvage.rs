@@ -70,7 +70,7 @@ pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Resu
     let Ok(old) = Connection::open_with_flags(damaged, flags) else { return Ok(Saved::default()) };
     let packs = read_packs(&old);
     let (connection, ledger) = database.parts_mut();
-    let saved = Saved { state: state_of(&old), ..Saved::default() };
+    let saved = Saved { state: database::read_document(&old, database::STATE), ..Saved::default() };
     let count = i64::try_from(packs.len()).unwrap_or(1).max(1);
     let mut copier =
         Copier { connection, ledger, moment: None, before: Some((0, [0; 32])), packs: count, saved };
@@ -90,12 +90,6 @@ pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Resu
     database::write_ledger(connection, ledger)?;
     connection.execute_batch("COMMIT")?;
     Ok(saved)
-}
-
-fn state_of(old: &Connection) -> Option<Document> {
-    let shelf = database::read_shelf(old).ok()?;
-    let stored = database::read_state(old, &shelf).ok()?.ok()??;
-    Document::parse(&stored.json).ok()
 }
 
 /// A row of the table `pack`.

@@ -48,6 +48,8 @@ struct Queue {
     backlog: Backlog,
     state: Option<Document>,
     exact: bool,
+    /// The stored state is to be kept beside the next one.
+    sets_aside: bool,
     ticket: u64,
     /// Something is to be done now.
     wanted: bool,
@@ -59,6 +61,7 @@ struct Work {
     batches: Vec<Batch>,
     state: Option<Document>,
     exact: bool,
+    sets_aside: bool,
     ticket: u64,
     stop: bool,
 }
@@ -84,6 +87,11 @@ impl Desk {
     /// Keeps rows for the next commit.
     pub(super) fn keep(&self, rows: Batch) {
         self.lock().backlog.push(rows);
+    }
+
+    /// Nobody has taken up the stored state: the next one does not overwrite it.
+    pub(super) fn set_aside(&self) {
+        self.lock().sets_aside = true;
     }
 
     /// The last thing the writer will be asked.
@@ -112,7 +120,8 @@ impl Desk {
         let state = queue.state.take();
         // Rows go with the state they were learned in.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
-        Work { batches, state, exact: std::mem::take(&mut queue.exact), ticket: queue.ticket, stop: queue.stop }
+        let (exact, sets_aside) = (std::mem::take(&mut queue.exact), std::mem::take(&mut queue.sets_aside));
+        Work { batches, state, exact, sets_aside, ticket: queue.ticket, stop: queue.stop }
     }
 
     fn put_back(&self, batches: Vec<Batch>, state: Option<Document>) {
@@ -135,6 +144,8 @@ pub(super) struct Writer {
     pub(super) failures: u64,
     /// The daemon began with what the database had, or it had nothing.
     pub(super) knows_state: bool,
+    /// The stored state is kept beside the next one.
+    pub(super) sets_aside: bool,
 }
 
 /// When a failed disk is tried again.
@@ -161,7 +172,8 @@ impl Writer {
     pub(super) fn run(mut self) {
         loop {
             let work = self.desk.take(self.retry.at);
-            let Work { batches, state, exact, ticket, stop } = work;
+            let Work { batches, state, exact, sets_aside, ticket, stop } = work;
+            self.sets_aside |= sets_aside;
             // The last attempt before the end is made whenever it is.
             let works = if self.retry.is_due() || stop {
                 self.write(batches, state, exact)
@@ -220,8 +232,9 @@ impl Writer {
             Some(database) => database,
             None => self.reopen(&document.stamp)?,
         };
-        match database.commit(batches, Some(StateRecord { parts, exact })) {
+        match database.commit(batches, Some(StateRecord { parts, exact, sets_aside: self.sets_aside })) {
             Ok(()) => {
+                self.sets_aside = false;
                 self.database = Some(database);
                 Ok(())
             }
@@ -238,12 +251,13 @@ impl Writer {
 
     fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
         let opening = self.folder.open(now).map_err(|error| error.to_string())?;
-        let Opening { mut database, mut rows, state, .. } = opening;
+        let Opening { mut database, mut rows, state, is_strange, .. } = opening;
+        self.sets_aside |= is_strange;
         if !self.knows_state && state.is_some() {
             // The daemon began without it, because the disk came too late: for people to find.
-            database.put_state_aside().map_err(|error| error.to_string())?;
+            self.sets_aside = true;
             tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
-            rows.push(Row::Own { reason: "state_too_late", detail: "set aside in slots 10 and 11".to_owned() });
+            rows.push(Row::Own { reason: "state_too_late", detail: "set aside".to_owned() });
         }
         self.knows_state = true;
         if !rows.is_empty() {

@@ -19,7 +19,7 @@ fn batch(seconds: f64, kinds: &[EventKind]) -> Batch {
 }
 
 fn state(numbers: &[f64]) -> StateRecord {
-    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false }
+    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
 }
 
 fn open(folder: &Path) -> Database {

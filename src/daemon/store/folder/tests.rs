@@ -22,7 +22,7 @@ fn damaged() -> tempfile::TempDir {
         database.commit(&[Batch { stamp: state.stamp, rows }], None).unwrap();
     }
     let parts = Parts::of(&state.to_json().unwrap()).unwrap();
-    database.commit(&[], Some(StateRecord { parts, exact: true })).unwrap();
+    database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
     database.close().unwrap();
     let file = File::options().write(true).open(place.path().join(DATABASE)).unwrap();
     let at = file.metadata().unwrap().len() * 2 / 5;
