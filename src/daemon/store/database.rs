@@ -283,6 +283,8 @@ impl Database {
 
 /// First slot of the state.
 pub(super) const STATE: i64 = 0;
+/// Serial number of a delta to nothing.
+const NO_SERIAL: i64 = -1;
 /// First slot of a state that was set aside.
 pub(super) const ASIDE: i64 = 10;
 
@@ -483,7 +485,7 @@ fn replace_pack(connection: &Connection, ledger: &mut Ledger, stamp: &Stamp) -> 
 }
 
 fn write_state(transaction: &Transaction<'_>, packed: &super::shelf::Packed) -> rusqlite::Result<()> {
-    let slot = i64::from(!packed.is_full);
+    let slot = STATE + i64::from(!packed.is_full);
     let length = i64::try_from(packed.length).unwrap_or(i64::MAX);
     let values = params![slot, packed.serial, length, packed.bytes];
     // An update of equal length overwrites in place, page by changed page.
@@ -492,6 +494,10 @@ fn write_state(transaction: &Transaction<'_>, packed: &super::shelf::Packed) -> 
         .execute(values)?;
     if updated == 0 {
         transaction.execute("INSERT INTO state VALUES (?1, ?2, ?3, ?4)", values)?;
+    }
+    if packed.is_full {
+        // Serial numbers begin anew when a full record was lost: an old delta must never fit a new one. Its room is kept.
+        transaction.execute("UPDATE state SET serial = ?2 WHERE slot = ?1", [STATE + 1, NO_SERIAL])?;
     }
     Ok(())
 }

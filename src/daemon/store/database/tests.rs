@@ -299,3 +299,26 @@ fn a_history_can_be_read_while_it_is_written() {
     };
     assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
 }
+
+#[test]
+fn a_delta_never_fits_another_full_record_of_its_number() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    database.commit(&[], Some(state(&[1.5; 300]))).unwrap();
+    database.commit(&[], Some(state(&[2.5; 300]))).unwrap();
+    let serials = |database: &Database| -> Vec<i64> {
+        let mut statement = database.connection().prepare("SELECT serial FROM state ORDER BY slot").unwrap();
+        statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
+    };
+    assert_eq!(serials(&database), [1, 1]);
+    // The full record can no longer be read: numbers begin anew.
+    database.connection().execute("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", []).unwrap();
+    drop(database);
+    let mut database = open(folder.path());
+    assert!(database.state().unwrap().is_err());
+    database.commit(&[], Some(state(&[3.5; 300]))).unwrap();
+    assert_eq!(serials(&database)[0], 1);
+    drop(database);
+    let stored = open(folder.path()).state().unwrap().unwrap().unwrap();
+    assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![3.5; 300]).unwrap(), None));
+}
