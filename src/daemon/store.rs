@@ -47,6 +47,7 @@ use document::Document;
 use folder::{Folder, Opening, SET_ASIDE};
 use gatherer::{Gatherer, Worth};
 use rows::{Batch, Row};
+use reader::MAX_DAEMON_COPY_BYTES;
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp};
 use writer::{Desk, Retry, Writer};
@@ -208,7 +209,7 @@ impl Store {
             None => {
                 retry.after_failure();
                 // A disk that cannot be written can perhaps be read.
-                (None, Vec::new(), Reader::open(&path).ok().and_then(|reader| reader.state()), None, false)
+                (None, Vec::new(), unwritable_state(&path), None, false)
             }
         };
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
@@ -335,6 +336,17 @@ impl Store {
         let stamp = Stamp::now(now, self.boot);
         let folder = self.folder.to_string_lossy().into_owned();
         Document { folder, stamp, snapshot: Box::new(monitor.snapshot()) }
+    }
+}
+
+/// The state in a folder that cannot be written.
+fn unwritable_state(folder: &Path) -> Option<Document> {
+    match Reader::open_within(folder, MAX_DAEMON_COPY_BYTES) {
+        Ok(reader) => reader.state(),
+        Err(error) => {
+            tracing::error!(error, "no stored state is read");
+            None
+        }
     }
 }
 
