@@ -344,7 +344,7 @@ fn unwritable_state(folder: &Path) -> Option<Document> {
     match Reader::open_within(folder, MAX_DAEMON_COPY_BYTES) {
         Ok(reader) => reader.state(),
         Err(error) => {
-            tracing::error!(error, "no stored state is read");
+            tracing::warn!(error, "no stored state is read");
             None
         }
     }

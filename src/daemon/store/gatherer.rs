@@ -153,6 +153,7 @@ fn is_learned(kind: &EventKind) -> bool {
         EventKind::HalfCycle { .. }
         | EventKind::Capacity { .. }
         | EventKind::RechargePeriod { .. }
+        | EventKind::AlarmDropped { .. }
         | EventKind::FilterReset { .. }
         | EventKind::PackReplaced { .. }
         | EventKind::PackIdentity { .. } => true,

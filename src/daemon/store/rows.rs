@@ -4,7 +4,7 @@ use rusqlite::types::Value;
 use serde::Serialize;
 
 use super::stamp::Stamp;
-use crate::alarm::{Rule, Severity};
+use crate::alarm::{Rule, Severity, State};
 use crate::monitor::EventKind;
 use crate::quantity::CellIndex;
 
@@ -176,6 +176,9 @@ fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
         EventKind::HalfCycle { .. } => (Table::HalfCycle, half_cycle_values(kind)?),
         EventKind::Capacity { .. } => (Table::Capacity, capacity_values(kind)?),
         EventKind::Alarm { .. } => (Table::Alarm, alarm_values(kind)?),
+        EventKind::AlarmDropped { rule, severity, cell, active: _, occurrences } => {
+            (Table::Alarm, dropped_values(rule, severity, cell, occurrences))
+        }
         EventKind::FilterReset { cell } => reset(whole(cell.0), "filter_reset", Value::Null),
         EventKind::PackIdentity { identity } => {
             reset(Value::Null, "pack_identity", Value::Text(identity.to_string()))
@@ -274,6 +277,23 @@ fn alarm_values(kind: &EventKind) -> Option<Vec<Value>> {
     ])
 }
 
+/// An alarm that nothing watches any more has ended, without a value that said so.
+fn dropped_values(rule: Rule, severity: Severity, cell: Option<CellIndex>, occurrences: u32) -> Vec<Value> {
+    vec![
+        cell.map_or(Value::Null, |cell| whole(cell.0)),
+        Value::Text(rule.name().to_owned()),
+        word(&severity),
+        word(&"dropped"),
+        word(&State::Inactive),
+        whole(0),
+        Value::Null,
+        Value::Null,
+        Value::Null,
+        whole(occurrences),
+        whole(0),
+    ]
+}
+
 fn whole(value: impl Into<i64>) -> Value {
     Value::Integer(value.into())
 }
@@ -298,7 +318,7 @@ fn word(value: &impl Serialize) -> Value {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use crate::alarm::{Change, State};
+    use crate::alarm::Change;
     use crate::quantity::Mode;
 
     /// A capacity of a cell, with or without information.
@@ -354,6 +374,13 @@ pub(super) mod tests {
             half_cycle(3),
             capacity(3, None, 2.4),
             alarm(Change::Raised),
+            EventKind::AlarmDropped {
+                rule: Rule::SocLow,
+                severity: Severity::Severe,
+                cell: None,
+                active: true,
+                occurrences: 3,
+            },
             EventKind::FilterReset { cell: CellIndex(1) },
             EventKind::PackReplaced { capacity_ah: Some(2.0), capacity_std_ah: None },
         ];
