@@ -35,10 +35,10 @@ mod writer;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
+use super::background_file::{MAX_FINISH, ends_in_time};
 use crate::config::StoreConfig;
 use crate::monitor::{Away, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
@@ -46,12 +46,13 @@ use database::OpenError;
 use document::Document;
 use folder::{Folder, Opening, SET_ASIDE};
 use gatherer::{Gatherer, Worth};
-use rows::{Batch, Row};
 use reader::MAX_DAEMON_COPY_BYTES;
+use rows::{Batch, Row};
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp};
 use writer::{Desk, Retry, Writer};
 
+pub(crate) use folder::with_suffix;
 pub use reader::{Entry, Filter, Kind, Reader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
@@ -64,10 +65,6 @@ const STANDARD_FOLDER: &str = "/var/lib/packwatch";
 const RUNTIME_PERIOD_S: f64 = 1.0;
 /// While no frame comes, the state is checkpointed this seldom, s: it only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
-/// Longest wait for the disk at the end: half of what systemd waits before it kills.
-const MAX_FINISH: Duration = Duration::from_secs(5);
-/// How often the end is looked for.
-const FINISH_POLL: Duration = Duration::from_millis(5);
 
 /// Where state and history are kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -218,7 +215,8 @@ impl Store {
         });
         found.states = candidates(running, state, now);
         found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now)));
-        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
+        let (told, progress) =
+            watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
             // They wait for the first state.
@@ -308,16 +306,9 @@ impl Store {
         self.leave(waiting, monitor, now, true);
         self.desk.stop();
         let Some(writer) = self.writer.take() else { return };
-        let asked = Instant::now();
-        while !writer.is_finished() {
-            if asked.elapsed() > MAX_FINISH {
-                tracing::error!(
-                    limit_s = MAX_FINISH.as_secs(),
-                    "the disk does not answer: the last state is not stored"
-                );
-                return;
-            }
-            std::thread::sleep(FINISH_POLL);
+        if !ends_in_time(&writer) {
+            tracing::error!(limit_s = MAX_FINISH.as_secs(), "the disk does not answer: the last state is not stored");
+            return;
         }
         let lost = self.desk.lost_rows();
         if lost > 0 || !self.progress.borrow().works {

@@ -1,7 +1,7 @@
 //! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -14,7 +14,7 @@ use crate::daemon::snapshot_file;
 use crate::daemon::status::collect::RecentEvents;
 use crate::daemon::status::document::Store as StoreStatus;
 use crate::daemon::store::hold::Hold;
-use crate::daemon::store::{Candidate, DATABASE_SOURCE, Progress, Store};
+use crate::daemon::store::{Candidate, DATABASE_SOURCE, Progress, Store, with_suffix};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
@@ -260,11 +260,7 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
 
 /// Takes up the first of the stored states that fits; how old it is, and why the database's was not, if it does not fit.
 /// Beside a journal goes what it began from.
-fn take_up(
-    monitor: &mut Monitor,
-    states: Vec<Candidate>,
-    journal: Option<&Path>,
-) -> (Option<Away>, Option<String>) {
+fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> (Option<Away>, Option<String>) {
     let mut unfit = None;
     for Candidate { snapshot, away, source } in states {
         let beside = journal.map(|path| with_suffix(path, ".state.json"));
@@ -285,12 +281,6 @@ fn take_up(
     }
     tracing::info!("no stored state: nothing is known of the cells yet");
     (None, unfit)
-}
-
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(suffix);
-    PathBuf::from(name)
 }
 
 /// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.

@@ -337,7 +337,11 @@ fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
 /// Settings of the connection, and of the file while it is new.
 fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "page_size", PAGE_BYTES)?;
-    connection.query_row("PRAGMA journal_mode = WAL", [], |_| Ok(()))?;
+    let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
+    if mode != "wal" {
+        // As safe, but every commit is written twice and made last twice: on a file system without shared memory.
+        tracing::warn!(mode, "the file system allows the database no write-ahead log: more is written");
+    }
     connection.pragma_update(None, "synchronous", "FULL")?;
     connection.pragma_update(None, "cache_size", -i64::from(CACHE_KIB))?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;

@@ -193,7 +193,7 @@ impl Folder {
     /// Puts a complete replacement in the database's place; false when there is none.
     fn finish_replacement(&self) -> Result<bool, OpenError> {
         let (path, new) = (self.path.join(DATABASE), self.path.join(NEW));
-        if !new.exists() {
+        if !new.is_file() {
             return Ok(false);
         }
         let place = self.free_place();
@@ -299,7 +299,8 @@ fn unavailable(error: io::Error) -> OpenError {
     OpenError::Unavailable(format!("the replacement of a damaged database: {error}"))
 }
 
-pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+/// A path with something behind its name.
+pub(crate) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);
     PathBuf::from(name)

@@ -250,7 +250,8 @@ fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Optio
     if !matches!(code, Some(rusqlite::ErrorCode::CannotOpen | rusqlite::ErrorCode::ReadOnly)) {
         return Err(error.to_string());
     }
-    let folder = copy_beside_nothing(path, max_copy_bytes).map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
+    let folder = copy_beside_nothing(path, max_copy_bytes)
+        .map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
     // A copy may be written: SQLite makes its index there.
     let opened = Connection::open(folder.join(DATABASE)).and_then(|connection| {
         readable(&connection)?;

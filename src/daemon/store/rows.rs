@@ -180,9 +180,7 @@ fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
             (Table::Alarm, dropped_values(rule, severity, cell, occurrences))
         }
         EventKind::FilterReset { cell } => reset(whole(cell.0), "filter_reset", Value::Null),
-        EventKind::PackIdentity { identity } => {
-            reset(Value::Null, "pack_identity", Value::Text(identity.to_string()))
-        }
+        EventKind::PackIdentity { identity } => reset(Value::Null, "pack_identity", Value::Text(identity.to_string())),
         EventKind::PackReplaced { capacity_ah, capacity_std_ah } => (
             Table::Reset,
             vec![Value::Null, word(&"pack_replaced"), maybe(capacity_ah), maybe(capacity_std_ah), Value::Null],

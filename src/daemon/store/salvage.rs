@@ -72,9 +72,8 @@ pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Resu
     let (connection, ledger) = database.parts_mut();
     let saved = Saved { state: database::read_document(&old, database::STATE), ..Saved::default() };
     let count = i64::try_from(packs.len()).unwrap_or(1).max(1);
-    let mut copier =
-        Copier { connection, ledger, moment: None, before: Some((0, [0; 32])), packs: count, saved };
-    let mut sources = Table::ALL.map(Source::new);
+    let mut copier = Copier { connection, ledger, moment: None, before: Some((0, [0; 32])), packs: count, saved };
+    let mut sources = Table::ALL.map(|table| Source::new(&old, table));
     connection.execute_batch("BEGIN IMMEDIATE")?;
     let mut rows = 0_usize;
     while let Some((table, row)) = next(&old, &mut sources) {
@@ -103,7 +102,8 @@ struct Pack {
 
 /// Those that can be read.
 fn read_packs(old: &Connection) -> Vec<Pack> {
-    let Ok(mut statement) = old.prepare("SELECT id, opened_ns, closed_ns, reason, identity FROM pack ORDER BY id") else {
+    let Ok(mut statement) = old.prepare("SELECT id, opened_ns, closed_ns, reason, identity FROM pack ORDER BY id")
+    else {
         return Vec::new();
     };
     let of = |row: &Row<'_>| {
@@ -130,6 +130,8 @@ struct Source {
     table: Table,
     page: VecDeque<Found>,
     last: Key,
+    /// The key of the table's last row: none is beyond it.
+    end: Key,
     phase: Phase,
 }
 
@@ -144,8 +146,16 @@ enum Phase {
 }
 
 impl Source {
-    fn new(table: Table) -> Self {
-        Self { table, page: VecDeque::new(), last: (i64::MIN, i64::MIN), phase: Phase::Front }
+    fn new(old: &Connection, table: Table) -> Self {
+        let mut source = Self {
+            table,
+            page: VecDeque::new(),
+            last: (i64::MIN, i64::MIN),
+            end: (i64::MAX, i64::MAX),
+            phase: Phase::Front,
+        };
+        source.end = source.back_keys(old, Some(1)).unwrap_or(source.end);
+        source
     }
 
     /// Reads on when nothing is left.
@@ -176,8 +186,8 @@ impl Source {
         let mut count = 0;
         while let Some(row) = rows.next()? {
             let key = key_of(self.table, row)?;
-            if key <= self.last {
-                // Out of order: what follows could be the same rows without end.
+            if key <= self.last || key > self.end {
+                // Out of order: reading on from there would go round, or past all that follows.
                 return Err(rusqlite::Error::QueryReturnedMoreThanOneRow);
             }
             self.last = key;
@@ -189,23 +199,30 @@ impl Source {
 
     /// The key before the lowest that can be reached from the back.
     fn before_back(&self, old: &Connection) -> Key {
-        let order = match self.table {
-            Table::HalfCycle => "ORDER BY r.moment DESC, r.cell DESC",
-            _ => "ORDER BY r.seq DESC",
-        };
-        let mut lowest = (i64::MAX, i64::MAX);
-        let Ok(mut statement) = old.prepare(&database::rows_sql(self.table, order)) else { return lowest };
-        let Ok(mut rows) = statement.query([]) else { return lowest };
-        while let Ok(Some(row)) = rows.next() {
-            match key_of(self.table, row) {
-                Ok(key) if key < lowest && key > self.last => lowest = key,
-                _ => break,
-            }
-        }
+        let lowest = self.back_keys(old, None).unwrap_or((i64::MAX, i64::MAX));
         match self.table {
             Table::HalfCycle => (lowest.0, lowest.1.saturating_sub(1)),
             _ => (lowest.0.saturating_sub(1), 0),
         }
+    }
+
+    /// The lowest key that can be reached from the back in so many rows; `None` = not even the last.
+    fn back_keys(&self, old: &Connection, rows: Option<usize>) -> Option<Key> {
+        let order = match self.table {
+            Table::HalfCycle => "ORDER BY r.moment DESC, r.cell DESC",
+            _ => "ORDER BY r.seq DESC",
+        };
+        let mut statement = old.prepare(&database::rows_sql(self.table, order)).ok()?;
+        let mut found = statement.query([]).ok()?;
+        let mut lowest = None;
+        for _ in 0..rows.unwrap_or(usize::MAX) {
+            let Ok(Some(row)) = found.next() else { break };
+            match key_of(self.table, row) {
+                Ok(key) if lowest.is_none_or(|lowest| key < lowest) && key > self.last => lowest = Some(key),
+                _ => break,
+            }
+        }
+        lowest
     }
 }
 

@@ -304,8 +304,10 @@ fn a_history_can_be_read_while_it_is_written() {
 fn a_delta_never_fits_another_full_record_of_its_number() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
-    database.commit(&[], Some(state(&[1.5; 300]))).unwrap();
-    database.commit(&[], Some(state(&[2.5; 300]))).unwrap();
+    let mut numbers: Vec<f64> = (0..300).map(|n| f64::from(n).sqrt()).collect();
+    database.commit(&[], Some(state(&numbers))).unwrap();
+    numbers[7] = 0.5;
+    database.commit(&[], Some(state(&numbers))).unwrap();
     let serials = |database: &Database| -> Vec<i64> {
         let mut statement = database.connection().prepare("SELECT serial FROM state ORDER BY slot").unwrap();
         statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
@@ -321,4 +323,25 @@ fn a_delta_never_fits_another_full_record_of_its_number() {
     drop(database);
     let stored = open(folder.path()).state().unwrap().unwrap().unwrap();
     assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![3.5; 300]).unwrap(), None));
+}
+
+#[test]
+fn a_moment_goes_with_its_last_row() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    for day in 0..1200_u32 {
+        // Every fifth transition teaches something; now and then there is an alarm.
+        let mut learned = vec![half_cycle(0)];
+        learned.extend((day % 5 == 0).then(|| capacity(0, Some(2.0), 1.9)));
+        learned.extend((day % 7 == 0).then(|| alarm(Change::Raised)));
+        database.commit(&[batch(f64::from(day), &learned)], None).unwrap();
+        database.commit(&[], None).unwrap();
+    }
+    let count = |sql: &str| -> i64 { database.connection().query_row(sql, [], |row| row.get(0)).unwrap() };
+    let rows = "SELECT moment FROM half_cycle UNION SELECT moment FROM capacity UNION SELECT moment FROM alarm";
+    assert_eq!(count("SELECT count(*) FROM half_cycle"), 1000);
+    assert_eq!(count(&format!("SELECT count(*) FROM ({rows}) WHERE moment NOT IN (SELECT id FROM moment)")), 0);
+    assert_eq!(count(&format!("SELECT count(*) FROM moment WHERE id NOT IN ({rows})")), 0);
+    assert!(count("SELECT count(*) FROM moment") < 1100);
+    assert_eq!(verify::verify(database.connection()).unwrap().broken, None);
 }
