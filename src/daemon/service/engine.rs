@@ -1,7 +1,7 @@
 //! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -14,7 +14,7 @@ use crate::daemon::snapshot_file;
 use crate::daemon::status::collect::RecentEvents;
 use crate::daemon::status::document::Store as StoreStatus;
 use crate::daemon::store::hold::Hold;
-use crate::daemon::store::{Candidate, Progress, Store};
+use crate::daemon::store::{Candidate, DATABASE_SOURCE, Progress, Store, with_suffix};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
@@ -58,14 +58,17 @@ impl Engine {
         let now = clock.now();
         let mut stamped_s = 0.0;
         // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-        let away = if let Some(snapshot) = service.restore.take() {
+        let (away, unfit) = if let Some(snapshot) = service.restore.take() {
             stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.away)?;
             tracing::info!(away = %service.away, stamped_s, "state taken up");
-            Some(service.away)
+            (Some(service.away), None)
         } else {
             take_up(&mut monitor, found.states, service.record.as_deref())
         };
+        if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
+            store.set_state_aside(why, now);
+        }
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
         let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
@@ -94,7 +97,7 @@ impl Engine {
             readiness,
             lost_file,
             store,
-            store_works: found.works,
+            store_works: found.works && unfit.is_none(),
             told_works: None,
             hold: Hold::default(),
             is_fresh: false,
@@ -176,6 +179,7 @@ impl Engine {
         self.hold.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
         self.stored.note(progress.works);
+        self.stored.failures = progress.failures;
         self.stored.file_bytes = progress.file_bytes;
         self.tell_works(time, links);
     }
@@ -257,8 +261,10 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
     }
 }
 
-/// Takes up the first of the stored states that fits; how old it is. Beside a journal goes what it began from.
-fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> Option<Away> {
+/// Takes up the first of the stored states that fits; how old it is, and why the database's was not, if it does not fit.
+/// Beside a journal goes what it began from.
+fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> (Option<Away>, Option<String>) {
+    let mut unfit = None;
     for Candidate { snapshot, away, source } in states {
         let beside = journal.map(|path| with_suffix(path, ".state.json"));
         let written = beside.as_deref().map(|path| snapshot_file::write(path, &snapshot));
@@ -268,19 +274,16 @@ fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>
                 if let Some(Err(error)) = written {
                     tracing::error!(%error, "the state this record begins from is not beside it");
                 }
-                return Some(away);
+                return (Some(away), unfit);
             }
-            Err(error) => tracing::error!(source, %error, "a stored state does not fit and is not used"),
+            Err(error) => {
+                tracing::error!(source, %error, "a stored state does not fit and is not used");
+                unfit = unfit.or_else(|| (source == DATABASE_SOURCE).then(|| error.to_string()));
+            }
         }
     }
     tracing::info!("no stored state: nothing is known of the cells yet");
-    None
-}
-
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(suffix);
-    PathBuf::from(name)
+    (None, unfit)
 }
 
 /// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.
