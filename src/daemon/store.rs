@@ -46,7 +46,7 @@ use document::Document;
 use folder::{Folder, Opening};
 use rows::{Batch, Gatherer, Worth};
 use runtime::RuntimeState;
-use stamp::{Age, BootId, Stamp};
+use stamp::{Age, BootId, Stamp, WallClock};
 use writer::{Desk, Retry, Writer};
 
 pub use reader::{Entry, Filter, Kind, Reader};
@@ -210,7 +210,7 @@ impl Store {
         let running = running.filter(|running| {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
-        found.states = candidates(running, state, now);
+        found.states = candidates(running, state, now, WallClock::look(now));
         let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
@@ -331,7 +331,7 @@ fn running_state(file: &Path, folder: &Path) -> Option<Document> {
 }
 
 /// Both states, the newer first.
-fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) -> Vec<Candidate> {
+fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp, wall: WallClock) -> Vec<Candidate> {
     let is_older = |running: &Document, stored: &Document| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };
@@ -342,7 +342,7 @@ fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) 
     }
     let candidate = |(document, source): (Option<Document>, &'static str)| {
         let document = document?;
-        let away = match document.stamp.age(now) {
+        let away = match document.stamp.age(now, wall) {
             Age::Seconds(seconds) => Away::Seconds(seconds),
             Age::Unknown => Away::Unknown,
         };
