@@ -49,7 +49,7 @@ use gatherer::{Gatherer, Worth};
 use reader::MAX_DAEMON_COPY_BYTES;
 use rows::{Batch, Row};
 use runtime::RuntimeState;
-use stamp::{Age, BootId, Stamp};
+use stamp::{Age, BootId, Stamp, WallClock};
 use writer::{Desk, Retry, Writer};
 
 pub(crate) use folder::with_suffix;
@@ -213,8 +213,9 @@ impl Store {
         let running = running.filter(|running| {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
-        found.states = candidates(running, state, now);
-        found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now)));
+        let wall = WallClock::look(now);
+        found.states = candidates(running, state, now, wall);
+        found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
         let (told, progress) =
             watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
         let desk = Arc::new(Desk::default());
@@ -362,7 +363,7 @@ fn running_state(file: &Path, folder: &Path) -> Option<Document> {
 }
 
 /// Both states, the newer first.
-fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) -> Vec<Candidate> {
+fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp, wall: WallClock) -> Vec<Candidate> {
     let is_older = |running: &Document, stored: &Document| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };
@@ -371,11 +372,11 @@ fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) 
     if stored_first {
         both.reverse();
     }
-    both.into_iter().filter_map(|(document, source)| Some(candidate(document?, source, now))).collect()
+    both.into_iter().filter_map(|(document, source)| Some(candidate(document?, source, now, wall))).collect()
 }
 
-fn candidate(document: Document, source: &'static str, now: &Stamp) -> Candidate {
-    let away = match document.stamp.age(now) {
+fn candidate(document: Document, source: &'static str, now: &Stamp, wall: WallClock) -> Candidate {
+    let away = match document.stamp.age(now, wall) {
         Age::Seconds(seconds) => Away::Seconds(seconds),
         Age::Unknown => Away::Unknown,
     };

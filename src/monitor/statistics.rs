@@ -6,13 +6,11 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::buses::CAN_ERR_BUSOFF;
 use super::{BusEvent, Event, EventKind, Input};
 use crate::alarm::{Change, Severity};
 use crate::cell::StepResult;
 use crate::quantity::BusIndex;
-
-/// Error class bits of an error frame (linux/can/error.h).
-const CAN_ERR_BUSOFF: u32 = 0x40;
 
 /// Counts since the first start.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]

@@ -140,11 +140,10 @@ impl Engine {
 
     /// What came out of the core: frames to the interfaces, events to the log, both to their files.
     fn hand_on(&mut self, time: Timestamp, links: &[LinkOutput]) {
-        let ticket = self.keep(time);
+        self.keep(time);
         for transmit in &self.outputs.frames {
-            match ticket.or_else(|| self.hold.behind(transmit)) {
-                Some(ticket) => self.hold.push(ticket, *transmit),
-                None => send(links, transmit),
+            if !self.hold.take(transmit) {
+                send(links, transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -159,14 +158,13 @@ impl Engine {
         }
     }
 
-    /// Makes what was learned durable; the ticket its announcement waits for. A store that fails is not waited for.
-    fn keep(&mut self, now: Timestamp) -> Option<u64> {
-        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
-        if !self.store_works {
-            return None;
+    /// Makes what was learned durable; its announcement waits for that. A store that fails is not waited for.
+    fn keep(&mut self, now: Timestamp) {
+        let Some(store) = &mut self.store else { return };
+        let ticket = store.learned(&self.outputs.events, &self.monitor, now);
+        if let Some(ticket) = ticket.filter(|_| self.store_works) {
+            self.hold.begin(ticket, Instant::now());
         }
-        self.hold.begin(ticket, Instant::now());
-        Some(ticket)
     }
 
     /// How far the store is, told whenever that changes; `None` = there is none.

@@ -1,5 +1,7 @@
 //! A real state through the store and back.
 
+mod rounding;
+
 use std::fmt::Write as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -100,7 +102,7 @@ fn the_database_holds_the_state_in_which_the_replay_ended() {
     let counts = database.counts();
     assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
     let stored = Document::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
-    assert_eq!(stored.stamp.age(&now), Age::Seconds(60.0));
+    assert_eq!(stored.stamp.age(&now, WallClock::Kept), Age::Seconds(60.0));
     assert_eq!(serde_json::to_vec(&stored.snapshot).unwrap(), serde_json::to_vec(&end).unwrap());
     restored(*stored.snapshot);
 }
@@ -119,7 +121,10 @@ fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
     const WALL_S: i64 = 1_800_000_000;
     let now = document(1, 100, WALL_S).stamp;
     let of = |running: Option<Document>, stored: Option<Document>| -> Vec<(&str, Away)> {
-        candidates(running, stored, &now).into_iter().map(|candidate| (candidate.source, candidate.away)).collect()
+        candidates(running, stored, &now, WallClock::Kept)
+            .into_iter()
+            .map(|candidate| (candidate.source, candidate.away))
+            .collect()
     };
     let (running, stored) = (|at| Some(document(1, at, 0)), |at| Some(document(1, at, 0)));
     let both = |first, second| [(first, Away::Seconds(2.0)), (second, Away::Seconds(50.0))];
