@@ -19,7 +19,7 @@ pub(super) struct Seeing {
     pub(super) identity: Identity,
     pub(super) counters: LoopCounters,
     told: Option<Instant>,
-    /// Of the first document: the first tick has taken the stored state up, and nothing was counted yet.
+    /// Of the first document: the first tick has taken the stored state up, and no frame was counted yet.
     before: Option<Before>,
 }
 

@@ -62,7 +62,8 @@ pub(crate) struct Before {
 }
 
 impl Before {
-    /// As a monitor has it that has just taken up its stored state, if there is one.
+    /// As a monitor has it that has just taken up its stored state, if there is one. What it tells in the very tick in which
+    /// it does (an alarm about an input that has been silent meanwhile) counts as before.
     pub(crate) fn of(monitor: &Monitor) -> Self {
         let mut statistics = monitor.statistics().clone();
         if statistics.restores == 0 {
