@@ -129,7 +129,8 @@ struct Found {
 struct Source {
     table: Table,
     page: VecDeque<Found>,
-    last: Key,
+    /// Where reading goes on. A search for the key before it could end in a damaged page.
+    from: Key,
     /// The key of the table's last row: none is beyond it.
     end: Key,
     phase: Phase,
@@ -150,7 +151,7 @@ impl Source {
         let mut source = Self {
             table,
             page: VecDeque::new(),
-            last: (i64::MIN, i64::MIN),
+            from: (i64::MIN, i64::MIN),
             end: (i64::MAX, i64::MAX),
             phase: Phase::Front,
         };
@@ -165,7 +166,7 @@ impl Source {
                 (Ok(PAGE_ROWS), _) => {}
                 (Err(_), Phase::Front) => {
                     self.phase = Phase::Back;
-                    self.last = self.before_back(old);
+                    self.from = self.back_keys(old, None).unwrap_or((i64::MAX, i64::MAX));
                 }
                 _ => self.phase = Phase::Done,
             }
@@ -174,36 +175,30 @@ impl Source {
 
     /// The next rows; how many. What was read before an error is in the page.
     fn read_page(&mut self, old: &Connection) -> rusqlite::Result<usize> {
-        let (after, bound): (&str, &[i64]) = match self.table {
+        let (which, bound): (&str, &[i64]) = match self.table {
             Table::HalfCycle => {
-                ("WHERE (r.moment, r.cell) > (?1, ?2) ORDER BY r.moment, r.cell", &[self.last.0, self.last.1])
+                ("WHERE (r.moment, r.cell) >= (?1, ?2) ORDER BY r.moment, r.cell", &[self.from.0, self.from.1])
             }
-            _ => ("WHERE r.seq > ?1 ORDER BY r.seq", &[self.last.0]),
+            _ => ("WHERE r.seq >= ?1 ORDER BY r.seq", &[self.from.0]),
         };
-        let sql = database::rows_sql(self.table, &format!("{after} LIMIT {PAGE_ROWS}"));
+        let sql = database::rows_sql(self.table, &format!("{which} LIMIT {PAGE_ROWS}"));
         let mut statement = old.prepare_cached(&sql)?;
         let mut rows = statement.query(rusqlite::params_from_iter(bound))?;
         let mut count = 0;
         while let Some(row) = rows.next()? {
             let key = key_of(self.table, row)?;
-            if key <= self.last || key > self.end {
+            if key < self.from || key > self.end {
                 // Out of order: reading on from there would go round, or past all that follows.
                 return Err(rusqlite::Error::QueryReturnedMoreThanOneRow);
             }
-            self.last = key;
+            self.from = match self.table {
+                Table::HalfCycle => (key.0, key.1.saturating_add(1)),
+                _ => (key.0.saturating_add(1), key.1),
+            };
             self.page.push_back(found(self.table, key, row));
             count += 1;
         }
         Ok(count)
-    }
-
-    /// The key before the lowest that can be reached from the back.
-    fn before_back(&self, old: &Connection) -> Key {
-        let lowest = self.back_keys(old, None).unwrap_or((i64::MAX, i64::MAX));
-        match self.table {
-            Table::HalfCycle => (lowest.0, lowest.1.saturating_sub(1)),
-            _ => (lowest.0.saturating_sub(1), 0),
-        }
     }
 
     /// The lowest key that can be reached from the back in so many rows; `None` = not even the last.
@@ -218,7 +213,7 @@ impl Source {
         for _ in 0..rows.unwrap_or(usize::MAX) {
             let Ok(Some(row)) = found.next() else { break };
             match key_of(self.table, row) {
-                Ok(key) if lowest.is_none_or(|lowest| key < lowest) && key > self.last => lowest = Some(key),
+                Ok(key) if lowest.is_none_or(|lowest| key < lowest) && key >= self.from => lowest = Some(key),
                 _ => break,
             }
         }

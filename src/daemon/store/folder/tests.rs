@@ -51,13 +51,16 @@ fn start(place: &Path) -> (Counts, usize) {
     (counts, told.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
 }
 
+/// When the power goes, and what is in the folder then.
+type Cut<'a> = (&'a str, &'a dyn Fn(&Path));
+
 #[test]
 fn a_replacement_that_was_cut_short_is_begun_again_or_finished() {
     let uncut = start(damaged().path());
     assert!(uncut.0.chained > 400 && uncut.0.chained < 800 && uncut.1 == 1, "{uncut:?}");
     let stamp = document(1, 150, 1_800_000_050).stamp;
     let filled = |place: &Path| Folder::new(place.to_owned(), 1000).fill_replacement(WHY, &stamp).unwrap();
-    let cuts: [(&str, &dyn Fn(&Path)); 4] = [
+    let cuts: [Cut<'_>; 4] = [
         ("while it was filled", &|place| {
             let _ = Database::open(&place.join(PART), &stamp, 1000).unwrap();
             fs::write(place.join("packwatch.db.part-wal"), "of another file").unwrap();
