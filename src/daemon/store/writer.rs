@@ -202,6 +202,8 @@ impl Writer {
     fn commit(&mut self, batches: &[Batch], state: Option<&Document>, exact: bool) -> Result<(), String> {
         let Some(document) = state else { return Ok(()) };
         let json = document.to_json().map_err(|error| error.to_string())?;
+        // A number that is not finite is written as nothing: the state could never be taken up again.
+        Document::parse(&json)?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
         drop(json);
         let mut database = match self.database.take() {
