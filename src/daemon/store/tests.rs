@@ -1,5 +1,7 @@
 //! A real state through the store and back.
 
+mod rounding;
+
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
