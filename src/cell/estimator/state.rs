@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn a_capacity_no_filter_can_go_on_from_is_reset_once_and_not_for_ever() {
-        for (mean, variance) in [(2.0, -0.04), (2.0, f64::NAN), (0.0, 0.04), (-2.0, 0.04), (f64::NAN, 0.04)] {
+        for (mean, variance) in [(2.0, -0.04), (2.0, f64::NAN), (0.0, 0.04)] {
             let mut state = settled();
             let last = state.covariance.len() - 1;
             (state.mean[3], state.covariance[last]) = (mean, variance);
