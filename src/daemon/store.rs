@@ -303,6 +303,10 @@ impl Store {
 
     /// The last state, to the last bit; waits until it is on the disk, for a while.
     pub(crate) fn finish(mut self, monitor: &Monitor, now: Timestamp) {
+        // On a disk that fails it is lost: then what the last second has taught is in the runtime folder alone.
+        if let Some(runtime) = &self.runtime {
+            runtime.put(self.document(monitor, now));
+        }
         let waiting = self.gatherer.deferred();
         self.leave(waiting, monitor, now, true);
         self.desk.stop();

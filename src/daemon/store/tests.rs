@@ -253,6 +253,20 @@ fn states(found: &Found) -> Vec<(&'static str, f64)> {
     found.states.iter().map(|state| (state.source, state.snapshot.time.secs())).collect()
 }
 
+#[test]
+fn on_a_disk_that_fails_the_last_state_is_in_the_runtime_folder() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    std::fs::write(&state, "").unwrap();
+    let (store, _) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let file = place.path().join(runtime::FILE_NAME);
+    let mut store = store.unwrap();
+    store.runtime = Some(RuntimeState::start(file.clone()).unwrap());
+    store.tick(&at(3.0), Timestamp::from_secs(3.0), true);
+    store.finish(&at(3.9), Timestamp::from_secs(3.9));
+    assert_eq!(running_state(&file, &state).unwrap().snapshot.time, Timestamp::from_secs(3.9));
+}
+
 fn reasons(folder: &Path) -> Vec<String> {
     let filter = Filter { kinds: vec![Kind::Reset], ..Filter::default() };
     let entries = Reader::open(folder).unwrap().entries(&filter).unwrap();
