@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::Fault;
 use super::basis::Coefficients;
-use super::model::Jitter;
+use super::jitter::{Jitter, until_positive};
 use super::nearest::Data;
 use super::plan::{Plan, Values, Work};
 
@@ -24,10 +24,6 @@ const BLOCK_PAIRS: usize = 1024;
 const BLOCK_QUERIES: usize = 256;
 /// Columns one thread takes at a time.
 const COLUMNS: usize = 8;
-/// Jitter tried first, as part of the prior variance, its growth and its end.
-const JITTER_FIRST: f64 = 1e-10;
-const JITTER_GROWTH: f64 = 100.0;
-pub(super) const JITTER_LAST: f64 = 1e-4;
 
 /// Everything a prediction needs.
 #[derive(Debug, Clone)]
@@ -105,18 +101,10 @@ impl Posterior {
         let columns = by_column(&data.inputs, data.dimensions);
         let mut factor = vec![0.0; n * n];
         let mut jitter = Jitter::default();
-        let mut added = 0.0;
-        loop {
+        jitter.note(until_positive(|added| {
             fill(&plan, &values, &data, &columns, added, &mut factor);
-            if cholesky(&mut factor, n) {
-                break;
-            }
-            if added >= JITTER_LAST {
-                return Err(Fault::NotPositiveDefinite { jitter: added });
-            }
-            added = if added == 0.0 { JITTER_FIRST } else { added * JITTER_GROWTH };
-        }
-        jitter.note(added);
+            cholesky(&mut factor, n)
+        })?);
         let mut posterior = Self {
             data,
             plan,

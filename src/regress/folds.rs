@@ -4,7 +4,8 @@ use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
-use super::model::{Hyperparameter, Jitter, Prediction, fit};
+use super::jitter::Jitter;
+use super::model::{Hyperparameter, Prediction, fit};
 use super::scale::check;
 use super::{Fault, Rows, Settings, Watcher};
 

@@ -29,6 +29,7 @@ mod exact;
 mod fault;
 mod folds;
 mod inducing;
+mod jitter;
 mod kernel;
 mod minimise;
 mod model;
@@ -40,11 +41,15 @@ mod search;
 mod tree;
 mod wide;
 
+#[cfg(test)]
+mod tests;
+
 pub use basis::Basis;
 pub use fault::Fault;
 pub use folds::{Fold, Folds, Score, assign, cross_validate, score};
+pub use jitter::Jitter;
 pub use kernel::{Kernel, Shape};
-pub use model::{Hyperparameter, Jitter, Model, Prediction, fit};
+pub use model::{Hyperparameter, Model, Prediction, fit};
 
 use std::ops::ControlFlow;
 

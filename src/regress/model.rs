@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::ThreadPool;
 use serde::{Deserialize, Serialize};
 
+use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
 use super::minimise::Lowest;
 use super::nearest::{Data, Factors};
@@ -24,23 +25,6 @@ const MAX_ROUNDS: usize = 4;
 const SAME_METRIC: f64 = 1.3;
 /// Most threads.
 const MAX_THREADS: usize = 1024;
-
-/// What had to be added to the diagonal of matrices that were not positive definite.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Jitter {
-    /// Matrices that needed it, in the final model (the search steps round such places).
-    pub matrices: usize,
-    /// The most that was added, as part of the signal variance.
-    pub largest: f64,
-}
-
-impl Jitter {
-    pub(super) fn note(&mut self, jitter: f64) {
-        self.matrices += usize::from(jitter > 0.0);
-        self.largest = self.largest.max(jitter);
-    }
-}
 
 /// One hyperparameter: length scales in (standardised) inputs, standard deviations in units of the target.
 #[derive(Debug, Clone, PartialEq)]
@@ -222,7 +206,7 @@ impl<'a> Job<'a> {
                 (old, _) => old,
             };
         }
-        best.map(|best| (best.x, best.iterations)).ok_or(Fault::NotPositiveDefinite { jitter: exact::JITTER_LAST })
+        best.map(|best| (best.x, best.iterations)).ok_or(Fault::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
     fn search_rows(&self) -> usize {
@@ -273,7 +257,8 @@ impl<'a> Job<'a> {
                 })
             }
             Form::Inducing { points } => {
-                let points = inducing::choose(&self.data, metric, points, self.settings.seed);
+                let choose = || inducing::choose(&self.data, metric, points, self.settings.seed);
+                let points = self.pool.install(choose);
                 descend(start, bounds, steps, watched, |theta| {
                     self.pool.install(|| {
                         let posterior = inducing::Posterior::new(&self.data, &self.plan, theta, &points)?;

@@ -19,17 +19,14 @@ use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
+use super::Fault;
 use super::basis::{Basis, Coefficients};
+use super::jitter::{Jitter, until_positive};
 use super::plan::{Plan, Values, Work};
 use super::tree::Tree;
-use super::{Fault, model};
 
 /// Rows that one thread takes at a time; sums are the same for any number of threads.
 const CHUNK: usize = 64;
-/// Jitter tried first, as part of the prior variance, and its growth.
-const JITTER_FIRST: f64 = 1e-10;
-const JITTER_GROWTH: f64 = 100.0;
-const JITTER_LAST: f64 = 1e-4;
 
 /// Standardised rows in the order of conditioning.
 #[derive(Debug, Clone)]
@@ -63,7 +60,7 @@ pub(super) struct Sums {
     pub value: f64,
     pub gradient: Vec<f64>,
     pub coefficients: Coefficients,
-    pub jitter: model::Jitter,
+    pub jitter: Jitter,
 }
 
 /// What the first pass leaves for the second.
@@ -105,7 +102,7 @@ impl Factors {
             })
             .collect();
         let (mut g, mut value, mut factors) = (vec![0.0; width * width], 0.0, Vec::with_capacity(self.rows.len()));
-        let mut jitter = model::Jitter::default();
+        let mut jitter = Jitter::default();
         for part in first {
             let (some, sums, log) = part?;
             some.iter().for_each(|factor| jitter.note(factor.jitter));
@@ -214,23 +211,16 @@ impl Scratch {
 /// Cholesky factor (lower, column after column) of the kernel's lower triangle with prior and noise on the diagonal;
 /// gives the jitter that was needed, as part of the prior variance.
 fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, values: &Values) -> Result<f64, Fault> {
-    let mut jitter = 0.0;
-    loop {
-        matrix.resize(n * n, 0.0);
+    matrix.resize(n * n, 0.0);
+    until_positive(|jitter| {
         let mut from = 0;
         for j in 0..n {
             matrix[j * n + j] = values.prior_variance * (1.0 + jitter) + values.noise_variance;
             matrix[j * n + j + 1..][..n - j - 1].copy_from_slice(&kernel[from..][..n - j - 1]);
             from += n - j - 1;
         }
-        if faer::traits::pulp::Arch::new().dispatch(|| cholesky(matrix, n)) {
-            return Ok(jitter);
-        }
-        if jitter >= JITTER_LAST {
-            return Err(Fault::NotPositiveDefinite { jitter });
-        }
-        jitter = if jitter == 0.0 { JITTER_FIRST } else { jitter * JITTER_GROWTH };
-    }
+        faer::traits::pulp::Arch::new().dispatch(|| cholesky(matrix, n))
+    })
 }
 
 /// In place, lower, column after column; `false` = not positive definite.
