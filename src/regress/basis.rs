@@ -48,7 +48,7 @@ pub(super) struct Coefficients {
 
 impl Coefficients {
     /// From `G`, symmetric, row after row, of size (1 + coefficients)^2, target first.
-    pub fn solve(g: &[f64], size: usize) -> Result<Self, Fault> {
+    pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, Fault> {
         let width = size + 1;
         let fault =
             || Fault::range("basis", format!("{size} functions"), "such that the rows tell its functions apart");
@@ -80,12 +80,12 @@ impl Coefficients {
     }
 
     /// Value of the mean function at a row.
-    pub fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
+    pub(super) fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
     /// Variance that comes from not knowing the coefficients; `rest` = h(x) - H' K^-1 k(x).
-    pub fn variance(&self, rest: &[f64]) -> f64 {
+    pub(super) fn variance(&self, rest: &[f64]) -> f64 {
         let size = self.beta.len();
         (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
     }

@@ -96,7 +96,7 @@ pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
 }
 
 impl Posterior {
-    pub fn new(data: Data, plan: Plan, theta: &[f64]) -> Result<Self, Fault> {
+    pub(super) fn new(data: Data, plan: Plan, theta: &[f64]) -> Result<Self, Fault> {
         let (n, values) = (data.len(), plan.values(theta));
         let columns = by_column(&data.inputs, data.dimensions);
         let mut factor = vec![0.0; n * n];
@@ -154,7 +154,7 @@ impl Posterior {
     }
 
     /// Derivative of minus the log likelihood by every parameter.
-    pub fn gradient(&self) -> Vec<f64> {
+    pub(super) fn gradient(&self) -> Vec<f64> {
         let n = self.data.len();
         let par = parallelism();
         let mut inverse = vec![0.0; n * n];
@@ -193,7 +193,7 @@ impl Posterior {
     }
 
     /// Mean and variance of the function at standardised rows.
-    pub fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
+    pub(super) fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
         let (n, d) = (self.data.len(), self.data.dimensions);
         let mut all = Vec::with_capacity(queries.len() / d);
         let mut block = vec![0.0; n * BLOCK_QUERIES.min(queries.len() / d)];
@@ -225,7 +225,7 @@ impl Posterior {
     }
 
     /// For some rows: residual and variance of the measurement, predicted from all other rows (coefficients as they are).
-    pub fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
+    pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());
         for some in rows.chunks(BLOCK_QUERIES) {

@@ -94,8 +94,9 @@ pub fn cross_validate(
 ) -> Result<Folds, Fault> {
     check(rows)?;
     let n = rows.targets.len();
-    if folds < 2 || folds > MAX_FOLDS || 2 * folds > n {
-        return Err(Fault::range("folds", folds, format!("2 to {}", MAX_FOLDS.min(n / 2))));
+    let most = MAX_FOLDS.min(n / 2);
+    if !(2..=most).contains(&folds) {
+        return Err(Fault::range("folds", folds, format!("2 to {most}")));
     }
     let fold_of_row = assign(n, folds, settings.seed);
     let mut predictions = vec![None; n];

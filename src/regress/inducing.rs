@@ -99,7 +99,7 @@ struct Block {
 }
 
 impl Posterior {
-    pub fn new(data: &Data, plan: &Plan, theta: &[f64], points: &[f64]) -> Result<Self, Fault> {
+    pub(super) fn new(data: &Data, plan: &Plan, theta: &[f64], points: &[f64]) -> Result<Self, Fault> {
         let values = plan.values(theta);
         let (d, m) = (data.dimensions, points.len() / data.dimensions);
         let columns = by_column(points, d);
@@ -125,7 +125,7 @@ impl Posterior {
         Ok(posterior)
     }
 
-    pub fn points(&self) -> &[f64] {
+    pub(super) fn points(&self) -> &[f64] {
         &self.points
     }
 
@@ -231,7 +231,7 @@ impl Posterior {
     }
 
     /// Derivative of minus the log likelihood by every parameter.
-    pub fn gradient(&self) -> Vec<f64> {
+    pub(super) fn gradient(&self) -> Vec<f64> {
         let (m, d) = (self.count(), self.data.dimensions);
         let parameters = self.plan.parameters.len();
         let (mut gradient, mut by_points, mut by_rows) = (vec![0.0; parameters], vec![0.0; m * m], 0.0);
@@ -316,7 +316,7 @@ impl Posterior {
     }
 
     /// Mean and variance of the function at standardised rows.
-    pub fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
+    pub(super) fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
         let (m, d) = (self.count(), self.data.dimensions);
         let mut all = Vec::with_capacity(queries.len() / d);
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
@@ -336,7 +336,7 @@ impl Posterior {
     }
 
     /// For some rows: residual and variance of the measurement, predicted from all other rows (coefficients as they are).
-    pub fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
+    pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let m = self.count();
         let mut all = Vec::with_capacity(rows.len());
         for some in rows.chunks(BLOCK) {

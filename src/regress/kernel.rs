@@ -184,7 +184,7 @@ impl Reader<'_> {
 
     fn fault(&self, at: &str, allowed: &str) -> Fault {
         let column = self.text[..self.text.len() - at.trim_start().len()].chars().count() + 1;
-        let found = at.trim_start().split_whitespace().next().unwrap_or("the end").to_owned();
+        let found = at.split_whitespace().next().unwrap_or("the end").to_owned();
         Fault::Kernel { text: self.text.to_owned(), column, found, allowed: allowed.to_owned() }
     }
 }

@@ -92,7 +92,7 @@ pub(super) enum Posterior {
 }
 
 impl Posterior {
-    pub fn data(&self) -> &Data {
+    pub(super) fn data(&self) -> &Data {
         match self {
             Self::Exact(posterior) => &posterior.data,
             Self::Nearest(posterior) => &posterior.data,

@@ -38,11 +38,11 @@ pub(super) struct Data {
 }
 
 impl Data {
-    pub fn row(&self, at: usize) -> &[f64] {
+    pub(super) fn row(&self, at: usize) -> &[f64] {
         &self.inputs[at * self.dimensions..][..self.dimensions]
     }
 
-    pub fn len(&self) -> usize {
+    pub(super) fn len(&self) -> usize {
         self.targets.len()
     }
 }
@@ -63,6 +63,13 @@ pub(super) struct Sums {
     pub jitter: Jitter,
 }
 
+/// Some factors, with what they add to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
+struct Part {
+    factors: Vec<Factor>,
+    g: Vec<f64>,
+    log: f64,
+}
+
 /// What the first pass leaves for the second.
 struct Factor {
     q: Vec<f64>,
@@ -73,7 +80,7 @@ struct Factor {
 
 impl Factors {
     /// Neighbours of the given rows among the rows before each.
-    pub fn new(data: &Data, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
+    pub(super) fn new(data: &Data, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
         let tree = Tree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
         let neighbours = rows.par_iter().with_min_len(CHUNK).map(of).collect();
@@ -81,34 +88,22 @@ impl Factors {
     }
 
     /// Minus the log density of the rows given their neighbours, its gradient (if asked for) and the coefficients.
-    pub fn sums(&self, data: &Data, plan: &Plan, theta: &[f64], with_gradient: bool) -> Result<Sums, Fault> {
+    pub(super) fn sums(&self, data: &Data, plan: &Plan, theta: &[f64], with_gradient: bool) -> Result<Sums, Fault> {
         let values = plan.values(theta);
         let size = data.basis.size(data.dimensions);
         let width = size + 1;
-        let first: Vec<Result<(Vec<Factor>, Vec<f64>, f64), Fault>> = (self.rows.par_chunks(CHUNK))
+        let first: Vec<Result<Part, Fault>> = (self.rows.par_chunks(CHUNK))
             .zip(self.neighbours.par_chunks(CHUNK))
-            .map_init(Scratch::default, |scratch, (rows, neighbours)| {
-                let (mut g, mut log) = (vec![0.0; width * width], 0.0);
-                let mut factors = Vec::with_capacity(rows.len());
-                for (row, near) in rows.iter().zip(neighbours) {
-                    let factor = scratch.factor(data, plan, &values, *row, near)?;
-                    let (n, q) = (factor.q.len(), factor.q[factor.q.len() - 1]);
-                    let last: Vec<f64> = (0..width).map(|c| factor.a[c * n + n - 1]).collect();
-                    (0..width * width).for_each(|at| g[at] += last[at / width] * last[at % width] / q);
-                    log += 0.5 * (TAU.ln() - q.ln());
-                    factors.push(factor);
-                }
-                Ok((factors, g, log))
-            })
+            .map_init(Scratch::default, |scratch, (rows, near)| scratch.part(data, plan, &values, rows, near))
             .collect();
-        let (mut g, mut value, mut factors) = (vec![0.0; width * width], 0.0, Vec::with_capacity(self.rows.len()));
+        let (mut g, mut value, mut factors) = (vec![0.0; width * width], 0.0, Vec::with_capacity(first.len()));
         let mut jitter = Jitter::default();
         for part in first {
-            let (some, sums, log) = part?;
-            some.iter().for_each(|factor| jitter.note(factor.jitter));
-            g.iter_mut().zip(&sums).for_each(|(total, sum)| *total += sum);
-            value += log;
-            factors.push(some);
+            let part = part?;
+            part.factors.iter().for_each(|factor| jitter.note(factor.jitter));
+            g.iter_mut().zip(&part.g).for_each(|(total, sum)| *total += sum);
+            value += part.log;
+            factors.push(part.factors);
         }
         let coefficients = Coefficients::solve(&g, size)?;
         value += 0.5 * coefficients.squared_norm;
@@ -165,6 +160,27 @@ impl Scratch {
             self.squares.push(0.0);
         }
         debug_assert_eq!(self.squares.len(), pairs * data.dimensions);
+    }
+
+    fn part(
+        &mut self,
+        data: &Data,
+        plan: &Plan,
+        values: &Values,
+        rows: &[u32],
+        neighbours: &[Vec<u32>],
+    ) -> Result<Part, Fault> {
+        let width = data.basis.size(data.dimensions) + 1;
+        let mut part = Part { factors: Vec::with_capacity(rows.len()), g: vec![0.0; width * width], log: 0.0 };
+        for (row, near) in rows.iter().zip(neighbours) {
+            let factor = self.factor(data, plan, values, *row, near)?;
+            let (n, q) = (factor.q.len(), factor.q[factor.q.len() - 1]);
+            let last: Vec<f64> = (0..width).map(|c| factor.a[c * n + n - 1]).collect();
+            (0..width * width).for_each(|at| part.g[at] += last[at / width] * last[at % width] / q);
+            part.log += 0.5 * (TAU.ln() - q.ln());
+            part.factors.push(factor);
+        }
+        Ok(part)
     }
 
     fn factor(&mut self, data: &Data, plan: &Plan, values: &Values, row: u32, near: &[u32]) -> Result<Factor, Fault> {
@@ -289,14 +305,14 @@ pub(super) struct Posterior {
 }
 
 impl Posterior {
-    pub fn new(data: Data, plan: Plan, theta: &[f64], coefficients: Coefficients, neighbours: usize) -> Self {
+    pub(super) fn new(data: Data, plan: Plan, theta: &[f64], coefficients: Coefficients, neighbours: usize) -> Self {
         let values = plan.values(theta);
         let tree = Tree::new(&data.inputs, &plan.metric(&values));
         Self { data, plan, values, coefficients, neighbours, tree }
     }
 
     /// Mean and variance of the function at standardised rows; every row of `but` is left out for its own query.
-    pub fn predict(&self, queries: &[f64], but: Option<&[u32]>) -> Result<Vec<(f64, f64)>, Fault> {
+    pub(super) fn predict(&self, queries: &[f64], but: Option<&[u32]>) -> Result<Vec<(f64, f64)>, Fault> {
         let d = self.data.dimensions;
         let parts: Vec<Result<Vec<(f64, f64)>, Fault>> = (queries.par_chunks(CHUNK * d).enumerate())
             .map_init(Scratch::default, |scratch, (chunk, rows)| {

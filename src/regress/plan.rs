@@ -80,7 +80,7 @@ pub(super) struct Work {
 }
 
 impl Plan {
-    pub fn new(kernel: &Kernel, dimensions: usize, ard: bool) -> Self {
+    pub(super) fn new(kernel: &Kernel, dimensions: usize, ard: bool) -> Self {
         let mut plan = Self { dimensions, ard, leaves: vec![], steps: vec![], parameters: vec![] };
         plan.add(&kernel.root, true);
         plan.parameters.push(Parameter { role: Role::Noise, name: "noise_sd".to_owned() });
@@ -122,7 +122,7 @@ impl Plan {
         self.leaves.len() - 1
     }
 
-    pub fn values(&self, theta: &[f64]) -> Values {
+    pub(super) fn values(&self, theta: &[f64]) -> Values {
         let leaves: Vec<LeafValues> = self.leaves.iter().map(|leaf| self.leaf_values(leaf, theta)).collect();
         let mut values =
             Values { leaves, prior_variance: 0.0, noise_variance: (2.0 * theta[self.parameters.len() - 1]).exp() };
@@ -141,19 +141,19 @@ impl Plan {
     }
 
     /// Weights of the inputs in a distance that says which rows are near: of the shortest length scale of each.
-    pub fn metric(&self, values: &Values) -> Vec<f64> {
+    pub(super) fn metric(&self, values: &Values) -> Vec<f64> {
         let of = |d: usize| values.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.dimensions).map(of).collect()
     }
 
     /// The kernel over a block of pairs.
-    pub fn evaluate<'w>(&self, values: &Values, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
+    pub(super) fn evaluate<'w>(&self, values: &Values, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
         self.forward(values, squares, count, work, false);
         &work.values[self.steps.len() - 1][..count]
     }
 
     /// Adds to `gradient` the derivative of `sum of weight * kernel` over a block of pairs by every parameter but the noise.
-    pub fn add_gradient(
+    pub(super) fn add_gradient(
         &self,
         values: &Values,
         squares: &[f64],

@@ -56,7 +56,7 @@ fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
 
 impl Scale {
     /// The scale of checked rows. With the zero basis the target is not shifted: 0 is then what is meant.
-    pub fn of(rows: &Rows, standardise: bool, basis: Basis) -> Self {
+    pub(super) fn of(rows: &Rows, standardise: bool, basis: Basis) -> Self {
         let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
         let inputs: Vec<(f64, f64)> =
             (0..rows.dimensions).map(|d| if standardise { moments(column(d)) } else { (0.0, 1.0) }).collect();
@@ -69,12 +69,12 @@ impl Scale {
         }
     }
 
-    pub fn inputs(&self, inputs: &[f64]) -> Vec<f64> {
+    pub(super) fn inputs(&self, inputs: &[f64]) -> Vec<f64> {
         let d = self.means.len();
         inputs.iter().enumerate().map(|(at, x)| (x - self.means[at % d]) / self.deviations[at % d]).collect()
     }
 
-    pub fn targets(&self, targets: &[f64]) -> Vec<f64> {
+    pub(super) fn targets(&self, targets: &[f64]) -> Vec<f64> {
         targets.iter().map(|y| (y - self.target_mean) / self.target_deviation).collect()
     }
 }

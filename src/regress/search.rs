@@ -77,7 +77,7 @@ pub(super) struct Watched<'a, 'w> {
 }
 
 impl Watched<'_, '_> {
-    pub fn tell(&mut self, iteration: usize, value: f64) -> Result<(), Fault> {
+    pub(super) fn tell(&mut self, iteration: usize, value: f64) -> Result<(), Fault> {
         self.progress.iteration = iteration;
         self.progress.log_likelihood_per_row = -value / self.rows as f64;
         match (self.watcher)(self.progress) {

@@ -64,7 +64,7 @@ impl Found {
 
 impl Tree {
     /// A tree over rows of `weights.len()` inputs.
-    pub fn new(inputs: &[f64], weights: &[f64]) -> Self {
+    pub(super) fn new(inputs: &[f64], weights: &[f64]) -> Self {
         let d = weights.len();
         let weighted: Vec<f64> = inputs.iter().enumerate().map(|(at, x)| x * weights[at % d]).collect();
         let mut numbers: Vec<u32> = (0..).take(inputs.len() / d).collect();
@@ -102,7 +102,7 @@ impl Tree {
     }
 
     /// The `wanted` nearest rows with numbers below `before` and other than `but`, nearest first.
-    pub fn nearest(&self, point: &[f64], wanted: usize, before: usize, but: Option<usize>) -> Vec<u32> {
+    pub(super) fn nearest(&self, point: &[f64], wanted: usize, before: usize, but: Option<usize>) -> Vec<u32> {
         let point: Vec<f64> = point.iter().zip(&self.weights).map(|(x, w)| x * w).collect();
         let before = u32::try_from(before).unwrap_or(u32::MAX);
         let but = but.and_then(|row| u32::try_from(row).ok());
