@@ -20,6 +20,9 @@
 //! the default for as many: a rough function over months cannot go through a few hundred points.
 //! Deviation 2: what a prediction does not know of the basis' coefficients is part of its variance.
 //!
+//! Deviation 3: the 95 % interval is not 1.96 standard deviations: training rows predicted without themselves say how
+//! wide it must be, and where ([`Settings::calibrate`]).
+//!
 //! Results are the same for the same rows, settings and seed on one machine; linear algebra may differ in the last bits
 //! between machines and numbers of threads.
 
@@ -117,7 +120,7 @@ pub struct Settings {
     pub max_iterations: usize,
     /// Hyperparameters to start from, in the order and units of [`Model::hyperparameters`]; empty = guessed from the rows.
     pub start: Vec<f64>,
-    /// The 95 % interval is made as wide as training rows, predicted without themselves, say; else Gaussian.
+    /// The 95 % interval is made as wide as training rows near by, predicted without themselves, say; else Gaussian.
     pub calibrate: bool,
     /// Threads, 1 or more.
     pub threads: usize,

@@ -4,8 +4,10 @@ use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rayon::ThreadPool;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::calibration::{Calibration, ROWS};
 use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
 use super::minimise::Lowest;
@@ -14,7 +16,7 @@ use super::plan::{Plan, Role};
 use super::scale::{Scale, check};
 use super::search::{Watched, descend, first_start, log_bounds, random_start};
 use super::{Basis, Fault, Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, Progress, Rows, Settings, Watcher};
-use super::{calibration, exact, inducing, nearest};
+use super::{exact, inducing, nearest};
 
 /// Rows whose factors the search of [`Form::Nearest`] sums over; the hyperparameters' standard error from this choice is
 /// far below what a prediction can show.
@@ -44,7 +46,8 @@ pub struct Prediction {
     pub function_variance: f64,
     /// Variance of a new measurement: the function's and the noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval that holds 95 % of new measurements, see [`Model::interval_factor`].
+    /// Lower end of the interval that holds 95 % of new measurements, see [`Model::interval_factor`]: not 1.96 standard
+    /// deviations when residuals are not Gaussian or not as wide everywhere.
     pub low_95: f64,
     /// Its upper end.
     pub high_95: f64,
@@ -59,7 +62,18 @@ pub struct Model {
     pub(super) theta: Vec<f64>,
     pub(super) posterior: Posterior,
     pub(super) outcome: Outcome,
+    pub(super) calibration: Calibration,
     pool: ThreadPool,
+}
+
+/// A model without its threads.
+pub(super) struct Parts {
+    pub spec: Spec,
+    pub scale: Scale,
+    pub theta: Vec<f64>,
+    pub posterior: Posterior,
+    pub outcome: Outcome,
+    pub calibration: Calibration,
 }
 
 /// What a model is, apart from its numbers.
@@ -80,7 +94,6 @@ pub(super) struct Outcome {
     /// In standardised targets.
     pub log_likelihood: f64,
     pub jitter: Jitter,
-    pub interval_factor: f64,
     pub iterations: usize,
 }
 
@@ -292,12 +305,13 @@ impl<'a> Job<'a> {
                 Ok::<_, Fault>((Posterior::Inducing(Box::new(posterior)), value, jitter))
             }
         })?;
-        let mut outcome =
-            Outcome { log_likelihood: -value, jitter, interval_factor: calibration::GAUSSIAN, iterations };
+        let outcome = Outcome { log_likelihood: -value, jitter, iterations };
+        let mut calibration = Calibration::none();
         if self.settings.calibrate {
-            let rows = chosen(posterior.data().len(), calibration::ROWS);
+            let rows = chosen(posterior.data().len(), ROWS);
             let left_out = self.pool.install(|| posterior.left_out(&rows, noise_variance))?;
-            outcome.interval_factor = calibration::factor(&left_out);
+            let ratios = left_out.into_iter().map(|(residual, variance)| residual.abs() / variance.sqrt()).collect();
+            calibration = Calibration::new(posterior.data(), rows, ratios);
         }
         let settings = self.settings;
         let spec = Spec {
@@ -307,7 +321,7 @@ impl<'a> Job<'a> {
             form: settings.form,
             dimensions: self.scale.means.len(),
         };
-        Ok(Model { spec, scale: self.scale, theta, posterior, outcome, pool: self.pool })
+        Ok(Model { spec, scale: self.scale, theta, posterior, outcome, calibration, pool: self.pool })
     }
 }
 
@@ -347,15 +361,9 @@ fn check_settings(settings: &Settings, rows: usize) -> Result<(), Fault> {
 }
 
 impl Model {
-    pub(super) fn assemble(
-        spec: Spec,
-        scale: Scale,
-        theta: Vec<f64>,
-        posterior: Posterior,
-        outcome: Outcome,
-        pool: ThreadPool,
-    ) -> Self {
-        Self { spec, scale, theta, posterior, outcome, pool }
+    pub(super) fn assemble(parts: Parts, pool: ThreadPool) -> Self {
+        let Parts { spec, scale, theta, posterior, outcome, calibration } = parts;
+        Self { spec, scale, theta, posterior, outcome, calibration, pool }
     }
 
     /// What is to be expected at rows of inputs, one after the other.
@@ -369,16 +377,23 @@ impl Model {
             return Err(Fault::NotFinite { line: (at / d) as u64 + 1, what, found: inputs[at] });
         }
         let queries = self.scale.inputs(inputs);
-        let found = self.pool.install(|| self.posterior.predict(&queries))?;
-        Ok(found.into_iter().map(|(mean, variance)| self.prediction(mean, variance)).collect())
+        self.pool.install(|| {
+            let found = self.posterior.predict(&queries)?;
+            let rows = queries.par_chunks_exact(d).with_min_len(64);
+            Ok(found
+                .into_par_iter()
+                .zip(rows)
+                .map(|((mean, variance), row)| self.prediction(row, mean, variance))
+                .collect())
+        })
     }
 
-    fn prediction(&self, mean: f64, variance: f64) -> Prediction {
+    fn prediction(&self, row: &[f64], mean: f64, variance: f64) -> Prediction {
         let unit = self.scale.target_deviation;
         let mean = self.scale.target_mean + unit * mean;
         let noise = (2.0 * self.theta[self.theta.len() - 1]).exp();
         let measurement_variance = (variance + noise) * unit * unit;
-        let half = self.outcome.interval_factor * measurement_variance.sqrt();
+        let half = self.calibration.half_width(row) * measurement_variance.sqrt();
         Prediction {
             mean,
             function_variance: variance * unit * unit,
@@ -401,10 +416,11 @@ impl Model {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval in standard deviations of a measurement: 1.96 for Gaussian residuals; from
-    /// training rows predicted without themselves when [`Settings::calibrate`] is set.
+    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals are as wide as on the
+    /// whole: 1.96 for Gaussian residuals; from training rows predicted without themselves when
+    /// [`Settings::calibrate`] is set, and then wider or narrower where such rows nearby say so.
     pub fn interval_factor(&self) -> f64 {
-        self.outcome.interval_factor
+        self.calibration.factor
     }
 
     /// What had to be added to diagonals.

@@ -7,7 +7,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::basis::Coefficients;
-use super::model::{Model, Outcome, Posterior, Spec, threads};
+use super::calibration::Calibration;
+use super::model::{Model, Outcome, Parts, Posterior, Spec, threads};
 use super::nearest::Data;
 use super::plan::Plan;
 use super::scale::Scale;
@@ -40,6 +41,11 @@ struct Body {
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
+    /// Rows that were left out for the intervals, and their ratios.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    left_out: Vec<u32>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    ratios: Vec<f64>,
     /// Inducing points, row after row.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     points: Vec<f64>,
@@ -70,6 +76,8 @@ impl Model {
             targets: data.targets.clone(),
             beta: vec![],
             beta_covariance: vec![],
+            left_out: self.calibration.rows.clone(),
+            ratios: self.calibration.ratios.clone(),
             points: vec![],
         };
         match &self.posterior {
@@ -118,6 +126,7 @@ impl Body {
         if d == 0 || d > super::MAX_DIMENSIONS || n == 0 {
             return Err(damaged(format!("{n} rows of {d} inputs")));
         }
+        same("ratios", self.ratios.len(), self.left_out.len())?;
         same("inputs", self.inputs.len(), d * n)?;
         same("means", self.scale.means.len(), d)?;
         same("deviations", self.scale.deviations.len(), d)?;
@@ -143,11 +152,15 @@ impl Body {
         }
         let scale = &self.scale;
         let numbers = [&self.inputs, &self.targets, &self.theta, &scale.means, &scale.deviations, &self.beta];
-        let finite = numbers.into_iter().chain([&self.beta_covariance, &self.points]).flatten().all(|x| x.is_finite());
+        let finite = numbers
+            .into_iter()
+            .chain([&self.beta_covariance, &self.points, &self.ratios])
+            .flatten()
+            .all(|x| x.is_finite());
         let positive = scale.deviations.iter().chain([&scale.target_deviation]).all(|x| *x > 0.0);
         let small = self.theta.iter().all(|x| x.abs() < 100.0);
-        let outcome = self.outcome.interval_factor > 0.0 && scale.target_mean.is_finite();
-        if finite && positive && small && outcome { Ok(()) } else { Err(damaged("a number out of its range")) }
+        let rows = scale.target_mean.is_finite() && self.left_out.iter().all(|row| (*row as usize) < n);
+        if finite && positive && small && rows { Ok(()) } else { Err(damaged("a number out of its range")) }
     }
 
     fn model(self, thread_count: usize) -> Result<Model, Fault> {
@@ -169,6 +182,11 @@ impl Body {
                 Ok::<_, Fault>(Posterior::Inducing(Box::new(posterior)))
             }
         })?;
-        Ok(Model::assemble(spec, self.scale, theta, posterior, self.outcome, pool))
+        let calibration = match self.left_out.len() {
+            0 => Calibration::none(),
+            _ => Calibration::new(posterior.data(), self.left_out, self.ratios),
+        };
+        let parts = Parts { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration };
+        Ok(Model::assemble(parts, pool))
     }
 }

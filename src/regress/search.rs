@@ -10,7 +10,7 @@ use super::plan::{Parameter, Plan, Role};
 use super::{Fault, Progress, Watcher};
 
 /// Fall of the negative log likelihood per row that no longer counts; twice running ends a search.
-const CONVERGED_PER_ROW: f64 = 2e-6;
+const CONVERGED_PER_ROW: f64 = 5e-6;
 
 /// Lowest and highest value of a parameter, in standardised units, before the logarithm.
 fn bounds(role: Role) -> (f64, f64) {

@@ -140,10 +140,10 @@ fn the_search_finds_noise_and_function_again() {
         let model = fitted(form, |settings| settings.restarts = 1);
         let hyperparameters = model.hyperparameters();
         let noise_sd = hyperparameters.last().expect("the noise is there").value;
-        // Three uniform draws times 0.1: a standard deviation of 0.1. Inducing points are known to find too little: what
-        // they cannot follow counts as each row's own noise.
-        let lowest = if matches!(form, Form::Inducing { .. }) { 0.06 } else { 0.085 };
-        assert!((lowest..0.115).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
+        // The noise of these 120 rows came out at 0.086. Inducing points are known to find too little: what they cannot
+        // follow counts as each row's own noise.
+        let lowest = if matches!(form, Form::Inducing { .. }) { 0.06 } else { 0.075 };
+        assert!((lowest..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
         let (queries, targets) = made(400, 99);
         let predictions = model.predict(&queries).expect("finite");
         let score = score(&predictions, &targets);
