@@ -12,7 +12,7 @@ pub(super) const LAST: f64 = 1e-4;
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Matrices that needed it, in the final model (the search steps round such places).
+    /// Matrices that needed it in the final model's likelihood; a prediction's own are mended the same way, uncounted.
     pub matrices: usize,
     /// The most that was added, as part of the signal variance.
     pub largest: f64,

@@ -60,7 +60,7 @@ use serde::{Deserialize, Serialize};
 
 /// Most inputs of a row.
 pub const MAX_DIMENSIONS: usize = 256;
-/// Most rows of an exact fit: its matrix alone is then 3.2 GB.
+/// Most rows of an exact fit: its matrix alone is then 3.2 GB, and a search needs three of them.
 pub const MAX_EXACT_ROWS: usize = 20_000;
 /// Most neighbours of a row.
 pub const MAX_NEIGHBOURS: usize = 500;

@@ -229,15 +229,16 @@ impl<'a> Job<'a> {
     /// One search; what depends on the metric (neighbours, inducing points) is chosen anew until the metric rests.
     fn one_search(&self, mut start: Vec<f64>, watched: &mut Watched) -> Result<Option<Lowest>, Fault> {
         let (low, high) = log_bounds(&self.plan, self.spread);
-        let mut found = None;
+        let mut found: Option<Lowest> = None;
         for _ in 0..MAX_ROUNDS {
             let metric = self.metric(&start);
-            found = self.one_round(&start, &metric, (&low, &high), watched)?;
-            let Some(lowest) = &found else { break };
-            if matches!(self.settings.form, Form::Exact) || same(&metric, &self.metric(&lowest.x)) {
+            let Some(mut lowest) = self.one_round(&start, &metric, (&low, &high), watched)? else { break };
+            lowest.iterations += found.map_or(0, |before| before.iterations);
+            start.clone_from(&lowest.x);
+            found = Some(lowest);
+            if matches!(self.settings.form, Form::Exact) || same(&metric, &self.metric(&start)) {
                 break;
             }
-            start.clone_from(&lowest.x);
         }
         Ok(found)
     }
@@ -428,7 +429,7 @@ impl Model {
         self.outcome.jitter
     }
 
-    /// Steps of the best search.
+    /// Steps of the best search, over all its choices of neighbours or inducing points.
     pub fn iterations(&self) -> usize {
         self.outcome.iterations
     }
