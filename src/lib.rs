@@ -7,6 +7,7 @@
 //! | --- | --- | --- |
 //! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
 //! | 1 | [`filter`] | unscented and linear Kalman filters: pure numbers |
+//! | 1 | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | 1 | [`can`] | frame, signal layout, decode, encode, end-to-end protection, bound on frames, J1939 |
 //! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
 //! | 2 | [`cell`] | equivalent circuit, thermal model, estimator |
@@ -42,5 +43,7 @@ pub mod io;
 pub mod lab;
 pub mod monitor;
 pub mod quantity;
+#[cfg(feature = "lab")]
+pub mod regress;
 pub mod sample;
 pub mod sim;
