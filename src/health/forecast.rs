@@ -35,24 +35,24 @@ const RATE_WALK_USE: f64 = 0.3;
 /// Standard deviation of the recovery while the cell is used, part of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
 /// Use that takes an e-fold of the recovery away, equivalent full cycles.
-const RECOVERY_CYCLES: f64 = 7.0;
+const RECOVERY_CYCLES: f64 = 10.0;
 /// Standard deviation of the recovery of a long rest, part of the reference.
-const RECOVERY_IN_REST: f64 = 0.03;
+const RECOVERY_IN_REST: f64 = 0.02;
 /// Rest after which it has come, e-fold, days; also what takes it away where the use is not known.
 const RECOVERY_DAYS: f64 = 1.0;
 /// Standard deviation of a reading's own noise beyond its stated variance, part of the reference.
 const READING_NOISE: f64 = 0.003;
 /// Standard deviation of the level before the first reading, part of the reference: as good as unknown.
 const LEVEL_PRIOR: f64 = 1.0;
-/// Standard deviation of the rate before the first reading, part of the reference per unit of use: 5 % a cycle.
-const RATE_PRIOR: f64 = 0.05;
+/// Standard deviation of the rate before the first reading, part of the reference per unit of use: 2 % a cycle.
+const RATE_PRIOR: f64 = 0.02;
 
 /// Readings without which nothing is told.
 pub const MIN_READINGS: u32 = 6;
 /// The capacity lost must be this many times its standard deviation.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.5;
 /// The interval's ends may lie apart by this factor.
-pub const MAX_SPREAD: f64 = 50.0;
+pub const MAX_SPREAD: f64 = 100.0;
 /// Days over which the rate of use is taken, e-fold.
 const RECENT_DAYS: f64 = 30.0;
 
