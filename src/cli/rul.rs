@@ -47,7 +47,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("{}: named twice, again as number {}", file.display(), index + 1)));
     }
     let shown = if args.at.is_empty() {
-        let forecasts: Vec<Now> = each(args, |history, name, threshold| rul::now(history, name, threshold))?;
+        let forecasts: Vec<Now> = each(args, rul::now)?;
         if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
     } else {
         let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);

@@ -268,16 +268,11 @@ impl Forecast {
         let (x, p) = (&mut self.x, &mut self.p);
         x[LEVEL] -= used * x[RATE];
         x[RECOVERY] *= kept;
-        for j in 0..N {
-            p[LEVEL][j] -= used * p[RATE][j];
-        }
+        let rate_row = p[RATE];
+        p[LEVEL].iter_mut().zip(rate_row).for_each(|(level, rate)| *level -= used * rate);
+        p[RECOVERY].iter_mut().for_each(|recovery| *recovery *= kept);
         for row in p.iter_mut() {
             row[LEVEL] -= used * row[RATE];
-        }
-        for j in 0..N {
-            p[RECOVERY][j] *= kept;
-        }
-        for row in p.iter_mut() {
             row[RECOVERY] *= kept;
         }
         // The rate has walked while the level followed it.
