@@ -19,10 +19,13 @@ const NODES: [(f64, f64); 5] = [
     (2.856_970_013_872_806, 0.011_257_411_327_720_69),
 ];
 
-/// Steps of the bisections: from 60 e-folds to less than a part in 10^7.
-pub(super) const HALVINGS: u32 = 32;
+/// Steps of the bisections: from some 20 e-folds to a part in 10^6.
+pub(super) const HALVINGS: u32 = 24;
 
-/// Logarithm of the least and the largest use told.
+/// Deviations from its mean beyond which a part has no quantile that anybody asks for.
+const REACH: f64 = 6.0;
+
+/// Logarithm of the largest use told, and of the least rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 
 /// Below this the moments' closed form loses digits and their series serves.
@@ -71,13 +74,17 @@ impl Crossing {
 
     /// Use within which it comes with this probability.
     pub(super) fn quantile(&self, probability: f64) -> f64 {
-        let (mut least, mut most) = LOG_RANGE;
         let passed = |log_use: f64| -> f64 {
             self.parts.iter().map(|part| part.weight * part.log.map_or(1.0, |log| below(log_use, log))).sum()
         };
-        if passed(least) >= probability {
+        let over = self.parts.iter().filter(|part| part.log.is_none()).map(|part| part.weight).sum::<f64>();
+        if over >= probability {
             return 0.0;
         }
+        let ends =
+            |sign: f64| self.parts.iter().filter_map(move |part| part.log.map(|(m, std)| m + sign * REACH * std));
+        let mut least = ends(-1.0).fold(LOG_RANGE.1, f64::min);
+        let mut most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (least + most);
             if passed(middle) < probability {

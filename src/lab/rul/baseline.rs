@@ -13,7 +13,7 @@ const STEPS: u32 = 20_000;
 /// Where the search for the exponents starts, e-folds over the use so far: both falling, one rising, nearly straight.
 const STARTS: [[f64; 2]; 4] = [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]];
 /// First step of that search, and when it is done.
-const SEARCH: (f64, f64) = (0.5, 1e-3);
+const SEARCH: (f64, f64) = (0.5, 1e-4);
 /// Exponents beyond this are not tried: e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
 /// A determinant less than this part of its terms: both exponentials are one.
