@@ -214,3 +214,56 @@ fn print(scored: &[Scored]) {
         }
     }
 }
+
+/// A file of a straight fade, 0.01 Ah a reading, five days between readings.
+fn straight_file(folder: &Path) -> PathBuf {
+    let rows = (0..40).map(|n| format!("{},{:.3}\n", 432_000 * n, 2.0 - 0.01 * f64::from(n)));
+    let path = folder.join("cell.csv");
+    std::fs::write(&path, format!("date,capacity_ah\n{}", rows.collect::<String>())).unwrap();
+    path
+}
+
+fn command(args: &[&str]) -> assert_cmd::assert::Assert {
+    assert_cmd::Command::cargo_bin("packwatch").unwrap().arg("rul").args(args).assert()
+}
+
+fn json(args: &[&str]) -> serde_json::Value {
+    serde_json::from_slice(&command(args).success().get_output().stdout).unwrap()
+}
+
+#[test]
+fn the_command_forecasts_now_and_says_what_it_cannot_judge() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = straight_file(folder.path());
+    let file = file.to_str().unwrap();
+    let now = json(&[file, "--end-of-life", "1.5,80 %", "--json"]);
+    // 1.61 Ah at the end, 0.002 Ah a day: 55 days to 1.5 Ah.
+    let median = now["forecasts"][0]["remaining"]["days"]["median"].as_f64().unwrap();
+    assert!((median - 55.0).abs() < 10.0, "{now}");
+    assert_eq!(now["forecasts"][0]["remaining"]["cycles"], serde_json::Value::Null);
+    assert_eq!(now["forecasts"][1]["threshold_ah"], 1.6);
+    let judged = json(&[file, "--end-of-life", "1.7", "--at", "50,80", "--json"]);
+    assert_eq!(judged["files"][0]["end_of_life"], 150.0);
+    assert_eq!(judged["total"]["forecasts"], 2);
+    assert_eq!(judged["total"]["within_alpha"], 1.0);
+    let text = command(&[file, "--end-of-life", "1.5", "--at", "50"]).success();
+    let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
+    assert!(text.contains("does not fall through 1.500 Ah for good (least capacity 1.610 Ah): not judged"), "{text}");
+}
+
+#[test]
+fn the_command_refuses_what_it_cannot_read_with_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("bad.csv");
+    std::fs::write(&path, "date,capacity_ah\n0,2\n5,much\n").unwrap();
+    let failed = command(&[path.to_str().unwrap(), "--end-of-life", "1.4"]).failure().code(1);
+    let said = String::from_utf8_lossy(&failed.get_output().stderr).into_owned();
+    let wanted = "bad.csv:3: column capacity_ah: found \"much\", must be Ah above 0 or nothing";
+    assert!(said.contains(wanted), "{said}");
+    command(&[path.to_str().unwrap(), "--end-of-life", "120 %"]).failure().code(2);
+    let few = folder.path().join("few.csv");
+    std::fs::write(&few, "date,capacity_ah\n0,2\n5,1.9\n").unwrap();
+    let text = command(&[few.to_str().unwrap(), "--end-of-life", "1.4"]).success();
+    let text = String::from_utf8_lossy(&text.get_output().stdout).into_owned();
+    assert!(text.contains("no forecast: 2 capacity readings, needs 6"), "{text}");
+}
