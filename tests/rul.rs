@@ -137,7 +137,7 @@ fn fades_of_many_shapes_lie_in_the_interval_as_often_as_it_says() {
     let (mut dice, mut all) = (Dice(6), Vec::new());
     for shape in shapes {
         for axis in [Axis::Cycles, Axis::Days] {
-            let scored: Vec<Scored> = (0..10)
+            let scored: Vec<Scored> = (0..6)
                 .map(|_| {
                     let (history, end_ah) = life(shape, axis, &mut dice);
                     rul::score(&history, "simulated", Threshold::AmpereHours(end_ah), &AT, ALPHA)
