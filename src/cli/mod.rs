@@ -15,6 +15,8 @@ mod generate;
 mod history;
 mod replay;
 mod reset;
+#[cfg(feature = "lab")]
+mod rul;
 mod run;
 #[cfg(feature = "lab")]
 mod score;
@@ -80,6 +82,9 @@ enum Command {
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
+    /// Forecast the remaining useful life of measured capacity histories, and judge forecasts made during the life
+    #[cfg(feature = "lab")]
+    Rul(rul::Args),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -128,6 +133,8 @@ pub fn main() -> ExitCode {
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
         Command::Score(args) => score::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Rul(args) => rul::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

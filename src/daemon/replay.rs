@@ -427,6 +427,7 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
             "capacity"
         }
+        EventKind::RemainingLife { .. } => "remaining_life",
         EventKind::RechargePeriod { .. } => "recharge_period",
         EventKind::Alarm { change, .. } => {
             if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {

@@ -248,6 +248,7 @@ impl Monitor {
             let period = Observation { is_new: false, ..period };
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
         }
+        self.observe_life(false, out);
     }
 
     /// The last recharge period, of the kind the rule about it compares.

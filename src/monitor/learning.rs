@@ -33,14 +33,18 @@ impl Monitor {
         let mut half_cycles = std::mem::take(&mut self.scratch.half_cycles);
         let rated_ah = self.config.model.rated_capacity_ah;
         self.learner.complete(&self.config.health.transition, rated_ah, change.from, &mut half_cycles);
+        let life_before = self.pack_remaining_life();
+        let days = self.learned_at.map_or(0.0, |before| self.now.since(before) / 86_400.0);
         for (index, half_cycle) in half_cycles.iter().enumerate() {
-            self.learn_cell(index, half_cycle, out);
+            self.learn_cell(index, half_cycle, days, out);
         }
         if change.from == Mode::Charge {
             self.finish_charge(!half_cycles.is_empty(), out);
         }
         if !half_cycles.is_empty() {
             self.learner.finish();
+            self.learned_at = Some(self.now);
+            self.tell_life(life_before.is_some(), out);
             half_cycles.clear();
         }
         self.scratch.half_cycles = half_cycles;
@@ -49,7 +53,8 @@ impl Monitor {
         }
     }
 
-    fn learn_cell(&mut self, index: usize, half_cycle: &HalfCycle, out: &mut Outputs) {
+    /// `days` have passed since the half-cycle before.
+    fn learn_cell(&mut self, index: usize, half_cycle: &HalfCycle, days: f64, out: &mut Outputs) {
         let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
         let slot = &mut self.cells[index];
         if slot.estimator.soc().is_none() {
@@ -62,6 +67,7 @@ impl Monitor {
             &mut slot.estimator,
             half_cycle,
         );
+        slot.life.learn(&self.config, half_cycle, days, &update);
         if half_cycle.mode == Mode::Charge && slot.tapered {
             slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
         }

@@ -256,6 +256,24 @@ pub enum EventKind {
         /// Its standard deviation.
         resistance_ratio_std: f64,
     },
+    /// A half-cycle is over: what remains of the life of the cell whose life ends first. Told while it is known, and once
+    /// when it no longer is (nothing in it, then).
+    RemainingLife {
+        /// Which cell.
+        cell: Option<CellIndex>,
+        /// Equivalent full cycles until its capacity passes the end of life, median.
+        cycles: Option<f64>,
+        /// 5 % quantile.
+        cycles_low: Option<f64>,
+        /// 95 % quantile.
+        cycles_high: Option<f64>,
+        /// Days, if it goes on being used as of late, median.
+        days: Option<f64>,
+        /// 5 % quantile.
+        days_low: Option<f64>,
+        /// 95 % quantile.
+        days_high: Option<f64>,
+    },
     /// A charge is over that covered the recharge window, or enough of it to be told.
     RechargePeriod {
         /// Seconds between the two configured SOC values; `None` = it did not cover the whole window in one go.

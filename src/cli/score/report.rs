@@ -330,7 +330,7 @@ fn percent(value: f64) -> String {
 }
 
 /// Columns as wide as their widest entry: the first two to the left, numbers to the right.
-fn write_table(out: &mut impl Write, rows: &[Vec<String>]) -> io::Result<()> {
+pub(crate) fn write_table(out: &mut impl Write, rows: &[Vec<String>]) -> io::Result<()> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
     let widths: Vec<usize> =

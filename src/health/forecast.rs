@@ -1,0 +1,355 @@
+//! Remaining useful life: how much use, and how many days, until a cell's capacity passes an end-of-life threshold.
+//!
+//! A linear Kalman filter over the learned capacities, one step per reading, whose cost and memory do not grow with the
+//! history. State x = [level, rate, recovery], capacities in parts of a reference capacity:
+//! * level: the capacity that only falls; level -= rate dt, with t the use (equivalent full cycles; days where the
+//!   use is not known);
+//! * rate: loss per unit of use. Its logarithm walks: by `RATE_WALK` per square root of capacity lost, and by
+//!   `RATE_WALK_USE` per e-fold of use. Both are relative, so one pair of numbers serves cells that live for 50 cycles
+//!   and for 5,000; in the linear filter they become Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
+//! * recovery: capacity that comes back in rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
+//!   show 1 to 5 % after days of rest). It is also what readings that follow each other have in common, so that ten
+//!   readings in one cycle do not count as ten.
+//!
+//! A reading is level + recovery + noise. The forecast takes the loss as the free variable, not the time: the use until
+//! the level has fallen by L is the integral of 1 / rate over the loss, a sum of lognormals, here one lognormal of the
+//! same mean and variance (closed form, see [`distribution`]). There is no first-passage problem, for the level only
+//! falls, and no sampling.
+//!
+//! Assumed: fade has no preferred curvature (it may slow down as well as speed up), so the median is the present rate
+//! held; a knee that no reading has shown lies outside the interval. `tests/rul.md` has what was tried and the figures.
+
+mod distribution;
+#[cfg(test)]
+mod tests;
+
+use serde::{Deserialize, Serialize};
+
+use self::distribution::Crossing;
+
+/// Standard deviation of the logarithm of the rate per square root of capacity lost (part of the reference): while 10 %
+/// is lost the rate changes by a factor of e^0.32 either way.
+const RATE_WALK: f64 = 1.0;
+/// The same per square root of an e-fold of use since the first reading.
+const RATE_WALK_USE: f64 = 0.3;
+/// Standard deviation of the recovery while the cell is used, part of the reference.
+const RECOVERY_IN_USE: f64 = 0.01;
+/// Use that takes an e-fold of the recovery away, equivalent full cycles.
+const RECOVERY_CYCLES: f64 = 10.0;
+/// Standard deviation of the recovery of a long rest, part of the reference.
+const RECOVERY_IN_REST: f64 = 0.02;
+/// Rest after which it has come, e-fold, days; also what takes it away where the use is not known.
+const RECOVERY_DAYS: f64 = 1.0;
+/// Standard deviation of a reading's own noise beyond its stated variance, part of the reference.
+const READING_NOISE: f64 = 0.003;
+/// Standard deviation of the level before the first reading, part of the reference: as good as unknown.
+const LEVEL_PRIOR: f64 = 1.0;
+/// Standard deviation of the rate before the first reading, part of the reference per unit of use: 2 % a cycle.
+const RATE_PRIOR: f64 = 0.02;
+
+/// Readings without which nothing is told.
+pub const MIN_READINGS: u32 = 6;
+/// The capacity lost must be this many times its standard deviation.
+pub const MIN_FADE_DEVIATIONS: f64 = 1.5;
+/// The interval's ends may lie apart by this factor.
+pub const MAX_SPREAD: f64 = 100.0;
+/// Days over which the rate of use is taken, e-fold.
+const RECENT_DAYS: f64 = 30.0;
+
+/// Quantiles of the interval: 5, 50 and 95 %.
+const QUANTILES: [f64; 3] = [0.05, 0.5, 0.95];
+
+const LEVEL: usize = 0;
+const RATE: usize = 1;
+const RECOVERY: usize = 2;
+const N: usize = 3;
+
+/// What counts as use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Axis {
+    /// Equivalent full cycles.
+    Cycles,
+    /// Days: the history does not say how much the cell was used. Any of them may have been rest.
+    Days,
+}
+
+/// What passed since the reading before.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Passed {
+    /// Equivalent full cycles; not looked at on the axis of days.
+    pub cycles: f64,
+    /// Days, rest included.
+    pub days: f64,
+    /// Days without current; not looked at on the axis of days.
+    pub rest_days: f64,
+}
+
+/// A learned capacity.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// Ah.
+    pub capacity_ah: f64,
+    /// Variance of what this reading alone says, Ah^2: independent of the readings before.
+    pub variance_ah2: f64,
+    /// Variance of what all readings have wrong alike (the current sensor's gain, say), Ah^2.
+    pub shared_variance_ah2: f64,
+}
+
+/// Median and 90 % interval of an amount that remains.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Remaining {
+    /// 5 % quantile.
+    pub low: f64,
+    /// 50 % quantile.
+    pub median: f64,
+    /// 95 % quantile.
+    pub high: f64,
+}
+
+/// Remaining useful life. At least one of both is known.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RemainingLife {
+    /// Equivalent full cycles; `None` on the axis of days.
+    pub cycles: Option<Remaining>,
+    /// Days, if the cell goes on being used as of late (`RECENT_DAYS`); `None` while that is not known.
+    pub days: Option<Remaining>,
+}
+
+/// Why there is no forecast.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", tag = "reason")]
+pub enum TooThin {
+    /// Too few readings.
+    #[error("{found} capacity readings, needs {MIN_READINGS}")]
+    Readings {
+        /// So far.
+        found: u32,
+    },
+    /// The fade is not told from noise.
+    #[error(
+        "capacity lost is {:.1} +- {:.1} %, must be {MIN_FADE_DEVIATIONS} times its deviation",
+        100.0 * lost, 100.0 * std
+    )]
+    Fade {
+        /// Part of the reference.
+        lost: f64,
+        /// Its standard deviation.
+        std: f64,
+    },
+    /// The interval is too wide to be of use.
+    #[error("the interval would be from {low:.1} to {high:.1}, may not span more than a factor of {MAX_SPREAD}")]
+    Spread {
+        /// 5 % quantile, units of use.
+        low: f64,
+        /// 95 % quantile, units of use.
+        high: f64,
+    },
+}
+
+/// Capacity at a moment to come, for pictures.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct FanPoint {
+    /// Use from the last reading on, units of the axis.
+    pub ahead: f64,
+    /// 5 % quantile, Ah.
+    pub low_ah: f64,
+    /// 50 % quantile, Ah.
+    pub median_ah: f64,
+    /// 95 % quantile, Ah.
+    pub high_ah: f64,
+}
+
+/// The filter of one cell: 18 numbers, however long its history.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Forecast {
+    axis: Axis,
+    reference_ah: f64,
+    readings: u32,
+    /// Use since the first reading.
+    used: f64,
+    /// Level after the first reading, and its variance.
+    first: [f64; 2],
+    x: [f64; N],
+    p: [[f64; N]; N],
+    shared_variance: f64,
+    /// Equivalent full cycles and days of late.
+    recent: [f64; 2],
+}
+
+impl Forecast {
+    /// For a cell of this capacity when new, Ah; any capacity of its size serves, it is only a scale.
+    pub fn new(axis: Axis, reference_ah: f64) -> Self {
+        let mut p = [[0.0; N]; N];
+        p[LEVEL][LEVEL] = LEVEL_PRIOR * LEVEL_PRIOR;
+        p[RATE][RATE] = RATE_PRIOR * RATE_PRIOR;
+        let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
+        p[RECOVERY][RECOVERY] = RECOVERY_IN_USE * RECOVERY_IN_USE + rest * rest;
+        let x = [1.0, 0.0, 0.0];
+        let (first, recent) = ([x[LEVEL], p[LEVEL][LEVEL]], [0.0; 2]);
+        Self { axis, reference_ah, readings: 0, used: 0.0, first, x, p, shared_variance: 0.0, recent }
+    }
+
+    /// Use and rest have passed; `reading` is what was learned at their end, if anything.
+    pub fn update(&mut self, passed: Passed, reading: Option<Reading>) {
+        let kept = libm::exp(-passed.days.max(0.0) / RECENT_DAYS);
+        self.recent = [self.recent[0] * kept + passed.cycles.max(0.0), self.recent[1] * kept + passed.days.max(0.0)];
+        if self.readings > 0 {
+            self.advance(&passed);
+        }
+        let Some(reading) = reading.filter(|r| r.capacity_ah.is_finite() && r.variance_ah2 >= 0.0) else { return };
+        self.observe(&reading);
+    }
+
+    /// Readings so far.
+    pub fn readings(&self) -> u32 {
+        self.readings
+    }
+
+    /// Capacity without what rest has brought back, mean and standard deviation, Ah.
+    pub fn level_ah(&self) -> (f64, f64) {
+        let std = (self.p[LEVEL][LEVEL].max(self.shared_variance)).sqrt();
+        (self.reference_ah * self.x[LEVEL], self.reference_ah * std)
+    }
+
+    /// Loss per unit of use, mean and standard deviation, Ah.
+    pub fn rate_ah(&self) -> (f64, f64) {
+        (self.reference_ah * self.x[RATE], self.reference_ah * self.p[RATE][RATE].sqrt())
+    }
+
+    /// What remains until the level passes the threshold.
+    ///
+    /// # Errors
+    /// While there is too little to tell it from.
+    pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, TooThin> {
+        self.check_fade()?;
+        let crossing = self.crossing(threshold_ah / self.reference_ah);
+        let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
+        // At the threshold the lower end is 0 whatever is known.
+        if high > MAX_SPREAD * low && low > 0.0 {
+            return Err(TooThin::Spread { low, high });
+        }
+        let remaining = Remaining { low, median, high };
+        let [cycles, days] = self.recent;
+        Ok(match self.axis {
+            Axis::Days => RemainingLife { cycles: None, days: Some(remaining) },
+            Axis::Cycles => {
+                let per_cycle = (cycles > 0.0 && days > 0.0).then(|| days / cycles);
+                RemainingLife { cycles: Some(remaining), days: per_cycle.map(|factor| remaining.times(factor)) }
+            }
+        })
+    }
+
+    /// Capacity at `points` moments, evenly spaced from now until `ahead` units of use from now. Not for use on line.
+    ///
+    /// # Errors
+    /// While there is too little to tell it from.
+    pub fn fan(&self, ahead: f64, points: usize) -> Result<Vec<FanPoint>, TooThin> {
+        self.check_fade()?;
+        let at = |index: usize| {
+            let ahead = ahead * index as f64 / (points.max(2) - 1) as f64;
+            let [low_ah, median_ah, high_ah] = QUANTILES.map(|quantile| self.capacity_ah(ahead, quantile));
+            FanPoint { ahead, low_ah, median_ah, high_ah }
+        };
+        Ok((0..points).map(at).collect())
+    }
+
+    /// The recovery relaxes, the level falls by the rate, and both rate and recovery become less certain.
+    fn advance(&mut self, passed: &Passed) {
+        let (used, rest_days, relaxation) = match self.axis {
+            Axis::Cycles => (passed.cycles.max(0.0), passed.rest_days.max(0.0), RECOVERY_CYCLES),
+            Axis::Days => (passed.days.max(0.0), passed.days.max(0.0), RECOVERY_DAYS),
+        };
+        let kept = libm::exp(-used / relaxation);
+        let walk = self.rate_walk(used);
+        let (x, p) = (&mut self.x, &mut self.p);
+        x[LEVEL] -= used * x[RATE];
+        x[RECOVERY] *= kept;
+        let rate_row = p[RATE];
+        p[LEVEL].iter_mut().zip(rate_row).for_each(|(level, rate)| *level -= used * rate);
+        p[RECOVERY].iter_mut().for_each(|recovery| *recovery *= kept);
+        for row in p.iter_mut() {
+            row[LEVEL] -= used * row[RATE];
+            row[RECOVERY] *= kept;
+        }
+        // The rate has walked while the level followed it.
+        p[RATE][RATE] += walk;
+        p[LEVEL][RATE] -= walk * used / 2.0;
+        p[RATE][LEVEL] = p[LEVEL][RATE];
+        p[LEVEL][LEVEL] += walk * used * used / 3.0;
+        p[RECOVERY][RECOVERY] += RECOVERY_IN_USE * RECOVERY_IN_USE * (1.0 - kept * kept)
+            + RECOVERY_IN_REST * RECOVERY_IN_REST * (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS));
+        self.used += used;
+    }
+
+    /// Variance that the rate gains over `used` units of use.
+    fn rate_walk(&self, used: f64) -> f64 {
+        let rate = self.x[RATE].max(0.0);
+        let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
+        let relative = RATE_WALK * RATE_WALK * rate * used + RATE_WALK_USE * RATE_WALK_USE * e_folds;
+        relative * (rate * rate + self.p[RATE][RATE])
+    }
+
+    fn observe(&mut self, reading: &Reading) {
+        let scale = self.reference_ah * self.reference_ah;
+        let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
+        let noise = READING_NOISE * READING_NOISE + reading.variance_ah2 / scale;
+        let innovation_variance = ph[LEVEL] + ph[RECOVERY] + noise;
+        let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
+        for i in 0..N {
+            self.x[i] += ph[i] / innovation_variance * innovation;
+            for (j, ph_j) in ph.iter().enumerate() {
+                self.p[i][j] -= ph[i] * ph_j / innovation_variance;
+            }
+        }
+        self.shared_variance = reading.shared_variance_ah2 / scale;
+        if self.readings == 0 {
+            self.first = [self.x[LEVEL], self.p[LEVEL][LEVEL]];
+        }
+        self.readings = self.readings.saturating_add(1);
+    }
+
+    fn check_fade(&self) -> Result<(), TooThin> {
+        if self.readings < MIN_READINGS {
+            return Err(TooThin::Readings { found: self.readings });
+        }
+        let lost = self.first[0] - self.x[LEVEL];
+        let std = (self.first[1] + self.p[LEVEL][LEVEL]).sqrt();
+        if lost < MIN_FADE_DEVIATIONS * std { Err(TooThin::Fade { lost, std }) } else { Ok(()) }
+    }
+
+    /// The use until the level passes `threshold`, part of the reference.
+    fn crossing(&self, threshold: f64) -> Crossing {
+        let level_variance = self.p[LEVEL][LEVEL].max(self.shared_variance);
+        Crossing::new(
+            [self.x[LEVEL] - threshold, self.x[RATE]],
+            [level_variance, self.p[LEVEL][RATE], self.p[RATE][RATE]],
+            self.used,
+        )
+    }
+
+    /// Quantile of the capacity after `ahead` units of use: the threshold that is passed by then with that probability.
+    fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
+        let (level, std) = (self.x[LEVEL], self.p[LEVEL][LEVEL].max(self.shared_variance).sqrt());
+        let (mut below, mut above) = (0.0, level + 5.0 * std);
+        for _ in 0..distribution::HALVINGS {
+            let middle = 0.5 * (below + above);
+            if self.crossing(middle).probability(ahead) < quantile {
+                below = middle;
+            } else {
+                above = middle;
+            }
+        }
+        self.reference_ah * above
+    }
+}
+
+impl Remaining {
+    /// In another unit.
+    fn times(self, factor: f64) -> Self {
+        Self { low: factor * self.low, median: factor * self.median, high: factor * self.high }
+    }
+}
