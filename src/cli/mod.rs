@@ -11,6 +11,8 @@ mod doctor;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+#[cfg(feature = "lab")]
+mod fleet;
 mod generate;
 mod history;
 mod replay;
@@ -21,6 +23,8 @@ mod score;
 mod simulate;
 mod status;
 mod test_alarm;
+#[cfg(feature = "lab")]
+mod whatif;
 
 use std::process::ExitCode;
 
@@ -80,6 +84,9 @@ enum Command {
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
+    /// Tell when the alarms would have come with other settings, over many logs
+    #[cfg(feature = "lab")]
+    Whatif(Box<whatif::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -128,6 +135,8 @@ pub fn main() -> ExitCode {
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
         Command::Score(args) => score::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Whatif(args) => whatif::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

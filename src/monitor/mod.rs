@@ -35,7 +35,7 @@ use cyclic::{Schedule, Test};
 use intake::Intake;
 use snapshot::{PendingRestore, Taken};
 
-use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
@@ -390,7 +390,7 @@ impl Monitor {
     fn fall_asleep(&mut self, out: &mut Outputs) {
         self.intake.restart(self.now, out);
         self.observe_current(None, out);
-        self.alarms.handle_gap();
+        self.tell_alarms(AlarmInput::Gap, out);
         self.recharge.interrupt();
         self.cells.iter_mut().for_each(|cell| cell.estimator.note_asleep());
         self.forget_pack();
