@@ -107,7 +107,9 @@ pub(crate) fn write_table(
 ) -> std::io::Result<()> {
     let head: Vec<String> = heads.iter().map(|head| (*head).to_owned()).collect();
     let all = || std::iter::once(&head).chain(rows);
-    let wide = |column: usize| all().filter_map(|row| row.get(column)).map(|cell: &String| cell.chars().count()).max().unwrap_or(0);
+    let wide = |column: usize| {
+        all().filter_map(|row| row.get(column)).map(|cell: &String| cell.chars().count()).max().unwrap_or(0)
+    };
     let widths: Vec<usize> = (0..heads.len()).map(wide).collect();
     for row in all() {
         let cells = row.iter().zip(&widths).enumerate();

@@ -8,6 +8,8 @@ mod control_args;
 mod dbc;
 mod demo;
 mod doctor;
+#[cfg(feature = "lab")]
+mod export;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
@@ -87,6 +89,9 @@ enum Command {
     /// Tell when the alarms would have come with other settings, over many logs
     #[cfg(feature = "lab")]
     Whatif(Box<whatif::Args>),
+    /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
+    #[cfg(feature = "lab")]
+    Export(Box<export::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -137,6 +142,8 @@ pub fn main() -> ExitCode {
         Command::Score(args) => score::run(&args),
         #[cfg(feature = "lab")]
         Command::Whatif(args) => whatif::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -5,6 +5,7 @@
 //! that fails is told and the others go on. Memory is bounded by what is kept per log, not by its length.
 
 pub(crate) mod drive;
+pub(crate) mod export;
 pub(crate) mod judge;
 mod lanes;
 mod track;
