@@ -42,7 +42,7 @@ impl Bench {
     }
 }
 
-fn row<'v>(document: &'v Value, log: usize, setting: usize) -> &'v Value {
+fn row(document: &Value, log: usize, setting: usize) -> &Value {
     let alarms = document["logs"][log]["alarms"].as_array().unwrap();
     alarms.iter().find(|row| row["setting"] == setting && row["rule"] == "capacity_low").unwrap()
 }

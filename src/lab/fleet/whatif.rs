@@ -42,26 +42,29 @@ pub(crate) struct Settings {
 
 /// What the end of life was judged by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "snake_case")]
 pub(crate) enum JudgedBy {
     /// The true capacity.
-    TrueCapacity,
+    #[serde(rename = "true_capacity")]
+    Truth,
     /// Published capacities.
-    PublishedCapacity,
+    #[serde(rename = "published_capacity")]
+    Published,
     /// The usable capacity learned.
-    LearnedUsableCapacity,
+    #[serde(rename = "learned_usable_capacity")]
+    LearnedUsable,
     /// The capacity learned.
-    LearnedCapacity,
+    #[serde(rename = "learned_capacity")]
+    Learned,
 }
 
 impl JudgedBy {
     /// For people.
     pub(crate) const fn words(self) -> &'static str {
         match self {
-            Self::TrueCapacity => "the true capacity",
-            Self::PublishedCapacity => "published capacities",
-            Self::LearnedUsableCapacity => "the learned usable capacity",
-            Self::LearnedCapacity => "the learned capacity",
+            Self::Truth => "the true capacity",
+            Self::Published => "published capacities",
+            Self::LearnedUsable => "the learned usable capacity",
+            Self::Learned => "the learned capacity",
         }
     }
 }
@@ -242,12 +245,12 @@ fn end_of_life(track: &Track, truth: Option<&Truth>, end_ah: f64) -> (JudgedBy, 
     match (truth, track.learned()) {
         (Some(truth), _) => {
             let by = match truth.kind {
-                TruthKind::Capacity => JudgedBy::TrueCapacity,
-                TruthKind::Published => JudgedBy::PublishedCapacity,
+                TruthKind::Capacity => JudgedBy::Truth,
+                TruthKind::Published => JudgedBy::Published,
             };
             (by, truth.falls_below(end_ah))
         }
-        (None, Learned::Usable) => (JudgedBy::LearnedUsableCapacity, track.stays_below(end_ah)),
-        (None, Learned::Capacity) => (JudgedBy::LearnedCapacity, track.stays_below(end_ah)),
+        (None, Learned::Usable) => (JudgedBy::LearnedUsable, track.stays_below(end_ah)),
+        (None, Learned::Capacity) => (JudgedBy::Learned, track.stays_below(end_ah)),
     }
 }
