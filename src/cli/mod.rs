@@ -8,9 +8,13 @@ mod control_args;
 mod dbc;
 mod demo;
 mod doctor;
+#[cfg(feature = "lab")]
+mod export;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+#[cfg(feature = "lab")]
+mod fleet;
 mod generate;
 mod history;
 mod replay;
@@ -23,6 +27,8 @@ mod score;
 mod simulate;
 mod status;
 mod test_alarm;
+#[cfg(feature = "lab")]
+mod whatif;
 
 use std::process::ExitCode;
 
@@ -85,6 +91,12 @@ enum Command {
     /// Forecast the remaining useful life of measured capacity histories, and judge forecasts made during the life
     #[cfg(feature = "lab")]
     Rul(rul::Args),
+    /// Tell when the alarms would have come with other settings, over many logs
+    #[cfg(feature = "lab")]
+    Whatif(Box<whatif::Args>),
+    /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
+    #[cfg(feature = "lab")]
+    Export(Box<export::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -135,6 +147,10 @@ pub fn main() -> ExitCode {
         Command::Score(args) => score::run(&args),
         #[cfg(feature = "lab")]
         Command::Rul(args) => rul::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Whatif(args) => whatif::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Export(args) => export::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

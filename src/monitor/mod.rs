@@ -37,7 +37,7 @@ use intake::Intake;
 use life::CellLife;
 use snapshot::{PendingRestore, Taken};
 
-use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
@@ -398,7 +398,7 @@ impl Monitor {
     fn fall_asleep(&mut self, out: &mut Outputs) {
         self.intake.restart(self.now, out);
         self.observe_current(None, out);
-        self.alarms.handle_gap();
+        self.tell_alarms(AlarmInput::Gap, out);
         self.recharge.interrupt();
         self.cells.iter_mut().for_each(|cell| cell.estimator.note_asleep());
         self.forget_pack();

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::alarm::{Change, Rule, Selector, Severity, State};
+use crate::alarm::{AlarmInput, Change, Rule, Selector, Severity, State};
 use crate::can::decode::Channel;
 use crate::can::e2e::Status;
 use crate::can::j1939::NodeEvent;
@@ -504,6 +504,10 @@ pub struct Outputs {
     pub estimates: Vec<Estimate>,
     /// Whether anybody wants `estimates`.
     pub want_estimates: bool,
+    /// What the alarm engine was told, only when `want_alarm_inputs`; not what a restore or another configuration did to it.
+    pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
+    /// Whether anybody wants `alarm_inputs`.
+    pub want_alarm_inputs: bool,
 }
 
 impl Outputs {
@@ -512,5 +516,6 @@ impl Outputs {
         self.frames.clear();
         self.events.clear();
         self.estimates.clear();
+        self.alarm_inputs.clear();
     }
 }

@@ -1,0 +1,384 @@
+//! What `whatif` tells: the summary over the logs, each log, JSON, CSV.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use serde::Serialize;
+use serde_json::json;
+
+use crate::alarm::{Rule, Severity};
+use crate::cli::fleet::write_table;
+use crate::io::result_file::ResultFile;
+use crate::io::stamp;
+use crate::lab::fleet::judge::Horizon;
+use crate::lab::fleet::variants::{Grid, Variant};
+use crate::lab::fleet::whatif::{AlarmRow, LogResult, Settings};
+use crate::quantity::Timestamp;
+
+/// Version of the JSON document.
+const VERSION: u32 = 1;
+
+/// Everything that is shown.
+pub(super) struct Shown<'a> {
+    pub(super) grid: &'a Grid,
+    pub(super) settings: &'a Settings,
+    pub(super) rated_ah: f64,
+    /// Rules in the tables.
+    pub(super) rules: &'a [Rule],
+    pub(super) logs: &'a [&'a LogResult],
+    /// Logs that failed.
+    pub(super) failed: Vec<String>,
+}
+
+/// One threshold under one setting, over all logs.
+#[derive(Debug, Clone, Serialize)]
+struct Summary {
+    setting: usize,
+    rule: Rule,
+    severity: Severity,
+    threshold: f64,
+    /// Logs in which it was raised.
+    raised_logs: usize,
+    /// Median, 5 % and 95 % of the logs.
+    lead_days: Option<[f64; 3]>,
+    lead_cycles: Option<[f64; 3]>,
+    missed: Option<usize>,
+    false_alarms: Option<usize>,
+    open: Option<usize>,
+    false_raises: Option<usize>,
+    flickers: usize,
+}
+
+impl Shown<'_> {
+    /// Tables for people.
+    pub(super) fn table(&self, each: bool) -> io::Result<()> {
+        let mut text = Vec::new();
+        self.write_head(&mut text)?;
+        if self.logs.len() != 1 {
+            self.write_summary(&mut text)?;
+        }
+        if each || self.logs.len() == 1 {
+            self.logs.iter().try_for_each(|log| self.write_log(&mut text, log))?;
+        }
+        io::stdout().write_all(&text)
+    }
+
+    fn write_head(&self, out: &mut impl Write) -> io::Result<()> {
+        let (settings, replays) = (self.grid.variants.len(), self.grid.replays);
+        let more = if settings == 1 { "the configuration as it is".to_owned() } else { format!("{settings} settings") };
+        writeln!(out, "{} logs, {more}, {replays} replays per log", self.logs.len())?;
+        let (end_ah, part) = (self.settings.end_of_life_ah, 100.0 * self.settings.end_of_life_ah / self.rated_ah);
+        let reached = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
+        let mut by: Vec<_> = self.logs.iter().map(|log| log.judged_by).collect();
+        by.sort_unstable();
+        let by = by.chunk_by(|a, b| a == b).map(|same| format!("{} ({})", same[0].words(), same.len()));
+        let by = by.collect::<Vec<_>>().join(", ");
+        writeln!(out, "end of life {end_ah:.3} Ah ({part:.0} % of rated), reached in {reached}, judged by {by}")?;
+        match self.settings.horizon {
+            None => writeln!(out, "a raise is false in a log that has no end of life")?,
+            Some(Horizon::Cycles(n)) => writeln!(out, "a raise is false when the end does not come within {n} cycles")?,
+            Some(Horizon::Days(n)) => writeln!(out, "a raise is false when the end does not come within {n} days")?,
+        }
+        self.grid.notes.iter().try_for_each(|note| writeln!(out, "note: {note}"))?;
+        for log in self.logs {
+            log.notes.iter().try_for_each(|note| writeln!(out, "note: {}: {note}", log.log.display()))?;
+        }
+        writeln!(out)
+    }
+
+    fn write_summary(&self, out: &mut impl Write) -> io::Result<()> {
+        let own = [
+            "alarm",
+            "threshold",
+            "raised",
+            "lead, days",
+            "lead, cycles",
+            "missed",
+            "false",
+            "open",
+            "false raises",
+            "flickers",
+        ];
+        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
+        let ended = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
+        let row = |summary: &Summary| {
+            let own = [
+                alarm_name(summary.rule, summary.severity),
+                level(summary.threshold),
+                format!("{} of {}", summary.raised_logs, self.logs.len()),
+                spread(summary.lead_days),
+                spread(summary.lead_cycles),
+                summary.missed.map_or_else(dash, |missed| format!("{missed} of {ended}")),
+                count(summary.false_alarms),
+                count(summary.open),
+                count(summary.false_raises),
+                summary.flickers.to_string(),
+            ];
+            self.setting_cells(summary.setting).chain(own).collect()
+        };
+        let rows: Vec<Vec<String>> = self.summaries().iter().map(row).collect();
+        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+    }
+
+    fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
+        let learned =
+            log.learned_ah.map_or_else(|| "nothing learned".to_owned(), |ah| format!("{ah:.3} Ah learned at the end"));
+        let end = match &log.end_of_life {
+            Some(end) => format!("end of life at day {:.2}, cycle {:.1}, cell {}", end.days, end.cycles, end.cell + 1),
+            None => "end of life not reached".to_owned(),
+        };
+        let (name, by) = (log.log.display(), log.judged_by.words());
+        writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
+        let own = [
+            "alarm",
+            "threshold",
+            "raised",
+            "at day",
+            "cycle",
+            "cell",
+            "value",
+            "lead, days",
+            "lead, cycles",
+            "judged",
+        ];
+        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
+        let rows: Vec<Vec<String>> = self.rows(log).map(|row| self.log_row(row)).collect();
+        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+    }
+
+    fn log_row(&self, row: &AlarmRow) -> Vec<String> {
+        let judged = &row.judged;
+        let first = judged.first.as_ref();
+        let number = |value: Option<f64>, digits: usize| value.map_or_else(dash, |value| format!("{value:.digits$}"));
+        let own = [
+            alarm_name(row.rule, row.severity),
+            level(row.threshold),
+            format!("{} times", judged.raises as u64),
+            number(first.map(|first| first.days), 2),
+            number(first.map(|first| first.cycles), 1),
+            first
+                .map_or_else(dash, |first| first.cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string())),
+            number(first.and_then(|first| first.value), 4),
+            number(judged.lead_days, 2),
+            number(judged.lead_cycles, 1),
+            verdict(row),
+        ];
+        self.setting_cells(row.setting).chain(own).collect()
+    }
+
+    /// Columns of the values set; those of the configuration as it is are said so.
+    fn setting_cells(&self, setting: usize) -> impl Iterator<Item = String> {
+        let values = self.grid.variants.get(setting).map(|variant| variant.values.clone()).unwrap_or_default();
+        let plain = values.is_empty();
+        (0..self.grid.keys.len()).map(move |key| match values.get(key) {
+            Some(value) => value.clone(),
+            None if plain => "as it is".to_owned(),
+            None => dash(),
+        })
+    }
+
+    /// The rows of a log that are shown.
+    fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l AlarmRow> {
+        log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
+    }
+
+    fn summaries(&self) -> Vec<Summary> {
+        let Some(first) = self.logs.first() else { return Vec::new() };
+        // Every log has the same rows in the same order.
+        (0..first.alarms.len())
+            .filter(|&index| self.rules.contains(&first.alarms[index].rule))
+            .map(|index| summary(&self.logs.iter().map(|log| &log.alarms[index]).collect::<Vec<_>>()))
+            .collect()
+    }
+
+    /// One JSON document.
+    pub(super) fn json(&self) -> io::Result<()> {
+        let horizon = match self.settings.horizon {
+            None => json!(null),
+            Some(Horizon::Cycles(cycles)) => json!({ "cycles": cycles }),
+            Some(Horizon::Days(days)) => json!({ "days": days }),
+        };
+        let setting = |variant: &Variant| {
+            let set = self.grid.keys.iter().cloned().zip(variant.values.iter().map(|value| json!(value)));
+            json!({ "set": serde_json::Map::from_iter(set), "replay": variant.replay })
+        };
+        let logs: Vec<_> = self
+            .logs
+            .iter()
+            .map(|log| {
+                let alarms = self.rows(log).cloned().collect();
+                LogResult { alarms, ..(*log).clone() }
+            })
+            .collect();
+        let document = json!({
+            "version": VERSION,
+            "end_of_life_ah": self.settings.end_of_life_ah,
+            "rated_capacity_ah": self.rated_ah,
+            "horizon": horizon,
+            "replays_per_log": self.grid.replays,
+            "settings": self.grid.variants.iter().map(setting).collect::<Vec<_>>(),
+            "summary": self.summaries(),
+            "logs": logs,
+            "failed": self.failed,
+            "notes": self.grid.notes,
+        });
+        let mut out = io::stdout().lock();
+        serde_json::to_writer_pretty(&mut out, &document)?;
+        writeln!(out)
+    }
+
+    /// A row per log, setting and alarm.
+    pub(super) fn csv(&self, path: &Path) -> io::Result<()> {
+        let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
+        let own = [
+            "log",
+            "judged_by",
+            "days",
+            "cycles",
+            "end_of_life_day",
+            "end_of_life_cycle",
+            "setting",
+            "rule",
+            "severity",
+            "threshold",
+            "raises",
+            "raised_utc",
+            "raised_day",
+            "raised_cycle",
+            "cell",
+            "value",
+            "lead_days",
+            "lead_cycles",
+            "missed",
+            "false_alarms",
+            "open",
+            "false_raises",
+            "flickers",
+        ];
+        out.write_record(own.into_iter().chain(self.grid.keys.iter().map(String::as_str)))?;
+        for log in self.logs {
+            for row in self.rows(log) {
+                let values =
+                    self.grid.variants.get(row.setting).map(|variant| variant.values.as_slice()).unwrap_or_default();
+                let set = (0..self.grid.keys.len()).map(|key| values.get(key).cloned().unwrap_or_default());
+                out.write_record(csv_row(log, row).into_iter().chain(set))?;
+            }
+        }
+        out.into_inner().map_err(|error| io::Error::other(error.to_string()))?.finish()
+    }
+}
+
+fn csv_row(log: &LogResult, row: &AlarmRow) -> Vec<String> {
+    fn text(value: Option<impl ToString>) -> String {
+        value.map(|value| value.to_string()).unwrap_or_default()
+    }
+    let (judged, first, end) = (&row.judged, row.judged.first.as_ref(), log.end_of_life.as_ref());
+    vec![
+        log.log.display().to_string(),
+        log.judged_by.words().to_owned(),
+        log.days.to_string(),
+        log.cycles.to_string(),
+        text(end.map(|end| end.days)),
+        text(end.map(|end| end.cycles)),
+        row.setting.to_string(),
+        row.rule.name().to_owned(),
+        row.severity.name().to_owned(),
+        row.threshold.to_string(),
+        judged.raises.to_string(),
+        text(first.map(|first| stamp::format_utc(Timestamp::from_secs(first.time_s)))),
+        text(first.map(|first| first.days)),
+        text(first.map(|first| first.cycles)),
+        text(first.and_then(|first| first.cell).map(|cell| cell + 1)),
+        text(first.and_then(|first| first.value)),
+        text(judged.lead_days),
+        text(judged.lead_cycles),
+        text(judged.missed),
+        text(judged.false_alarms),
+        text(judged.open),
+        text(judged.false_raises),
+        judged.flickers.to_string(),
+    ]
+}
+
+fn summary(rows: &[&AlarmRow]) -> Summary {
+    let first = rows[0];
+    let sum = |of: fn(&AlarmRow) -> Option<usize>| {
+        rows.iter()
+            .map(|row| of(row))
+            .fold(None, |so_far: Option<usize>, next| next.map(|next| so_far.unwrap_or(0) + next).or(so_far))
+    };
+    let leads = |of: fn(&AlarmRow) -> Option<f64>| quantiles(rows.iter().filter_map(|row| of(row)).collect());
+    Summary {
+        setting: first.setting,
+        rule: first.rule,
+        severity: first.severity,
+        threshold: first.threshold,
+        raised_logs: rows.iter().filter(|row| row.judged.raises > 0).count(),
+        lead_days: leads(|row| row.judged.lead_days),
+        lead_cycles: leads(|row| row.judged.lead_cycles),
+        missed: sum(|row| row.judged.missed.map(usize::from)),
+        false_alarms: sum(|row| row.judged.false_alarms),
+        open: sum(|row| row.judged.open),
+        false_raises: sum(|row| row.judged.false_raises),
+        flickers: rows.iter().map(|row| row.judged.flickers).sum(),
+    }
+}
+
+/// Median, 5 % and 95 %, each the nearest value there is (the lower of two middle ones).
+fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
+    values.sort_by(f64::total_cmp);
+    let last = values.len().checked_sub(1)?;
+    let at = |part: f64| values[((part * values.len() as f64).ceil() as usize).saturating_sub(1).min(last)];
+    Some([at(0.5), at(0.05), at(0.95)])
+}
+
+fn alarm_name(rule: Rule, severity: Severity) -> String {
+    format!("{} {}", rule.name(), severity.name())
+}
+
+fn verdict(row: &AlarmRow) -> String {
+    let judged = &row.judged;
+    let words = [
+        judged.missed.filter(|missed| *missed).map(|_| "missed".to_owned()),
+        judged.false_alarms.filter(|n| *n > 0).map(|n| format!("{n} false")),
+        judged.open.filter(|n| *n > 0).map(|n| format!("{n} open")),
+        judged.false_raises.filter(|n| *n > 0).map(|n| format!("{n} false raises")),
+        Some(judged.flickers).filter(|n| *n > 0).map(|n| format!("{n} flickers")),
+        Some(judged.not_kept).filter(|n| *n > 0).map(|n| format!("{n} more not judged")),
+    ];
+    let words: Vec<String> = words.into_iter().flatten().collect();
+    match (words.is_empty(), judged.lead_days.is_some()) {
+        (false, _) => words.join(", "),
+        (true, true) => "good".to_owned(),
+        (true, false) => dash(),
+    }
+}
+
+fn level(threshold: f64) -> String {
+    let text = format!("{threshold:.4}");
+    text.trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+fn spread(values: Option<[f64; 3]>) -> String {
+    values.map_or_else(dash, |[median, low, high]| format!("{median:.1} ({low:.1} to {high:.1})"))
+}
+
+fn count(value: Option<usize>) -> String {
+    value.map_or_else(dash, |value| value.to_string())
+}
+
+fn dash() -> String {
+    "-".to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_are_values_that_there_are() {
+        assert_eq!(quantiles(Vec::new()), None);
+        assert_eq!(quantiles(vec![3.0]), Some([3.0; 3]));
+        assert_eq!(quantiles((1..=100).map(f64::from).collect()), Some([50.0, 5.0, 95.0]));
+    }
+}

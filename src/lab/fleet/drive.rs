@@ -1,0 +1,158 @@
+//! One log through one core: the loop of a replay without its files.
+//!
+//! In: a log and a monitor that has had no input. Out: after each input what came out, to a closure. Promise: the same
+//! inputs and ticks as `packwatch replay` gives the core, so the same results.
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+
+use crate::can::encode::{InputEncoder, InputProtector};
+use crate::config::Config;
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::{LogCounts, LogOptions, LogSource, Record};
+use crate::io::ticks::Ticks;
+use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
+use crate::quantity::Timestamp;
+use crate::sample::VoltageSource;
+
+/// Records between two reports of progress.
+const REPORT_EVERY: u64 = 4096;
+
+/// How logs are to be read.
+#[derive(Debug, Clone)]
+pub(crate) struct Reading {
+    /// A bad line ends the reading of its log.
+    pub(crate) strict: bool,
+    /// CSV columns, role to name.
+    pub(crate) columns: Vec<(String, String)>,
+    /// A CSV's positive current is charge.
+    pub(crate) charge_positive: bool,
+    /// CSV table of the sections' start times.
+    pub(crate) start_times: Option<PathBuf>,
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub(crate) sleep_gap_s: f64,
+}
+
+impl Reading {
+    /// A log as it is read with `config`.
+    pub(crate) fn source(&self, config: &Config, log: &Path) -> LogSource {
+        let sample = &config.monitor.sample;
+        let encoder = InputEncoder::new(&config.monitor.input);
+        let mut protector = InputProtector::new(&config.monitor.guards);
+        let options = LogOptions {
+            interfaces: config.interfaces.iter().map(|interface| interface.name.clone()).collect(),
+            strict: self.strict,
+            csv: CsvOptions {
+                columns: self.columns.clone(),
+                charge_positive: self.charge_positive,
+                start_times: self.start_times.clone(),
+                cells: sample.cells,
+                pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
+            },
+            encode_row: Box::new(move |values, frames| {
+                let uncarried = encoder.encode(values, frames);
+                protector.protect(frames);
+                uncarried
+            }),
+        };
+        LogSource::new([log.to_owned()], options)
+    }
+}
+
+/// What a log was.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Driven {
+    /// What was read.
+    pub(crate) counts: LogCounts,
+    /// First and last stamp.
+    pub(crate) span: Option<(Timestamp, Timestamp)>,
+    /// What the user should know.
+    pub(crate) notes: Vec<String>,
+}
+
+impl Driven {
+    /// From the first stamp to the last, days.
+    pub(crate) fn days(&self) -> f64 {
+        self.span.map_or(0.0, |(first, last)| last.since(first) / 86_400.0)
+    }
+}
+
+/// Replays a log. `each` sees what came of every input and empties it; `report` is told the bytes read since it was last told.
+///
+/// # Errors
+/// When the log cannot be read, or what `each` says.
+pub(crate) fn drive(
+    mut source: LogSource,
+    mut monitor: Monitor,
+    mut out: Outputs,
+    sleep_gap_s: f64,
+    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), String>,
+    report: &dyn Fn(u64),
+) -> Result<Driven, String> {
+    let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
+    let (mut driven, mut records, mut told) = (Driven::default(), 0_u64, 0);
+    let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
+        while let Some(time) = ticks.pop(monitor.next_due()) {
+            monitor.handle(Input::Tick { time }, &mut out);
+            each(monitor, &mut out)?;
+        }
+        let Some(input) = input else { return Ok(()) };
+        monitor.handle(input, &mut out);
+        each(monitor, &mut out)
+    };
+    while let Some(record) = source.next_record().map_err(|error| error.to_string())? {
+        driven.note(&record);
+        if matches!(record, Record::UnknownGap { .. }) || source.carries_ticks() {
+            ticks.sleep();
+        } else {
+            ticks.advance(record.time());
+        }
+        tick(&mut ticks, &mut monitor, record.input())?;
+        records += 1;
+        if records.is_multiple_of(REPORT_EVERY) {
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            report(bytes - told);
+            told = bytes;
+        }
+    }
+    ticks.sleep();
+    tick(&mut ticks, &mut monitor, None)?;
+    report(source.read_bytes().load(Ordering::Relaxed) - told);
+    driven.finish(source.counts());
+    Ok(driven)
+}
+
+impl Driven {
+    fn note(&mut self, record: &Record) {
+        let time = record.time();
+        let (first, last) = self.span.unwrap_or((time, time));
+        self.span = Some((first.min(time), last.max(time)));
+        let noted = match record {
+            Record::Restore { .. } => "the recorded run began from a stored state, this one did not",
+            Record::Reload { .. } => "the recorded run took another configuration over, this one did not",
+            _ => return,
+        };
+        if !self.notes.iter().any(|note| note == noted) {
+            self.notes.push(noted.to_owned());
+        }
+    }
+
+    fn finish(&mut self, counts: &LogCounts) {
+        self.counts = counts.clone();
+        if counts.bad_lines > 0 {
+            let first = counts.first_bad_line.as_deref().unwrap_or("");
+            self.notes.push(format!("{} bad lines left out, the first: {first}", counts.bad_lines));
+        }
+        if counts.unknown_gaps > 0 {
+            self.notes.push(format!(
+                "{} gaps of unknown length: its days are fewer than those that passed",
+                counts.unknown_gaps
+            ));
+        }
+        if counts.frames == 0 {
+            let others: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
+            let others = if others.is_empty() { String::new() } else { format!(": the log has {}", others.join(", ")) };
+            self.notes.push(format!("no frame of the configured interfaces{others}"));
+        }
+    }
+}
