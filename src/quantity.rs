@@ -58,6 +58,44 @@ impl Timestamp {
     }
 }
 
+/// A number of a stored state that cannot be: what, found, allowed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Unsound {
+    /// Which number.
+    pub what: &'static str,
+    /// What it is.
+    pub found: f64,
+    /// What it may be.
+    pub allowed: &'static str,
+}
+
+impl Unsound {
+    /// The number, unless `is_sound`.
+    pub fn unless(is_sound: bool, what: &'static str, found: f64, allowed: &'static str) -> Result<(), Self> {
+        if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
+    }
+
+    /// Finite, and so small that its square and its cube are. Nothing measured comes near the bound.
+    pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless(found.abs() <= 1e20, what, found, "at most 1e20 in size")
+    }
+
+    /// The same, and not below 0.
+    pub fn unless_natural(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
+    }
+
+    /// The same, and so much above 0 that one can divide by its square.
+    pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((1e-40..=1e20).contains(&found), what, found, "1e-40 to 1e20")
+    }
+
+    /// A capacity a cell can have, Ah.
+    pub fn unless_capacity(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((1e-6..=1e9).contains(&found), what, found, "1e-6 to 1e9 Ah")
+    }
+}
+
 /// Largest number of cells (series elements) one daemon watches: 1,024, so that a cell number and
 /// "the pack as a whole" fit the 11-bit field of the alarm frame.
 pub const MAX_CELLS: usize = 1024;

@@ -3,7 +3,7 @@
 
 mod rig;
 
-use packwatch::monitor::{Away, Validity};
+use packwatch::monitor::{Away, BusStatistics, Statistics, Validity};
 use packwatch::quantity::{CellIndex, Mode};
 use rig::{Rig, learned};
 
@@ -41,6 +41,11 @@ fn counts_go_on_after_a_restart() {
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
+    // And what was added since can be told from it.
+    let added = after.since(&before);
+    assert_eq!((added.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
+    assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
+    assert_eq!(before.since(after), Statistics { buses: vec![BusStatistics::default()], ..Statistics::default() });
 }
 
 #[test]
@@ -70,9 +75,23 @@ fn what_is_not_known_any_more_is_not_shown() {
     assert!(cells[0].voltage_v.is_some() && cells[0].soc.is_some());
     let silent = cells[1];
     assert_eq!((silent.cell, silent.voltage_v, silent.soc, silent.resistance_ratio), (CellIndex(1), None, None, None));
+    assert_eq!((cells[0].trusted, silent.trusted), (Some(true), None));
     assert!(silent.capacity.is_some());
     let pack = rig.monitor.pack_view();
     assert_eq!((pack.validity, pack.soc, pack.voltage_v), (Validity::Unavailable, None, None));
+}
+
+#[test]
+fn the_highest_temperature_is_not_known_while_a_sensor_is_silent() {
+    let mut rig = Rig::new("");
+    rig.temperatures_c = [Some(25.0), Some(60.0)];
+    rig.seconds(3);
+    assert_eq!(rig.monitor.pack_view().temperature_max_c, Some(60.0));
+    // The hot one: what the other says is no "at most".
+    rig.temperatures_c[1] = None;
+    rig.seconds(10);
+    assert_eq!(rig.monitor.cell_views().map(|cell| cell.temperature_c).collect::<Vec<_>>(), [Some(25.0), None]);
+    assert_eq!(rig.monitor.pack_view().temperature_max_c, None);
 }
 
 #[test]

@@ -145,16 +145,12 @@ use noise::Reading;
 impl CellEstimator {
     /// A cell of which nothing was measured yet.
     pub fn new(config: &EstimatorConfig) -> Self {
-        let capacity_variance = match config.capacity_state {
-            CapacityState::Joint => config.initial_capacity_std_ah * config.initial_capacity_std_ah,
-            CapacityState::Held => KNOWN_VARIANCE,
-        };
-        let log_std = config.initial_log_resistance_std;
+        let (capacity, log_resistance) = configured(config);
         Self {
             filter: None,
             memory: Memory {
-                capacity: Belief { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
-                log_resistance: Belief { mean: 0.0, variance: (log_std * log_std).max(KNOWN_VARIANCE) },
+                capacity,
+                log_resistance,
                 temperature_c: None,
                 last_current_a: 0.0,
                 load_a: 0.0,
@@ -246,6 +242,7 @@ impl CellEstimator {
             self.memory.capacity = each!(filter, x => marginal(x, capacity_index(x)));
             self.memory.log_resistance = each!(filter, x => marginal(x, log_resistance_index(x)));
         }
+        self.replace_unusable(config);
         let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
         let told = config.initial_soc.filter(|_| first);
         let soc = told.unwrap_or_else(|| {
@@ -270,6 +267,18 @@ impl CellEstimator {
         self.memory.mean_nis = self.memory.mean_nis.min(config.consistency_limit * std::f64::consts::E);
         (self.memory.information_s, self.memory.away_std) = (config.max_information_s, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+    }
+
+    /// What no filter can go on from is as configured again: it would be reset at every reading, for ever.
+    fn replace_unusable(&mut self, config: &EstimatorConfig) {
+        let (capacity, log_resistance) = configured(config);
+        let is_usable = |x: &Belief| x.mean.is_finite() && x.variance.is_finite() && x.variance > 0.0;
+        if !is_usable(&self.memory.capacity) || self.memory.capacity.mean <= 0.0 {
+            self.memory.capacity = capacity;
+        }
+        if !is_usable(&self.memory.log_resistance) {
+            self.memory.log_resistance = log_resistance;
+        }
     }
 
     fn forget_correlation(&mut self) {
@@ -385,6 +394,19 @@ impl CellEstimator {
     pub fn temperature_c(&self) -> Option<f64> {
         self.memory.temperature_c
     }
+}
+
+/// Capacity (Ah) and ln(resistance) of a cell of which nothing was learned.
+fn configured(config: &EstimatorConfig) -> (Belief, Belief) {
+    let capacity_variance = match config.capacity_state {
+        CapacityState::Joint => square(config.initial_capacity_std_ah),
+        CapacityState::Held => KNOWN_VARIANCE,
+    };
+    let log_variance = square(config.initial_log_resistance_std);
+    (
+        Belief { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
+        Belief { mean: 0.0, variance: log_variance.max(KNOWN_VARIANCE) },
+    )
 }
 
 fn square(x: f64) -> f64 {

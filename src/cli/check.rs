@@ -3,10 +3,10 @@
 //! Opens everything the configuration names. Good: the meaning on standard output, exit 0. Bad: every fault,
 //! one a line, on standard error, exit 78.
 
-use std::io::Write as _;
 use std::path::PathBuf;
 
 use super::Failure;
+use super::control_args::print;
 use crate::config::{Description, OutputUse, SignalUse};
 
 /// Arguments of `check`.
@@ -37,16 +37,6 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let mut page = String::new();
         show(&description, &mut page);
         print(&page)
-    }
-}
-
-/// Writes to standard output; a reader that has seen enough (`| head`) is no failure.
-fn print(text: &str) -> Result<(), Failure> {
-    match std::io::stdout().lock().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
-            Err(Failure::new(format!("standard output cannot be written: {error}")))
-        }
-        Ok(()) | Err(_) => Ok(()),
     }
 }
 

@@ -69,7 +69,9 @@ fn cell(text: &str) -> Result<CellIndex, String> {
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
     use std::io::Write as _;
     match std::io::stdout().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::new(error.to_string())),
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Failure::new(format!("standard output cannot be written: {error}")))
+        }
         Ok(()) | Err(_) => Ok(()),
     }
 }

@@ -5,12 +5,12 @@
 
 mod page;
 
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
+use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 use crate::config::{self, Survey};
@@ -174,15 +174,5 @@ fn json(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
     });
     let text = serde_json::to_string_pretty(&document)
         .map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?;
-    write_out(&(text + "\n"))
-}
-
-/// Writes to standard output; a reader that has seen enough is no failure.
-fn write_out(text: &str) -> Result<(), Failure> {
-    match std::io::stdout().lock().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
-            Err(Failure::new(format!("standard output cannot be written: {error}")))
-        }
-        Ok(()) | Err(_) => Ok(()),
-    }
+    print(&(text + "\n"))
 }

@@ -13,7 +13,7 @@ use super::{Cli, Failure};
 const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
 
 /// What the page about the whole says besides the command line's own definition.
-const MORE: &str = "\
+const WHOLE: &str = "\
 .SH EXIT STATUS
 0: success. 1: the work failed. 2: the command line is wrong. 78: the configuration is. A command with others names them.
 .SH FILES
@@ -29,6 +29,8 @@ Its sockets.
 .TP
 .I /usr/share/packwatch/packwatch.dbc
 The frames it sends, as shipped; \\fBpackwatch dbc\\fR writes them as they are configured.
+.SH SEE ALSO
+.BR packwatch.toml (5)
 ";
 
 /// Arguments of `generate`.
@@ -80,7 +82,6 @@ fn manual_pages() -> Vec<(String, Vec<u8>)> {
     let command = visible();
     let mut pages = vec![(CONFIGURATION_PAGE.to_owned(), crate::config::manual().into_bytes())];
     add_pages(&command, &mut pages);
-    pages[1].1.extend_from_slice(MORE.as_bytes());
     pages
 }
 
@@ -97,7 +98,9 @@ fn page(command: &clap::Command) -> (String, Vec<u8>) {
     let (name, mut text) = (man.get_filename(), Vec::new());
     // Writing to a Vec cannot fail.
     let _ = man.render(&mut text);
-    text.extend_from_slice(b".SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch.toml (5)\n");
+    let is_whole = command.get_name() == "packwatch";
+    let more = if is_whole { WHOLE } else { ".SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch.toml (5)\n" };
+    text.extend_from_slice(more.as_bytes());
     (name, text)
 }
 
@@ -157,6 +160,13 @@ mod tests {
         assert!(run.contains("\\fBpackwatch run\\fR") && run.contains("\\-\\-config"), "{run}");
         let whole = text("packwatch.1");
         assert!(whole.contains("packwatch\\-alarms(1)") && !whole.contains("generate"), "{whole}");
+        // In the order of man-pages(7), and not of itself.
+        let files = whole.find(".SH FILES").unwrap_or(usize::MAX);
+        assert!(
+            whole.find(".SH SEE ALSO").is_some_and(|at| at > files) && !whole.contains(".BR packwatch (1)"),
+            "{whole}"
+        );
+        assert!(run.contains(".BR packwatch (1)"), "{run}");
     }
 
     #[test]

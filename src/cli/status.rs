@@ -3,6 +3,7 @@
 mod table;
 mod view;
 
+use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::Failure;
@@ -103,6 +104,26 @@ fn word(value: impl serde::Serialize) -> String {
         Ok(serde_json::Value::String(word)) => word,
         _ => "?".to_owned(),
     }
+}
+
+/// What becomes of what is learned, in a line.
+fn store(document: &Document) -> String {
+    let Some(store) = &document.store else { return "none".to_owned() };
+    let works = match store.works {
+        None => "not tried yet",
+        Some(true) => "works",
+        Some(false) => "CANNOT BE WRITTEN",
+    };
+    let mut text = format!("{works}, {} commits", store.commits);
+    if let Some(bytes) = store.file_bytes {
+        let _ = write!(text, ", {:.1} MB", bytes as f64 / 1e6);
+    }
+    for (count, what) in [(store.failures, "failed"), (store.late, "told before they were stored")] {
+        if count > 0 {
+            let _ = write!(text, ", {count} {what}");
+        }
+    }
+    text
 }
 
 /// The configuration in a few characters: its name and the beginning of its fingerprint.

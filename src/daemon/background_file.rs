@@ -16,7 +16,7 @@ const PIECE_BYTES: usize = 64 * 1024;
 const MAX_PIECES: usize = 64;
 
 /// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
-const MAX_FINISH: Duration = Duration::from_secs(5);
+pub(crate) const MAX_FINISH: Duration = Duration::from_secs(5);
 /// How often the end is looked for.
 const FINISH_POLL: Duration = Duration::from_millis(5);
 
@@ -73,18 +73,24 @@ impl BackgroundFile {
     fn join(&mut self) -> io::Result<()> {
         self.pieces = None;
         let Some(writer) = self.writer.take() else { return Ok(()) };
-        let asked = Instant::now();
-        while !writer.is_finished() {
-            if asked.elapsed() > MAX_FINISH {
-                return Err(io::Error::new(
-                    io::ErrorKind::TimedOut,
-                    "the disk does not answer, the file is not complete",
-                ));
-            }
-            std::thread::sleep(FINISH_POLL);
+        if !ends_in_time(&writer) {
+            let why = "the disk does not answer, the file is not complete";
+            return Err(io::Error::new(io::ErrorKind::TimedOut, why));
         }
         writer.join().unwrap_or_else(|_| Err(io::Error::other("writer panicked")))
     }
+}
+
+/// Waits for a thread that was told to end, up to [`MAX_FINISH`]; whether it has.
+pub(crate) fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
+    let asked = Instant::now();
+    while !thread.is_finished() {
+        if asked.elapsed() > MAX_FINISH {
+            return false;
+        }
+        std::thread::sleep(FINISH_POLL);
+    }
+    true
 }
 
 /// A record of an earlier run becomes `NAME.1`: what led to a crash is what somebody will want to read.

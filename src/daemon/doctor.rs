@@ -210,9 +210,8 @@ pub fn listen(
         each(Progress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
         std::thread::sleep(READ_PERIOD);
     }
-    let mut report = session.doctor.finish();
-    report.seconds = began.elapsed().as_secs_f64();
-    Ok(report)
+    session.doctor.handle_listened(began.elapsed().as_secs_f64());
+    Ok(session.doctor.finish())
 }
 
 impl Ear {

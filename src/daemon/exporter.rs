@@ -12,6 +12,7 @@ use std::convert::Infallible;
 use std::io;
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::pin::pin;
 use std::rc::Rc;
 use std::time::Duration;
 
@@ -43,6 +44,8 @@ const MAX_HEADERS: usize = 64;
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
 /// Time a connection has in all, whatever it does: a slow reader must not hold its place for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
+/// Time the answer has that is under way then: as long as a scrape may take.
+const ANSWER_LIMIT: Duration = Duration::from_secs(10);
 /// Time the daemon has to tell its status: under the ten seconds a scrape may take.
 const ASK_LIMIT: Duration = Duration::from_secs(3);
 /// Time running answers have when the exporter stops.
@@ -126,9 +129,17 @@ async fn converse(stream: TcpStream, asker: Rc<Asker>) {
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);
     builder.max_buf_size(MAX_REQUEST_BYTES).max_headers(MAX_HEADERS);
-    match timeout(CONNECTION_LIMIT, builder.serve_connection(TokioIo::new(stream), answer)).await {
-        Ok(Ok(())) | Err(_) => {}
-        Ok(Err(error)) => tracing::debug!(%error, "connection ended"),
+    let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), answer));
+    let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
+        Ok(ended) => ended,
+        Err(_) => {
+            // An answer under way is finished, another request is not taken.
+            connection.as_mut().graceful_shutdown();
+            timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
+        }
+    };
+    if let Err(error) = ended {
+        tracing::debug!(%error, "connection ended");
     }
 }
 

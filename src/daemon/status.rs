@@ -7,8 +7,9 @@
 //! | `status.sock` | one [`Document`] as a line of JSON, then the end |
 //! | `status-stream.sock` | the same, one line a second, until the client goes |
 //!
-//! * Everybody on this computer may look (mode 0666): there is nothing secret in it, and the exporter runs as a user of
-//!   its own. Changing something is the control socket's, which is not open to others.
+//! * Whoever reaches the sockets may look (mode 0666): there is nothing secret in it, and the exporter runs as a user of
+//!   its own. Under the shipped unit root and the exporter do: the folder of a dynamic user's service is within one that
+//!   is closed to others. Changing something is the control socket's, which is not open to others anywhere.
 //! * The loop fills in a [`Draft`] once a second (structs copied) and offers it; a thread of its own writes it down as
 //!   JSON and serves the clients. Nothing a client does reaches the loop's thread. A draft that finds the thread still
 //!   busy with the one before is dropped and counted.
@@ -45,7 +46,7 @@ pub(crate) const STALE: Duration = Duration::from_secs(3);
 
 /// The socket's name in the folder of the daemon.
 const FILE_NAME: &str = "status.sock";
-/// Everybody may look.
+/// Whoever reaches it may look.
 const MODE: u32 = 0o666;
 
 /// Where the socket is when nobody says where.

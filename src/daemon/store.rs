@@ -14,6 +14,7 @@ mod chain;
 mod database;
 mod document;
 mod folder;
+mod gatherer;
 pub(crate) mod hold;
 mod packed;
 mod parts;
@@ -34,21 +35,24 @@ mod writer;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
+use super::background_file::{MAX_FINISH, ends_in_time};
 use crate::config::StoreConfig;
 use crate::monitor::{Away, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::Document;
-use folder::{Folder, Opening};
-use rows::{Batch, Gatherer, Worth};
+use folder::{Folder, Opening, SET_ASIDE};
+use gatherer::{Gatherer, Worth};
+use reader::MAX_DAEMON_COPY_BYTES;
+use rows::{Batch, Row};
 use runtime::RuntimeState;
-use stamp::{Age, BootId, Stamp};
+use stamp::{Age, BootId, Stamp, WallClock};
 use writer::{Desk, Retry, Writer};
 
+pub(crate) use folder::with_suffix;
 pub use reader::{Entry, Filter, Kind, Reader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
@@ -61,10 +65,6 @@ const STANDARD_FOLDER: &str = "/var/lib/packwatch";
 const RUNTIME_PERIOD_S: f64 = 1.0;
 /// While no frame comes, the state is checkpointed this seldom, s: it only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
-/// Longest wait for the disk at the end: half of what systemd waits before it kills.
-const MAX_FINISH: Duration = Duration::from_secs(5);
-/// How often the end is looked for.
-const FINISH_POLL: Duration = Duration::from_millis(5);
 
 /// Where state and history are kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -98,6 +98,9 @@ fn first_folder(variable: &str) -> Option<PathBuf> {
     let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
     std::env::split_paths(&folders).next()
 }
+
+/// Where the state is that the next checkpoint overwrites.
+pub(crate) const DATABASE_SOURCE: &str = "database";
 
 /// A stored state that may be taken up.
 #[derive(Debug)]
@@ -187,8 +190,8 @@ impl Store {
         let mut retry = Retry::default();
         let mut found = Found { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
         let mut reset_ns = None;
-        let (database, rows, state) = match opening {
-            Some(Opening { database, rows, state, .. }) => {
+        let (database, rows, state, aside, is_strange) = match opening {
+            Some(Opening { database, rows, state, aside, is_strange, .. }) => {
                 let counts = database.counts();
                 tracing::info!(
                     folder = %path.display(),
@@ -198,27 +201,39 @@ impl Store {
                     "history open"
                 );
                 reset_ns = database.last_reset_ns(now.boot).unwrap_or_default();
-                (Some(database), rows, state)
+                (Some(database), rows, state, aside, is_strange)
             }
             None => {
                 retry.after_failure();
                 // A disk that cannot be written can perhaps be read.
-                (None, Vec::new(), Reader::open(&path).ok().and_then(|reader| reader.state()))
+                (None, Vec::new(), unwritable_state(&path), None, false)
             }
         };
         let running = runtime_file.as_deref().and_then(|file| running_state(file, &path));
         let running = running.filter(|running| {
             running.stamp.same_boot(now) && reset_ns.is_none_or(|reset_ns| running.stamp.boottime_ns > reset_ns)
         });
-        found.states = candidates(running, state, now);
-        let (told, progress) = watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None });
+        let wall = WallClock::look(now);
+        found.states = candidates(running, state, now, wall);
+        found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
+        let (told, progress) =
+            watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
             // They wait for the first state.
             desk.keep(Batch { stamp: *now, rows });
         }
         let knows_state = database.is_some() || !found.states.is_empty();
-        let writer = Writer { desk: Arc::clone(&desk), folder, database, progress: told, retry, knows_state };
+        let writer = Writer {
+            desk: Arc::clone(&desk),
+            folder,
+            database,
+            progress: told,
+            retry,
+            failures: 0,
+            knows_state,
+            sets_aside: is_strange,
+        };
         let writer = std::thread::Builder::new().name("store".to_owned()).spawn(move || writer.run())?;
         let store = Self {
             desk,
@@ -240,6 +255,14 @@ impl Store {
         &self.folder
     }
 
+    /// The stored state could not be taken up, and why: it is not overwritten, and used at the first start at which it fits.
+    pub(crate) fn set_state_aside(&self, why: &str, now: Timestamp) {
+        tracing::error!(error = why, "the stored state is {SET_ASIDE}");
+        let row = Row::Own { reason: "state_unfit", detail: format!("{why}; {SET_ASIDE}") };
+        self.desk.keep(Batch { stamp: Stamp::now(now, self.boot), rows: vec![row] });
+        self.desk.set_aside();
+    }
+
     /// Tells how far the writer is, whenever that changes.
     pub(crate) fn progress(&self) -> watch::Receiver<Progress> {
         self.progress.clone()
@@ -252,10 +275,8 @@ impl Store {
             Worth::Commit(rows) => rows,
             Worth::Nothing | Worth::Deferred => return None,
         };
-        let state = self.document(monitor, now);
-        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
         self.checkpointed = Some(now);
-        Some(self.desk.leave(batch, state, false))
+        Some(self.leave(rows, monitor, now, false))
     }
 
     /// With every tick: the state of the second, and the checkpoint when it is due. `is_fresh`: frames have come since
@@ -264,8 +285,9 @@ impl Store {
         let due = |last: Option<Timestamp>, period_s: f64| last.is_none_or(|last| now.since(last) >= period_s);
         if self.runtime.is_some() && due(self.put, RUNTIME_PERIOD_S) {
             self.put = Some(now);
-            let document = self.document(monitor, now);
-            self.runtime.iter().for_each(|runtime| runtime.put(document.clone()));
+            if let Some(runtime) = &self.runtime {
+                runtime.put(self.document(monitor, now));
+            }
         }
         let period_s = if is_fresh { self.checkpoint_s } else { self.checkpoint_s.max(QUIET_PERIOD_S) };
         // The first is a period after the start: what was restored is in the database already.
@@ -274,28 +296,20 @@ impl Store {
             return false;
         }
         self.checkpointed = Some(now);
-        self.desk.leave(None, self.document(monitor, now), false);
+        let waiting = self.gatherer.for_checkpoint(now);
+        self.leave(waiting, monitor, now, false);
         true
     }
 
     /// The last state, to the last bit; waits until it is on the disk, for a while.
     pub(crate) fn finish(mut self, monitor: &Monitor, now: Timestamp) {
-        let state = self.document(monitor, now);
-        let rows = self.gatherer.deferred();
-        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
-        self.desk.leave(batch, state, true);
+        let waiting = self.gatherer.deferred();
+        self.leave(waiting, monitor, now, true);
         self.desk.stop();
         let Some(writer) = self.writer.take() else { return };
-        let asked = Instant::now();
-        while !writer.is_finished() {
-            if asked.elapsed() > MAX_FINISH {
-                tracing::error!(
-                    limit_s = MAX_FINISH.as_secs(),
-                    "the disk does not answer: the last state is not stored"
-                );
-                return;
-            }
-            std::thread::sleep(FINISH_POLL);
+        if !ends_in_time(&writer) {
+            tracing::error!(limit_s = MAX_FINISH.as_secs(), "the disk does not answer: the last state is not stored");
+            return;
         }
         let lost = self.desk.lost_rows();
         if lost > 0 || !self.progress.borrow().works {
@@ -303,10 +317,28 @@ impl Store {
         }
     }
 
+    /// Leaves rows and the state for the writer; the ticket.
+    fn leave(&self, rows: Vec<Row>, monitor: &Monitor, now: Timestamp, exact: bool) -> u64 {
+        let state = self.document(monitor, now);
+        let batch = (!rows.is_empty()).then_some(Batch { stamp: state.stamp, rows });
+        self.desk.leave(batch, state, exact)
+    }
+
     fn document(&self, monitor: &Monitor, now: Timestamp) -> Document {
         let stamp = Stamp::now(now, self.boot);
         let folder = self.folder.to_string_lossy().into_owned();
         Document { folder, stamp, snapshot: Box::new(monitor.snapshot()) }
+    }
+}
+
+/// The state in a folder that cannot be written.
+fn unwritable_state(folder: &Path) -> Option<Document> {
+    match Reader::open_within(folder, MAX_DAEMON_COPY_BYTES) {
+        Ok(reader) => reader.state(),
+        Err(error) => {
+            tracing::warn!(error, "no stored state is read");
+            None
+        }
     }
 }
 
@@ -331,24 +363,24 @@ fn running_state(file: &Path, folder: &Path) -> Option<Document> {
 }
 
 /// Both states, the newer first.
-fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp) -> Vec<Candidate> {
+fn candidates(running: Option<Document>, stored: Option<Document>, now: &Stamp, wall: WallClock) -> Vec<Candidate> {
     let is_older = |running: &Document, stored: &Document| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };
     let stored_first = matches!((&running, &stored), (Some(running), Some(stored)) if is_older(running, stored));
-    let mut both = [(running, "runtime folder"), (stored, "database")];
+    let mut both = [(running, "runtime folder"), (stored, DATABASE_SOURCE)];
     if stored_first {
         both.reverse();
     }
-    let candidate = |(document, source): (Option<Document>, &'static str)| {
-        let document = document?;
-        let away = match document.stamp.age(now) {
-            Age::Seconds(seconds) => Away::Seconds(seconds),
-            Age::Unknown => Away::Unknown,
-        };
-        Some(Candidate { snapshot: *document.snapshot, away, source })
+    both.into_iter().filter_map(|(document, source)| Some(candidate(document?, source, now, wall))).collect()
+}
+
+fn candidate(document: Document, source: &'static str, now: &Stamp, wall: WallClock) -> Candidate {
+    let away = match document.stamp.age(now, wall) {
+        Age::Seconds(seconds) => Away::Seconds(seconds),
+        Age::Unknown => Away::Unknown,
     };
-    both.into_iter().filter_map(candidate).collect()
+    Candidate { snapshot: *document.snapshot, away, source }
 }
 
 #[cfg(test)]

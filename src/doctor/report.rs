@@ -97,7 +97,7 @@ pub struct Finding {
 /// Everything.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Report {
-    /// Seconds from the first frame to the last.
+    /// Seconds listened; of a record, those from the first frame to the last without sleep.
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,

@@ -81,6 +81,8 @@ pub struct Doctor {
     pub(crate) first: Option<Timestamp>,
     pub(crate) last: Timestamp,
     pub(crate) awake_s: f64,
+    /// How long somebody listened, s; `None` = a record, which tells by its frames.
+    listened_s: Option<f64>,
     pub(crate) frames: u64,
 }
 
@@ -116,6 +118,7 @@ impl Doctor {
             first: None,
             last: Timestamp::ZERO,
             awake_s: 0.0,
+            listened_s: None,
             frames: 0,
             plan,
         }
@@ -256,7 +259,12 @@ impl Doctor {
 
     /// Seconds listened so far, sleep not counted.
     pub fn seconds(&self) -> f64 {
-        self.awake_s
+        self.listened_s.unwrap_or(self.awake_s)
+    }
+
+    /// For so long somebody listened, whether a frame came or not.
+    pub fn handle_listened(&mut self, seconds: f64) {
+        self.listened_s = Some(seconds);
     }
 
     /// Frames so far.

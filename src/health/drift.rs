@@ -13,6 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::CapacityConfig;
 use crate::filter::{Belief, Measurement};
+use crate::quantity::Unsound;
 
 /// The offset walks by this part of its first standard deviation in a full cycle: sensors drift with temperature.
 const OFFSET_WALK: f64 = 0.1;
@@ -48,6 +49,29 @@ impl Drift {
     /// Offset of the current, per cell, A: measured less true.
     pub fn offset_a(&self) -> f64 {
         self.x[OFFSET]
+    }
+
+    /// Whether a stored filter can be gone on with.
+    pub(super) fn check(&self) -> Result<(), Unsound> {
+        Unsound::unless_capacity("a learned capacity", self.x[C])?;
+        let all = self.x.iter().chain(self.p.iter().flatten());
+        all.copied().try_for_each(|x| Unsound::unless_number("a number beside a learned capacity", x))?;
+        Unsound::unless_positive("the variance of a learned capacity", self.p[C][C])?;
+        for i in 0..N {
+            Unsound::unless_natural("a variance beside a learned capacity", self.p[i][i])?;
+            for j in 0..i {
+                let (covariance, most) = (self.p[i][j], (self.p[i][i] * self.p[j][j]).sqrt());
+                // It is stored rounded.
+                let fits = covariance.abs() <= most * (1.0 + 1e-5) && (covariance - self.p[j][i]).abs() <= most * 1e-5;
+                Unsound::unless(
+                    fits,
+                    "a covariance beside a learned capacity",
+                    covariance,
+                    "what its variances allow",
+                )?;
+            }
+        }
+        Ok(())
     }
 
     /// Takes in what a half-cycle with this mean current says of the capacity.

@@ -15,7 +15,7 @@ use super::drift::Drift;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Belief, Measurement};
-use crate::quantity::{Mode, Timestamp};
+use crate::quantity::{Mode, Timestamp, Unsound};
 
 /// A half-cycle's ends are weighed over no less than this swing: below it the variance is beyond use anyway.
 const MIN_WEIGHED_SWING: f64 = 0.02;
@@ -85,6 +85,17 @@ struct CellMark {
     load_v: f64,
     temperature_integral: f64,
     temperature_s: f64,
+}
+
+impl CellMark {
+    fn check(&self) -> Result<(), Unsound> {
+        for number in [self.load_v, self.temperature_integral, self.temperature_s] {
+            Unsound::unless_number("a load or temperature at a half-cycle's end", number)?;
+        }
+        let Some(soc) = self.soc else { return Ok(()) };
+        Unsound::unless_number("the SOC at a half-cycle's end", soc.mean)?;
+        Unsound::unless_natural("its variance", soc.variance)
+    }
 }
 
 /// The state of all totals at a moment.
@@ -279,6 +290,24 @@ impl Learner {
     pub fn fits(&self, cells: usize) -> bool {
         [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
+    }
+
+    /// Whether the numbers of a stored one can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), Unsound> {
+        for belief in self.prior.iter().chain(&self.capacity) {
+            Unsound::unless_capacity("a learned capacity", belief.mean)?;
+            Unsound::unless_positive("the variance of a learned capacity", belief.variance)?;
+        }
+        self.drift.iter().try_for_each(Drift::check)?;
+        Unsound::unless_natural("the time at rest", self.rest_s)?;
+        let marks = [&self.start, &self.candidate].into_iter().flatten();
+        marks
+            .clone()
+            .try_for_each(|mark| Unsound::unless_number("the charge at a half-cycle's end", mark.charge_as))?;
+        marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
     }
 
     /// Moves stored stamps onto another clock.

@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::CellIndex;
+use crate::quantity::{CellIndex, Unsound};
 
 /// One cell's part in the pack.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,6 +58,18 @@ pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
         capacity_std_ah: limiting.capacity_std_ah,
         limiting_cell: limiting.cell,
     })
+}
+
+impl PackState {
+    /// Whether the numbers of a stored one can be shown.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), Unsound> {
+        Unsound::unless_number("the pack's SOC", self.soc)?;
+        let natural = [self.soc_std, self.capacity_ah, self.capacity_std_ah];
+        natural.into_iter().try_for_each(|x| Unsound::unless_natural("the pack's capacity or a deviation", x))
+    }
 }
 
 #[cfg(test)]

@@ -28,7 +28,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RechargeConfig;
 use crate::filter::Belief;
-use crate::quantity::{Mode, Timestamp};
+use crate::quantity::{Mode, Timestamp, Unsound};
 
 /// Watches the pack's SOC during charges.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -92,6 +92,16 @@ impl RechargeTimer {
         let inside = |soc: f64| soc.clamp(config.from_soc, config.to_soc);
         let covered = ended.range.map_or(0.0, |(low, high)| inside(high) - inside(low));
         Charged { raw_s: ended.raw_s, coverage: covered / (config.to_soc - config.from_soc) }
+    }
+
+    /// Whether the numbers of a stored one can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), Unsound> {
+        let (low, high) = self.range.unwrap_or_default();
+        let all = [self.last.map_or(0.0, |(_, soc)| soc), low, high, self.raw_s.unwrap_or(0.0)];
+        all.into_iter().try_for_each(|x| Unsound::unless_number("a SOC or time of the charge under way", x))
     }
 
     /// Moves stored stamps onto another clock.

@@ -10,7 +10,7 @@ use super::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Error class bits of an error frame (linux/can/error.h).
-const CAN_ERR_BUSOFF: u32 = 0x40;
+pub(super) const CAN_ERR_BUSOFF: u32 = 0x40;
 const CAN_ERR_RESTARTED: u32 = 0x100;
 
 /// Without another report for this long frames can be sent again, s: four of the drivers' report periods.

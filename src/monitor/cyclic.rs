@@ -92,7 +92,7 @@ impl Monitor {
         let (status_s, health_s, alarm_s) = (output.status_period_s, output.health_period_s, output.alarm_period_s);
         if take_due(&mut self.schedule.status, self.now, status_s) {
             let frame = self.status_frame();
-            self.send(frame, out);
+            self.send(frame, false, out);
         }
         if take_due(&mut self.schedule.health, self.now, health_s) {
             self.send_health(out);
@@ -116,9 +116,9 @@ impl Monitor {
         self.watch(out);
     }
 
-    fn send(&self, frame: Option<Frame>, out: &mut Outputs) {
+    fn send(&self, frame: Option<Frame>, announces: bool, out: &mut Outputs) {
         let (Some(frame), Some(output)) = (frame, &self.config.output) else { return };
-        out.frames.extend(output.buses.iter().map(|&bus| Transmit { time: self.now, bus, frame }));
+        out.frames.extend(output.buses.iter().map(|&bus| Transmit { time: self.now, bus, frame, announces }));
     }
 
     pub(super) fn validity(&self) -> Validity {
@@ -181,7 +181,7 @@ impl Monitor {
         for page in 0..pages {
             let plan = self.config.output.as_ref().map(|output| &output.plan);
             let frame = plan.map(|plan| plan.health(page, &fields, &mut self.schedule.counters));
-            self.send(frame, out);
+            self.send(frame, true, out);
         }
     }
 
@@ -217,7 +217,7 @@ impl Monitor {
     fn send_alarm_fields(&mut self, fields: AlarmFields, out: &mut Outputs) {
         let counters = &mut self.schedule.counters;
         let frame = self.config.output.as_ref().map(|output| output.plan.alarm(&fields, counters));
-        self.send(frame, out);
+        self.send(frame, true, out);
     }
 
     /// Begins to send a rule's alarm frame marked as a test, in place of one that runs; of 0 s, only ends that one.

@@ -72,7 +72,8 @@ impl J1939 {
 
     fn hand_on(&mut self, now: Timestamp, out: &mut Outputs) {
         let bus = self.config.bus;
-        out.frames.extend(self.out.frames.drain(..).map(|frame| Transmit { time: now, bus, frame }));
+        let transmit = |frame| Transmit { time: now, bus, frame, announces: true };
+        out.frames.extend(self.out.frames.drain(..).map(transmit));
         let event = |what| Event { time: now, kind: EventKind::J1939 { what } };
         out.events.extend(self.out.events.drain(..).map(event));
     }

@@ -11,7 +11,7 @@ use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
 use crate::health::{Learner, PackState, RechargeTimer, TransitionDetector};
-use crate::quantity::Timestamp;
+use crate::quantity::{Timestamp, Unsound};
 use crate::sample::SamplerState;
 
 /// Layout version of [`Snapshot`].
@@ -81,6 +81,24 @@ pub enum RestoreError {
         /// Configured.
         allowed: String,
     },
+    /// A number in it cannot be: it is damaged.
+    #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
+    Number {
+        /// Which number.
+        what: &'static str,
+        /// Of which cell, counted from 0, where it is of one.
+        cell: Option<usize>,
+        /// What it is.
+        found: f64,
+        /// What it may be.
+        allowed: &'static str,
+    },
+}
+
+impl From<Unsound> for RestoreError {
+    fn from(Unsound { what, found, allowed }: Unsound) -> Self {
+        Self::Number { what, cell: None, found, allowed }
+    }
 }
 
 /// What became of a restore that waited.
@@ -134,7 +152,8 @@ impl Monitor {
     /// any other.
     ///
     /// # Errors
-    /// When the snapshot's version or shape does not fit.
+    /// When the snapshot's version or shape does not fit, or a number in it cannot be. Then none of it is used: where one
+    /// number is damaged nobody knows which others are.
     pub fn restore(&mut self, snapshot: Snapshot, away: Away) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
@@ -150,6 +169,7 @@ impl Monitor {
                 allowed: format!("{} cells of {branches} branches", self.cells.len()),
             });
         }
+        snapshot.check()?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away });
         Ok(())
     }
@@ -207,6 +227,21 @@ impl Monitor {
 }
 
 impl Snapshot {
+    /// Whether its numbers can be gone on with.
+    fn check(&self) -> Result<(), RestoreError> {
+        for (cell, document) in self.cells.iter().enumerate() {
+            let at_cell =
+                |Unsound { what, found, allowed }| RestoreError::Number { what, cell: Some(cell), found, allowed };
+            document.check().map_err(at_cell)?;
+        }
+        self.sampler.check()?;
+        self.learner.check()?;
+        self.recharge.check()?;
+        self.pack.iter().try_for_each(PackState::check)?;
+        Unsound::unless_natural("the recharge period", self.recharge_period_s.unwrap_or(0.0))?;
+        Ok(check_belief("the normalised recharge period", self.normalised_recharge)?)
+    }
+
     /// Moves every stamp by `by_nanos`.
     fn rebase(&mut self, by_nanos: i64) {
         self.time = self.time.plus_nanos(by_nanos);
@@ -221,6 +256,25 @@ impl Snapshot {
         self.schedule.rebase(by_nanos);
         self.buses.rebase(by_nanos);
     }
+}
+
+impl CellDocument {
+    fn check(&self) -> Result<(), Unsound> {
+        self.estimator.check()?;
+        Unsound::unless_number("the SOC of a full cell", self.full_soc)?;
+        check_belief("the usable capacity", self.usable)?;
+        check_belief("the resistance of discharge", self.discharge_resistance)?;
+        let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
+        Unsound::unless_number("the charge taken in", charge_as)?;
+        Unsound::unless_number("the unmeasured time taken in", unmeasured_s)
+    }
+}
+
+/// A mean that is not below 0, and its variance.
+fn check_belief(what: &'static str, belief: Option<Belief>) -> Result<(), Unsound> {
+    let Some(Belief { mean, variance }) = belief else { return Ok(()) };
+    Unsound::unless_natural(what, mean)?;
+    Unsound::unless_natural(what, variance)
 }
 
 impl CellSlot {

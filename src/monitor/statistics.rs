@@ -6,13 +6,11 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::buses::CAN_ERR_BUSOFF;
 use super::{BusEvent, Event, EventKind, Input};
 use crate::alarm::{Change, Severity};
 use crate::cell::StepResult;
 use crate::quantity::BusIndex;
-
-/// Error class bits of an error frame (linux/can/error.h).
-const CAN_ERR_BUSOFF: u32 = 0x40;
 
 /// Counts since the first start.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -68,6 +66,16 @@ pub struct BusStatistics {
     pub bus_offs: u64,
 }
 
+impl BusStatistics {
+    fn since(&self, before: &Self) -> Self {
+        Self {
+            frames: self.frames.saturating_sub(before.frames),
+            error_frames: self.error_frames.saturating_sub(before.error_frames),
+            bus_offs: self.bus_offs.saturating_sub(before.bus_offs),
+        }
+    }
+}
+
 /// Alarms by severity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
@@ -100,6 +108,36 @@ impl AlarmCounts {
 }
 
 impl Statistics {
+    /// What was counted since they were `before`.
+    pub fn since(&self, before: &Self) -> Self {
+        let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
+        let buses = self.buses.iter().enumerate();
+        Self {
+            buses: buses.map(|(bus, now)| before.buses.get(bus).map_or(*now, |before| now.since(before))).collect(),
+            voltages_used: of(|it| it.voltages_used),
+            voltages_gated: of(|it| it.voltages_gated),
+            voltages_without_current: of(|it| it.voltages_without_current),
+            filter_resets: of(|it| it.filter_resets),
+            trust_lost: of(|it| it.trust_lost),
+            gaps: of(|it| it.gaps),
+            mode_changes: of(|it| it.mode_changes),
+            half_cycles: of(|it| it.half_cycles),
+            capacity_updates: of(|it| it.capacity_updates),
+            capacity_measurements: of(|it| it.capacity_measurements),
+            recharge_periods: of(|it| it.recharge_periods),
+            alarms_raised: AlarmCounts {
+                info: of(|it| it.alarms_raised.info),
+                warning: of(|it| it.alarms_raised.warning),
+                severe: of(|it| it.alarms_raised.severe),
+            },
+            commands: of(|it| it.commands),
+            bad_commands: of(|it| it.bad_commands),
+            packs_replaced: of(|it| it.packs_replaced),
+            restores: of(|it| it.restores),
+            store_failures: of(|it| it.store_failures),
+        }
+    }
+
     /// Takes an input and what came of it.
     pub(super) fn note(&mut self, input: &Input<'_>, told: &[Event]) {
         match *input {

@@ -185,6 +185,9 @@ pub struct Transmit {
     pub bus: BusIndex,
     /// What.
     pub frame: Frame,
+    /// It tells what was learned or what became of an alarm: health, alarm and J1939 frames, all of them, so that frames of
+    /// one identifier, and the parts of one transfer, are all of one kind.
+    pub announces: bool,
 }
 
 /// Validity of the published estimates, as on the wire.

@@ -24,7 +24,7 @@ pub struct CellView {
     pub usable_capacity: Option<Belief>,
     /// Resistance relative to new, while its voltage is fresh.
     pub resistance_ratio: Option<Belief>,
-    /// Whether its innovations agree with their covariance; `None` before its first estimate.
+    /// Whether its innovations agree with their covariance; `None` while there is no SOC.
     pub trusted: Option<bool>,
 }
 
@@ -43,7 +43,7 @@ pub struct PackView {
     pub voltage_v: Option<f64>,
     /// Current, A, positive = discharge.
     pub current_a: Option<f64>,
-    /// Highest temperature of the sensors that are fresh, degrees C.
+    /// Highest temperature, degrees C, while all sensors are fresh.
     pub temperature_max_c: Option<f64>,
     /// The cell with the least capacity, and that, Ah, once every cell was learned.
     pub weakest: Option<(CellIndex, Belief)>,
@@ -96,7 +96,7 @@ impl Monitor {
             capacity: self.learner.has_learned(cell.index()).then(|| self.capacity(cell)),
             usable_capacity: slot.usable.filter(|_| self.learner.has_learned(cell.index())),
             resistance_ratio: soc.map(|_| slot.resistance()),
-            trusted: slot.estimator.soc().map(|_| slot.trusted),
+            trusted: soc.map(|_| slot.trusted),
         }
     }
 
@@ -122,7 +122,10 @@ impl Monitor {
             limiting_cell: pack.map(|pack| pack.limiting_cell),
             voltage_v: self.pack_voltage_v(),
             current_a: self.sampler.pack_current_a(self.now),
-            temperature_max_c: self.sampler.hottest_c(self.now).map(|(hottest_c, _)| hottest_c),
+            temperature_max_c: self
+                .sampler
+                .hottest_c(self.now)
+                .and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)),
             weakest: weakest.filter(|_| self.learner.has_learned_all()),
             usable_capacity: health
                 .usable_capacity_ah

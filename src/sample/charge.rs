@@ -12,7 +12,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::Timestamp;
+use crate::quantity::{Timestamp, Unsound};
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -73,6 +73,13 @@ impl ChargeCounter {
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {
         self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
+    }
+
+    /// Whether a stored counter can be gone on with.
+    pub(super) fn check(&self) -> Result<(), Unsound> {
+        let Totals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
+        let all = [charge_as, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
+        all.into_iter().try_for_each(|found| Unsound::unless_number("the counted charge, a time or its current", found))
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {

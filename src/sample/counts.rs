@@ -33,6 +33,24 @@ pub struct ReadingCounts {
 }
 
 impl ReadingCounts {
+    /// What was counted since they were `before`.
+    pub fn since(&self, before: &Self) -> Self {
+        let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
+        Self {
+            accepted: of(|it| it.accepted),
+            unused: of(|it| it.unused),
+            levels_believed: of(|it| it.levels_believed),
+            short_frame: of(|it| it.short_frame),
+            end_to_end: of(|it| it.end_to_end),
+            not_available: of(|it| it.not_available),
+            not_finite: of(|it| it.not_finite),
+            out_of_range: of(|it| it.out_of_range),
+            rate_too_high: of(|it| it.rate_too_high),
+            stuck: of(|it| it.stuck),
+            stale: of(|it| it.stale),
+        }
+    }
+
     /// Counts a reading by its judgement.
     pub(super) fn note(&mut self, fault: Option<Fault>) {
         let count = match fault {

@@ -13,7 +13,7 @@ use super::charge::{ChargeCounter, Totals};
 use super::config::{Limits, SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::signal::Signal;
-use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp};
+use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp, Unsound};
 
 /// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
 /// sensor at rest, below any load under which a voltage or temperature has to move.
@@ -61,6 +61,15 @@ pub struct SamplerState {
 }
 
 impl SamplerState {
+    /// Whether its numbers can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), Unsound> {
+        self.charge.check()?;
+        self.signals.iter().try_for_each(Signal::check)
+    }
+
     /// Moves every stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));

@@ -13,7 +13,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::config::Limits;
-use crate::quantity::{Fault, Timestamp};
+use crate::quantity::{Fault, Timestamp, Unsound};
 
 /// Readings in a row that must agree on a new level: two could be one disturbance seen twice.
 pub const ACCEPT_AFTER: u32 = 3;
@@ -127,6 +127,13 @@ impl Signal {
             bad_share: self.bad_share,
             ..Self::default()
         };
+    }
+
+    /// Whether a stored signal can be gone on with.
+    pub(super) fn check(&self) -> Result<(), Unsound> {
+        let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
+        let others = [self.rests_since_s, self.rests_at.unwrap_or(0.0), self.bad_share];
+        values.chain(others).try_for_each(|found| Unsound::unless_number("a signal", found))
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {

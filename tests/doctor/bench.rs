@@ -7,7 +7,7 @@ use std::sync::{LazyLock, Mutex};
 use assert_cmd::Command;
 use packwatch::config;
 use packwatch::daemon::doctor::{self, Interrupt};
-use packwatch::doctor::Report;
+use packwatch::doctor::{Doctor, Report};
 use packwatch::io::csv_log::CsvOptions;
 
 /// A kind of healthy pack.
@@ -228,6 +228,12 @@ impl Broken {
         let path = folder.join("pack.toml");
         std::fs::write(&path, &self.config).unwrap();
         path
+    }
+
+    /// One that has heard nothing yet.
+    pub(crate) fn doctor(&self) -> Doctor {
+        let folder = tempfile::tempdir().unwrap();
+        Doctor::new(config::survey(&self.write(folder.path())).unwrap().plan)
     }
 
     /// What the doctor says.

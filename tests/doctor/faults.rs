@@ -174,6 +174,15 @@ pub(crate) const FAULTS: &[Fault] = &[
         2,
     ),
     fault(
+        // Of a pack at about 10 degrees C: nothing about the figure itself is odd.
+        "Fahrenheit in the DBC, not converted",
+        |b| b.dbc("(0.1,0) [-40|125] \"degC\"", "(0.18,5) [-40|300] \"degF\""),
+        &[Topic::Unit],
+        "scale = 0.5555",
+        &[Pack12, Total],
+        2,
+    ),
+    fault(
         "tenths of a degree",
         |b| temperatures(b, "scale = 10.0"),
         &[Topic::Unit],
@@ -300,6 +309,21 @@ pub(crate) const FAULTS: &[Fault] = &[
         },
         &[Topic::CellCount],
         "cells = 9",
+        &[Pack12],
+        4,
+    ),
+    fault(
+        // A smaller pack, or a dead module.
+        "last cells without values",
+        |b| {
+            b.data("110", |d| {
+                if d[0] > 2 {
+                    d[2..].fill(0xFF)
+                }
+            })
+        },
+        &[Topic::Silent],
+        "signal",
         &[Pack12],
         4,
     ),

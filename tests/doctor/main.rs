@@ -11,7 +11,7 @@ mod faults;
 
 use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
-use packwatch::doctor::{Report, Severity};
+use packwatch::doctor::{Report, Severity, Topic};
 
 /// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs nobody has looked at yet.
 fn first_seed() -> u64 {
@@ -54,6 +54,30 @@ fn nothing_is_found_on_healthy_packs() {
     eprintln!("{logs} healthy logs, {} with a finding", wrong.len());
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert!(logs >= 20);
+}
+
+#[test]
+fn a_dead_last_module_is_not_told_as_a_smaller_pack_for_certain() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.data("110", |data| {
+        if data[0] > 2 {
+            data[2..].fill(0xFF);
+        }
+    });
+    let report = broken.report();
+    let found = report.findings.iter().find(|finding| finding.topic == Topic::CellCount).unwrap();
+    assert_eq!((found.severity, &*found.title), (Severity::Warning, "the pack may have 9 cells, 12 are configured"));
+    assert!(found.advice.as_ref().is_some_and(|advice| advice.contains("count the cells")), "{found:?}");
+}
+
+#[test]
+fn a_silent_interface_is_told_with_the_time_that_was_listened() {
+    let mut doctor = Broken::of(Bench::Pack12, 1).doctor();
+    doctor.handle_listened(60.0);
+    let report = doctor.finish();
+    let seen = &report.findings[0].seen;
+    assert!(seen.contains("no frame on") && seen.contains("in 60 s;"), "{seen}");
+    assert_eq!(report.seconds, 60.0);
 }
 
 /// Found first, found but not first, not found.

@@ -4,7 +4,7 @@
     fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
                                                            dropped and time goes on, as a pack does. SIGTERM parks it
     fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers nobody configured
-    fault_tools.py clients SOCKET [--count N] [--seconds S]  clients of the status socket that never read
+    fault_tools.py clients SOCKET [--count N] [--seconds S]  clients of the status socket that never read; are others answered?
     fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is nothing that was told missing?
     fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
     fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
@@ -334,6 +334,8 @@ def clients(args) -> None:
             refused += 1
         time.sleep(0.2)
     print(f"{len(idle)} clients that do not read, {answered} answers to others meanwhile, {refused} turned away")
+    if not answered:
+        sys.exit("nobody was answered beside the clients that do not read")
 
 
 def main() -> None:

@@ -88,7 +88,8 @@ has() { [[ $(property "$1" "${3-packwatch.service}") == "$2" ]]; }
 status_has() { [[ $(property StatusText) =~ $1 ]]; }
 # journal [ARGS...]: what the journal has of packwatch, the message alone.
 journal() { in_system journalctl --quiet --no-pager --unit packwatch.service --output cat "$@"; }
-journal_has() { journal | grep -qE -- "$1"; }
+# Not grep -q: it ends at the first match, and journalctl, which writes on into nothing, would fail the pipeline.
+journal_has() { journal | grep -E -- "$1" >/dev/null; }
 
 # Shown when a test fails (lib.sh shows $tmp/*.log).
 keep_journal() { [[ -z ${pids[systemd]-} ]] || journal >"$tmp/journal.log" 2>&1 || true; }

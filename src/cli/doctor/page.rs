@@ -3,8 +3,7 @@
 use std::io::IsTerminal as _;
 use std::path::Path;
 
-use super::super::Failure;
-use super::write_out;
+use super::super::{Failure, control_args};
 use crate::doctor::{Change, Finding, Report, Severity};
 
 /// Width of the text where no terminal says one.
@@ -41,7 +40,7 @@ pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), 
     } else {
         USUAL_WIDTH
     };
-    write_out(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
+    control_args::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
 }
 
 fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Paint) -> String {

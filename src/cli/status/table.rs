@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
-use super::{config, duration, number, percent, shown, with_std, word};
+use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
 use crate::cli::alarms::{cell as cell_name, severity, state_name, with_unit};
+use crate::daemon::status::counters::LATENCY_BOUNDS_S;
 use crate::daemon::status::document::{Cell, Document};
 use crate::io::stamp;
 
@@ -82,14 +83,17 @@ fn interfaces(text: &mut String, document: &Document) {
     }
     let (readings, service) = (&document.counters.readings, &document.counters.service);
     let rejected: u64 = readings.rejected().iter().map(|(_, count)| count).sum();
-    let slowest = document.latency.quantile_s(0.99);
+    let latency = &document.latency;
+    let slowest = match latency.quantile_s(0.99) {
+        None if latency.frames > 0 => format!("more than {} s", LATENCY_BOUNDS_S[LATENCY_BOUNDS_S.len() - 1]),
+        seconds => shown(seconds.map(|seconds| 1e3 * seconds), 2, " ms"),
+    };
     let _ = writeln!(
         text,
-        "counted    {} readings used, {rejected} not; {} late ticks; 99 % of estimates within {}",
-        readings.accepted,
-        service.missed_deadlines,
-        shown(slowest.map(|seconds| 1e3 * seconds), 2, " ms"),
+        "counted    {} readings used, {rejected} not; {} late ticks; 99 % of estimates within {slowest}",
+        readings.accepted, service.missed_deadlines,
     );
+    let _ = writeln!(text, "store      {}", store(document));
 }
 
 fn alarms(text: &mut String, document: &Document) {

@@ -1,7 +1,7 @@
 //! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
 
 use std::io::{self, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -14,7 +14,7 @@ use crate::daemon::snapshot_file;
 use crate::daemon::status::collect::RecentEvents;
 use crate::daemon::status::document::Store as StoreStatus;
 use crate::daemon::store::hold::Hold;
-use crate::daemon::store::{Candidate, Progress, Store};
+use crate::daemon::store::{Candidate, DATABASE_SOURCE, Progress, Store, with_suffix};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::journal::JournalWriter;
@@ -58,14 +58,17 @@ impl Engine {
         let now = clock.now();
         let mut stamped_s = 0.0;
         // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-        let away = if let Some(snapshot) = service.restore.take() {
+        let (away, unfit) = if let Some(snapshot) = service.restore.take() {
             stamped_s = now.since(snapshot.time);
             monitor.restore(snapshot, service.away)?;
             tracing::info!(away = %service.away, stamped_s, "state taken up");
-            Some(service.away)
+            (Some(service.away), None)
         } else {
             take_up(&mut monitor, found.states, service.record.as_deref())
         };
+        if let Some((store, why)) = store.as_ref().zip(unfit.as_ref()) {
+            store.set_state_aside(why, now);
+        }
         let mut record = open_journal(service.record.as_deref(), &names)?;
         let mut lost_file = false;
         let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
@@ -82,6 +85,7 @@ impl Engine {
             Away::Unknown => restored_words(None),
         });
         let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
+        let is_unusable = store.is_none() && !found.works;
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
@@ -93,12 +97,13 @@ impl Engine {
             readiness,
             lost_file,
             store,
-            store_works: found.works,
+            store_works: found.works && unfit.is_none(),
             told_works: None,
             hold: Hold::default(),
             is_fresh: false,
             recent: RecentEvents::default(),
-            stored: StoreStatus::default(),
+            // One that cannot be opened is told as such, not as "none".
+            stored: StoreStatus { works: is_unusable.then_some(false), ..StoreStatus::default() },
         })
     }
 
@@ -135,11 +140,10 @@ impl Engine {
 
     /// What came out of the core: frames to the interfaces, events to the log, both to their files.
     fn hand_on(&mut self, time: Timestamp, links: &[LinkOutput]) {
-        let ticket = self.keep(time);
+        self.keep(time);
         for transmit in &self.outputs.frames {
-            match ticket.or_else(|| self.hold.behind(transmit)) {
-                Some(ticket) => self.hold.push(ticket, *transmit),
-                None => send(links, transmit),
+            if !self.hold.take(transmit) {
+                send(links, transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -154,14 +158,13 @@ impl Engine {
         }
     }
 
-    /// Makes what was learned durable; the ticket its announcement waits for. A store that fails is not waited for.
-    fn keep(&mut self, now: Timestamp) -> Option<u64> {
-        let ticket = self.store.as_mut()?.learned(&self.outputs.events, &self.monitor, now)?;
-        if !self.store_works {
-            return None;
+    /// Makes what was learned durable; its announcement waits for that. A store that fails is not waited for.
+    fn keep(&mut self, now: Timestamp) {
+        let Some(store) = &mut self.store else { return };
+        let ticket = store.learned(&self.outputs.events, &self.monitor, now);
+        if let Some(ticket) = ticket.filter(|_| self.store_works) {
+            self.hold.begin(ticket, Instant::now());
         }
-        self.hold.begin(ticket, Instant::now());
-        Some(ticket)
     }
 
     /// How far the store is, told whenever that changes; `None` = there is none.
@@ -174,15 +177,16 @@ impl Engine {
         self.hold.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
         self.stored.note(progress.works);
+        self.stored.failures = progress.failures;
         self.stored.file_bytes = progress.file_bytes;
         self.tell_works(time, links);
     }
 
     /// The store, for those who look.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
-        self.store
-            .as_ref()
-            .map(|store| StoreStatus { path: store.folder().display().to_string(), ..self.stored.clone() })
+        let path = self.store.as_ref().map(|store| store.folder().display().to_string());
+        (path.is_some() || self.stored.works.is_some())
+            .then(|| StoreStatus { path: path.unwrap_or_default(), ..self.stored.clone() })
     }
 
     /// Nothing waits any longer: the daemon stops.
@@ -196,6 +200,7 @@ impl Engine {
             self.hold.release(ticket, |transmit| send(links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
             self.stored.late += 1;
+            self.stored.works = Some(false);
             self.store_works = false;
         }
         if let Some(store) = &mut self.store
@@ -254,8 +259,10 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
     }
 }
 
-/// Takes up the first of the stored states that fits; how old it is. Beside a journal goes what it began from.
-fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> Option<Away> {
+/// Takes up the first of the stored states that fits; how old it is, and why the database's was not, if it does not fit.
+/// Beside a journal goes what it began from.
+fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> (Option<Away>, Option<String>) {
+    let mut unfit = None;
     for Candidate { snapshot, away, source } in states {
         let beside = journal.map(|path| with_suffix(path, ".state.json"));
         let written = beside.as_deref().map(|path| snapshot_file::write(path, &snapshot));
@@ -265,19 +272,16 @@ fn take_up(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>
                 if let Some(Err(error)) = written {
                     tracing::error!(%error, "the state this record begins from is not beside it");
                 }
-                return Some(away);
+                return (Some(away), unfit);
             }
-            Err(error) => tracing::error!(source, %error, "a stored state does not fit and is not used"),
+            Err(error) => {
+                tracing::error!(source, %error, "a stored state does not fit and is not used");
+                unfit = unfit.or_else(|| (source == DATABASE_SOURCE).then(|| error.to_string()));
+            }
         }
     }
     tracing::info!("no stored state: nothing is known of the cells yet");
-    None
-}
-
-fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(suffix);
-    PathBuf::from(name)
+    (None, unfit)
 }
 
 /// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.

@@ -189,14 +189,29 @@ impl Loop {
     }
 }
 
-/// How far the store is, once that has changed.
+/// How far the store is, once that has changed; when its thread has ended before the loop, that it works no longer.
 async fn next_progress(stored: &mut Option<watch::Receiver<Progress>>) -> Progress {
-    if let Some(receiver) = stored
-        && receiver.changed().await.is_ok()
-    {
+    let Some(receiver) = stored else { return std::future::pending().await };
+    if receiver.changed().await.is_ok() {
         return *receiver.borrow_and_update();
     }
-    // No store, or its thread has ended.
+    let last = *receiver.borrow();
     *stored = None;
-    std::future::pending().await
+    tracing::error!("the store's thread has ended: state and history are not written any more");
+    Progress { works: false, failures: last.failures + 1, ..last }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_store_whose_thread_is_gone_is_told_to_fail_once() {
+        let last = Progress { ticket: 7, works: true, file_bytes: Some(1), failures: 0 };
+        let (told, progress) = watch::channel(last);
+        drop(told);
+        let mut stored = Some(progress);
+        assert_eq!(next_progress(&mut stored).await, Progress { works: false, failures: 1, ..last });
+        assert!(timeout(Duration::from_millis(20), next_progress(&mut stored)).await.is_err(), "once");
+    }
 }

@@ -5,7 +5,7 @@ use tokio::time::Instant;
 use super::engine::Engine;
 use crate::daemon::status::PERIOD;
 use crate::daemon::status::StatusServer;
-use crate::daemon::status::collect::{Identity, Sources};
+use crate::daemon::status::collect::{Before, Identity, Sources};
 use crate::daemon::status::counters::LoopCounters;
 use crate::daemon::status::document::ConfigFile;
 use crate::io::socket::LinkOutput;
@@ -19,11 +19,13 @@ pub(super) struct Seeing {
     pub(super) identity: Identity,
     pub(super) counters: LoopCounters,
     told: Option<Instant>,
+    /// Of the first document: the first tick has taken the stored state up, and no frame was counted yet.
+    before: Option<Before>,
 }
 
 impl Seeing {
     pub(super) fn new(server: Option<StatusServer>, identity: Identity) -> Self {
-        Self { server, identity, counters: LoopCounters::default(), told: None }
+        Self { server, identity, counters: LoopCounters::default(), told: None, before: None }
     }
 
     /// A tick that was due then comes now.
@@ -59,6 +61,7 @@ impl Seeing {
             identity: &self.identity,
             monitor: &engine.monitor,
             links,
+            before: self.before.get_or_insert_with(|| Before::of(&engine.monitor)),
             counters: &self.counters,
             clients: server.clients(),
             events: &engine.recent,

@@ -72,6 +72,7 @@ pub(crate) fn explain(path: &Path, error: &io::Error) -> String {
             "{path}: no daemon listens there; start one with \"packwatch run -c FILE --status {path}\", or say with \
              --socket where it listens"
         ),
+        ErrorKind::PermissionDenied => format!("{path}: only root may look into the service's folder; try sudo"),
         ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: no document in time"),
         ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => {
             format!("{path}: the daemon has no document that is fresh, or too many clients")

@@ -10,12 +10,15 @@ use super::document::{
     VERSION,
 };
 use super::server::Draft;
+use crate::can::flood::FloodCount;
+use crate::can::guard::GuardCounts;
 use crate::daemon::control::answer;
 use crate::filter::Belief;
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkCounters, LinkOutput};
-use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor};
+use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
+use crate::sample::ReadingCounts;
 
 /// Events kept for those who look: a screenful.
 const MAX_EVENTS: usize = 32;
@@ -48,11 +51,42 @@ pub(crate) struct Identity {
     pub(crate) interfaces: Vec<String>,
 }
 
+/// What had been counted before this program, by those whose counts are part of the stored state.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Before {
+    statistics: Statistics,
+    readings: ReadingCounts,
+    time_backwards: u64,
+    protected: Vec<GuardCounts>,
+    floods: Vec<FloodCount>,
+}
+
+impl Before {
+    /// As a monitor has it that has just taken up its stored state, if there is one. What it tells in the very tick in which
+    /// it does (an alarm about an input that has been silent meanwhile) counts as before.
+    pub(crate) fn of(monitor: &Monitor) -> Self {
+        let mut statistics = monitor.statistics().clone();
+        if statistics.restores == 0 {
+            return Self::default();
+        }
+        // This one is this program's.
+        statistics.restores -= 1;
+        Self {
+            statistics,
+            readings: monitor.reading_counts(),
+            time_backwards: monitor.time_backwards(),
+            protected: monitor.protected().collect(),
+            floods: monitor.dropped().collect(),
+        }
+    }
+}
+
 /// What a document is made of.
 pub(crate) struct Sources<'a> {
     pub(crate) identity: &'a Identity,
     pub(crate) monitor: &'a Monitor,
     pub(crate) links: &'a [LinkOutput],
+    pub(crate) before: &'a Before,
     pub(crate) counters: &'a LoopCounters,
     pub(crate) clients: Clients,
     pub(crate) events: &'a RecentEvents,
@@ -67,8 +101,9 @@ impl Sources<'_> {
     }
 
     fn document(self, now: Timestamp) -> Document {
-        let Self { identity, monitor, counters, .. } = self;
+        let Self { identity, monitor, before, counters, .. } = self;
         let pack = pack(monitor);
+        let core = monitor.statistics().since(&before.statistics);
         Document {
             version: VERSION,
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -79,14 +114,16 @@ impl Sources<'_> {
             uptime_s: now.since(identity.started),
             config: identity.config.clone(),
             state: pack.validity,
-            interfaces: self.interfaces(),
+            interfaces: self.interfaces(&core),
             pack,
             cells: monitor.cell_views().map(cell).collect(),
             alarms: alarms(monitor),
             counters: Counters {
-                core: monitor.statistics().clone(),
-                readings: monitor.reading_counts(),
-                time_backwards: monitor.time_backwards(),
+                core,
+                // By their index: another order of the interfaces would exchange their past.
+                lifetime: Statistics { buses: Vec::new(), ..monitor.statistics().clone() },
+                readings: monitor.reading_counts().since(&before.readings),
+                time_backwards: monitor.time_backwards().saturating_sub(before.time_backwards),
                 service: counters.service,
                 clients: self.clients,
             },
@@ -102,29 +139,30 @@ impl Sources<'_> {
         self.identity.interfaces.get(bus.index()).cloned().unwrap_or_default()
     }
 
-    fn interfaces(&self) -> Vec<Interface> {
-        let frames = &self.monitor.statistics().buses;
+    fn interfaces(&self, core: &Statistics) -> Vec<Interface> {
         let each = self.identity.interfaces.iter().zip(self.links).enumerate();
-        each.map(|(bus, (name, link))| interface(name, link.counters(), frames.get(bus))).collect()
+        each.map(|(bus, (name, link))| interface(name, link.counters(), core.buses.get(bus))).collect()
     }
 
     fn protection(&self) -> Vec<Protected> {
-        let checks = |counts: &crate::can::e2e::StatusCounts| {
-            counts.iter().map(|(status, count)| StatusCount { status: status.name().to_owned(), count }).collect()
-        };
-        let each = self.monitor.protected();
-        each.map(|guard| Protected {
-            interface: self.name(guard.bus),
-            id: guard.id.to_string(),
-            checks: checks(&guard.counts),
-        })
-        .collect()
+        let each = self.monitor.protected().map(|guard| {
+            let before = self.before.protected.iter().find(|it| (it.bus, it.id) == (guard.bus, guard.id));
+            let checks = guard.counts.iter().map(|(status, count)| {
+                let before = before.map_or(0, |before| before.counts.get(status));
+                StatusCount { status: status.name().to_owned(), count: count.saturating_sub(before) }
+            });
+            Protected { interface: self.name(guard.bus), id: guard.id.to_string(), checks: checks.collect() }
+        });
+        each.collect()
     }
 
     fn floods(&self) -> Vec<Flooded> {
-        let each = self.monitor.dropped();
-        each.map(|flood| Flooded { interface: self.name(flood.bus), id: flood.id.to_string(), dropped: flood.dropped })
-            .collect()
+        let each = self.monitor.dropped().map(|flood| {
+            let before = self.before.floods.iter().find(|it| (it.bus, it.id) == (flood.bus, flood.id));
+            let dropped = flood.dropped.saturating_sub(before.map_or(0, |before| before.dropped));
+            Flooded { interface: self.name(flood.bus), id: flood.id.to_string(), dropped }
+        });
+        each.filter(|flood| flood.dropped > 0).collect()
     }
 }
 

@@ -60,7 +60,7 @@ pub(crate) struct Document {
     pub(crate) floods: Vec<Flooded>,
     /// From the kernel's receive stamp of a frame to its estimate.
     pub(crate) latency: Latency,
-    /// The store of what is learned; `None` = there is none.
+    /// The store of what is learned; `None` = none is wanted.
     pub(crate) store: Option<Store>,
     /// The latest events but those of single cells' half-cycles, oldest first, as `--events` writes them.
     pub(crate) events: Vec<serde_json::Value>,
@@ -75,7 +75,7 @@ pub struct ConfigFile {
     pub sha256: String,
 }
 
-/// One interface. Its counts are since the program's start, but those of frames and error frames, which go on.
+/// One interface.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Interface {
     /// Kernel name.
@@ -125,7 +125,7 @@ pub(crate) struct Pack {
     pub(crate) voltage_v: Option<f64>,
     /// Current, positive = discharge.
     pub(crate) current_a: Option<f64>,
-    /// Highest temperature.
+    /// Highest temperature, while all sensors are fresh.
     pub(crate) temperature_max_c: Option<f64>,
     /// The cell with the least capacity, once every cell was learned.
     pub(crate) weakest_cell: Option<u16>,
@@ -178,7 +178,7 @@ pub(crate) struct Cell {
     pub(crate) resistance_ratio: Option<f64>,
     /// Its standard deviation.
     pub(crate) resistance_ratio_std: Option<f64>,
-    /// Whether the filter agrees with itself.
+    /// Whether the filter agrees with itself; of a cell without SOC that is not known.
     pub(crate) trusted: Option<bool>,
 }
 
@@ -199,11 +199,15 @@ pub(crate) struct Alarms {
     pub(crate) omitted: usize,
 }
 
-/// Counts. `core` and `readings` go on after a restart with a stored state, the others begin with the program.
+/// Counts. All begin with the program, as those of interfaces, protected messages and floods do, but `lifetime`: what goes on
+/// from a stored state may be a minute old after a power cut, and a counter that falls is a lie to those who add up differences.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Counters {
     /// What the core has done.
     pub(crate) core: Statistics,
+    /// The same since the first start, as far as it was stored; without the interfaces.
+    #[serde(default)]
+    pub(crate) lifetime: Statistics,
     /// Readings by what became of them.
     pub(crate) readings: ReadingCounts,
     /// Inputs whose time was before that of an earlier one.
@@ -279,7 +283,7 @@ pub(crate) struct Flooded {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct Store {
-    /// Its folder.
+    /// Its folder; empty when it could not be opened.
     pub(crate) path: String,
     /// Whether it can be written; `None` = not tried yet.
     pub(crate) works: Option<bool>,

@@ -3,6 +3,7 @@
 //! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`), counters end with
 //!   `_total`, cells count from 1 as people do.
 //! * What is not known is left out: a value that is there is a value that holds.
+//! * Counters begin with the daemon's process (`packwatch_uptime_seconds`), all of them, as those who add up increases expect.
 //! * Without a daemon there is `packwatch_up 0` and nothing else.
 
 use std::collections::HashSet;
@@ -99,19 +100,12 @@ impl Families<'_> {
         Ok(())
     }
 
-    fn counter(
-        &mut self,
-        name: &str,
-        unit: &str,
-        help: &str,
-        samples: impl IntoIterator<Item = (Labels, u64)>,
-    ) -> fmt::Result {
+    fn counter(&mut self, name: &str, help: &str, samples: impl IntoIterator<Item = (Labels, u64)>) -> fmt::Result {
         let mut samples = samples.into_iter().peekable();
         if samples.peek().is_none() {
             return Ok(());
         }
-        let unit = (!unit.is_empty()).then(|| Unit::Other(unit.to_owned()));
-        let mut family = self.0.encode_descriptor(name, help, unit.as_ref(), MetricType::Counter)?;
+        let mut family = self.0.encode_descriptor(name, help, None, MetricType::Counter)?;
         let exemplar: Option<&Exemplar<NoLabelSet, u64>> = None;
         for (labels, value) in samples {
             if labels.is_empty() {
@@ -192,7 +186,7 @@ fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     let states = all.iter().map(|it| (named(&it.name), up(it.state)));
     families.gauge("interface_up", "", "Whether the interface is up", states)?;
     let mut counts = |name, help, of: fn(&super::document::Interface) -> u64| {
-        families.counter(name, "", help, all.iter().map(|it| (named(&it.name), of(it))))
+        families.counter(name, help, all.iter().map(|it| (named(&it.name), of(it))))
     };
     counts("interface_reconnects", "Times the interface came up again", |it| it.reconnects)?;
     counts("interface_received_frames", "Frames taken in", |it| it.frames)?;
@@ -204,14 +198,14 @@ fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
         let reasons = [("kernel", it.kernel_dropped), ("queue", it.queue_dropped), ("malformed", it.malformed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
-    families.counter("interface_dropped_frames", "", "Received frames that were lost", dropped)?;
+    families.counter("interface_dropped_frames", "Received frames that were lost", dropped)?;
     let unsent = all.iter().flat_map(|it| {
         let reasons = [("queue", it.send_queue_full), ("kernel", it.send_failed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
-    families.counter("interface_unsent_frames", "", "Frames that could not be sent", unsent)?;
+    families.counter("interface_unsent_frames", "Frames that could not be sent", unsent)?;
     let flooded = document.floods.iter().map(|flood| (message(&flood.interface, &flood.id), flood.dropped));
-    families.counter("message_flood_dropped_frames", "", "Frames of a message beyond the rate taken in", flooded)?;
+    families.counter("message_flood_dropped_frames", "Frames of a message beyond the rate taken in", flooded)?;
     let checks = document.protection.iter().flat_map(|protected| {
         protected.checks.iter().map(|check| {
             let mut labels = message(&protected.interface, &protected.id);
@@ -219,7 +213,7 @@ fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
             (labels, check.count)
         })
     });
-    families.counter("message_protection_checks", "", "End-to-end checks of a message by their status", checks)
+    families.counter("message_protection_checks", "End-to-end checks of a message by their status", checks)
 }
 
 fn message(interface: &str, id: &str) -> Labels {
@@ -233,14 +227,24 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
         ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
         ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
-        ("pack_temperature_max", "celsius", "Highest temperature", pack.temperature_max_c),
+        (
+            "pack_temperature_max",
+            "celsius",
+            "Highest temperature, while all sensors tell theirs",
+            pack.temperature_max_c,
+        ),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),
         ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
-        ("pack_capacity_std", "amperehours", "Standard deviation of that", pack.capacity_std_ah),
+        ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
-        ("pack_usable_capacity_std", "amperehours", "Standard deviation of that", pack.usable_capacity_std_ah),
+        (
+            "pack_usable_capacity_std",
+            "amperehours",
+            "Standard deviation of the least usable capacity",
+            pack.usable_capacity_std_ah,
+        ),
         ("pack_recharge_period", "seconds", "Last recharge period", pack.recharge_period_s),
         (
             "pack_recharge_period_normalised",
@@ -251,7 +255,7 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
         (
             "pack_recharge_period_normalised_std",
             "seconds",
-            "Standard deviation of that",
+            "Standard deviation of the recharge period with the reference charger",
             pack.normalised_recharge_period_std_s,
         ),
         ("pack_reported_soc", "ratio", "State of charge as the pack reports it", pack.reported_soc),
@@ -270,11 +274,15 @@ const CELL_ROWS: [CellRow; 12] = [
     ("cell_soc", "ratio", "State of charge", |cell| cell.soc),
     ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
-    ("cell_capacity_std", "amperehours", "Standard deviation of that", |cell| cell.capacity_std_ah),
+    ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
     ("cell_usable_capacity", "amperehours", "Usable capacity", |cell| cell.usable_capacity_ah),
-    ("cell_usable_capacity_std", "amperehours", "Standard deviation of that", |cell| cell.usable_capacity_std_ah),
+    ("cell_usable_capacity_std", "amperehours", "Standard deviation of the usable capacity", |cell| {
+        cell.usable_capacity_std_ah
+    }),
     ("cell_resistance", "ratio", "Resistance relative to new", |cell| cell.resistance_ratio),
-    ("cell_resistance_std", "ratio", "Standard deviation of that", |cell| cell.resistance_ratio_std),
+    ("cell_resistance_std", "ratio", "Standard deviation of the resistance relative to new", |cell| {
+        cell.resistance_ratio_std
+    }),
     ("cell_trusted", "", "Whether the filter agrees with itself", |cell| cell.trusted.and_then(flag)),
 ];
 
@@ -299,18 +307,18 @@ fn alarms(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     families.gauge("alarm_active", "", "An alarm that is raised", active)?;
     let raised = Severity::ALL
         .map(|severity| (label("severity", severity.name()), document.counters.core.alarms_raised.get(severity)));
-    families.counter("alarms_raised", "", "Times an alarm was raised", raised)
+    families.counter("alarms_raised", "Times an alarm was raised", raised)
 }
 
 fn readings(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     let readings = &document.counters.readings;
-    families.counter("readings_accepted", "", "Readings used", one(readings.accepted))?;
+    families.counter("readings_accepted", "Readings used", one(readings.accepted))?;
     let rejected = readings.rejected().map(|(reason, count)| (label("reason", reason), count));
-    families.counter("readings_rejected", "", "Readings not used", rejected)?;
-    families.counter("readings_unused", "", "Readings that feed nothing", one(readings.unused))?;
-    families.counter("signals_stale", "", "Times a signal became too old", one(readings.stale))?;
+    families.counter("readings_rejected", "Readings not used", rejected)?;
+    families.counter("readings_unused", "Readings that feed nothing", one(readings.unused))?;
+    families.counter("signals_stale", "Times a signal became too old", one(readings.stale))?;
     let levels = one(readings.levels_believed);
-    families.counter("signal_levels_believed", "", "Steps of a signal refused at first, then believed", levels)
+    families.counter("signal_levels_believed", "Steps of a signal refused at first, then believed", levels)
 }
 
 fn core(families: &mut Families<'_>, document: &Document) -> fmt::Result {
@@ -334,7 +342,7 @@ fn core(families: &mut Families<'_>, document: &Document) -> fmt::Result {
         ("state_restores", "Times a stored state was taken up", core.restores),
         ("file_failures", "Times a file could not be written any more", core.store_failures),
     ];
-    rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, "", help, one(count)))
+    rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, help, one(count)))
 }
 
 fn service(families: &mut Families<'_>, document: &Document) -> fmt::Result {
@@ -349,7 +357,7 @@ fn service(families: &mut Families<'_>, document: &Document) -> fmt::Result {
         ("status_clients_refused", "Clients turned away, too many at once", clients.refused),
         ("status_clients_dropped", "Clients that did not take what they were sent", clients.dropped),
     ];
-    rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, "", help, one(count)))?;
+    rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, help, one(count)))?;
     let lateness = one(Some(service.worst_lateness_s));
     families.gauge("tick_lateness_max", "seconds", "The latest a tick ever came", lateness)?;
     let latency = &document.latency;
@@ -364,9 +372,9 @@ fn service(families: &mut Families<'_>, document: &Document) -> fmt::Result {
 fn store(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     let Some(store) = &document.store else { return Ok(()) };
     families.gauge("store_works", "", "Whether the store can be written", one(store.works.and_then(flag)))?;
-    families.counter("store_commits", "", "Commits done", one(store.commits))?;
-    families.counter("store_failures", "", "Commits that failed", one(store.failures))?;
-    families.counter("store_late", "", "Results told before they were stored", one(store.late))?;
+    families.counter("store_commits", "Commits done", one(store.commits))?;
+    families.counter("store_failures", "Commits that failed", one(store.failures))?;
+    families.counter("store_late", "Results told before they were stored", one(store.late))?;
     let size = one(store.file_bytes.map(|bytes| bytes as f64));
     families.gauge("store_size", "bytes", "Size of the store's files", size)
 }

@@ -33,6 +33,7 @@ pub(crate) fn sample(cells: u16) -> Document {
         alarms: alarms(),
         counters: Counters {
             core: core(),
+            lifetime: Statistics { buses: Vec::new(), half_cycles: 1200, ..core() },
             readings: ReadingCounts { accepted: 123_456, out_of_range: 7, ..ReadingCounts::default() },
             time_backwards: 2,
             service: ServiceCounters {

@@ -12,6 +12,7 @@ use rusqlite::types::Value;
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Transaction, TransactionBehavior, params};
 
 use super::chain::Head;
+use super::document::Document;
 use super::parts::Parts;
 use super::rows::{Batch, Row, Table};
 use super::schema::{self, MIGRATIONS};
@@ -110,6 +111,8 @@ pub(crate) struct StateRecord {
     pub(crate) parts: Parts,
     /// To the last bit (on stop), not rounded.
     pub(crate) exact: bool,
+    /// The state stored so far is kept beside it: nobody has taken it up.
+    pub(crate) sets_aside: bool,
 }
 
 /// A state as it was stored.
@@ -188,7 +191,11 @@ impl Database {
         }
         let packed = match state {
             None => None,
-            Some(StateRecord { parts, exact }) => {
+            Some(StateRecord { parts, exact, sets_aside }) => {
+                if sets_aside {
+                    set_aside(&transaction)?;
+                    self.shelf = Shelf::default();
+                }
                 let packed = self.shelf.pack(parts, exact);
                 write_state(&transaction, &packed)?;
                 Some(packed)
@@ -205,7 +212,12 @@ impl Database {
 
     /// The latest state; `None` = none was stored. A damaged one is an error in words: the history may still be good.
     pub(crate) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-        read_state(&self.connection, &self.shelf)
+        read_state(&self.connection, &self.shelf, STATE)
+    }
+
+    /// The state that was set aside; `None` = there is none, or it is not good.
+    pub(crate) fn state_aside(&self) -> Option<Document> {
+        read_document(&self.connection, ASIDE)
     }
 
     /// When in this boot another pack was connected last, boot time.
@@ -242,16 +254,18 @@ impl Database {
         Ok(ledger.pack)
     }
 
-    /// Keeps the stored state where the next checkpoint does not overwrite it.
-    pub(super) fn put_state_aside(&mut self) -> rusqlite::Result<()> {
-        self.connection.execute("UPDATE OR REPLACE state SET slot = slot + 10 WHERE slot < 10", [])?;
-        self.shelf = Shelf::default();
-        Ok(())
-    }
-
     /// For rows copied from a damaged database.
     pub(super) fn parts_mut(&mut self) -> (&mut Connection, &mut Ledger) {
         (&mut self.connection, &mut self.ledger)
+    }
+
+    /// Closes it with everything in the one file.
+    pub(super) fn close(self) -> rusqlite::Result<()> {
+        let is_busy: bool = self.connection.query_row("PRAGMA wal_checkpoint(TRUNCATE)", [], |row| row.get(0))?;
+        if is_busy {
+            return Err(rusqlite::Error::SqliteFailure(rusqlite::ffi::Error::new(rusqlite::ffi::SQLITE_BUSY), None));
+        }
+        self.connection.close().map_err(|(_, error)| error)
     }
 
     /// The connection, for looking.
@@ -262,34 +276,58 @@ impl Database {
 
     fn fill_shelf(&mut self) -> rusqlite::Result<()> {
         // A damaged one is told when the state is asked for.
-        self.shelf = read_shelf(&self.connection)?;
+        self.shelf = read_shelf(&self.connection, STATE)?;
         Ok(())
     }
 }
 
+/// First slot of the state.
+pub(super) const STATE: i64 = 0;
+/// Serial number of a delta to nothing.
+const NO_SERIAL: i64 = -1;
+/// First slot of a state that was set aside.
+pub(super) const ASIDE: i64 = 10;
+
 /// The shelf with the full record that is stored, if it is good.
-pub(super) fn read_shelf(connection: &Connection) -> rusqlite::Result<Shelf> {
-    let Some(full) = slot(connection, 0)? else { return Ok(Shelf::default()) };
-    let room = slot(connection, 1)?.map_or(0, |delta| delta.room);
+fn read_shelf(connection: &Connection, first: i64) -> rusqlite::Result<Shelf> {
+    let Some(full) = slot(connection, first)? else { return Ok(Shelf::default()) };
+    let room = slot(connection, first + 1)?.map_or(0, |delta| delta.room);
     Ok(Shelf::with_base(full.serial, &full.record, room).unwrap_or_default())
 }
 
 /// As [`Database::state`].
-pub(super) fn read_state(
+fn read_state(
     connection: &Connection,
     shelf: &Shelf,
+    first: i64,
 ) -> rusqlite::Result<Result<Option<StoredState>, String>> {
-    if slot(connection, 0)?.is_none() {
+    if slot(connection, first)?.is_none() {
         return Ok(Ok(None));
     }
     let Some((serial, base)) = shelf.base() else { return Ok(Err("the stored state is damaged".to_owned())) };
-    let delta = slot(connection, 1)?.filter(|delta| delta.serial == serial);
+    let delta = slot(connection, first + 1)?.filter(|delta| delta.serial == serial);
     let (parts, lost_later) = match delta.map(|slot| packed::read_delta(&slot.record, base, serial)) {
         None => (base.clone(), None),
         Some(Ok(parts)) => (parts, None),
         Some(Err(damaged)) => (base.clone(), Some(damaged.to_string())),
     };
     Ok(Ok(Some(StoredState { json: parts.join(), lost_later })))
+}
+
+/// The document of a state from this slot on, if it is good.
+pub(super) fn read_document(connection: &Connection, first: i64) -> Option<Document> {
+    let shelf = read_shelf(connection, first).ok()?;
+    let stored = read_state(connection, &shelf, first).ok()?.ok()??;
+    Document::parse(&stored.json).ok()
+}
+
+/// Keeps the stored state where no checkpoint overwrites it, in place of one that was kept before.
+fn set_aside(transaction: &Transaction<'_>) -> rusqlite::Result<()> {
+    transaction.execute(
+        "DELETE FROM state WHERE slot >= ?1 AND EXISTS (SELECT 1 FROM state WHERE slot = ?2)",
+        [ASIDE, STATE],
+    )?;
+    transaction.execute("UPDATE state SET slot = slot + ?1 WHERE slot < ?1", [ASIDE]).map(drop)
 }
 
 fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
@@ -299,7 +337,11 @@ fn has_tables(connection: &Connection) -> rusqlite::Result<bool> {
 /// Settings of the connection, and of the file while it is new.
 fn prepare(connection: &Connection) -> rusqlite::Result<()> {
     connection.pragma_update(None, "page_size", PAGE_BYTES)?;
-    connection.query_row("PRAGMA journal_mode = WAL", [], |_| Ok(()))?;
+    let mode: String = connection.query_row("PRAGMA journal_mode = WAL", [], |row| row.get(0))?;
+    if mode != "wal" {
+        // As safe, but every commit is written twice and made last twice: on a file system without shared memory.
+        tracing::warn!(mode, "the file system allows the database no write-ahead log: more is written");
+    }
     connection.pragma_update(None, "synchronous", "FULL")?;
     connection.pragma_update(None, "cache_size", -i64::from(CACHE_KIB))?;
     connection.pragma_update(None, "temp_store", "MEMORY")?;
@@ -357,12 +399,14 @@ pub(super) fn write_ledger(connection: &Connection, ledger: &Ledger) -> rusqlite
 /// Columns of a moment in a chained row.
 pub(super) const MOMENT_COLUMNS: usize = 6;
 
-/// The number, the hash and the chained values of a table's rows, in the order of the chain.
-pub(super) fn chained_sql(table: Table) -> String {
+/// Rows of a table: number and hash (of a half-cycle, which has none: moment and cell), the moment's values, the row's own.
+/// `tail` says which and in which order.
+pub(super) fn rows_sql(table: Table, tail: &str) -> String {
     let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
+    let own = if table == Table::HalfCycle { "r.moment, r.cell" } else { "r.seq, r.hash" };
     format!(
-        "SELECT r.seq, r.hash, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, {} FROM {} r LEFT JOIN moment m \
-         ON m.id = r.moment ORDER BY r.seq",
+        "SELECT {own}, r.moment, m.wall_ns, m.time_ns, m.boottime_ns, m.boot, m.pack, {} FROM {} r LEFT JOIN moment m ON \
+         m.id = r.moment {tail}",
         columns.join(", "),
         table.name()
     )
@@ -437,13 +481,15 @@ fn replace_pack(connection: &Connection, ledger: &mut Ledger, stamp: &Stamp) -> 
         params![ledger.pack, stamp.wall_ns],
     )?;
     ledger.pack += 1;
+    // A state of the pack that has gone must not come back.
+    connection.execute("DELETE FROM state WHERE slot >= ?1", [ASIDE])?;
     connection
         .execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![ledger.pack, stamp.wall_ns])
         .map(drop)
 }
 
 fn write_state(transaction: &Transaction<'_>, packed: &super::shelf::Packed) -> rusqlite::Result<()> {
-    let slot = i64::from(!packed.is_full);
+    let slot = STATE + i64::from(!packed.is_full);
     let length = i64::try_from(packed.length).unwrap_or(i64::MAX);
     let values = params![slot, packed.serial, length, packed.bytes];
     // An update of equal length overwrites in place, page by changed page.
@@ -452,6 +498,10 @@ fn write_state(transaction: &Transaction<'_>, packed: &super::shelf::Packed) -> 
         .execute(values)?;
     if updated == 0 {
         transaction.execute("INSERT INTO state VALUES (?1, ?2, ?3, ?4)", values)?;
+    }
+    if packed.is_full {
+        // Serial numbers begin anew when a full record was lost: an old delta must never fit a new one. Its room is kept.
+        transaction.execute("UPDATE state SET serial = ?2 WHERE slot = ?1", [STATE + 1, NO_SERIAL])?;
     }
     Ok(())
 }

@@ -1,8 +1,11 @@
 //! Frames that wait until what they announce is on the disk.
 //!
-//! Frames of one input wait together for one ticket; later frames of the same identifier on the same interface wait
-//! behind them, so that nobody sees them in another order (their counters count). All others go at once. Nothing waits
-//! longer than [`MAX_WAIT`]: an alarm that is not on the disk is worth more than one that is not on the bus.
+//! What announces ([`Transmit::announces`]) waits, all of it, for as long as anything learned is not yet on the disk: not
+//! only the frames of the input that taught it, but also the cyclic ones that come meanwhile and would tell the same, and
+//! the later packets of a transfer whose first one waits. They go in the order in which they came. The status frame is not
+//! held: state of charge and validity must not grow old; it tells how many alarms are raised, and of none which.
+//!
+//! Nothing waits longer than [`MAX_WAIT`]: an alarm that is not on the disk is worth more than one that is not on the bus.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -31,15 +34,11 @@ impl Hold {
         self.tickets.push_back((ticket, now + MAX_WAIT));
     }
 
-    /// The ticket a frame must wait for because an earlier one of its identifier does.
-    pub(crate) fn behind(&self, transmit: &Transmit) -> Option<u64> {
-        let same = |held: &&(u64, Transmit)| held.1.bus == transmit.bus && held.1.frame.id() == transmit.frame.id();
-        self.held.iter().rev().find(same).map(|(ticket, _)| *ticket)
-    }
-
-    /// Lets a frame wait.
-    pub(crate) fn push(&mut self, ticket: u64, transmit: Transmit) {
-        self.held.push_back((ticket, transmit));
+    /// Lets a frame wait, where it announces something and a ticket is open; `false` = it may go.
+    pub(crate) fn take(&mut self, transmit: &Transmit) -> bool {
+        let last = self.tickets.back().filter(|_| transmit.announces);
+        self.held.extend(last.map(|(ticket, _)| (*ticket, *transmit)));
+        last.is_some()
     }
 
     /// Everything up to `ticket` is answered: its frames go.
@@ -71,9 +70,9 @@ mod tests {
     use crate::can::{CanId, Frame};
     use crate::quantity::{BusIndex, Timestamp};
 
-    fn frame(bus: u8, id: u32, data: u8) -> Transmit {
-        let id = CanId::standard(id).unwrap();
-        Transmit { time: Timestamp::ZERO, bus: BusIndex(bus), frame: Frame::classic(id, &[data]).unwrap() }
+    fn frame(id: u32, data: u8) -> Transmit {
+        let frame = Frame::classic(CanId::standard(id).unwrap(), &[data]).unwrap();
+        Transmit { time: Timestamp::ZERO, bus: BusIndex(0), frame, announces: true }
     }
 
     fn sent(hold: &mut Hold, ticket: u64) -> Vec<u8> {
@@ -83,21 +82,23 @@ mod tests {
     }
 
     #[test]
-    fn frames_of_one_identifier_keep_their_order_and_others_pass() {
+    fn while_a_ticket_is_open_all_that_announces_waits_and_keeps_its_order() {
         let now = Instant::now();
         let mut hold = Hold::default();
+        let (control, data, health) = (0x10, 0x11, 0x12);
+        assert!(!hold.take(&frame(health, 0)), "nothing to wait for");
         hold.begin(1, now);
-        hold.push(1, frame(0, 0x10, 1));
-        assert_eq!(hold.behind(&frame(0, 0x10, 2)), Some(1));
-        assert_eq!(hold.behind(&frame(0, 0x11, 2)), None);
-        assert_eq!(hold.behind(&frame(1, 0x10, 2)), None);
-        hold.push(1, frame(0, 0x10, 2));
+        // A transfer's announcement, its packets by later ticks, a cyclic frame between.
+        for (id, data) in [(control, 1), (data, 2), (health, 3), (data, 4)] {
+            assert!(hold.take(&frame(id, data)));
+        }
+        assert!(!hold.take(&Transmit { announces: false, ..frame(0x13, 9) }), "a state goes");
         hold.begin(2, now);
-        hold.push(2, frame(0, 0x12, 3));
-        hold.push(2, frame(0, 0x10, 4));
-        assert_eq!(hold.behind(&frame(0, 0x10, 5)), Some(2));
-        assert_eq!(sent(&mut hold, 1), [1, 2]);
-        assert_eq!(sent(&mut hold, 2), [3, 4]);
+        assert!(hold.take(&frame(data, 5)));
+        assert_eq!(sent(&mut hold, 1), [1, 2, 3, 4]);
+        assert!(hold.take(&frame(health, 6)));
+        assert_eq!(sent(&mut hold, 2), [5, 6]);
+        assert!(!hold.take(&frame(health, 7)), "all is on the disk");
     }
 
     #[test]

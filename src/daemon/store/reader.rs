@@ -14,8 +14,10 @@ use super::rows::Table;
 use super::schema;
 use super::verify::{self, Verdict};
 
-/// Largest database that is copied to be read, bytes: what a temporary folder can be asked for.
+/// Largest database that is copied to be read, with its log, bytes: what a temporary folder can be asked for.
 const MAX_COPY_BYTES: u64 = 256 << 20;
+/// The same for the daemon at its start: the temporary folder may be in the memory it is allowed.
+pub(super) const MAX_DAEMON_COPY_BYTES: u64 = 8 << 20;
 
 /// A store open for looking.
 #[derive(Debug)]
@@ -112,12 +114,17 @@ impl Reader {
     /// # Errors
     /// When there is none, or it cannot be read; names the file.
     pub fn open(folder: &Path) -> Result<Self, String> {
+        Self::open_within(folder, MAX_COPY_BYTES)
+    }
+
+    /// As [`Reader::open`], with another limit to what is copied where it cannot be read in its place.
+    pub(super) fn open_within(folder: &Path, max_copy_bytes: u64) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
         if !path.exists() {
             return Err(named("no history there; --state says where the daemon keeps it".to_owned()));
         }
-        let (connection, copy) = open_read_only(&path).map_err(named)?;
+        let (connection, copy) = open_read_only(&path, max_copy_bytes).map_err(named)?;
         let reader = Self { connection, path: path.clone(), copy };
         let version = schema::version(&reader.connection).map_err(|error| named(error.to_string()))?;
         let known = schema::known(schema::MIGRATIONS);
@@ -141,9 +148,7 @@ impl Reader {
 
     /// The stored state, if it is good.
     pub(super) fn state(&self) -> Option<Document> {
-        let shelf = database::read_shelf(&self.connection).ok()?;
-        let stored = database::read_state(&self.connection, &shelf).ok()?.ok()??;
-        Document::parse(&stored.json).ok()
+        database::read_document(&self.connection, database::STATE)
     }
 
     /// The wanted rows in the order in which they were written.
@@ -227,7 +232,7 @@ fn json(value: Value) -> serde_json::Value {
 
 /// Opens for reading: as it is, beside a daemon that writes; else, on a disk that cannot be written, where SQLite
 /// cannot make its index of the log, a copy.
-fn open_read_only(path: &Path) -> Result<(Connection, Option<PathBuf>), String> {
+fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<PathBuf>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let readable = |connection: &Connection| -> rusqlite::Result<()> {
         connection.busy_timeout(std::time::Duration::from_secs(1))?;
@@ -245,20 +250,28 @@ fn open_read_only(path: &Path) -> Result<(Connection, Option<PathBuf>), String> 
     if !matches!(code, Some(rusqlite::ErrorCode::CannotOpen | rusqlite::ErrorCode::ReadOnly)) {
         return Err(error.to_string());
     }
-    let folder = copy_beside_nothing(path).map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
+    let folder = copy_beside_nothing(path, max_copy_bytes)
+        .map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
     // A copy may be written: SQLite makes its index there.
     let opened = Connection::open(folder.join(DATABASE)).and_then(|connection| {
         readable(&connection)?;
         Ok(connection)
     });
-    opened.map(|connection| (connection, Some(folder))).map_err(|error| error.to_string())
+    match opened {
+        Ok(connection) => Ok((connection, Some(folder))),
+        Err(error) => {
+            let _ = fs::remove_dir_all(&folder);
+            Err(error.to_string())
+        }
+    }
 }
 
 /// Copies a database and its log into a folder of its own in the temporary folder.
-fn copy_beside_nothing(path: &Path) -> std::io::Result<PathBuf> {
-    let bytes = fs::metadata(path)?.len();
-    if bytes > MAX_COPY_BYTES {
-        return Err(std::io::Error::other(format!("{bytes} bytes, at most {MAX_COPY_BYTES} are copied")));
+fn copy_beside_nothing(path: &Path, max_bytes: u64) -> std::io::Result<PathBuf> {
+    let log_bytes = fs::metadata(with_suffix(path, "-wal")).map_or(0, |file| file.len());
+    let bytes = fs::metadata(path)?.len() + log_bytes;
+    if bytes > max_bytes {
+        return Err(std::io::Error::other(format!("{bytes} bytes, at most {max_bytes} are copied")));
     }
     let folder = std::env::temp_dir().join(format!("packwatch-history-{}", std::process::id()));
     fs::create_dir(&folder)?;
@@ -274,5 +287,23 @@ fn copy_beside_nothing(path: &Path) -> std::io::Result<PathBuf> {
             let _ = fs::remove_dir_all(&folder);
             Err(error)
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_so_much_is_copied_the_log_counted() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join(DATABASE);
+        fs::write(&path, [0; 600]).unwrap();
+        fs::write(with_suffix(&path, "-wal"), [0; 500]).unwrap();
+        let refused = copy_beside_nothing(&path, 1000).unwrap_err().to_string();
+        assert_eq!(refused, "1100 bytes, at most 1000 are copied");
+        let copy = copy_beside_nothing(&path, 1100).unwrap();
+        assert!(with_suffix(&copy.join(DATABASE), "-wal").exists());
+        fs::remove_dir_all(copy).unwrap();
     }
 }

@@ -4,9 +4,10 @@ use std::path::Path;
 
 use super::database::{Database, StateRecord};
 use super::document::Document;
-use super::folder::{DATABASE, Folder};
+use super::folder::{self, DATABASE, Folder};
+use super::gatherer::{Gatherer, Worth};
 use super::parts::Parts;
-use super::rows::{Batch, Gatherer, Worth};
+use super::rows::Batch;
 use super::stamp::Stamp;
 use crate::config::StoreConfig;
 use crate::monitor::{Event, Monitor};
@@ -30,7 +31,7 @@ impl Recorder {
     /// When there is one, or it cannot be made: a replay must never get into the history of a real pack.
     pub fn create(path: &Path, config: &StoreConfig) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
-        if path.join(DATABASE).exists() {
+        if folder::has_history(path) {
             return Err(format!("{shown}: exists; a replay needs a state folder of its own, name a new one"));
         }
         let mut folder = Folder::new(path.to_owned(), config.max_half_cycles);
@@ -53,7 +54,8 @@ impl Recorder {
             return Ok(());
         }
         self.checkpointed = Some(now);
-        let rows = rows.filter(|rows| !rows.is_empty());
+        let rows = rows.unwrap_or_else(|| self.gatherer.for_checkpoint(now));
+        let rows = Some(rows).filter(|rows| !rows.is_empty());
         let batches: Vec<Batch> = rows.map(|rows| Batch { stamp: Stamp::replayed(now), rows }).into_iter().collect();
         self.write(&batches, monitor, now, false)
     }
@@ -73,7 +75,7 @@ impl Recorder {
         };
         let json = document.to_json().map_err(|error| error.to_string())?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
-        let written = self.database.commit(batches, Some(StateRecord { parts, exact }));
+        let written = self.database.commit(batches, Some(StateRecord { parts, exact, sets_aside: false }));
         written.map_err(|error| format!("{}: {error}", self.folder))
     }
 }

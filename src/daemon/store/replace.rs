@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
-use super::database::{Database, OpenError};
-use super::folder::{DATABASE, Folder};
+use super::folder::{self, DATABASE, Folder, Opening};
+use super::rows::Batch;
 use super::stamp::{BootId, Stamp};
 use crate::config::DEFAULT_MAX_HALF_CYCLES;
 use crate::io::clock::Reading;
@@ -16,7 +16,7 @@ use crate::quantity::Timestamp;
 pub fn replace_pack(path: &Path) -> Result<i64, String> {
     let file = path.join(DATABASE);
     let named = |error: String| format!("{}: {error}", file.display());
-    if !file.is_file() {
+    if !folder::has_history(path) {
         return Err(named("no daemon runs, and there is no history; --state says where it is kept".to_owned()));
     }
     let mut folder = Folder::new(path.to_owned(), DEFAULT_MAX_HALF_CYCLES);
@@ -27,7 +27,11 @@ pub fn replace_pack(path: &Path) -> Result<i64, String> {
         _ => named(error.to_string()),
     })?;
     let now = Stamp::now(Timestamp::from_nanos(Reading::now().realtime_ns), BootId::current());
-    let open = Database::open(&file, &now, DEFAULT_MAX_HALF_CYCLES);
-    let mut database = open.map_err(|error: OpenError| named(error.to_string()))?;
+    // As the daemon opens it: what is damaged is noticed, and told in the history that is closed.
+    let opening = folder.open(&now).map_err(|error| named(error.to_string()))?;
+    let Opening { mut database, rows, .. } = opening;
+    if !rows.is_empty() {
+        database.commit(&[Batch { stamp: now, rows }], None).map_err(|error| named(error.to_string()))?;
+    }
     database.replace_pack(&now).map_err(|error| named(error.to_string()))
 }

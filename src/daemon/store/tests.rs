@@ -1,7 +1,10 @@
 //! A real state through the store and back.
 
+mod rounding;
+
 use std::fmt::Write as _;
 use std::path::PathBuf;
+use std::time::{Duration, Instant};
 
 use super::database::Database;
 use super::folder::DATABASE;
@@ -99,13 +102,13 @@ fn the_database_holds_the_state_in_which_the_replay_ended() {
     let counts = database.counts();
     assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
     let stored = Document::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
-    assert_eq!(stored.stamp.age(&now), Age::Seconds(60.0));
+    assert_eq!(stored.stamp.age(&now, WallClock::Kept), Age::Seconds(60.0));
     assert_eq!(serde_json::to_vec(&stored.snapshot).unwrap(), serde_json::to_vec(&end).unwrap());
     restored(*stored.snapshot);
 }
 
 /// A document of a state taken at `boottime_s` of boot `boot`.
-fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
+pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
     let boot = BootId([boot; 16]);
     let time = Timestamp::from_secs(1.0);
     let stamp = Stamp { wall_ns: wall_s * 1_000_000_000, time, boottime_ns: boottime_s * 1_000_000_000, boot };
@@ -118,7 +121,10 @@ fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
     const WALL_S: i64 = 1_800_000_000;
     let now = document(1, 100, WALL_S).stamp;
     let of = |running: Option<Document>, stored: Option<Document>| -> Vec<(&str, Away)> {
-        candidates(running, stored, &now).into_iter().map(|candidate| (candidate.source, candidate.away)).collect()
+        candidates(running, stored, &now, WallClock::Kept)
+            .into_iter()
+            .map(|candidate| (candidate.source, candidate.away))
+            .collect()
     };
     let (running, stored) = (|at| Some(document(1, at, 0)), |at| Some(document(1, at, 0)));
     let both = |first, second| [(first, Away::Seconds(2.0)), (second, Away::Seconds(50.0))];
@@ -171,6 +177,34 @@ fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
 }
 
 #[test]
+fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    std::fs::write(&state, "").unwrap();
+    let (store, _) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let store = store.unwrap();
+    let mut progress = store.progress();
+    let (begun, mut changes) = (Instant::now(), 0);
+    while begun.elapsed() < Duration::from_millis(2500) {
+        changes += u32::from(progress.has_changed().unwrap());
+        progress.borrow_and_update();
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    // After 1 s, with 2 s to the next.
+    assert_eq!((changes, progress.borrow().failures), (1, 1));
+    // Tickets answered meanwhile are no attempts.
+    let desk = Arc::clone(&store.desk);
+    for _ in 0..3 {
+        let ticket = desk.leave(None, document(1, 1, 1), false);
+        assert_eq!(answer(&store, ticket).failures, 1);
+    }
+    std::fs::remove_file(&state).unwrap();
+    let monitor = Monitor::new(config().monitor);
+    store.finish(&monitor, Timestamp::from_secs(4.0));
+    assert!(Reader::open(&state).unwrap().state().is_some());
+}
+
+#[test]
 fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the_next_start() {
     let place = tempfile::tempdir().unwrap();
     let (store, _) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
@@ -206,4 +240,72 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     assert_eq!(reader.verify().unwrap().broken, None);
     assert!(reader.state().is_some());
     assert!(place.path().join("packwatch.db.damaged-1").exists());
+}
+
+/// A monitor whose state was taken at that time.
+fn at(seconds: f64) -> Monitor {
+    let mut monitor = Monitor::new(config().monitor);
+    monitor.handle(Input::Tick { time: Timestamp::from_secs(seconds) }, &mut Outputs::default());
+    monitor
+}
+
+fn states(found: &Found) -> Vec<(&'static str, f64)> {
+    found.states.iter().map(|state| (state.source, state.snapshot.time.secs())).collect()
+}
+
+fn reasons(folder: &Path) -> Vec<String> {
+    let filter = Filter { kinds: vec![Kind::Reset], ..Filter::default() };
+    let entries = Reader::open(folder).unwrap().entries(&filter).unwrap();
+    entries.iter().map(|entry| entry.values[1].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
+    const ASIDE: &str = "database, set aside earlier";
+    let place = tempfile::tempdir().unwrap();
+    let open = || {
+        let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+        (store.unwrap(), found)
+    };
+    let finish = |store: Store, seconds: f64| store.finish(&at(seconds), Timestamp::from_secs(seconds));
+    finish(open().0, 1.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 1.0)]);
+    store.set_state_aside("snapshot is of 4 cells", Timestamp::from_secs(2.0));
+    finish(store, 2.0);
+    assert_eq!(reasons(place.path()), ["state_unfit"]);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 2.0), (ASIDE, 1.0)]);
+    // Stays, however many states come after it.
+    finish(store, 3.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 3.0), (ASIDE, 1.0)]);
+    // The edit was undone: they change places.
+    store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
+    finish(store, 4.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 4.0), (ASIDE, 3.0)]);
+    drop(found);
+    finish(store, 5.0);
+    // It belongs to the pack.
+    replace_pack(place.path()).unwrap();
+    assert_eq!(states(&open().1), []);
+}
+
+#[test]
+fn a_state_of_another_version_is_told_and_not_overwritten() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join(DATABASE);
+    let now = document(1, 1, 1).stamp;
+    let mut database = Database::open(&path, &now, 1000).unwrap();
+    let parts = Parts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
+    database.commit(&[], Some(database::StateRecord { parts, exact: true, sets_aside: false })).unwrap();
+    drop(database);
+    let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+    assert!(!found.works && found.states.is_empty());
+    store.unwrap().finish(&at(1.0), Timestamp::from_secs(1.0));
+    assert_eq!(reasons(place.path()), ["state_unfit"]);
+    let database = Database::open(&path, &now, 1000).unwrap();
+    let kept = "SELECT count(*) FROM state WHERE slot IN (0, 10)";
+    assert_eq!(database.connection().query_row(kept, [], |row| row.get::<_, i64>(0)).unwrap(), 2);
 }

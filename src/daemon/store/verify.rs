@@ -46,7 +46,9 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<Verdict> {
     let ledger = database::read_ledger(connection)?;
     let mut statements: Vec<(Table, Statement<'_>)> = Table::CHAINED
         .into_iter()
-        .map(|table| connection.prepare(&database::chained_sql(table)).map(|statement| (table, statement)))
+        .map(|table| {
+            connection.prepare(&database::rows_sql(table, "ORDER BY r.seq")).map(|statement| (table, statement))
+        })
         .collect::<rusqlite::Result<_>>()?;
     let mut cursors = statements
         .iter_mut()

@@ -15,6 +15,8 @@ use super::document::Document;
 use super::folder::{Folder, Opening};
 use super::parts::Parts;
 use super::rows::{Batch, Row};
+use super::stamp::{BootId, Stamp};
+use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -30,6 +32,8 @@ pub(crate) struct Progress {
     pub(crate) works: bool,
     /// Size of the database and its log after the last success, bytes; `None` = none so far.
     pub(crate) file_bytes: Option<u64>,
+    /// Attempts that failed.
+    pub(crate) failures: u64,
 }
 
 /// What the loop leaves for the writer.
@@ -44,6 +48,8 @@ struct Queue {
     backlog: Backlog,
     state: Option<Document>,
     exact: bool,
+    /// The stored state is to be kept beside the next one.
+    sets_aside: bool,
     ticket: u64,
     /// Something is to be done now.
     wanted: bool,
@@ -55,6 +61,7 @@ struct Work {
     batches: Vec<Batch>,
     state: Option<Document>,
     exact: bool,
+    sets_aside: bool,
     ticket: u64,
     stop: bool,
 }
@@ -80,6 +87,11 @@ impl Desk {
     /// Keeps rows for the next commit.
     pub(super) fn keep(&self, rows: Batch) {
         self.lock().backlog.push(rows);
+    }
+
+    /// Nobody has taken up the stored state: the next one does not overwrite it.
+    pub(super) fn set_aside(&self) {
+        self.lock().sets_aside = true;
     }
 
     /// The last thing the writer will be asked.
@@ -108,7 +120,8 @@ impl Desk {
         let state = queue.state.take();
         // Rows go with the state they were learned in.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
-        Work { batches, state, exact: std::mem::take(&mut queue.exact), ticket: queue.ticket, stop: queue.stop }
+        let (exact, sets_aside) = (std::mem::take(&mut queue.exact), std::mem::take(&mut queue.sets_aside));
+        Work { batches, state, exact, sets_aside, ticket: queue.ticket, stop: queue.stop }
     }
 
     fn put_back(&self, batches: Vec<Batch>, state: Option<Document>) {
@@ -127,8 +140,12 @@ pub(super) struct Writer {
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<Progress>,
     pub(super) retry: Retry,
+    /// Attempts that failed.
+    pub(super) failures: u64,
     /// The daemon began with what the database had, or it had nothing.
     pub(super) knows_state: bool,
+    /// The stored state is kept beside the next one.
+    pub(super) sets_aside: bool,
 }
 
 /// When a failed disk is tried again.
@@ -155,7 +172,8 @@ impl Writer {
     pub(super) fn run(mut self) {
         loop {
             let work = self.desk.take(self.retry.at);
-            let Work { batches, state, exact, ticket, stop } = work;
+            let Work { batches, state, exact, sets_aside, ticket, stop } = work;
+            self.sets_aside |= sets_aside;
             // The last attempt before the end is made whenever it is.
             let works = if self.retry.is_due() || stop {
                 self.write(batches, state, exact)
@@ -165,20 +183,26 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            self.progress.send_replace(Progress { ticket, works, file_bytes });
+            let progress = Progress { ticket, works, file_bytes, failures: self.failures };
+            self.progress.send_if_modified(|told| std::mem::replace(told, progress) != progress);
             if stop {
                 return;
             }
         }
     }
 
-    /// One transaction; on failure everything waits for the next.
+    /// One transaction; on failure everything waits for the next. Without a state there is nothing to write, but a
+    /// database that could not be opened is tried again.
     fn write(&mut self, batches: Vec<Batch>, state: Option<Document>, exact: bool) -> bool {
-        if state.is_none() {
-            return self.retry.pause.is_none();
-        }
         let begun = Instant::now();
-        match self.commit(&batches, state.as_ref(), exact) {
+        let written = match &state {
+            Some(document) => self.commit(&batches, document, exact),
+            None if self.retry.pause.is_none() => return true,
+            None => self.reopen(&Stamp::now(Timestamp::ZERO, BootId::current())).map(|database| {
+                self.database = Some(database);
+            }),
+        };
+        match written {
             Ok(()) => {
                 tracing::debug!(took = ?begun.elapsed(), batches = batches.len(), "state stored");
                 if self.retry.pause.is_some() {
@@ -192,6 +216,7 @@ impl Writer {
                 if self.retry.pause.is_none() {
                     tracing::error!(folder = %self.folder, error = why, "state and history not written; kept in memory");
                 }
+                self.failures += 1;
                 self.retry.after_failure();
                 self.desk.put_back(batches, state);
                 false
@@ -199,24 +224,26 @@ impl Writer {
         }
     }
 
-    fn commit(&mut self, batches: &[Batch], state: Option<&Document>, exact: bool) -> Result<(), String> {
-        let Some(document) = state else { return Ok(()) };
+    fn commit(&mut self, batches: &[Batch], document: &Document, exact: bool) -> Result<(), String> {
         let json = document.to_json().map_err(|error| error.to_string())?;
+        // A number that is not finite is written as nothing: the state could never be taken up again.
+        Document::parse(&json)?;
         let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
         drop(json);
         let mut database = match self.database.take() {
             Some(database) => database,
-            None => self.reopen(document)?,
+            None => self.reopen(&document.stamp)?,
         };
-        match database.commit(batches, Some(StateRecord { parts, exact })) {
+        match database.commit(batches, Some(StateRecord { parts, exact, sets_aside: self.sets_aside })) {
             Ok(()) => {
+                self.sets_aside = false;
                 self.database = Some(database);
                 Ok(())
             }
             Err(error) if is_damage(&error) => {
                 drop(database);
-                // The next attempt, soon, finds the folder free of it.
-                self.folder.set_aside(&error.to_string());
+                // The next attempt, soon, replaces it.
+                self.folder.mark_damaged(&error.to_string());
                 Err(format!("database damaged: {error}"))
             }
             // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
@@ -224,18 +251,19 @@ impl Writer {
         }
     }
 
-    fn reopen(&mut self, document: &Document) -> Result<Database, String> {
-        let opening = self.folder.open(&document.stamp).map_err(|error| error.to_string())?;
-        let Opening { mut database, mut rows, state, .. } = opening;
+    fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
+        let opening = self.folder.open(now).map_err(|error| error.to_string())?;
+        let Opening { mut database, mut rows, state, is_strange, .. } = opening;
+        self.sets_aside |= is_strange;
         if !self.knows_state && state.is_some() {
             // The daemon began without it, because the disk came too late: for people to find.
-            database.put_state_aside().map_err(|error| error.to_string())?;
+            self.sets_aside = true;
             tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
-            rows.push(Row::Own { reason: "state_too_late", detail: "set aside in slots 10 and 11".to_owned() });
+            rows.push(Row::Own { reason: "state_too_late", detail: "set aside".to_owned() });
         }
         self.knows_state = true;
         if !rows.is_empty() {
-            let batch = Batch { stamp: document.stamp, rows };
+            let batch = Batch { stamp: *now, rows };
             database.commit(&[batch], None).map_err(|error| error.to_string())?;
         }
         Ok(database)

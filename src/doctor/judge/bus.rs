@@ -86,7 +86,7 @@ fn interface(judge: &mut Judge<'_>, index: usize) {
         format!("{} had some, none of them ours", heard.join(", "))
     };
     let finding = Finding::error(Topic::Interface, format!("{} {what}", bus.name))
-        .seen(format!("no frame on {} in {}; {heard}", bus.name, words::seconds(judge.doctor.awake_s)))
+        .seen(format!("no frame on {} in {}; {heard}", bus.name, words::seconds(judge.doctor.seconds())))
         .why("the configured signals are expected there")
         .change(&table, "name", "the interface the pack is on")
         .advice(advice);
@@ -283,7 +283,7 @@ fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, checked: &Che
 /// What else goes on, for the record.
 fn traffic(judge: &mut Judge<'_>) {
     for bus in judge.doctor.buses.iter().filter(|bus| bus.frames > 0) {
-        let per_s = bus.frames as f64 / judge.doctor.awake_s.max(1e-3);
+        let per_s = bus.frames as f64 / judge.doctor.seconds().max(1e-3);
         judge.report.fine.push(format!(
             "{}: {} frames a second under {}{}",
             bus.name,

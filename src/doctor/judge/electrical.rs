@@ -276,10 +276,10 @@ fn model_fit(judge: &mut Judge<'_>, drift: Option<Drift>) {
     let temperature_c = warmth_c(judge);
     let ends = [0.0, 1.0].map(|soc| model.ocv_v(&model.place(soc, temperature_c)));
     let rests: Vec<f64> = judge.doctor.link.rests.iter().map(|rest| rest.end_v).collect();
-    let middle = rests.iter().copied().fold(f64::NAN, f64::max);
+    let highest = rests.iter().copied().fold(f64::NAN, f64::max);
     let lowest = rests.iter().copied().fold(f64::NAN, f64::min);
-    if middle > ends[1] + 0.06 || lowest < ends[0] - 0.06 {
-        let off = if middle > ends[1] + 0.06 { middle } else { lowest };
+    if highest > ends[1] + 0.06 || lowest < ends[0] - 0.06 {
+        let off = if highest > ends[1] + 0.06 { highest } else { lowest };
         let finding = Finding::error(Topic::CellModel, "the resting voltage is not on the cell model's curve")
             .seen(format!(
                 "{} V at rest; {} runs from {} to {} V",

@@ -23,6 +23,8 @@ use crate::quantity::{BusIndex, Channel};
 
 /// Seconds of a record below which little can be said.
 const SHORT_S: f64 = 5.0;
+/// A pack's current stays below this many times its capacity.
+const MAX_C_RATE: f64 = 30.0;
 
 /// The judgement in the making.
 pub(super) struct Judge<'d> {
@@ -40,7 +42,7 @@ pub(super) struct Judge<'d> {
 
 /// Judges all that was seen.
 pub(super) fn judge(doctor: &Doctor) -> Report {
-    let report = Report { seconds: doctor.awake_s, frames: doctor.frames, ..Report::default() };
+    let report = Report { seconds: doctor.seconds(), frames: doctor.frames, ..Report::default() };
     let plan = &doctor.plan;
     let mut judge = Judge {
         doctor,
@@ -60,7 +62,7 @@ pub(super) fn judge(doctor: &Doctor) -> Report {
     timing::judge(&mut judge);
     if doctor.frames > 0 && doctor.awake_s < SHORT_S {
         judge.report.unjudged.push(format!(
-            "only {} were heard: listen longer for anything about periods and the cells",
+            "frames came for only {}: listen longer for anything about periods and the cells",
             words::seconds(doctor.awake_s)
         ));
     }

@@ -3,13 +3,11 @@
 use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
 use super::super::series::Series;
-use super::{Judge, Kind, words};
+use super::{Judge, Kind, MAX_C_RATE, words};
 use crate::quantity::Channel;
 
 /// Temperatures a pack in use may have, degrees C.
 const WARMTH_C: (f64, f64) = (-45.0, 95.0);
-/// A pack's current stays below this many times its capacity.
-const MAX_C_RATE: f64 = 30.0;
 
 /// What a DBC's unit says.
 pub(super) fn unit_of(text: &str) -> Option<(&'static str, f64, f64)> {

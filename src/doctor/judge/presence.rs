@@ -56,7 +56,8 @@ fn absence(judge: &Judge<'_>, signal: &SignalPlan, series: &Series) -> Option<Ab
     (is_still && (is_absent || is_dead)).then_some(Absence::Zero)
 }
 
-/// When exactly the last cells are silent, the pack has fewer.
+/// When exactly the last cells are silent, the pack has fewer; or the last module is dead, which looks the same where
+/// there is no message or no value at all: then it is told as silent, too.
 fn fewer_cells<'d>(judge: &mut Judge<'d>, silent: Vec<(&'d SignalPlan, Absence)>) -> Vec<(&'d SignalPlan, Absence)> {
     let number = |signal: &SignalPlan| match signal.binding.channel {
         Channel::CellVoltage(cell) => Some(cell.0),
@@ -71,11 +72,22 @@ fn fewer_cells<'d>(judge: &mut Judge<'d>, silent: Vec<(&'d SignalPlan, Absence)>
         return silent;
     }
     let how = silent.iter().find(|(signal, _)| number(signal).is_some()).map_or(Absence::Message, |(_, how)| *how);
-    let finding = Finding::error(Topic::CellCount, format!("the pack has {first} cells, {configured} are configured"))
+    let may_be_dead = matches!(how, Absence::Message | Absence::NotAvailable);
+    let configures = format!("{first} cells, {configured} are configured");
+    let finding = if may_be_dead {
+        Finding::warning(Topic::CellCount, format!("the pack may have {configures}"))
+    } else {
+        Finding::error(Topic::CellCount, format!("the pack has {configures}"))
+    };
+    let finding = finding
         .seen(format!("cells 1-{first} have data; cells {}-{configured}: {}", first + 1, phrase(how)))
         .why("exactly the last ones are missing: the DBC serves a larger pack too")
-        .change("pack", "cells", first.to_string());
+        .change("pack", "cells", first.to_string())
+        .advice("or the last module does not report: count the cells before changing this");
     judge.report.add(finding);
+    if may_be_dead {
+        return silent;
+    }
     silent.into_iter().filter(|(signal, _)| number(signal).is_none()).collect()
 }
 
@@ -106,7 +118,7 @@ fn tell(judge: &mut Judge<'_>, silent: &[(&SignalPlan, Absence)]) {
             if is_reported { Finding::warning(Topic::Silent, title) } else { Finding::error(Topic::Silent, title) };
         let seen = match how {
             Absence::Message => {
-                format!("{message} ({id}) did not come on {interface} in {}", words::seconds(judge.doctor.awake_s))
+                format!("{message} ({id}) did not come on {interface} in {}", words::seconds(judge.doctor.seconds()))
             }
             Absence::Page => format!("{message} ({id}) came, but never with the page of {what}"),
             Absence::NotAvailable => format!("{message} ({id}) came, and always said \"signal not available\""),

@@ -4,12 +4,10 @@ use super::super::plan::SignalPlan;
 use super::super::report::{Finding, Topic};
 use super::super::series::{Alternative, Otherwise, Series};
 use super::places::unit_of;
-use super::{Judge, Kind, electrical, words};
+use super::{Judge, Kind, MAX_C_RATE, electrical, words};
 
 /// Factors a unit may slip by.
 const SLIPS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
-/// A pack's current stays below this many times its capacity.
-const MAX_C_RATE: f64 = 30.0;
 /// A temperature beyond this is looked at, degrees C.
 const HOT_C: f64 = 60.0;
 const COLD_C: f64 = -40.0;
@@ -231,6 +229,9 @@ fn temperatures(judge: &mut Judge<'_>) {
     if let Some((seen, other)) = other.filter(|_| meaning.is_none() || !is_steady) {
         return judge.report.add(layout_finding(&all, seen, other, "temperatures"));
     }
+    if let Some(finding) = unconverted(&all, middle) {
+        return judge.report.add(finding);
+    }
     if is_plausible {
         return;
     }
@@ -260,6 +261,28 @@ fn temperatures(judge: &mut Judge<'_>) {
         }
     }
     judge.report.add(finding);
+}
+
+/// Temperatures whose unit in the DBC is another, and nobody converts them: 50 degrees F pass for a warm day.
+fn unconverted(all: &[Seen<'_>], middle: f64) -> Option<Finding> {
+    let written = |signal: &SignalPlan| {
+        let (kind, factor, offset) = unit_of(&signal.unit)?;
+        let is_meant = kind == "temperature" && (COLD_C..=HOT_C).contains(&(middle * factor + offset));
+        let is_plain = (signal.scale, signal.offset) == (1.0, 0.0);
+        (is_meant && is_plain && (factor, offset) != (1.0, 0.0)).then_some((factor, offset))
+    };
+    let found: Vec<_> = all.iter().filter_map(|(signal, _)| Some((*signal, written(signal)?))).collect();
+    let &(first, (factor, offset)) = found.first()?;
+    let finding = Finding::error(Topic::Unit, format!("temperatures: the DBC's unit is {:?}", first.unit))
+        .seen(format!("the middle sensor reads {} degrees C", words::number(middle)))
+        .why(format!(
+            "the configuration does not convert it; it is {} degrees C",
+            words::number(middle * factor + offset)
+        ));
+    Some(found.into_iter().fold(finding, |finding, (signal, (factor, offset))| {
+        let finding = if factor == 1.0 { finding } else { finding.change(&signal.table, "scale", words::toml(factor)) };
+        finding.change(&signal.table, "offset", words::toml(offset))
+    }))
 }
 
 /// Share of implausible readings that is more than a disturbance.

@@ -14,6 +14,7 @@ reference charger 5432 ± 61 s
 interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
 interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
 counted    123456 readings used, 7 not; 3 late ticks; 99 % of estimates within 5.00 ms
+store      works, 21 commits, 0.1 MB
 alarms     1 raised of 4 thresholds, not known for 1
            severe capacity_low cell 1 active: 2.412 Ah, threshold 2.500 Ah, 97 % sure
            warning soc_low pack cleared: 63.2 %, threshold 10.0 %, acknowledged
@@ -23,6 +24,24 @@ cell  voltage    temp.           SOC          capacity   resistance  trusted
    3        -        -             -                 -            -        -
 ";
     assert_eq!(text, wanted);
+}
+
+#[test]
+fn a_store_that_fails_and_estimates_that_come_late_are_told() {
+    let mut document = sample(1);
+    let store = document.store.as_mut().unwrap();
+    (store.works, store.failures, store.late) = (Some(false), 3, 2);
+    document.latency.buckets.last_mut().unwrap().frames = 100;
+    document.latency.frames += 100;
+    let text = table(&document, false);
+    assert!(
+        text.contains("store      CANNOT BE WRITTEN, 21 commits, 0.1 MB, 3 failed, 2 told before they were stored\n"),
+        "{text}"
+    );
+    assert!(text.contains("99 % of estimates within more than 1 s\n"), "{text}");
+    (document.store, document.latency) = (None, Default::default());
+    let text = table(&document, false);
+    assert!(text.contains("store      none\n") && text.contains("99 % of estimates within -\n"), "{text}");
 }
 
 #[test]

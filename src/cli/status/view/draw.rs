@@ -9,7 +9,7 @@ use ratatui::widgets::{Block, Paragraph};
 use super::app::{App, Page};
 use super::{pages, plot};
 use crate::alarm::Severity;
-use crate::cli::status::{config, duration, number, percent, shown, with_std, word};
+use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
 use crate::daemon::status::document::Document;
 use crate::io::stamp;
 use crate::monitor::Validity;
@@ -111,7 +111,10 @@ fn head(document: &Document, theme: Theme) -> Line<'static> {
 
 fn pack(frame: &mut Frame<'_>, document: &Document, theme: Theme, area: Rect) {
     let pack = &document.pack;
-    let block = Block::bordered().title(" pack ");
+    let is_lost = document.store.as_ref().is_some_and(|store| store.works == Some(false));
+    let style = if is_lost { theme.colour(Color::Red).add_modifier(Modifier::BOLD) } else { Style::new() };
+    let stored = Span::styled(format!(" store {} ", store(document)), style);
+    let block = Block::bordered().title(" pack ").title_bottom(stored);
     let inner = block.inner(area);
     frame.render_widget(block, area);
     let band = match (pack.soc_low, pack.soc_high) {

@@ -111,7 +111,8 @@ fn map(app: &App, document: &Document, theme: Theme, grid: &Grid, lines: usize) 
             let bars = bar(share).to_string().repeat((grid.cell_width - 1).max(1));
             let mut style = match cell.trusted {
                 Some(false) => theme.colour(Color::Red).add_modifier(Modifier::UNDERLINED),
-                Some(true) | None => theme.colour(Color::Green),
+                Some(true) => theme.colour(Color::Green),
+                None => Style::new(),
             };
             if index == app.selected {
                 style = style.add_modifier(Modifier::REVERSED);

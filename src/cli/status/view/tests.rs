@@ -121,6 +121,18 @@ fn unknown_is_drawn_as_unknown() {
 }
 
 #[test]
+fn a_silent_cell_is_not_painted_as_trusted() {
+    let mut app = app();
+    app.handle_news(News::Document(Box::new(sample(3))));
+    let screen = drawn(&mut app, SMALL);
+    // The first row of the map: trusted, not trusted, silent; the chosen one is the first.
+    let row =
+        (0..SMALL.1).find(|row| (0..5).map(|x| screen.buffer()[(x, *row)].symbol()).eq([" ", " ", " ", "1", " "]));
+    let colours: Vec<Color> = [5, 9, 13].map(|x| screen.buffer()[(x, row.unwrap())].fg).to_vec();
+    assert_eq!(colours, [Color::Green, Color::Red, Color::Reset]);
+}
+
+#[test]
 fn every_size_is_drawn_and_every_key_taken_without_a_fault() {
     for cells in [1, 2, 96, 1024] {
         let mut app = watched(cells, 2);

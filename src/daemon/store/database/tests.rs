@@ -19,7 +19,7 @@ fn batch(seconds: f64, kinds: &[EventKind]) -> Batch {
 }
 
 fn state(numbers: &[f64]) -> StateRecord {
-    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false }
+    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
 }
 
 fn open(folder: &Path) -> Database {
@@ -210,14 +210,17 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
         drop(filled(place.path()));
         damage(&place.path().join(DATABASE), from, 3000);
         let mut folder = Folder::new(place.path().to_owned(), 1000);
-        let mut opening = folder.open(&stamp(1.0)).unwrap();
+        let opening = folder.open(&stamp(1.0)).unwrap();
         assert!(!opening.is_sound, "{from}");
         assert!(place.path().join("packwatch.db.damaged-1").exists(), "{from}");
         let saved = opening.database.counts();
         assert!(saved.chained > 100 && saved.chained < 200, "{from}: {saved:?}");
-        let rows = std::mem::take(&mut opening.rows);
-        assert!(matches!(&rows[..], [Row::Own { reason: "damaged", .. }]), "{rows:?}");
-        opening.database.commit(&[Batch { stamp: stamp(1.0), rows }], None).unwrap();
+        let told: i64 = opening
+            .database
+            .connection()
+            .query_row("SELECT count(*) FROM reset WHERE reason = 'damaged'", [], |row| row.get(0))
+            .unwrap();
+        assert_eq!(told, 1, "{from}");
         assert_eq!(verify::verify(opening.database.connection()).unwrap().broken, None, "{from}");
         // Nothing that was changed has come over.
         let odd: i64 = opening
@@ -295,4 +298,50 @@ fn a_history_can_be_read_while_it_is_written() {
         ..Filter::default()
     };
     assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
+}
+
+#[test]
+fn a_delta_never_fits_another_full_record_of_its_number() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    let mut numbers: Vec<f64> = (0..300).map(|n| f64::from(n).sqrt()).collect();
+    database.commit(&[], Some(state(&numbers))).unwrap();
+    numbers[7] = 0.5;
+    database.commit(&[], Some(state(&numbers))).unwrap();
+    let serials = |database: &Database| -> Vec<i64> {
+        let mut statement = database.connection().prepare("SELECT serial FROM state ORDER BY slot").unwrap();
+        statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
+    };
+    assert_eq!(serials(&database), [1, 1]);
+    // The full record can no longer be read: numbers begin anew.
+    database.connection().execute("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", []).unwrap();
+    drop(database);
+    let mut database = open(folder.path());
+    assert!(database.state().unwrap().is_err());
+    database.commit(&[], Some(state(&[3.5; 300]))).unwrap();
+    assert_eq!(serials(&database)[0], 1);
+    drop(database);
+    let stored = open(folder.path()).state().unwrap().unwrap().unwrap();
+    assert_eq!((stored.json, stored.lost_later), (serde_json::to_vec(&vec![3.5; 300]).unwrap(), None));
+}
+
+#[test]
+fn a_moment_goes_with_its_last_row() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut database = open(folder.path());
+    for day in 0..1200_u32 {
+        // Every fifth transition teaches something; now and then there is an alarm.
+        let mut learned = vec![half_cycle(0)];
+        learned.extend((day % 5 == 0).then(|| capacity(0, Some(2.0), 1.9)));
+        learned.extend((day % 7 == 0).then(|| alarm(Change::Raised)));
+        database.commit(&[batch(f64::from(day), &learned)], None).unwrap();
+        database.commit(&[], None).unwrap();
+    }
+    let count = |sql: &str| -> i64 { database.connection().query_row(sql, [], |row| row.get(0)).unwrap() };
+    let rows = "SELECT moment FROM half_cycle UNION SELECT moment FROM capacity UNION SELECT moment FROM alarm";
+    assert_eq!(count("SELECT count(*) FROM half_cycle"), 1000);
+    assert_eq!(count(&format!("SELECT count(*) FROM ({rows}) WHERE moment NOT IN (SELECT id FROM moment)")), 0);
+    assert_eq!(count(&format!("SELECT count(*) FROM moment WHERE id NOT IN ({rows})")), 0);
+    assert!(count("SELECT count(*) FROM moment") < 1100);
+    assert_eq!(verify::verify(database.connection()).unwrap().broken, None);
 }
