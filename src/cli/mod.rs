@@ -14,6 +14,8 @@ mod fit;
 mod generate;
 mod history;
 mod replay;
+#[cfg(feature = "lab")]
+mod report;
 mod reset;
 mod run;
 #[cfg(feature = "lab")]
@@ -80,6 +82,9 @@ enum Command {
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
+    /// Write a page that shows how a battery is and was, from a history or a replay
+    #[cfg(feature = "lab")]
+    Report(Box<report::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -128,6 +133,8 @@ pub fn main() -> ExitCode {
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
         Command::Score(args) => score::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Report(args) => report::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

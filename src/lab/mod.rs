@@ -1,6 +1,7 @@
 //! Offline work on measured files: reading them, fitting, scoring against truth, plots.
 
+pub(crate) mod chart;
 pub mod fit;
 pub mod measured;
-pub(crate) mod plot;
+pub mod report;
 pub mod score;

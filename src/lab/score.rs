@@ -27,7 +27,7 @@ pub use life::{DischargeScore, LifeScore};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
 use super::measured::{MeasuredError, MeasuredFile};
-use super::plot::PlotError;
+use super::chart::PlotError;
 use crate::monitor::MonitorConfig;
 
 /// Half-width of a Gaussian's 95 % interval in standard deviations.
