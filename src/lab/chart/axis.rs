@@ -110,7 +110,8 @@ fn number_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
         .map(|index| (first + index as f64) * step)
         .take_while(|value| *value <= high + 1e-9 * step)
         // No "-0".
-        .map(|value| (value, format!("{:.decimals$}", value + 0.0).replace("-0.", "\u{2212}0.").replace('-', "\u{2212}")))
+        .map(|value| if value.abs() < 1e-9 * step { 0.0 } else { value })
+        .map(|value| (value, format!("{value:.decimals$}").replace('-', "\u{2212}")))
         .collect()
 }
 
@@ -181,7 +182,7 @@ mod tests {
         let axis = Axis { scale: Scale::Date, ..Axis::number("time") };
         let start = 1_207_141_697.0; // 2008-04-02T13:08:17Z
         assert_eq!(words(&axis.ticks((start, start + 6.0 * HOUR), 6.0))[..2], ["14:00", "15:00"]);
-        assert_eq!(words(&axis.ticks((start, start + 50.0 * DAY), 5.0))[0], "04-06");
+        assert_eq!(words(&axis.ticks((start, start + 50.0 * DAY), 5.0))[0], "04-11");
         assert_eq!(words(&axis.ticks((start, start + 400.0 * DAY), 5.0)), ["2008-07", "2008-10", "2009-01", "2009-04"]);
         assert_eq!(words(&axis.ticks((start, start + 4000.0 * DAY), 6.0))[..2], ["2010", "2012"]);
     }

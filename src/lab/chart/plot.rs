@@ -286,7 +286,7 @@ mod tests {
     fn a_hole_interrupts_a_line_and_does_not_stretch_the_axes() {
         let points = vec![(0.0, 1.0), (1.0, 2.0), (2.0, f64::NAN), (3.0, 1.0), (f64::INFINITY, 9.0)];
         let layer = Layer::new("SOC & <truth>", Ink::Blue, Shape::Line(points));
-        assert_eq!(Axis::default().ends(layer.xs(), false), (0.0, f64::INFINITY).min((0.0, 3.0)));
+        assert_eq!(Axis::default().ends(layer.xs(), false), (0.0, 3.0));
         let area = Area { left: 0.0, top: 0.0, width: 300.0, height: 100.0, x: (0.0, 3.0), y: (1.0, 2.0) };
         let Shape::Line(points) = &layer.shape else { panic!("a line") };
         assert_eq!(line_path(points, &area, 300), "M0 100l100-100M299 100l2 0l-1 0");

@@ -99,7 +99,7 @@ mod tests {
     use super::*;
     use crate::lab::report::Origin;
 
-    pub(in crate::lab::report) fn pack() -> Data {
+    fn pack() -> Data {
         let mut data = Data::new(Origin::Store);
         for (time_s, cell, ah) in [(10.0, 0, 2.0), (10.0, 1, 1.9), (20.0, 1, 2.1), (30.0, 0, 1.5)] {
             data.learned.push(Learned {
