@@ -60,7 +60,9 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
     let place = Place::new();
     let log = place.path("cell.csv");
     let page = place.page("a.html", &["-c", &config(), &log, "--title", "cell <1>"]);
-    for part in ["cell &lt;1&gt;", "State of charge in the last", "Capacity between", "Usable capacity at 2 A", "Innovation"] {
+    for part in
+        ["cell &lt;1&gt;", "State of charge in the last", "Capacity between", "Usable capacity at 2 A", "Innovation"]
+    {
         assert!(page.contains(part), "no {part:?}");
     }
     assert!(!page.contains("NaN") && !page.contains("<script") && !page.contains("http"), "not self-contained");

@@ -156,7 +156,8 @@ fn settings(args: &Args, config: &Config) -> Settings {
 }
 
 fn provenance(args: &Args, summary: &Summary) -> Provenance {
-    let mut lines: Provenance = args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
+    let mut lines: Provenance =
+        args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
     lines.push(("Frames used".to_owned(), summary.log.frames.to_string()));
     lines.push(("Bad readings of signals that came back".to_owned(), summary.bad_readings.to_string()));
     lines.extend(summary.notes.iter().map(|note| ("Note".to_owned(), note.clone())));

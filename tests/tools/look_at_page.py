@@ -76,7 +76,7 @@ def look(browser, page, width, height, scheme, shot, print_to):
     if not any(event["method"] == "Page.loadEventFired" for event in browser.events):
         browser.wait(lambda message: message.get("method") == "Page.loadEventFired")
     wide = browser.call("Runtime.evaluate", returnByValue=True,
-                        expression="document.documentElement.scrollWidth - window.innerWidth")["result"]["value"]
+                        expression=f"document.documentElement.scrollWidth - {width}")["result"]["value"]
     if shot:
         data = browser.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)["data"]
         pathlib.Path(shot).write_bytes(base64.b64decode(data))

@@ -152,7 +152,13 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
 /// A moment as precise as the step asks for.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
-    let part = if step >= DAY { 5..10 } else if step >= MINUTE { 11..16 } else { 11..19 };
+    let part = if step >= DAY {
+        5..10
+    } else if step >= MINUTE {
+        11..16
+    } else {
+        11..19
+    };
     text.get(part).unwrap_or_default().to_owned()
 }
 

@@ -1,10 +1,10 @@
 //! Heat maps: a value per row and column of time, as one of nine colours, with its legend.
 
+use super::Size;
 use super::axis::Axis;
 use super::plot::{Area, title};
 use super::style::{STEPS, step_class};
 use super::svg::{Svg, short, text_width};
-use super::Size;
 
 /// Height of a row, pixels, within these bounds.
 const ROW: (f64, f64) = (4.0, 20.0);

@@ -1,10 +1,10 @@
 //! Spans of time in lanes: which alarm was raised from when to when.
 
+use super::Size;
 use super::axis::Axis;
 use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
-use super::Size;
 
 /// Height of a lane's name and of its spans, pixels.
 const NAME: f64 = 16.0;
@@ -63,7 +63,12 @@ impl Lanes {
             svg.open_area((area.left, y + NAME), (area.width, BAR));
             for span in &lane.spans {
                 let (from, to) = (area.px(span.from), area.px(span.to));
-                svg.rect((from.min(area.width - LEAST), 0.0), ((to - from).max(LEAST), BAR), &span.ink.fill(), &span.tip);
+                svg.rect(
+                    (from.min(area.width - LEAST), 0.0),
+                    ((to - from).max(LEAST), BAR),
+                    &span.ink.fill(),
+                    &span.tip,
+                );
             }
             svg.close_area();
         }

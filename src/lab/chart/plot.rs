@@ -111,7 +111,7 @@ impl Chart {
         let x = self.x.ends(self.layers.iter().flat_map(Layer::xs), false);
         let y = self.y.ends(self.layers.iter().flat_map(Layer::ys), true);
         let height = size.height - 60.0 - FOOT;
-        let y_ticks = self.y.ticks(y, height / 46.0);
+        let y_ticks = self.y.ticks(y, height / 34.0);
         let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
         let area = Area { left, top, width: size.width - left - RIGHT, height, x, y };
         for (y, word) in y_ticks {

@@ -222,7 +222,10 @@ impl Data {
         let what = match *kind {
             EventKind::FilterReset { cell } => format!("filter of cell {} started again", number(cell)),
             EventKind::Trust { cell, trusted: false, mean_nis } => {
-                format!("estimate of cell {} not to be trusted (innovations {mean_nis:.1} times as expected)", number(cell))
+                format!(
+                    "estimate of cell {} not to be trusted (innovations {mean_nis:.1} times as expected)",
+                    number(cell)
+                )
             }
             EventKind::Trust { cell, trusted: true, .. } => format!("estimate of cell {} trusted again", number(cell)),
             EventKind::PackReplaced { .. } => "another pack was connected".to_owned(),

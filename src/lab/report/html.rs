@@ -65,7 +65,9 @@ const PARTS: [Part; 7] = [
         title: "Cells",
         pictures: &["cells_capacity", "cells_resistance"],
         note: "Every row is a cell. A row that differs from its neighbours is the cell to look at.",
-        none: |data| if data.cells() == 1 { "one cell: see above" } else { "unknown: nothing was learned about the cells yet" },
+        none: |data| {
+            if data.cells() == 1 { "one cell: see above" } else { "unknown: nothing was learned about the cells yet" }
+        },
     },
     Part {
         id: "estimator",
@@ -81,7 +83,7 @@ const STYLE: &str = "*{box-sizing:border-box}body{margin:0;background:var(--page
 font:15px/1.5 system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif}\
 main{max-width:1008px;margin:0 auto;padding:24px}h1{font-size:24px;line-height:1.25;margin:0 0 4px;overflow-wrap:anywhere}\
 h2{font-size:18px;margin:36px 0 4px;padding-top:12px;border-top:1px solid var(--rule)}\
-p{margin:6px 0 10px;max-width:76ch}.soft{color:var(--soft)}nav{margin:10px 0 0;font-size:14px}nav a{margin-right:14px;white-space:nowrap}\
+p{margin:6px 0 10px;max-width:76ch}.soft{color:var(--soft)}nav{margin:10px 0 0;font-size:14px}nav a{display:inline-block;margin-right:14px}\
 a{color:var(--blue)}figure{margin:14px 0 18px}svg{display:block;width:100%;height:auto}.narrow{display:none}\
 .verdict{display:grid;grid-template-columns:56px 1fr;gap:16px;background:var(--card);border-left:6px solid var(--grey);\
 border-radius:6px;padding:16px 18px;margin:18px 0 14px}.verdict .sign{width:52px;height:52px;border-radius:50%;display:flex;align-items:center;\
@@ -94,9 +96,9 @@ justify-content:center;font-size:26px;font-weight:700;color:var(--page);backgrou
 .tile .name{color:var(--soft);font-size:13px}.tile .value{font-size:19px;font-weight:600;overflow-wrap:anywhere}.tile .note{color:var(--soft);font-size:12.5px;line-height:1.35}\
 .none{background:var(--card);border-radius:6px;padding:12px 14px;color:var(--soft)}\
 .scroll{overflow-x:auto}table{border-collapse:collapse;font-size:13.5px;width:100%}th,td{text-align:left;padding:4px 12px 4px 0;border-bottom:1px solid var(--rule);vertical-align:top}\
-th{color:var(--soft);font-weight:600}td.n{font-variant-numeric:tabular-nums}\
+th{color:var(--soft);font-weight:600}td.n{font-variant-numeric:tabular-nums;white-space:nowrap}td.n:last-child{white-space:normal;min-width:220px}\
 pre{overflow-x:auto;background:var(--card);padding:12px;border-radius:6px;font-size:12.5px;line-height:1.4}\
-.kv td:first-child{color:var(--soft);white-space:nowrap}.kv td{overflow-wrap:anywhere}summary{cursor:pointer;margin:8px 0}\
+.kv td:first-child{color:var(--soft);width:45%}.kv td{overflow-wrap:anywhere}summary{cursor:pointer;margin:8px 0}\
 @media screen and (max-width:640px){main{padding:16px 14px}.wide{display:none}.narrow{display:block}.verdict{grid-template-columns:1fr}\
 .verdict .sign{width:40px;height:40px;font-size:20px}.tiles{grid-template-columns:1fr 1fr}.tile .value{font-size:16px}}\
 @media print{@page{margin:14mm}body{font-size:11pt;background:#fff}main{max-width:none;padding:0}nav{display:none}figure,.tile,.verdict,tr{break-inside:avoid}\
@@ -137,7 +139,10 @@ fn head(data: &Data, setting: &Setting<'_>) -> String {
         1 => "one cell".to_owned(),
         cells => format!("{cells} cells"),
     };
-    let links = PARTS.iter().map(|part| (part.id, part.title)).chain([("alarms", "Alarms"), ("origin", "Where this comes from")]);
+    let links = PARTS
+        .iter()
+        .map(|part| (part.id, part.title))
+        .chain([("alarms", "Alarms"), ("origin", "Where this comes from")]);
     let links: String = links.map(|(id, title)| format!("<a href=\"#{id}\">{title}</a>")).collect();
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
@@ -203,7 +208,14 @@ fn alarms(out: &mut String, data: &Data, pictures: &[(String, Picture)]) {
     if !data.alarms.is_empty() {
         let rows = data.alarms.iter().rev().map(|row| {
             let cell = row.cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
-            let cells = [&summary::moment(data, row.time_s), &row.rule, &row.severity, &cell, &row.change, &summary::words(row)];
+            let cells = [
+                &summary::moment(data, row.time_s),
+                &row.rule,
+                &row.severity,
+                &cell,
+                &row.change,
+                &summary::words(row),
+            ];
             cells.map(|text| escape(text)).to_vec()
         });
         table(out, &["When", "Rule", "Severity", "Cell", "Change", "What"], rows, data.alarms.len());
@@ -263,22 +275,34 @@ fn end(out: &mut String, data: &Data, setting: &Setting<'_>) {
     let mut rows = vec![("Program".to_owned(), concat!("packwatch ", env!("CARGO_PKG_VERSION")).to_owned())];
     rows.extend(setting.provenance.iter().cloned());
     if let Some(pack) = data.source.pack {
-        rows.push(("Pack of this history".to_owned(), format!("{pack} (the latest; earlier ones are in packwatch history)")));
+        rows.push((
+            "Pack of this history".to_owned(),
+            format!("{pack} (the latest; earlier ones are in packwatch history)"),
+        ));
     }
     if let Some(config) = setting.config {
         let model = &config.monitor.model;
         let amount = |name: &str, value: String| (name.to_owned(), value);
         rows.push(amount("Cell model", model.name.clone()));
-        rows.push(amount("Capacity of a new cell", format!("{} Ah (rated {} Ah)", model.capacity_ah, model.rated_capacity_ah)));
+        rows.push(amount(
+            "Capacity of a new cell",
+            format!("{} Ah (rated {} Ah)", model.capacity_ah, model.rated_capacity_ah),
+        ));
         rows.push(amount("Cells", config.monitor.sample.cells.to_string()));
         for rule in &config.monitor.rules {
             let (name, unit) = (rule.rule.name(), rule.rule.row().unit.symbol());
-            rows.push(amount(&format!("Limit {name} ({})", rule.severity.name()), format!("{} {unit}", rule.threshold)));
+            rows.push(amount(
+                &format!("Limit {name} ({})", rule.severity.name()),
+                format!("{} {unit}", rule.threshold),
+            ));
         }
     }
     pairs(out, &rows);
     if let Some(text) = &setting.config_text {
-        out.push_str(&format!("<details><summary>The configuration as it was read</summary><pre>{}</pre></details>", escape(text)));
+        out.push_str(&format!(
+            "<details><summary>The configuration as it was read</summary><pre>{}</pre></details>",
+            escape(text)
+        ));
     }
     out.push_str("</section>\n</main></body></html>\n");
 }

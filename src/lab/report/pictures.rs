@@ -128,12 +128,7 @@ fn moment(data: &Data, time_s: f64) -> String {
 }
 
 /// Bins of a trace as a band and, where cells differ or bins are long, the range within.
-fn range(
-    bins: &[(f64, &Moment)],
-    clock: &Clock,
-    pick: fn(&Moment) -> (f64, f64),
-    factor: f64,
-) -> Vec<(f64, f64, f64)> {
+fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
     let band = bins.iter().map(|(time_s, bin)| {
         let (low, high) = pick(bin);
         (clock.x(*time_s), factor * low, factor * high)
@@ -200,7 +195,8 @@ fn soc_recent(data: &Data) -> Option<Picture> {
 
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.
 fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Vec<Layer> {
-    let interval = steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
+    let interval =
+        steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
     let mut layers = vec![Layer::new("95 % interval", ink, Shape::Band(interval.collect()))];
     if data.cells() > 1 {
         let range = steps.iter().map(|s| (clock.x(s.time_s), s.range.0, s.range.1));
@@ -323,7 +319,8 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     let is_stored = data.source.origin == Origin::Store;
     if is_stored {
         let charges = data.halves.chunk_by(|a, b| a.time_s == b.time_s).filter_map(|rows| rows.first());
-        let points: Vec<Point> = charges.filter(|row| row.is_charge).map(|row| point(row.time_s, row.duration_s)).collect();
+        let points: Vec<Point> =
+            charges.filter(|row| row.is_charge).map(|row| point(row.time_s, row.duration_s)).collect();
         layers.extend((!points.is_empty()).then(|| Layer::new("a whole charge", Ink::Grey, Shape::Points(points))));
     }
     if layers.is_empty() {
@@ -340,7 +337,8 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
         layers.extend(raised(data, &clock, Rule::RechargePeriodLow));
     }
     let window = setting.config.map(|config| &config.monitor.health.recharge);
-    let window = window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
+    let window =
+        window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
     let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
     let description = "Minutes a charge took, as it was and as the reference charger would take".to_owned();
     Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
@@ -419,7 +417,10 @@ fn alarms(data: &Data) -> Option<Picture> {
     let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
     Some(Picture::Lanes(Lanes {
         title: "Alarms".to_owned(),
-        description: format!("{} changes of alarms; each bar is an alarm from when it was raised until it ended", data.alarms.len()),
+        description: format!(
+            "{} changes of alarms; each bar is an alarm from when it was raised until it ended",
+            data.alarms.len()
+        ),
         x: clock.axis,
         lanes,
         keys: keys.map(|(ink, word)| (ink, word.to_owned())).to_vec(),

@@ -94,13 +94,14 @@ fn raised(data: &Data) -> Vec<Raised<'_>> {
     let mut last: BTreeMap<(&str, &str, Option<usize>), Raised<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        let since_s = match last.get(&key) {
-            Some(before) if before.row.is_active => before.since_s,
-            _ => row.time_s,
-        };
-        last.insert(key, Raised { row, since_s });
+        // The row that raised it has the value that did; later ones may not know one any more.
+        if row.is_active {
+            last.entry(key).or_insert(Raised { row, since_s: row.time_s });
+        } else {
+            last.remove(&key);
+        }
     }
-    last.into_values().filter(|raised| raised.row.is_active).collect()
+    last.into_values().collect()
 }
 
 fn rank(severity: &str) -> usize {
@@ -153,7 +154,9 @@ fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], 
         Verdict::Act => "Past its limit: act now.",
         Verdict::Unknown => "Unknown: nothing has been learned about this battery yet.",
     };
-    let why = worst.or(measuring.first().copied()).map_or(String::new(), |raised| format!(" When the alarm came, {}.", words(raised.row)));
+    let why = worst
+        .or(measuring.first().copied())
+        .map_or(String::new(), |raised| format!(" When the alarm came, {}.", words(raised.row)));
     let lost = data.trace.health().coverage().filter(|share| *share < 0.8);
     let doubt = lost.map_or(String::new(), |_| {
         " The estimator is less sure than it says (see its health below): take the figures with care.".to_owned()
@@ -187,12 +190,16 @@ fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>])
     let advice = worst.and_then(|raised| rule(&raised.row.rule)).map(|rule| match rule {
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
-        Rule::CellImbalance => "Have the cells balanced; if that does not hold, the weakest cell is the one to look at.",
+        Rule::CellImbalance => {
+            "Have the cells balanced; if that does not hold, the weakest cell is the one to look at."
+        }
         _ if verdict == Verdict::Act => "Replace the battery or the named cell, or take it out of service.",
         _ => "Order a replacement, and have its capacity measured at the next visit.",
     });
     let measure = measuring.first().map(|raised| match rule(&raised.row.rule) {
-        Some(Rule::EstimateUntrusted) => "Do not rely on these figures before the sensors and the cell model were checked.",
+        Some(Rule::EstimateUntrusted) => {
+            "Do not rely on these figures before the sensors and the cell model were checked."
+        }
         Some(Rule::StoreFailed) => "Check the disk of the vehicle computer: what is learned may be lost.",
         _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",
     });
@@ -212,7 +219,8 @@ fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> T
 fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, raised: &[Raised<'_>]) -> Vec<Tile> {
     let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
     let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
-    let of_cell = |step: &series::Step| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
+    let of_cell =
+        |step: &series::Step| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
     let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));
     let resistance = last(series::resistance, true);
     let figure = |step: &series::Step| format!("{:.3} \u{b1} {:.3} Ah", step.worst.0, step.worst.1);
