@@ -18,6 +18,8 @@ mod fleet;
 mod generate;
 mod history;
 mod replay;
+#[cfg(feature = "lab")]
+mod report;
 mod reset;
 #[cfg(feature = "lab")]
 mod rul;
@@ -97,6 +99,9 @@ enum Command {
     /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
     #[cfg(feature = "lab")]
     Export(Box<export::Args>),
+    /// Write a page that shows how a battery is and was, from a history or a replay
+    #[cfg(feature = "lab")]
+    Report(Box<report::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -151,6 +156,8 @@ pub fn main() -> ExitCode {
         Command::Whatif(args) => whatif::run(&args),
         #[cfg(feature = "lab")]
         Command::Export(args) => export::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Report(args) => report::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,8 +1,9 @@
 //! Offline work on measured files: reading them, fitting, scoring against truth, remaining useful life, plots.
 
+pub(crate) mod chart;
 pub mod fit;
 pub(crate) mod fleet;
 pub mod measured;
-pub(crate) mod plot;
+pub mod report;
 pub mod rul;
 pub mod score;

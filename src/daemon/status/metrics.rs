@@ -277,7 +277,7 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
 /// Name, unit, help, and where the value is.
 type CellRow = (&'static str, &'static str, &'static str, fn(&Cell) -> Option<f64>);
 
-const CELL_ROWS: [CellRow; 15] = [
+const CELL_ROWS: &[CellRow] = &[
     ("cell_voltage", "volts", "Voltage", |cell| cell.voltage_v),
     ("cell_current", "amperes", "Current, positive when discharging", |cell| cell.current_a),
     ("cell_temperature", "celsius", "Temperature of the cell's sensor", |cell| cell.temperature_c),
