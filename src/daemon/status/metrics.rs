@@ -240,8 +240,18 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
         ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", pack.remaining_cycles),
-        ("pack_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", pack.remaining_cycles_low),
-        ("pack_remaining_cycles_high", "", "95 % quantile of the cycles until the end of life", pack.remaining_cycles_high),
+        (
+            "pack_remaining_cycles_low",
+            "",
+            "5 % quantile of the cycles until the end of life",
+            pack.remaining_cycles_low,
+        ),
+        (
+            "pack_remaining_cycles_high",
+            "",
+            "95 % quantile of the cycles until the end of life",
+            pack.remaining_cycles_high,
+        ),
         (
             "pack_remaining_life",
             "seconds",
@@ -286,7 +296,9 @@ const CELL_ROWS: &[CellRow] = &[
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
     ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
     ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| cell.remaining_cycles),
-    ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| cell.remaining_cycles_low),
+    ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| {
+        cell.remaining_cycles_low
+    }),
     ("cell_remaining_cycles_high", "", "95 % quantile of the cycles until the end of life", |cell| {
         cell.remaining_cycles_high
     }),
