@@ -158,8 +158,8 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason"))));
             }
-            // A row of a cell without its number: the store writes none.
-            (Kind::HalfCycle | Kind::Capacity, None) => {}
+            // A row of a cell without its number: the store writes none. And the forecast is made anew here.
+            (Kind::HalfCycle | Kind::Capacity, None) | (Kind::RemainingLife, _) => {}
         }
     }
 
