@@ -33,6 +33,15 @@ fn the_hottest_sensor_raises_and_a_lost_sensor_neither_clears_nor_hides() {
 }
 
 #[test]
+fn alarms_and_health_announce_and_the_status_does_not() {
+    let mut rig = Rig::new("[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n");
+    rig.temperatures_c[0] = Some(60.0);
+    rig.seconds(12);
+    let [status, health, alarm] = [0x6B0, 0x6B1, 0x6B2].map(|id| CanId::standard(id).unwrap());
+    assert_eq!(rig.sent.iter().copied().collect::<Vec<_>>(), [(status, false), (health, true), (alarm, true)]);
+}
+
+#[test]
 fn the_emptiest_cell_and_the_spread_raise_their_alarms() {
     let mut rig = Rig::new(
         "[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n[[alarm]]\nrule = \"cell_imbalance\"\nsevere = \"30 %\"\n\

@@ -216,8 +216,7 @@ impl Store {
         let wall = WallClock::look(now);
         found.states = candidates(running, state, now, wall);
         found.states.extend(aside.map(|document| candidate(document, "database, set aside earlier", now, wall)));
-        let (told, progress) =
-            watch::channel(Progress { ticket: 0, works: found.works, file_bytes: None, failures: 0 });
+        let (told, progress) = watch::channel(Progress { works: found.works, ..Progress::default() });
         let desk = Arc::new(Desk::default());
         if !rows.is_empty() {
             // They wait for the first state.
@@ -230,6 +229,7 @@ impl Store {
             database,
             progress: told,
             retry,
+            commits: 0,
             failures: 0,
             knows_state,
             sets_aside: is_strange,

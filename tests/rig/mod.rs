@@ -4,6 +4,8 @@
 #[path = "../common/config.rs"]
 mod config;
 
+use std::collections::BTreeSet;
+
 use packwatch::alarm::{Change, Rule};
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::InputEncoder;
@@ -89,6 +91,8 @@ pub(crate) struct Rig {
     pub(crate) out: Outputs,
     pub(crate) events: Vec<Event>,
     pub(crate) frames: Vec<Frame>,
+    /// Identifiers sent, and whether their frames announce something.
+    pub(crate) sent: BTreeSet<(CanId, bool)>,
     pub(crate) deci: i64,
     pub(crate) commands_sent: u8,
     /// What the next second's frames carry; `None` = nothing.
@@ -112,6 +116,7 @@ impl Rig {
             out: Outputs::default(),
             events: Vec::new(),
             frames: Vec::new(),
+            sent: BTreeSet::new(),
             deci: 0,
             commands_sent: 0,
             current_a: Some(0.0),
@@ -140,6 +145,7 @@ impl Rig {
 
     fn collect(&mut self) {
         self.events.append(&mut self.out.events);
+        self.sent.extend(self.out.frames.iter().map(|sent| (sent.frame.id(), sent.announces)));
         self.frames.extend(self.out.frames.drain(..).map(|sent| sent.frame));
     }
 

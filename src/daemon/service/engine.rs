@@ -46,7 +46,10 @@ pub(super) struct Engine {
     pub(super) readiness: Readiness,
     /// For those who look.
     pub(super) recent: RecentEvents,
-    stored: StoreStatus,
+    /// What the store has told; `None` = nothing so far.
+    progress: Option<Progress>,
+    /// Announcements that did not wait for it any longer.
+    late: u64,
 }
 
 impl Engine {
@@ -85,7 +88,6 @@ impl Engine {
             Away::Unknown => restored_words(None),
         });
         let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
-        let is_unusable = store.is_none() && !found.works;
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
@@ -102,8 +104,8 @@ impl Engine {
             hold: Hold::default(),
             is_fresh: false,
             recent: RecentEvents::default(),
-            // One that cannot be opened is told as such, not as "none".
-            stored: StoreStatus { works: is_unusable.then_some(false), ..StoreStatus::default() },
+            progress: None,
+            late: 0,
         })
     }
 
@@ -176,17 +178,28 @@ impl Engine {
     pub(super) fn settle(&mut self, progress: Progress, time: Timestamp, links: &[LinkOutput]) {
         self.hold.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
-        self.stored.note(progress.works);
-        self.stored.failures = progress.failures;
-        self.stored.file_bytes = progress.file_bytes;
+        self.progress = Some(progress);
         self.tell_works(time, links);
     }
 
     /// The store, for those who look.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
-        let path = self.store.as_ref().map(|store| store.folder().display().to_string());
-        (path.is_some() || self.stored.works.is_some())
-            .then(|| StoreStatus { path: path.unwrap_or_default(), ..self.stored.clone() })
+        let path = match &self.store {
+            Some(store) => store.folder().display().to_string(),
+            // One that cannot be opened is told as such, not as "none".
+            None if !self.store_works => String::new(),
+            None => return None,
+        };
+        let progress = self.progress.unwrap_or_default();
+        let is_tried = self.progress.is_some() || self.late > 0 || self.store.is_none();
+        Some(StoreStatus {
+            path,
+            works: is_tried.then_some(self.store_works),
+            commits: progress.commits,
+            failures: progress.failures,
+            late: self.late,
+            file_bytes: progress.file_bytes,
+        })
     }
 
     /// Nothing waits any longer: the daemon stops.
@@ -199,8 +212,7 @@ impl Engine {
         if let Some(ticket) = self.hold.overdue(Instant::now()) {
             self.hold.release(ticket, |transmit| send(links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
-            self.stored.late += 1;
-            self.stored.works = Some(false);
+            self.late += 1;
             self.store_works = false;
         }
         if let Some(store) = &mut self.store

@@ -207,7 +207,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_store_whose_thread_is_gone_is_told_to_fail_once() {
-        let last = Progress { ticket: 7, works: true, file_bytes: Some(1), failures: 0 };
+        let last = Progress { ticket: 7, works: true, ..Progress::default() };
         let (told, progress) = watch::channel(last);
         drop(told);
         let mut stored = Some(progress);

@@ -317,7 +317,7 @@ pub(crate) struct Store {
     pub(crate) path: String,
     /// Whether it can be written; `None` = not tried yet.
     pub(crate) works: Option<bool>,
-    /// Commits done, as the loop heard of them: two in quick succession may count once.
+    /// Commits done.
     pub(crate) commits: u64,
     /// Commits that failed.
     pub(crate) failures: u64,
@@ -325,14 +325,6 @@ pub(crate) struct Store {
     pub(crate) late: u64,
     /// Size of the database and its log, bytes, as of the last commit; `None` = none yet.
     pub(crate) file_bytes: Option<u64>,
-}
-
-impl Store {
-    /// The store answered.
-    pub(crate) fn note(&mut self, works: bool) {
-        self.works = Some(works);
-        *if works { &mut self.commits } else { &mut self.failures } += 1;
-    }
 }
 
 impl ConfigFile {

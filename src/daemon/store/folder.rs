@@ -24,7 +24,7 @@ use super::parts::Parts;
 use super::rows::{Batch, Row};
 use super::salvage;
 use super::stamp::Stamp;
-use super::wal;
+use super::wal::{self, Fault};
 
 /// Name of the database.
 pub(crate) const DATABASE: &str = "packwatch.db";
@@ -235,7 +235,7 @@ impl Folder {
             tracing::warn!(path = %path.display(), "the database was empty: state and history begin anew");
         }
         // Before SQLite opens it, as it then makes the log anew.
-        let lost = wal::damage(&with_suffix(path, "-wal"));
+        let fault = wal::fault(&with_suffix(path, "-wal"));
         let database = Database::open(path, now, self.max_half_cycles)?;
         let (mut rows, mut is_sound, mut state) = (Vec::new(), !was_emptied, None);
         let mut is_strange = false;
@@ -244,8 +244,13 @@ impl Folder {
             rows.push(Row::Own { reason, detail: why });
             is_sound = false;
         };
-        if let Some(why) = lost {
-            tell("state_damaged", why);
+        match fault {
+            Some(Fault::Damaged(why)) => tell("state_damaged", why),
+            Some(Fault::LastStep(page)) => tracing::warn!(
+                page,
+                "the last step of the database's write-ahead log is not whole: the power was cut in it, or it is damaged"
+            ),
+            None => {}
         }
         match database.state()? {
             Ok(None) => {}

@@ -2,8 +2,8 @@
 //!
 //! SQLite takes a log up to the first page whose checksum is wrong and forgets the rest without a word: after a power cut
 //! that rest is a transaction that was never completed, but after damage it is what was learned last. In: the log as it
-//! lies beside the database, before that is opened. Out: what is wrong, for people. A log that is missing, empty or cannot
-//! be read tells nothing; so does one whose end alone is missing.
+//! lies beside the database, before that is opened. Out: what is wrong. A log that is missing, empty or cannot be read
+//! tells nothing; so does one whose end alone is missing.
 //!
 //! The format is that of <https://www.sqlite.org/fileformat2.html#walformat>.
 
@@ -16,13 +16,25 @@ const HEADER: usize = 32;
 const FRAME_HEADER: usize = 24;
 const FRAME_COVERED: usize = 8;
 
+/// Rounds of the log whose pages may still lie behind those of the current one.
+const MAX_ROUNDS: u32 = 1 << 24;
+
+/// What is wrong with a log.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Fault {
+    /// Completed steps are lost: what and where, for people.
+    Damaged(String),
+    /// The last step, from this page on, is not whole: the power was cut while it was written, or it was damaged.
+    LastStep(usize),
+}
+
 /// What is wrong with a log; `None` = nothing that shows.
-pub(super) fn damage(path: &Path) -> Option<String> {
+pub(super) fn fault(path: &Path) -> Option<Fault> {
     let log = std::fs::read(path).ok()?;
     check(&log)
 }
 
-fn check(log: &[u8]) -> Option<String> {
+fn check(log: &[u8]) -> Option<Fault> {
     let (header, frames) = log.split_at_checked(HEADER)?;
     if header.iter().all(|&byte| byte == 0) {
         return None; // room that was never written
@@ -30,30 +42,42 @@ fn check(log: &[u8]) -> Option<String> {
     let is_big = word(header, 0) == MAGIC | 1;
     let mut sum = checksum((0, 0), &header[..24], is_big);
     if word(header, 0) & !1 != MAGIC || sum != (word(header, 24), word(header, 28)) {
-        return Some("the header of the write-ahead log is damaged: what was stored last is lost".to_owned());
+        return Some(Fault::Damaged(
+            "the header of the write-ahead log is damaged: what was stored last is lost".to_owned(),
+        ));
     }
     let page_bytes = usize::try_from(word(header, 8)).ok().filter(|&bytes| (512..=65_536).contains(&bytes))?;
     let mut first_bad = None;
     let mut later_commits = 0_u32;
     for (number, frame) in frames.chunks_exact(FRAME_HEADER + page_bytes).enumerate() {
-        if frame[8..16] != header[16..24] {
-            continue; // of an earlier round of the log, or a damaged number of the round
+        if is_of_earlier_round(frame, header) {
+            continue;
         }
         if first_bad.is_some() {
             later_commits += u32::from(word(frame, 4) != 0);
             continue;
         }
         let next = checksum(checksum(sum, &frame[..FRAME_COVERED], is_big), &frame[FRAME_HEADER..], is_big);
-        if next == (word(frame, 16), word(frame, 20)) {
+        if frame[8..16] == header[16..24] && next == (word(frame, 16), word(frame, 20)) {
             sum = next;
         } else {
+            later_commits = u32::from(word(frame, 4) != 0);
             first_bad = Some(number + 1);
         }
     }
     // One: the transaction the power was cut in may have reached the disk in any order.
-    first_bad.filter(|_| later_commits > 1).map(|page| {
-        format!("page {page} of the write-ahead log is damaged: what was stored in {later_commits} later steps is lost")
+    first_bad.map(|page| match later_commits {
+        0 | 1 => Fault::LastStep(page),
+        lost => Fault::Damaged(format!(
+            "page {page} of the write-ahead log is damaged: what was stored in up to {lost} later steps is lost"
+        )),
     })
+}
+
+/// Whether a frame was left by an earlier round of the log: each round counts the first number up and draws the second.
+fn is_of_earlier_round(frame: &[u8], header: &[u8]) -> bool {
+    let rounds = word(header, 16).wrapping_sub(word(frame, 8));
+    (1..MAX_ROUNDS).contains(&rounds) && word(frame, 12) != word(header, 20)
 }
 
 /// The big-endian word at a place.
@@ -88,15 +112,25 @@ mod tests {
     }
 
     #[test]
-    fn a_flipped_bit_before_the_last_commits_is_told() {
+    fn a_flipped_bit_is_told_wherever_it_is() {
         let good = log();
         assert_eq!(check(&good), None);
         let frame = FRAME_HEADER + usize::try_from(word(&good, 8)).unwrap();
-        for at in (0..good.len() - 3 * frame).step_by(997) {
-            let mut bad = good.clone();
-            bad[at] ^= 1;
-            let in_salt = at >= HEADER && (8..16).contains(&((at - HEADER) % frame));
-            assert!(check(&bad).is_some() || in_salt, "byte {at}");
+        let last = good.len() - frame;
+        let places = (0..good.len())
+            .step_by(997)
+            .chain((HEADER..good.len()).step_by(frame).flat_map(|at| at..at + FRAME_HEADER));
+        for at in places {
+            for bit in 0..8 {
+                let mut bad = good.clone();
+                bad[at] ^= 1 << bit;
+                match check(&bad) {
+                    Some(Fault::Damaged(_)) => assert!(at < last, "byte {at}"),
+                    // A step may have reached the disk in any order; without its mark the one before is of the same.
+                    Some(Fault::LastStep(_)) => assert!(at + frame >= last, "byte {at}"),
+                    None => panic!("byte {at}, bit {bit}"),
+                }
+            }
         }
     }
 
@@ -106,9 +140,27 @@ mod tests {
         for length in [0, 10, HEADER, HEADER + 100, good.len() / 2, good.len() - 1] {
             assert_eq!(check(&good[..length]), None, "{length} bytes");
         }
-        let mut torn = good;
-        let last = torn.len() - 10;
-        torn[last..].fill(0);
-        assert_eq!(check(&torn), None);
+        for zeroed in [10, FRAME_HEADER + 4096] {
+            let mut torn = good.clone();
+            let kept = torn.len() - zeroed;
+            torn[kept..].fill(0);
+            assert!(matches!(check(&torn), Some(Fault::LastStep(_))), "{zeroed} bytes");
+        }
+    }
+
+    #[test]
+    fn what_an_earlier_round_left_is_no_fault() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.db");
+        let connection = rusqlite::Connection::open(&path).unwrap();
+        connection.execute_batch("PRAGMA journal_mode = WAL; CREATE TABLE t (x)").unwrap();
+        for round in 0..4 {
+            for number in 0..20 - 5 * round {
+                connection.execute("INSERT INTO t VALUES (?1)", [number]).unwrap();
+            }
+            let log = std::fs::read(folder.path().join("x.db-wal")).unwrap();
+            assert_eq!(check(&log), None, "round {round}");
+            connection.execute_batch("PRAGMA wal_checkpoint(RESTART)").unwrap();
+        }
     }
 }

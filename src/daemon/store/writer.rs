@@ -24,7 +24,7 @@ const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
 /// How far the writer is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct Progress {
     /// Everything up to this ticket was written, or cannot be now.
     pub(crate) ticket: u64,
@@ -32,6 +32,8 @@ pub(crate) struct Progress {
     pub(crate) works: bool,
     /// Size of the database and its log after the last success, bytes; `None` = none so far.
     pub(crate) file_bytes: Option<u64>,
+    /// Commits done.
+    pub(crate) commits: u64,
     /// Attempts that failed.
     pub(crate) failures: u64,
 }
@@ -140,6 +142,8 @@ pub(super) struct Writer {
     pub(super) database: Option<Database>,
     pub(super) progress: watch::Sender<Progress>,
     pub(super) retry: Retry,
+    /// Commits done.
+    pub(super) commits: u64,
     /// Attempts that failed.
     pub(super) failures: u64,
     /// The daemon began with what the database had, or it had nothing.
@@ -183,7 +187,7 @@ impl Writer {
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let progress = Progress { ticket, works, file_bytes, failures: self.failures };
+            let progress = Progress { ticket, works, file_bytes, commits: self.commits, failures: self.failures };
             self.progress.send_if_modified(|told| std::mem::replace(told, progress) != progress);
             if stop {
                 return;
@@ -209,6 +213,7 @@ impl Writer {
                     tracing::info!(folder = %self.folder, "state and history are written again");
                 }
                 self.retry = Retry::default();
+                self.commits += u64::from(state.is_some());
                 self.desk.lock().backlog.told();
                 true
             }
