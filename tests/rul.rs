@@ -179,8 +179,9 @@ fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
             else {
                 continue;
             };
-            let lost_each = 0.05 / 0.6;
-            let truth = ((sim.pack().cells()[0].capacity_ah - 1.3) / lost_each).max(0.0);
+            // Each cycle moves 0.6 of the capacity of the day, and a full cycle is one of the rated capacity.
+            let capacity_ah = sim.pack().cells()[0].capacity_ah;
+            let truth = (0.6 / 0.05 * (capacity_ah * capacity_ah - 1.3 * 1.3) / (2.0 * 2.6)).max(0.0);
             first.get_or_insert(sim.pack().cycles());
             if truth > 0.0 {
                 println!("after {} cycles: {cycles:.1} ({low:.1} to {high:.1}), truth {truth:.1}", sim.pack().cycles());

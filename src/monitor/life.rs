@@ -2,7 +2,7 @@
 //!
 //! What feeds a forecast is what each half-cycle alone says of the capacity, not the learned capacity: learned capacities
 //! that follow each other are mostly the same evidence. What all half-cycles have wrong alike (the current sensor's gain)
-//! goes in as the shared part of the deviation.
+//! goes in as the shared part of the deviation. An equivalent full cycle moves twice the rated capacity.
 
 use super::{CellSlot, Event, EventKind, Monitor, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
@@ -11,6 +11,8 @@ use crate::quantity::CellIndex;
 
 /// Seconds in a day.
 const DAY_S: f64 = 86_400.0;
+/// Rest that is assumed where nobody knows how long a cell has rested, days: all that comes back has come back.
+const LONG_REST_DAYS: f64 = 30.0;
 /// Deviations of a normal distribution between its median and its 5 % quantile.
 const LOW_DEVIATIONS: f64 = 1.645;
 
@@ -33,18 +35,26 @@ impl CellLife {
         Self { forecast, remaining }
     }
 
-    /// A half-cycle is over, `days` after the one before.
-    pub(super) fn learn(&mut self, config: &MonitorConfig, half: &HalfCycle, days: f64, update: &CapacityUpdate) {
+    /// A half-cycle is over, and so long after the one before (seconds; `None` = not known). `update` is what it taught.
+    pub(super) fn learn(
+        &mut self,
+        config: &MonitorConfig,
+        half: &HalfCycle,
+        since_before_s: Option<f64>,
+        update: Option<&CapacityUpdate>,
+    ) {
         let used_days = half.duration_s / DAY_S;
+        let rest_days = since_before_s.map_or(LONG_REST_DAYS, |seconds| (seconds / DAY_S - used_days).max(0.0));
         let passed = Passed {
-            cycles: half.charge_ah / (2.0 * update.capacity.mean),
-            days: days.max(used_days),
-            rest_days: (days - used_days).max(0.0),
+            cycles: half.charge_ah / (2.0 * config.model.rated_capacity_ah),
+            // A rest nobody knows says nothing of how much the cell is used of late.
+            days: used_days + since_before_s.map_or(0.0, |_| rest_days),
+            rest_days,
         };
-        let reading = update.measurement.map(|z| Reading {
-            capacity_ah: z.value,
-            variance_ah2: z.variance,
-            shared_variance_ah2: update.capacity.variance,
+        let reading = update.and_then(|update| {
+            let z = update.measurement?;
+            let gain_ah = config.health.capacity.current_gain_std * update.capacity.mean;
+            Some(Reading { capacity_ah: z.value, variance_ah2: z.variance, shared_variance_ah2: gain_ah * gain_ah })
         });
         self.forecast.update(passed, reading);
         self.restate(config);
@@ -89,13 +99,24 @@ impl Monitor {
         Some((cell, self.cells[cell.index()].life.remaining.ok()?))
     }
 
-    /// After a half-cycle: what remains, to the record and to the rule.
-    pub(super) fn tell_life(&mut self, was_known: bool, out: &mut Outputs) {
+    /// After a half-cycle: what remains, to the record and to the rule. `is_new`: some cell's capacity was measured.
+    pub(super) fn tell_life(&mut self, was_known: bool, is_new: bool, out: &mut Outputs) {
         let found = self.pack_remaining_life();
         if was_known || found.is_some() {
             out.events.push(Event { time: self.now, kind: life_event(found) });
         }
-        self.observe_life(true, out);
+        self.observe_life(is_new, out);
+    }
+
+    /// The end of life is another one: what was said of the one before is not known of it, before new thresholds look.
+    pub(super) fn restate_lives(&mut self, out: &mut Outputs) {
+        let before = self.pack_remaining_life();
+        self.cells.iter_mut().for_each(|slot| slot.life.restate(&self.config));
+        self.observe_alarm(Rule::RemainingLifeLow, None, Observation::default(), out);
+        let found = self.pack_remaining_life();
+        if before != found {
+            out.events.push(Event { time: self.now, kind: life_event(found) });
+        }
     }
 
     /// For the rule: while some cell's life is not known the pack's may be shorter, never longer.

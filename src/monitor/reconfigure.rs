@@ -111,7 +111,7 @@ impl Monitor {
             self.restate_recharge(&old.recharge, &new.recharge);
         }
         if old.end_of_life_ah != new.end_of_life_ah {
-            self.cells.iter_mut().for_each(|slot| slot.life.restate(&self.config));
+            self.restate_lives(out);
         }
         if old.usable == new.usable {
             return;

@@ -13,7 +13,7 @@ use super::{
 use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
-use crate::health::{Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{Axis, Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{Timestamp, Unsound};
 use crate::sample::SamplerState;
 
@@ -275,6 +275,7 @@ impl CellDocument {
         Unsound::unless_number("the SOC of a full cell", self.full_soc)?;
         check_belief("the usable capacity", self.usable)?;
         check_belief("the resistance of discharge", self.discharge_resistance)?;
+        self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         Unsound::unless_number("the charge taken in", charge_as)?;
         Unsound::unless_number("the unmeasured time taken in", unmeasured_s)

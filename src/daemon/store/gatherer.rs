@@ -130,7 +130,7 @@ impl Gatherer {
     fn is_news_of_life(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
         let written = &mut self.written_life;
         let has_moved = match (written.cycles, cycles) {
-            (Some((before, _)), Some((median, std))) => (median - before).abs() >= NEWS_STD * std,
+            (Some((before, _)), Some((median, std))) => (median - before).abs() > NEWS_STD * std,
             (before, now) => before.is_some() != now.is_some(),
         };
         let is_news = written.allowance.take(now) || has_moved;
@@ -143,6 +143,9 @@ impl Gatherer {
     /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news; nor is, when
     /// there have been many, one that has hardly moved.
     fn is_news(&mut self, kind: &EventKind, now: Timestamp) -> bool {
+        if matches!(kind, EventKind::PackReplaced { .. }) {
+            self.written_life.cycles = None;
+        }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
             // Half of the interval's lower part: a little less than a deviation.
             return self

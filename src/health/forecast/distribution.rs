@@ -5,19 +5,16 @@
 //! E T = (L / r) (e^a - 1) / a with a = k L / 2, and
 //! E T^2 = (4 / (k r^2)) (e^a (e^{3a} - 1) / (1.5 k) - (e^{4a} - 1) / (2 k)); a lognormal of that mean and variance.
 //! The rate, positive, is a lognormal of its truncated normal's mean and variance; the walk with use adds its variance;
-//! the loss is normal and taken at five Gauss-Hermite nodes, with the rate conditional on it. A node at or below the
-//! threshold has passed already: T = 0.
+//! the loss is normal. What of it is not above 0 has passed already: T = 0, with exactly that probability. The rest is cut
+//! into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for its own
+//! width w, a variance of (w / L)^2 / 12 more.
 
 use super::{RATE_WALK, RATE_WALK_USE};
 
-/// Gauss-Hermite nodes and weights of the standard normal distribution.
-const NODES: [(f64, f64); 5] = [
-    (-2.856_970_013_872_806, 0.011_257_411_327_720_69),
-    (-1.355_626_179_974_266, 0.222_075_922_005_612_63),
-    (0.0, 0.533_333_333_333_333_3),
-    (1.355_626_179_974_266, 0.222_075_922_005_612_63),
-    (2.856_970_013_872_806, 0.011_257_411_327_720_69),
-];
+/// Slices of the loss.
+const SLICES: usize = 10;
+/// Deviations of the loss on either side within which it is cut; what lies beyond counts with the outermost slices.
+const SLICED: f64 = 3.5;
 
 /// Steps of the bisections: from some 20 e-folds to a part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
@@ -31,63 +28,73 @@ const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 /// Below this the moments' closed form loses digits and their series serves.
 const SMALL: f64 = 1e-3;
 
-/// A part of the mixture: its weight and its lognormal; `None` = passed already.
-#[derive(Debug, Clone, Copy)]
-struct Part {
-    weight: f64,
-    log: Option<(f64, f64)>,
-}
+/// A slice: its probability, and mean and standard deviation of the logarithm of the use it takes.
+type Slice = (f64, (f64, f64));
 
 /// The distribution of the use until the crossing.
 #[derive(Debug, Clone)]
 pub(super) struct Crossing {
-    parts: [Part; NODES.len()],
+    /// Probability that it has come already.
+    passed: f64,
+    slices: [Slice; SLICES],
 }
 
 impl Crossing {
     /// From mean [loss to come, rate], covariance [loss, loss and rate, rate] and the use so far.
     pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
-        let loss_std = loss_variance.sqrt();
-        let parts = NODES.map(|(node, weight)| {
-            let loss = mean[0] + loss_std * node;
-            if loss <= 0.0 {
-                return Part { weight, log: None };
-            }
-            let by_loss = if loss_variance > 0.0 { both / loss_variance } else { 0.0 };
-            let left = (rate_variance - by_loss * both).max(0.0);
-            let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * node, left);
+        // Of a loss that is certain the slices are all the same.
+        let loss_std = loss_variance.max(1e-24).sqrt();
+        let by_loss = both / (loss_std * loss_std);
+        let left = (rate_variance - by_loss * both).max(0.0);
+        // Deviations from the mean at which nothing is left to lose.
+        let zero = -mean[0] / loss_std;
+        let from = zero.max(-SLICED);
+        let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;
+        let mut before = normal(zero);
+        let passed = before;
+        let slices = std::array::from_fn(|index| {
+            let upper = from + (index + 1) as f64 * width;
+            let until = if index + 1 == SLICES { 1.0 } else { normal(upper) };
+            let probability = (until - before).max(0.0);
+            before = until;
+            let deviation = upper - 0.5 * width;
+            let loss = mean[0] + loss_std * deviation;
+            let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
             let (log_use, walked) = use_of_loss(loss);
             let log_mean = log_use - log_rate;
             // The rate goes on walking with use; over the way the mean of its walk counts, about half.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
-            let variance = log_rate_variance + walked + 0.5 * RATE_WALK_USE * RATE_WALK_USE * ahead;
-            Part { weight, log: Some((log_mean, variance.sqrt())) }
+            let own_width = loss_std * width / loss;
+            let variance =
+                log_rate_variance + walked + 0.5 * RATE_WALK_USE * RATE_WALK_USE * ahead + own_width * own_width / 12.0;
+            (probability, (log_mean, variance.sqrt()))
         });
-        Self { parts }
+        Self { passed, slices }
     }
 
     /// Probability that the crossing comes within `ahead` units of use.
     pub(super) fn probability(&self, ahead: f64) -> f64 {
-        self.parts.iter().map(|part| part.weight * part.log.map_or(1.0, |log| below(libm::log(ahead), log))).sum()
+        self.probability_of_log(libm::log(ahead))
+    }
+
+    fn probability_of_log(&self, log_use: f64) -> f64 {
+        let to_come: f64 = self.slices.iter().map(|(weight, log)| weight * below(log_use, *log)).sum();
+        self.passed + to_come
     }
 
     /// Use within which it comes with this probability.
     pub(super) fn quantile(&self, probability: f64) -> f64 {
-        let passed = |log_use: f64| -> f64 {
-            self.parts.iter().map(|part| part.weight * part.log.map_or(1.0, |log| below(log_use, log))).sum()
-        };
-        let over = self.parts.iter().filter(|part| part.log.is_none()).map(|part| part.weight).sum::<f64>();
-        if over >= probability {
+        if self.passed >= probability {
             return 0.0;
         }
-        let ends =
-            |sign: f64| self.parts.iter().filter_map(move |part| part.log.map(|(m, std)| m + sign * REACH * std));
-        let mut least = ends(-1.0).fold(LOG_RANGE.1, f64::min);
+        let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
+        let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * REACH * std);
+        let mut least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
         let mut most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (least + most);
-            if passed(middle) < probability {
+            if self.probability_of_log(middle) < probability {
                 least = middle;
             } else {
                 most = middle;
@@ -97,9 +104,14 @@ impl Crossing {
     }
 }
 
+/// Probability of a standard normal distribution below `value`.
+fn normal(value: f64) -> f64 {
+    0.5 * libm::erfc(-value / std::f64::consts::SQRT_2)
+}
+
 /// Probability of a normal distribution (mean, standard deviation) below `value`.
 fn below(value: f64, (mean, std): (f64, f64)) -> f64 {
-    0.5 * libm::erfc((mean - value) / (std * std::f64::consts::SQRT_2))
+    normal((value - mean) / std)
 }
 
 /// Mean and variance of the logarithm of a lognormal that has the moments of the normal (mean, variance) above 0.
