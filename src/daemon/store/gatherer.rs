@@ -239,17 +239,18 @@ mod tests {
 
     #[test]
     fn remaining_lives_are_written_until_there_are_many_and_then_when_they_move() {
-        let mut gatherer = Gatherer::default();
-        // Slowly less, and nothing any more.
-        for per_minute in [0.01, 0.0] {
-            gatherer = Gatherer::default();
-            let mut rows = 0;
+        let day = |per_minute: f64| {
+            let (mut gatherer, mut rows) = (Gatherer::default(), 0);
             for minute in 0..1440 {
                 let kinds = [half_cycle(0), remaining_life(per_minute * f64::from(100_000 - minute))];
                 rows += take(&mut gatherer, f64::from(minute) * 60.0, &kinds).unwrap() - 1;
             }
             assert!((64 + 22..=64 + 24).contains(&rows), "{rows} rows");
-        }
+            gatherer
+        };
+        // Nothing any more, and slowly less.
+        day(0.0);
+        let mut gatherer = day(0.01);
         assert_eq!(take(&mut gatherer, 86_341.0, &[half_cycle(0), remaining_life(700.0)]), Some(2), "far");
         let unknown = EventKind::RemainingLife {
             cell: None,
