@@ -2,11 +2,13 @@
 
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::Failure;
 use super::fleet::{LogArgs, positive};
 use crate::alarm::Rule;
+use crate::config::Config;
+use crate::lab::fleet::Reading;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
 use crate::lab::fleet::variants::{self, Choice};
@@ -72,8 +74,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let grid = variants::grid(&args.config, &args.set)
         .map_err(|faults| Failure { message: faults.join("\n"), code: super::EXIT_CONFIG })?;
     let rated_ah = grid.variants[0].config.monitor.model.rated_capacity_ah;
+    if args.logs.is_stdin() && grid.replays > 1 {
+        return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
+    }
+    let open = |config: &Config, log: &Path| args.logs.open(config, log);
     let settings = Settings {
-        reading: args.logs.reading(),
+        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         end_of_life_ah: match args.end_of_life {
             EndOfLife::Ah(ah) => ah,
             EndOfLife::Part(part) => part * rated_ah,
@@ -106,7 +112,7 @@ impl Args {
         if truths != 0 && truths != logs {
             return Err(Failure::new(format!("--truth given {truths} times for {logs} logs, must be once per log")));
         }
-        if self.json && self.csv.as_deref() == Some(std::path::Path::new("-")) {
+        if self.json && self.csv.as_deref() == Some(Path::new("-")) {
             return Err(Failure::new("only one of --json and --csv can go to standard output"));
         }
         Ok(())
@@ -129,7 +135,7 @@ impl Args {
     fn write(&self, shown: &report::Shown<'_>) -> std::io::Result<()> {
         if let Some(path) = &self.csv {
             shown.csv(path)?;
-            if path == std::path::Path::new("-") {
+            if path == Path::new("-") {
                 return Ok(());
             }
         }

@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use crate::alarm::{Rule, Severity};
-use crate::cli::fleet::write_table;
+use crate::cli::score::write_table;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::judge::Horizon;
@@ -18,10 +18,17 @@ use crate::quantity::Timestamp;
 /// Version of the JSON document.
 const VERSION: u32 = 1;
 
+/// Columns of a table besides the alarm and the values set.
+const OWN_COLUMNS: usize = 9;
+const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
+    ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
+const LOG_HEADS: [&str; OWN_COLUMNS] =
+    ["threshold", "raised", "at day", "cycle", "cell", "value", "lead, days", "lead, cycles", "judged"];
+
 /// Everything that is shown.
 pub(super) struct Shown<'a> {
     pub(super) grid: &'a Grid,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a Settings<'a>,
     pub(super) rated_ah: f64,
     /// Rules in the tables.
     pub(super) rules: &'a [Rule],
@@ -87,23 +94,9 @@ impl Shown<'_> {
     }
 
     fn write_summary(&self, out: &mut impl Write) -> io::Result<()> {
-        let own = [
-            "alarm",
-            "threshold",
-            "raised",
-            "lead, days",
-            "lead, cycles",
-            "missed",
-            "false",
-            "open",
-            "false raises",
-            "flickers",
-        ];
-        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
         let ended = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
         let row = |summary: &Summary| {
             let own = [
-                alarm_name(summary.rule, summary.severity),
                 level(summary.threshold),
                 format!("{} of {}", summary.raised_logs, self.logs.len()),
                 spread(summary.lead_days),
@@ -114,10 +107,11 @@ impl Shown<'_> {
                 count(summary.false_raises),
                 summary.flickers.to_string(),
             ];
-            self.setting_cells(summary.setting).chain(own).collect()
+            self.row((summary.rule, summary.severity), summary.setting, own)
         };
-        let rows: Vec<Vec<String>> = self.summaries().iter().map(row).collect();
-        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+        let mut rows = vec![self.heads(SUMMARY_HEADS)];
+        rows.extend(self.summaries().iter().map(row));
+        write_table(out, &rows)
     }
 
     fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
@@ -129,41 +123,40 @@ impl Shown<'_> {
         };
         let (name, by) = (log.log.display(), log.judged_by.words());
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
-        let own = [
-            "alarm",
-            "threshold",
-            "raised",
-            "at day",
-            "cycle",
-            "cell",
-            "value",
-            "lead, days",
-            "lead, cycles",
-            "judged",
-        ];
-        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
-        let rows: Vec<Vec<String>> = self.rows(log).map(|row| self.log_row(row)).collect();
-        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+        let mut rows = vec![self.heads(LOG_HEADS)];
+        rows.extend(self.rows(log).map(|row| self.log_row(row)));
+        write_table(out, &rows)
     }
 
     fn log_row(&self, row: &AlarmRow) -> Vec<String> {
         let judged = &row.judged;
         let first = judged.first.as_ref();
         let number = |value: Option<f64>, digits: usize| value.map_or_else(dash, |value| format!("{value:.digits$}"));
+        let place = |cell: Option<u16>| cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
         let own = [
-            alarm_name(row.rule, row.severity),
             level(row.threshold),
-            format!("{} times", judged.raises as u64),
+            format!("{} times", judged.raises),
             number(first.map(|first| first.days), 2),
             number(first.map(|first| first.cycles), 1),
-            first
-                .map_or_else(dash, |first| first.cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string())),
+            first.map_or_else(dash, |first| place(first.cell)),
             number(first.and_then(|first| first.value), 4),
             number(judged.lead_days, 2),
             number(judged.lead_cycles, 1),
             verdict(row),
         ];
-        self.setting_cells(row.setting).chain(own).collect()
+        self.row((row.rule, row.severity), row.setting, own)
+    }
+
+    fn heads(&self, own: [&str; OWN_COLUMNS]) -> Vec<String> {
+        std::iter::once("alarm".to_owned())
+            .chain(self.grid.keys.iter().cloned())
+            .chain(own.map(str::to_owned))
+            .collect()
+    }
+
+    fn row(&self, (rule, severity): (Rule, Severity), setting: usize, own: [String; OWN_COLUMNS]) -> Vec<String> {
+        let alarm = format!("{} {}", rule.name(), severity.name());
+        std::iter::once(alarm).chain(self.setting_cells(setting)).chain(own).collect()
     }
 
     /// Columns of the values set; those of the configuration as it is are said so.
@@ -330,10 +323,6 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     let last = values.len().checked_sub(1)?;
     let at = |part: f64| values[((part * values.len() as f64).ceil() as usize).saturating_sub(1).min(last)];
     Some([at(0.5), at(0.05), at(0.95)])
-}
-
-fn alarm_name(rule: Rule, severity: Severity) -> String {
-    format!("{} {}", rule.name(), severity.name())
 }
 
 fn verdict(row: &AlarmRow) -> String {

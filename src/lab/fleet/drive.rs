@@ -3,60 +3,25 @@
 //! In: a log and a monitor that has had no input. Out: after each input what came out, to a closure. Promise: the same
 //! inputs and ticks as `packwatch replay` gives the core, so the same results.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::Ordering;
 
-use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::Config;
-use crate::io::csv_log::CsvOptions;
-use crate::io::log::{LogCounts, LogOptions, LogSource, Record};
+use crate::io::log::{LogCounts, LogSource, Record};
 use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
-use crate::sample::VoltageSource;
 
 /// Records between two reports of progress.
 const REPORT_EVERY: u64 = 4096;
 
-/// How logs are to be read.
-#[derive(Debug, Clone)]
-pub(crate) struct Reading {
-    /// A bad line ends the reading of its log.
-    pub(crate) strict: bool,
-    /// CSV columns, role to name.
-    pub(crate) columns: Vec<(String, String)>,
-    /// A CSV's positive current is charge.
-    pub(crate) charge_positive: bool,
-    /// CSV table of the sections' start times.
-    pub(crate) start_times: Option<PathBuf>,
+/// How logs are read.
+#[derive(Clone, Copy)]
+pub(crate) struct Reading<'a> {
+    /// Opens a log as it is read with a configuration.
+    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> LogSource + Sync),
     /// A hole longer than this means that the recorder was asleep, s.
     pub(crate) sleep_gap_s: f64,
-}
-
-impl Reading {
-    /// A log as it is read with `config`.
-    pub(crate) fn source(&self, config: &Config, log: &Path) -> LogSource {
-        let sample = &config.monitor.sample;
-        let encoder = InputEncoder::new(&config.monitor.input);
-        let mut protector = InputProtector::new(&config.monitor.guards);
-        let options = LogOptions {
-            interfaces: config.interfaces.iter().map(|interface| interface.name.clone()).collect(),
-            strict: self.strict,
-            csv: CsvOptions {
-                columns: self.columns.clone(),
-                charge_positive: self.charge_positive,
-                start_times: self.start_times.clone(),
-                cells: sample.cells,
-                pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            },
-            encode_row: Box::new(move |values, frames| {
-                let uncarried = encoder.encode(values, frames);
-                protector.protect(frames);
-                uncarried
-            }),
-        };
-        LogSource::new([log.to_owned()], options)
-    }
 }
 
 /// What a log was.

@@ -3,7 +3,8 @@ use std::fs;
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 
-use super::super::columns::{ESTIMATES, EstimateRow};
+use super::super::columns::ESTIMATES;
+use super::super::rows::EstimateRow;
 use super::*;
 use crate::monitor::Estimate;
 use crate::quantity::{CellIndex, Timestamp};
