@@ -29,7 +29,8 @@ enum FormatName {
 #[command(
     after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json per log. All logs of a fleet in one \
                   query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Tables that are there already are \
-                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others go on; the exit code is then 1."
+                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others go on; the exit code is then 1. The \
+                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv beside it."
 )]
 pub(crate) struct Args {
     /// Print the columns with their types and units as Markdown, and do nothing else

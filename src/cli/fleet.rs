@@ -8,6 +8,7 @@ use super::Failure;
 use super::replay::{InputArgs, log_options};
 use crate::config::Config;
 use crate::io::log::LogSource;
+use crate::lab::fleet::truth;
 
 /// The logs and how they are read.
 #[derive(Debug, clap::Args)]
@@ -33,7 +34,9 @@ impl LogArgs {
         }
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
-            return Err(Failure::new(format!("--start-times given for {found} logs, must be for 1")));
+            return Err(Failure::new(format!(
+                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv beside each serves as well"
+            )));
         }
         if self.logs.len() > 1 && self.is_stdin() {
             return Err(Failure::new("-: standard input must be the only log"));
@@ -41,9 +44,13 @@ impl LogArgs {
         Ok(())
     }
 
-    /// Opens a log as it is read with a configuration.
-    pub(crate) fn open(&self, config: &Config, log: &Path) -> LogSource {
-        LogSource::new([log.to_owned()], log_options(&self.input, config))
+    /// Opens a log as it is read with a configuration; with what the user should know of that.
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> (LogSource, Option<String>) {
+        let mut options = log_options(&self.input, config);
+        let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
+        let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));
+        options.csv.start_times = options.csv.start_times.or(beside);
+        (LogSource::new([log.to_owned()], options), note)
     }
 
     /// A hole longer than this means that the recorder was asleep, s.

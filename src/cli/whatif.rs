@@ -32,7 +32,8 @@ enum EndOfLife {
                   such a raise, but the log ends before the horizon does. false raise: capacity_low raised while the true capacity of the \
                   cell was above the threshold. flickers: clears before the end. Leads are medians over the logs (5 to 95 %).\n\n\
                   The end of life is judged by a truth beside the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv as \
-                  score --cycles takes it, or --truth), else by the learned capacity; the table says which."
+                  score --cycles takes it, or --truth), else by the learned capacity; the table says which. The sections of a CSV are dated by \
+                  --start-times, else by NAME_cycles.csv beside it."
 )]
 pub(crate) struct Args {
     /// Configuration

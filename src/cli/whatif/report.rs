@@ -12,7 +12,7 @@ use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::{Grid, Variant};
-use crate::lab::fleet::whatif::{AlarmRow, LogResult, Settings};
+use crate::lab::fleet::whatif::{AlarmRow, EndOfLife, LogResult, Settings};
 use crate::quantity::Timestamp;
 
 /// Version of the JSON document.
@@ -59,6 +59,9 @@ struct Summary {
 impl Shown<'_> {
     /// Tables for people.
     pub(super) fn table(&self, each: bool) -> io::Result<()> {
+        if self.logs.is_empty() {
+            return Ok(());
+        }
         let mut text = Vec::new();
         self.write_head(&mut text)?;
         if self.logs.len() != 1 {
@@ -73,7 +76,7 @@ impl Shown<'_> {
     fn write_head(&self, out: &mut impl Write) -> io::Result<()> {
         let (settings, replays) = (self.grid.variants.len(), self.grid.replays);
         let more = if settings == 1 { "the configuration as it is".to_owned() } else { format!("{settings} settings") };
-        writeln!(out, "{} logs, {more}, {replays} replays per log", self.logs.len())?;
+        writeln!(out, "{}, {more}, {} per log", numbered(self.logs.len(), "log"), numbered(replays, "replay"))?;
         let (end_ah, part) = (self.settings.end_of_life_ah, 100.0 * self.settings.end_of_life_ah / self.rated_ah);
         let reached = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
         let mut by: Vec<_> = self.logs.iter().map(|log| log.judged_by).collect();
@@ -124,11 +127,11 @@ impl Shown<'_> {
         let (name, by) = (log.log.display(), log.judged_by.words());
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
         let mut rows = vec![self.heads(LOG_HEADS)];
-        rows.extend(self.rows(log).map(|row| self.log_row(row)));
+        rows.extend(self.rows(log).map(|row| self.log_row(log, row)));
         write_table(out, &rows)
     }
 
-    fn log_row(&self, row: &AlarmRow) -> Vec<String> {
+    fn log_row(&self, log: &LogResult, row: &AlarmRow) -> Vec<String> {
         let judged = &row.judged;
         let first = judged.first.as_ref();
         let number = |value: Option<f64>, digits: usize| value.map_or_else(dash, |value| format!("{value:.digits$}"));
@@ -142,7 +145,7 @@ impl Shown<'_> {
             number(first.and_then(|first| first.value), 4),
             number(judged.lead_days, 2),
             number(judged.lead_cycles, 1),
-            verdict(row),
+            verdict(row, log.end_of_life.as_ref()),
         ];
         self.row((row.rule, row.severity), row.setting, own)
     }
@@ -325,10 +328,12 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     Some([at(0.5), at(0.05), at(0.95)])
 }
 
-fn verdict(row: &AlarmRow) -> String {
+fn verdict(row: &AlarmRow, end: Option<&EndOfLife>) -> String {
     let judged = &row.judged;
+    let late_days = judged.first.zip(end).map(|(first, end)| first.days - end.days).filter(|days| *days >= 0.0);
+    let missed = || late_days.map_or_else(|| "missed".to_owned(), |days| format!("missed, came {days:.2} days late"));
     let words = [
-        judged.missed.filter(|missed| *missed).map(|_| "missed".to_owned()),
+        judged.missed.filter(|missed| *missed).map(|_| missed()),
         judged.false_alarms.filter(|n| *n > 0).map(|n| format!("{n} false")),
         judged.open.filter(|n| *n > 0).map(|n| format!("{n} open")),
         judged.false_raises.filter(|n| *n > 0).map(|n| format!("{n} false raises")),
@@ -341,6 +346,10 @@ fn verdict(row: &AlarmRow) -> String {
         (true, true) => "good".to_owned(),
         (true, false) => dash(),
     }
+}
+
+fn numbered(count: usize, what: &str) -> String {
+    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 fn level(threshold: f64) -> String {

@@ -18,8 +18,8 @@ const REPORT_EVERY: u64 = 4096;
 /// How logs are read.
 #[derive(Clone, Copy)]
 pub(crate) struct Reading<'a> {
-    /// Opens a log as it is read with a configuration.
-    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> LogSource + Sync),
+    /// Opens a log as it is read with a configuration; with what the user should know of that.
+    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> (LogSource, Option<String>) + Sync),
     /// A hole longer than this means that the recorder was asleep, s.
     pub(crate) sleep_gap_s: f64,
 }
@@ -47,7 +47,7 @@ impl Driven {
 /// # Errors
 /// When the log cannot be read, or what `each` says.
 pub(crate) fn drive(
-    mut source: LogSource,
+    (mut source, note): (LogSource, Option<String>),
     mut monitor: Monitor,
     mut out: Outputs,
     sleep_gap_s: f64,
@@ -56,6 +56,7 @@ pub(crate) fn drive(
 ) -> Result<Driven, String> {
     let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
     let (mut driven, mut records, mut told) = (Driven::default(), 0_u64, 0);
+    driven.notes.extend(note);
     let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
         while let Some(time) = ticks.pop(monitor.next_due()) {
             monitor.handle(Input::Tick { time }, &mut out);

@@ -200,7 +200,9 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
     if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
-        return Err(format!("{file}: tells of {a} to {b} s, must tell of the log's {c} to {d} s"));
+        return Err(format!(
+            "{file}: tells of {a} to {b} s, must tell of the log's {c} to {d} s (--start-times dates a CSV)"
+        ));
     }
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
     let end = end.filter(|(time, _)| *time <= span.1);
