@@ -93,7 +93,7 @@ impl Shown<'_> {
         for log in self.logs {
             log.notes.iter().try_for_each(|note| writeln!(out, "note: {}: {note}", log.log.display()))?;
         }
-        writeln!(out)
+        Ok(())
     }
 
     fn write_summary(&self, out: &mut impl Write) -> io::Result<()> {
@@ -112,6 +112,7 @@ impl Shown<'_> {
             ];
             self.row((summary.rule, summary.severity), summary.setting, own)
         };
+        writeln!(out)?;
         let mut rows = vec![self.heads(SUMMARY_HEADS)];
         rows.extend(self.summaries().iter().map(row));
         write_table(out, &rows)

@@ -176,7 +176,7 @@ fn variant(
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
             rest.and_then(|rest| rest.strip_prefix(": ")).unwrap_or(fault).to_owned()
         };
-        faults.0.iter().map(without_line).collect::<Vec<_>>()
+        faults.0.iter().map(without_line).map(|fault| name_rules(fault, targets)).collect::<Vec<_>>()
     })?;
     Ok((config, replay_key(&root)))
 }
@@ -257,7 +257,7 @@ impl Target {
     fn of(key: &str, root: &Table, notes: &mut Vec<String>) -> Result<Self, String> {
         let (first, rest) = key.split_once('.').unwrap_or((key, ""));
         let Some(rule) = Rule::ALL.into_iter().find(|rule| rule.name() == first) else {
-            return Self::key(key).map_err(|what| format!("{what}{}", rule_meant(first)));
+            return Self::key(key);
         };
         let (name, part) = rest.split_once('.').unwrap_or((rest, "set"));
         let part = ["set", "clear"].into_iter().find(|known| *known == part);
@@ -322,11 +322,20 @@ impl Target {
     }
 }
 
-/// A rule that may have been meant.
-fn rule_meant(found: &str) -> String {
-    let near = Rule::ALL.into_iter().map(|rule| (strsim::jaro_winkler(found, rule.name()), rule));
+/// A fault of the configuration; where it knows no such table, a rule may have been meant.
+fn name_rules(fault: String, targets: &[Target]) -> String {
+    let unknown = targets.iter().find_map(|target| match target {
+        Target::Key(parts) => {
+            parts.first().filter(|(name, _)| fault.starts_with(&format!("{name} is not a known key")))
+        }
+        Target::Threshold { .. } | Target::Alarm { .. } => None,
+    });
+    let Some((name, _)) = unknown else { return fault };
+    let rules: Vec<&str> = Rule::ALL.into_iter().map(Rule::name).collect();
+    let near = rules.iter().map(|rule| (strsim::jaro_winkler(name, rule), rule));
     let best = near.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(similarity, _)| *similarity > 0.8);
-    best.map(|(_, rule)| format!(", did you mean {}", rule.name())).unwrap_or_default()
+    let meant = best.map(|(_, rule)| format!(", did you mean {rule}")).unwrap_or_default();
+    format!("{name} is no table of the configuration and no rule{meant} (rules: {})", rules.join(", "))
 }
 
 fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
