@@ -101,6 +101,9 @@ fn json(good: &[Exported], failed: &[String]) -> io::Result<()> {
 }
 
 fn table(good: &[Exported]) -> io::Result<()> {
+    if good.is_empty() {
+        return Ok(());
+    }
     let row = |exported: &Exported| {
         let rows = |table: &str| exported.rows.get(table).copied().unwrap_or(0).to_string();
         vec![

@@ -89,6 +89,15 @@ pub(crate) fn drive(
 }
 
 impl Driven {
+    /// First and last stamp of `log`.
+    ///
+    /// # Errors
+    /// Nothing of it was read: what is known of why.
+    pub(crate) fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+        let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
+        self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
+    }
+
     fn note(&mut self, record: &Record) {
         let time = record.time();
         let (first, last) = self.span.unwrap_or((time, time));

@@ -112,14 +112,13 @@ fn export(
     };
     let monitor = Monitor::new(config.monitor.clone());
     let driven = drive(source, monitor, out, settings.reading.sleep_gap_s, &mut each, report)?;
-    if driven.span.is_none() {
-        return Err(format!("{}: holds no record", log.display()));
-    }
+    let span = driven.span_of(log)?;
+    let metadata = metadata(config, log, span, settings);
     let mut notes = driven.notes.clone();
     notes.extend(forget_about(&folder, log)?);
-    let rows = tables.finish(&metadata(config, log, &driven, settings))?;
+    let rows = tables.finish(&metadata)?;
     let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes };
-    write_about(config, &exported, &driven, settings)?;
+    write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }
 
@@ -135,9 +134,13 @@ fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
 }
 
 /// What the files say of themselves.
-fn metadata(config: &Config, log: &Path, driven: &Driven, settings: &Settings<'_>) -> Vec<(&'static str, String)> {
+fn metadata(
+    config: &Config,
+    log: &Path,
+    (first, last): (Timestamp, Timestamp),
+    settings: &Settings<'_>,
+) -> Vec<(&'static str, String)> {
     let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
-    let (first, last) = driven.span.unwrap_or((Timestamp::ZERO, Timestamp::ZERO));
     vec![
         ("packwatch.version", env!("CARGO_PKG_VERSION").to_owned()),
         ("packwatch.config", config.path.display().to_string()),
@@ -149,8 +152,7 @@ fn metadata(config: &Config, log: &Path, driven: &Driven, settings: &Settings<'_
     ]
 }
 
-fn write_about(config: &Config, exported: &Exported, driven: &Driven, settings: &Settings<'_>) -> Result<(), String> {
-    let metadata = metadata(config, &exported.log, driven, settings);
+fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
@@ -170,6 +172,9 @@ fn write_about(config: &Config, exported: &Exported, driven: &Driven, settings: 
 fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
+        if log == Path::new("-") {
+            return "stdin".to_owned();
+        }
         let name = text(log.file_name());
         let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name).to_owned();
         let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned();
@@ -292,7 +297,8 @@ mod tests {
 
     #[test]
     fn names_are_safe_and_no_two_are_the_same() {
-        let logs = ["a/life.log.gz", "b/life.csv", "c/day 1.log", "b/life.log", ".log", "x/y.z.log"].map(PathBuf::from);
-        assert_eq!(names(&logs), ["a-life", "b-life", "day_1", "b-life-2", "log", "y.z"]);
+        let logs =
+            ["a/life.log.gz", "b/life.csv", "c/day 1.log", "b/life.log", ".log", "x/y.z.log", "-"].map(PathBuf::from);
+        assert_eq!(names(&logs), ["a-life", "b-life", "day_1", "b-life-2", "log", "y.z", "stdin"]);
     }
 }

@@ -196,7 +196,7 @@ fn replay(
 fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings<'_>) -> Result<LogResult, String> {
     let plain = replays.first().ok_or("no replay")?;
     let truth = plain.truth.as_ref();
-    let span = plain.driven.span.ok_or_else(|| format!("{}: holds no record", job.log.display()))?;
+    let span = plain.driven.span_of(&job.log)?;
     if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
