@@ -111,6 +111,8 @@ fn the_csv_has_a_row_per_log_setting_and_alarm() {
     let mut reader = csv::Reader::from_path(bench.path("rows.csv")).unwrap();
     assert!(reader.headers().unwrap().iter().any(|name| name == "capacity_low.warning"));
     assert_eq!(reader.records().map(Result::unwrap).count(), 2 * 3);
+    let document = bench.whatif(&["a.log.gz"]);
+    assert_eq!(document["end_of_life_ah"], 0.8 * 2.6, "capacity.end_of_life of the configuration");
 }
 
 #[test]

@@ -43,9 +43,10 @@ pub(crate) struct Args {
     /// has), probability, debounce_s and so on, or any key, as estimator.voltage_noise_v=0.005; several make a grid
     #[arg(long = "set", value_name = "KEY=V1,V2")]
     set: Vec<Choice>,
-    /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %"
-    #[arg(long, value_name = "AH|PERCENT", default_value = "70 %", value_parser = end_of_life)]
-    end_of_life: EndOfLife,
+    /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %" (default:
+    /// capacity.end_of_life of the configuration)
+    #[arg(long, value_name = "AH|PERCENT", value_parser = end_of_life)]
+    end_of_life: Option<EndOfLife>,
     /// A raise is false when the end of life does not come this soon after it: equivalent full cycles, or days as 90d (default: the
     /// rest of the log)
     #[arg(long, value_name = "CYCLES|DAYSd", value_parser = horizon)]
@@ -74,7 +75,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let grid = variants::grid(&args.config, &args.set)
         .map_err(|faults| Failure { message: faults.join("\n"), code: super::EXIT_CONFIG })?;
-    let rated_ah = grid.variants[0].config.monitor.model.rated_capacity_ah;
+    let plain = &grid.variants[0].config.monitor;
+    let rated_ah = plain.model.rated_capacity_ah;
     if args.logs.is_stdin() && grid.replays > 1 {
         return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
     }
@@ -82,8 +84,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let settings = Settings {
         reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         end_of_life_ah: match args.end_of_life {
-            EndOfLife::Ah(ah) => ah,
-            EndOfLife::Part(part) => part * rated_ah,
+            Some(EndOfLife::Ah(ah)) => ah,
+            Some(EndOfLife::Part(part)) => part * rated_ah,
+            None => plain.health.end_of_life_ah,
         },
         horizon: args.horizon,
         jobs: args.logs.threads(),
