@@ -1,5 +1,6 @@
 //! `packwatch whatif`: when the alarms would have come with other settings.
 
+mod document;
 mod report;
 
 use std::path::{Path, PathBuf};
