@@ -8,7 +8,7 @@ use super::Failure;
 use super::replay::{InputArgs, log_options};
 use crate::config::Config;
 use crate::io::log::LogSource;
-use crate::lab::fleet::truth;
+use crate::lab::fleet::{Opened, truth};
 
 /// The logs and how they are read.
 #[derive(Debug, clap::Args)]
@@ -44,8 +44,8 @@ impl LogArgs {
         Ok(())
     }
 
-    /// Opens a log as it is read with a configuration; with what the user should know of that.
-    pub(crate) fn open(&self, config: &Config, log: &Path) -> (LogSource, Option<String>) {
+    /// Opens a log as it is read with a configuration.
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> Opened {
         let mut options = log_options(&self.input, config);
         let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
         let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));

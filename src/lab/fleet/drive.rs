@@ -15,11 +15,14 @@ use crate::quantity::Timestamp;
 /// Records between two reports of progress.
 const REPORT_EVERY: u64 = 4096;
 
+/// A log to be read, and what the user should know of how.
+pub(crate) type Opened = (LogSource, Option<String>);
+
 /// How logs are read.
 #[derive(Clone, Copy)]
 pub(crate) struct Reading<'a> {
-    /// Opens a log as it is read with a configuration; with what the user should know of that.
-    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> (LogSource, Option<String>) + Sync),
+    /// Opens a log as it is read with a configuration.
+    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
     /// A hole longer than this means that the recorder was asleep, s.
     pub(crate) sleep_gap_s: f64,
 }
@@ -47,7 +50,7 @@ impl Driven {
 /// # Errors
 /// When the log cannot be read, or what `each` says.
 pub(crate) fn drive(
-    (mut source, note): (LogSource, Option<String>),
+    (mut source, note): Opened,
     mut monitor: Monitor,
     mut out: Outputs,
     sleep_gap_s: f64,

@@ -131,6 +131,9 @@ pub(crate) fn cycles_beside(log: &Path) -> Option<PathBuf> {
 }
 
 fn find(log: &Path, alone: bool) -> Option<PathBuf> {
+    if log == Path::new("-") {
+        return None;
+    }
     let (stem, _) = stem_of(log)?;
     let names = ENDINGS.iter().map(|ending| format!("{stem}{ending}"));
     existing(log, names.chain(alone.then(|| "truth.csv".to_owned())))
@@ -199,6 +202,7 @@ mod tests {
         let logs = ["a.log.gz", "b.csv.gz", "c.log"].map(path);
         assert_eq!(beside(&logs), [Some(path("a.truth.csv")), Some(path("b_cycles.csv.gz")), None]);
         assert_eq!(beside(&[path("c.log")]), [Some(path("truth.csv"))]);
+        assert_eq!(beside(&[PathBuf::from("-")]), [None], "standard input has nothing beside it");
         let logs = ["b.csv.gz", "b.log", "a.csv"].map(path);
         assert_eq!(logs.map(|log| cycles_beside(&log)), [Some(path("b_cycles.csv.gz")), None, None]);
     }
