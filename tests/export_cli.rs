@@ -2,12 +2,14 @@
 #![cfg(feature = "lab")]
 #![expect(clippy::unwrap_used, reason = "helpers of tests: a missing piece is a failed test")]
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
+use serde_json::Value;
 
 struct Bench {
     folder: tempfile::TempDir,
@@ -16,8 +18,12 @@ struct Bench {
 impl Bench {
     /// A simulated life of three cycles.
     fn new() -> Self {
+        Self::of_cycles("3")
+    }
+
+    fn of_cycles(cycles: &str) -> Self {
         let bench = Self { folder: tempfile::tempdir().unwrap() };
-        bench.run(&["simulate", "paper", "--out", "life.log", "--cycles", "3"]).success();
+        bench.run(&["simulate", "paper", "--out", "life.log", "--cycles", cycles]).success();
         bench
     }
 
@@ -29,6 +35,12 @@ impl Bench {
         let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/demo.toml");
         let mut command = Command::cargo_bin("packwatch").unwrap();
         command.current_dir(self.folder.path()).args(args).arg("--config").arg(config).assert()
+    }
+
+    /// Rows, each by its columns' names.
+    fn csv(&self, name: &str) -> Vec<BTreeMap<String, String>> {
+        let mut reader = csv::Reader::from_path(self.path(name)).unwrap();
+        reader.deserialize().map(Result::unwrap).collect()
     }
 
     fn parquet(&self, name: &str) -> SerializedFileReader<fs::File> {
@@ -55,6 +67,57 @@ fn estimates_are_those_of_a_replay() {
         count += 1;
     }
     assert!(count > 1000 && rows.next().is_none());
+}
+
+#[test]
+fn half_cycles_and_alarms_are_those_of_a_replay_and_say_what_remains() {
+    let bench = Bench::of_cycles("12");
+    bench.run(&["replay", "--events", "e.jsonl", "life.log"]).success();
+    bench.run(&["export", "--format", "csv", "--out", "out", "life.log"]).success();
+    let text = fs::read_to_string(bench.path("e.jsonl")).unwrap();
+    let events: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |kind: &str| events.iter().filter(|event| event["event"] == kind).collect::<Vec<_>>();
+    assert_eq!(bench.csv("out/life/alarms.csv").len(), of("alarm").len());
+    let rows = bench.csv("out/life/half_cycles.csv");
+    assert_eq!((rows.len(), rows.len()), (of("half_cycle").len(), of("capacity").len()));
+    let mut known = 0;
+    for (row, capacity) in rows.iter().zip(of("capacity")) {
+        assert_eq!(row["capacity_ah"].parse::<f64>().unwrap(), capacity["capacity_ah"].as_f64().unwrap());
+        let left = of("remaining_life").into_iter().find(|left| left["time"] == capacity["time"]);
+        for (column, key) in
+            [("cycles", "cycles"), ("cycles_low", "cycles_low"), ("cycles_high", "cycles_high"), ("days", "days")]
+        {
+            let told = row[&format!("remaining_{column}")].parse::<f64>().ok();
+            assert_eq!(told, left.and_then(|left| left[key].as_f64()), "{column} of {row:?}");
+        }
+        known += usize::from(!row["remaining_cycles"].is_empty());
+    }
+    assert!(known > 5 && known < rows.len(), "{known} of {}", rows.len());
+}
+
+#[test]
+fn tables_of_another_log_are_replaced_and_that_is_told() {
+    let bench = Bench::new();
+    bench.run(&["export", "--out", "out", "life.log"]).success();
+    fs::create_dir(bench.path("b")).unwrap();
+    fs::copy(bench.path("life.log"), bench.path("b/life.log")).unwrap();
+    let told = bench.run(&["export", "--out", "out", "b/life.log"]).success();
+    let stdout = String::from_utf8_lossy(&told.get_output().stdout).into_owned();
+    assert!(stdout.contains("replaced the tables of life.log"), "{stdout}");
+    let told = bench.run(&["export", "--out", "out", "b/life.log"]).success();
+    assert!(!String::from_utf8_lossy(&told.get_output().stdout).contains("replaced"), "the same log is no other");
+}
+
+#[test]
+fn a_csv_is_dated_by_the_table_beside_it() {
+    let bench = Bench::new();
+    fs::write(bench.path("b5.csv"), "cycle,time_s,current_a,voltage_v,temperature_c\n7,0,1,3.9,24\n7,10,1,3.9,24\n")
+        .unwrap();
+    fs::write(bench.path("b5_cycles.csv"), "cycle,start\n7,2008-04-02T13:08:17.921\n").unwrap();
+    bench.run(&["export", "--out", "out", "b5.csv"]).success();
+    let about: Value = serde_json::from_slice(&fs::read(bench.path("out/b5/about.json")).unwrap()).unwrap();
+    assert_eq!(about["metadata"]["packwatch.start_utc"], "2008-04-02T13:08:17.921000Z");
+    assert_eq!(about["notes"][0], "dated by b5_cycles.csv");
 }
 
 #[test]
@@ -100,8 +163,7 @@ fn files_say_where_they_come_from() {
     assert_eq!(value("packwatch.version"), env!("CARGO_PKG_VERSION"));
     assert_eq!(value("packwatch.start_utc"), "2023-11-14T22:13:20.000000Z");
     assert_eq!((value("packwatch.log").as_str(), value("packwatch.config_sha256").len()), ("life.log", 64));
-    let about: serde_json::Value =
-        serde_json::from_slice(&fs::read(bench.path("out/life/about.json")).unwrap()).unwrap();
+    let about: Value = serde_json::from_slice(&fs::read(bench.path("out/life/about.json")).unwrap()).unwrap();
     assert_eq!(about["metadata"]["packwatch.log"], "life.log");
 }
 

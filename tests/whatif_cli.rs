@@ -111,6 +111,8 @@ fn the_csv_has_a_row_per_log_setting_and_alarm() {
     let mut reader = csv::Reader::from_path(bench.path("rows.csv")).unwrap();
     assert!(reader.headers().unwrap().iter().any(|name| name == "capacity_low.warning"));
     assert_eq!(reader.records().map(Result::unwrap).count(), 2 * 3);
+    let document = bench.whatif(&["a.log.gz"]);
+    assert_eq!(document["end_of_life_ah"], 0.8 * 2.6, "capacity.end_of_life of the configuration");
 }
 
 #[test]
@@ -120,6 +122,15 @@ fn a_log_that_fails_is_told_and_the_others_go_on() {
     let output = told.get_output();
     assert!(String::from_utf8_lossy(&output.stderr).contains("none.log: cannot be read"), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
+    std::fs::write(bench.path("other.log"), "(1700000000.000000) can9 123#00\n").unwrap();
+    let told = bench.run(&["whatif"], &["other.log"]).code(1);
+    let output = told.get_output();
+    assert!(output.stdout.is_empty(), "no table of nothing: {output:?}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert!(stderr.contains("holds no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
+    let told = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);
+    let stderr = String::from_utf8_lossy(&told.get_output().stderr).into_owned();
+    assert!(stderr.contains("-: is read once"), "{stderr}");
     let told = bench.run(&["whatif"], &["--set", "capacity_lo.warning=2.3", "a.log.gz"]).code(78);
     assert!(String::from_utf8_lossy(&told.get_output().stderr).contains("did you mean capacity_low"));
 }

@@ -1,13 +1,15 @@
 //! `packwatch export`: estimates, half-cycles and alarms of many logs as Parquet or CSV.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
 use super::Failure;
-use super::fleet::{LogArgs, write_table};
-use crate::config;
+use super::fleet::LogArgs;
+use super::score::write_table;
+use crate::config::{self, Config};
+use crate::lab::fleet::Reading;
 use crate::lab::fleet::export::{self, Exported, Format, Settings};
 
 /// Version of the JSON document.
@@ -26,8 +28,9 @@ enum FormatName {
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json per log. All logs of a fleet in one \
-                  query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. A log that fails leaves no \
-                  new file under its name and the others go on; the exit code is then 1."
+                  query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Tables that are there already are \
+                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others go on; the exit code is then 1. The \
+                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv beside it."
 )]
 pub(crate) struct Args {
     /// Print the columns with their types and units as Markdown, and do nothing else
@@ -62,8 +65,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new("--config and --out must be given"));
     };
     let config = config::load(config)?;
+    let open = |config: &Config, log: &Path| args.logs.open(config, log);
     let settings = Settings {
-        reading: args.logs.reading(),
+        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         format: match args.format {
             FormatName::Parquet => Format::Parquet,
             FormatName::Csv => Format::Csv,
@@ -97,6 +101,9 @@ fn json(good: &[Exported], failed: &[String]) -> io::Result<()> {
 }
 
 fn table(good: &[Exported]) -> io::Result<()> {
+    if good.is_empty() {
+        return Ok(());
+    }
     let row = |exported: &Exported| {
         let rows = |table: &str| exported.rows.get(table).copied().unwrap_or(0).to_string();
         vec![
@@ -110,7 +117,9 @@ fn table(good: &[Exported]) -> io::Result<()> {
     };
     let mut text = Vec::new();
     let heads = ["log", "folder", "days", "estimates", "half-cycles", "alarms"];
-    write_table(&mut text, &heads, 2, &good.iter().map(row).collect::<Vec<_>>())?;
+    let mut rows = vec![heads.map(str::to_owned).to_vec()];
+    rows.extend(good.iter().map(row));
+    write_table(&mut text, &rows)?;
     for exported in good {
         exported.notes.iter().try_for_each(|note| writeln!(text, "note: {}: {note}", exported.log.display()))?;
     }

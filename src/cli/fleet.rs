@@ -1,37 +1,24 @@
-//! What the commands over many logs have in common: how logs are read, progress, failures of single logs, tables.
+//! What the commands over many logs have in common: the logs, how they are read, progress.
 
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::Failure;
-use super::replay::{CsvSign, column};
-use crate::lab::fleet::Reading;
+use super::replay::{InputArgs, log_options};
+use crate::config::Config;
+use crate::io::log::LogSource;
+use crate::lab::fleet::{Opened, truth};
 
-/// How logs are read.
+/// The logs and how they are read.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Logs")]
 pub(crate) struct LogArgs {
     /// Journals, candump logs or CSV files, also .gz or .zst; each is a life or a trip of its own
     #[arg(required = true, value_name = "LOG")]
     pub(crate) logs: Vec<PathBuf>,
-    /// A log ends in failure at its first malformed line (default: such lines are left out and told)
-    #[arg(long)]
-    strict: bool,
-    /// A hole in a record longer than this means that the recorder was asleep: no ticks, s
-    #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
-    sleep_gap: f64,
-    /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
-    /// with {n}, one per cell or sensor from 1, as voltage{n}=U{n}
-    #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
-    columns: Vec<(String, String)>,
-    /// Sign of a CSV's current
-    #[arg(long, value_enum, default_value = "discharge")]
-    csv_sign: CsvSign,
-    /// CSV table with the section's column and `start`, which makes stamps absolute, for one log
-    #[arg(long, value_name = "TABLE.csv")]
-    start_times: Option<PathBuf>,
+    #[command(flatten)]
+    input: InputArgs,
     /// Threads (default: one per core)
     #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     jobs: Option<u16>,
@@ -45,25 +32,35 @@ impl LogArgs {
                 return Err(Failure::new(format!("{}: named twice", log.display())));
             }
         }
-        if self.start_times.is_some() && self.logs.len() > 1 {
+        if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
-            return Err(Failure::new(format!("--start-times given for {found} logs, must be for 1")));
+            return Err(Failure::new(format!(
+                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv beside each serves as well"
+            )));
         }
-        if self.logs.len() > 1 && self.logs.iter().any(|log| log == Path::new("-")) {
+        if self.logs.len() > 1 && self.is_stdin() {
             return Err(Failure::new("-: standard input must be the only log"));
         }
         Ok(())
     }
 
-    /// How the logs are read.
-    pub(crate) fn reading(&self) -> Reading {
-        Reading {
-            strict: self.strict,
-            columns: self.columns.clone(),
-            charge_positive: self.csv_sign == CsvSign::Charge,
-            start_times: self.start_times.clone(),
-            sleep_gap_s: self.sleep_gap,
-        }
+    /// Opens a log as it is read with a configuration.
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> Opened {
+        let mut options = log_options(&self.input, config);
+        let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
+        let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));
+        options.csv.start_times = options.csv.start_times.or(beside);
+        (LogSource::new([log.to_owned()], options), note)
+    }
+
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub(crate) fn sleep_gap_s(&self) -> f64 {
+        self.input.sleep_gap
+    }
+
+    /// Whether the log is standard input, which is read once only.
+    pub(crate) fn is_stdin(&self) -> bool {
+        self.logs.iter().any(|log| log == Path::new("-"))
     }
 
     /// Threads asked for.
@@ -96,30 +93,6 @@ impl Bar {
     pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }
-}
-
-/// A table with a heading, columns as wide as they need; the first `left` are aligned left.
-pub(crate) fn write_table(
-    out: &mut impl Write,
-    heads: &[&str],
-    left: usize,
-    rows: &[Vec<String>],
-) -> std::io::Result<()> {
-    let head: Vec<String> = heads.iter().map(|head| (*head).to_owned()).collect();
-    let all = || std::iter::once(&head).chain(rows);
-    let wide = |column: usize| {
-        all().filter_map(|row| row.get(column)).map(|cell: &String| cell.chars().count()).max().unwrap_or(0)
-    };
-    let widths: Vec<usize> = (0..heads.len()).map(wide).collect();
-    for row in all() {
-        let cells = row.iter().zip(&widths).enumerate();
-        let cells = cells.map(|(column, (cell, &width))| match column < left {
-            true => format!("{cell:<width$}"),
-            false => format!("{cell:>width$}"),
-        });
-        writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-    }
-    Ok(())
 }
 
 /// A number above 0.

@@ -1,12 +1,15 @@
 //! `packwatch whatif`: when the alarms would have come with other settings.
 
+mod document;
 mod report;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use super::Failure;
 use super::fleet::{LogArgs, positive};
 use crate::alarm::Rule;
+use crate::config::Config;
+use crate::lab::fleet::Reading;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
 use crate::lab::fleet::variants::{self, Choice};
@@ -30,7 +33,8 @@ enum EndOfLife {
                   such a raise, but the log ends before the horizon does. false raise: capacity_low raised while the true capacity of the \
                   cell was above the threshold. flickers: clears before the end. Leads are medians over the logs (5 to 95 %).\n\n\
                   The end of life is judged by a truth beside the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv as \
-                  score --cycles takes it, or --truth), else by the learned capacity; the table says which."
+                  score --cycles takes it, or --truth), else by the learned capacity; the table says which. The sections of a CSV are dated by \
+                  --start-times, else by NAME_cycles.csv beside it."
 )]
 pub(crate) struct Args {
     /// Configuration
@@ -40,9 +44,10 @@ pub(crate) struct Args {
     /// has), probability, debounce_s and so on, or any key, as estimator.voltage_noise_v=0.005; several make a grid
     #[arg(long = "set", value_name = "KEY=V1,V2")]
     set: Vec<Choice>,
-    /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %"
-    #[arg(long, value_name = "AH|PERCENT", default_value = "70 %", value_parser = end_of_life)]
-    end_of_life: EndOfLife,
+    /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %" (default:
+    /// capacity.end_of_life of the configuration)
+    #[arg(long, value_name = "AH|PERCENT", value_parser = end_of_life)]
+    end_of_life: Option<EndOfLife>,
     /// A raise is false when the end of life does not come this soon after it: equivalent full cycles, or days as 90d (default: the
     /// rest of the log)
     #[arg(long, value_name = "CYCLES|DAYSd", value_parser = horizon)]
@@ -71,12 +76,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let grid = variants::grid(&args.config, &args.set)
         .map_err(|faults| Failure { message: faults.join("\n"), code: super::EXIT_CONFIG })?;
-    let rated_ah = grid.variants[0].config.monitor.model.rated_capacity_ah;
+    let plain = &grid.variants[0].config.monitor;
+    let rated_ah = plain.model.rated_capacity_ah;
+    if args.logs.is_stdin() && grid.replays > 1 {
+        return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
+    }
+    let open = |config: &Config, log: &Path| args.logs.open(config, log);
     let settings = Settings {
-        reading: args.logs.reading(),
+        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         end_of_life_ah: match args.end_of_life {
-            EndOfLife::Ah(ah) => ah,
-            EndOfLife::Part(part) => part * rated_ah,
+            Some(EndOfLife::Ah(ah)) => ah,
+            Some(EndOfLife::Part(part)) => part * rated_ah,
+            None => plain.health.end_of_life_ah,
         },
         horizon: args.horizon,
         jobs: args.logs.threads(),
@@ -106,7 +117,7 @@ impl Args {
         if truths != 0 && truths != logs {
             return Err(Failure::new(format!("--truth given {truths} times for {logs} logs, must be once per log")));
         }
-        if self.json && self.csv.as_deref() == Some(std::path::Path::new("-")) {
+        if self.json && self.csv.as_deref() == Some(Path::new("-")) {
             return Err(Failure::new("only one of --json and --csv can go to standard output"));
         }
         Ok(())
@@ -129,7 +140,7 @@ impl Args {
     fn write(&self, shown: &report::Shown<'_>) -> std::io::Result<()> {
         if let Some(path) = &self.csv {
             shown.csv(path)?;
-            if path == std::path::Path::new("-") {
+            if path == Path::new("-") {
                 return Ok(());
             }
         }

@@ -13,7 +13,7 @@ pub(crate) mod truth;
 pub(crate) mod variants;
 pub(crate) mod whatif;
 
-pub(crate) use drive::Reading;
+pub(crate) use drive::{Opened, Reading};
 
 use rayon::prelude::*;
 

@@ -1,27 +1,26 @@
-//! What `whatif` tells: the summary over the logs, each log, JSON, CSV.
+//! What `whatif` tells people: the summary over the logs, each log.
 
 use std::io::{self, Write};
-use std::path::Path;
 
 use serde::Serialize;
-use serde_json::json;
 
 use crate::alarm::{Rule, Severity};
-use crate::cli::fleet::write_table;
-use crate::io::result_file::ResultFile;
-use crate::io::stamp;
+use crate::cli::score::write_table;
 use crate::lab::fleet::judge::Horizon;
-use crate::lab::fleet::variants::{Grid, Variant};
-use crate::lab::fleet::whatif::{AlarmRow, LogResult, Settings};
-use crate::quantity::Timestamp;
+use crate::lab::fleet::variants::Grid;
+use crate::lab::fleet::whatif::{AlarmRow, EndOfLife, LogResult, Settings};
 
-/// Version of the JSON document.
-const VERSION: u32 = 1;
+/// Columns of a table besides the alarm and the values set.
+const OWN_COLUMNS: usize = 9;
+const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
+    ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
+const LOG_HEADS: [&str; OWN_COLUMNS] =
+    ["threshold", "raised", "at day", "cycle", "cell", "value", "lead, days", "lead, cycles", "judged"];
 
 /// Everything that is shown.
 pub(super) struct Shown<'a> {
     pub(super) grid: &'a Grid,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a Settings<'a>,
     pub(super) rated_ah: f64,
     /// Rules in the tables.
     pub(super) rules: &'a [Rule],
@@ -32,7 +31,7 @@ pub(super) struct Shown<'a> {
 
 /// One threshold under one setting, over all logs.
 #[derive(Debug, Clone, Serialize)]
-struct Summary {
+pub(super) struct Summary {
     setting: usize,
     rule: Rule,
     severity: Severity,
@@ -52,6 +51,9 @@ struct Summary {
 impl Shown<'_> {
     /// Tables for people.
     pub(super) fn table(&self, each: bool) -> io::Result<()> {
+        if self.logs.is_empty() {
+            return Ok(());
+        }
         let mut text = Vec::new();
         self.write_head(&mut text)?;
         if self.logs.len() != 1 {
@@ -66,7 +68,7 @@ impl Shown<'_> {
     fn write_head(&self, out: &mut impl Write) -> io::Result<()> {
         let (settings, replays) = (self.grid.variants.len(), self.grid.replays);
         let more = if settings == 1 { "the configuration as it is".to_owned() } else { format!("{settings} settings") };
-        writeln!(out, "{} logs, {more}, {replays} replays per log", self.logs.len())?;
+        writeln!(out, "{}, {more}, {} per log", numbered(self.logs.len(), "log"), numbered(replays, "replay"))?;
         let (end_ah, part) = (self.settings.end_of_life_ah, 100.0 * self.settings.end_of_life_ah / self.rated_ah);
         let reached = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
         let mut by: Vec<_> = self.logs.iter().map(|log| log.judged_by).collect();
@@ -83,27 +85,13 @@ impl Shown<'_> {
         for log in self.logs {
             log.notes.iter().try_for_each(|note| writeln!(out, "note: {}: {note}", log.log.display()))?;
         }
-        writeln!(out)
+        Ok(())
     }
 
     fn write_summary(&self, out: &mut impl Write) -> io::Result<()> {
-        let own = [
-            "alarm",
-            "threshold",
-            "raised",
-            "lead, days",
-            "lead, cycles",
-            "missed",
-            "false",
-            "open",
-            "false raises",
-            "flickers",
-        ];
-        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
         let ended = self.logs.iter().filter(|log| log.end_of_life.is_some()).count();
         let row = |summary: &Summary| {
             let own = [
-                alarm_name(summary.rule, summary.severity),
                 level(summary.threshold),
                 format!("{} of {}", summary.raised_logs, self.logs.len()),
                 spread(summary.lead_days),
@@ -114,10 +102,12 @@ impl Shown<'_> {
                 count(summary.false_raises),
                 summary.flickers.to_string(),
             ];
-            self.setting_cells(summary.setting).chain(own).collect()
+            self.row((summary.rule, summary.severity), summary.setting, own)
         };
-        let rows: Vec<Vec<String>> = self.summaries().iter().map(row).collect();
-        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+        writeln!(out)?;
+        let mut rows = vec![self.heads(SUMMARY_HEADS)];
+        rows.extend(self.summaries().iter().map(row));
+        write_table(out, &rows)
     }
 
     fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
@@ -129,41 +119,40 @@ impl Shown<'_> {
         };
         let (name, by) = (log.log.display(), log.judged_by.words());
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
-        let own = [
-            "alarm",
-            "threshold",
-            "raised",
-            "at day",
-            "cycle",
-            "cell",
-            "value",
-            "lead, days",
-            "lead, cycles",
-            "judged",
-        ];
-        let heads: Vec<&str> = self.grid.keys.iter().map(String::as_str).chain(own).collect();
-        let rows: Vec<Vec<String>> = self.rows(log).map(|row| self.log_row(row)).collect();
-        write_table(out, &heads, self.grid.keys.len() + 1, &rows)
+        let mut rows = vec![self.heads(LOG_HEADS)];
+        rows.extend(self.rows(log).map(|row| self.log_row(log, row)));
+        write_table(out, &rows)
     }
 
-    fn log_row(&self, row: &AlarmRow) -> Vec<String> {
+    fn log_row(&self, log: &LogResult, row: &AlarmRow) -> Vec<String> {
         let judged = &row.judged;
         let first = judged.first.as_ref();
         let number = |value: Option<f64>, digits: usize| value.map_or_else(dash, |value| format!("{value:.digits$}"));
+        let place = |cell: Option<u16>| cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
         let own = [
-            alarm_name(row.rule, row.severity),
             level(row.threshold),
-            format!("{} times", judged.raises as u64),
+            format!("{} times", judged.raises),
             number(first.map(|first| first.days), 2),
             number(first.map(|first| first.cycles), 1),
-            first
-                .map_or_else(dash, |first| first.cell.map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string())),
+            first.map_or_else(dash, |first| place(first.cell)),
             number(first.and_then(|first| first.value), 4),
             number(judged.lead_days, 2),
             number(judged.lead_cycles, 1),
-            verdict(row),
+            verdict(row, log.end_of_life.as_ref()),
         ];
-        self.setting_cells(row.setting).chain(own).collect()
+        self.row((row.rule, row.severity), row.setting, own)
+    }
+
+    fn heads(&self, own: [&str; OWN_COLUMNS]) -> Vec<String> {
+        std::iter::once("alarm".to_owned())
+            .chain(self.grid.keys.iter().cloned())
+            .chain(own.map(str::to_owned))
+            .collect()
+    }
+
+    fn row(&self, (rule, severity): (Rule, Severity), setting: usize, own: [String; OWN_COLUMNS]) -> Vec<String> {
+        let alarm = format!("{} {}", rule.name(), severity.name());
+        std::iter::once(alarm).chain(self.setting_cells(setting)).chain(own).collect()
     }
 
     /// Columns of the values set; those of the configuration as it is are said so.
@@ -178,11 +167,12 @@ impl Shown<'_> {
     }
 
     /// The rows of a log that are shown.
-    fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l AlarmRow> {
+    pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l AlarmRow> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
 
-    fn summaries(&self) -> Vec<Summary> {
+    /// Every threshold under every setting, over all logs.
+    pub(super) fn summaries(&self) -> Vec<Summary> {
         let Some(first) = self.logs.first() else { return Vec::new() };
         // Every log has the same rows in the same order.
         (0..first.alarms.len())
@@ -190,114 +180,6 @@ impl Shown<'_> {
             .map(|index| summary(&self.logs.iter().map(|log| &log.alarms[index]).collect::<Vec<_>>()))
             .collect()
     }
-
-    /// One JSON document.
-    pub(super) fn json(&self) -> io::Result<()> {
-        let horizon = match self.settings.horizon {
-            None => json!(null),
-            Some(Horizon::Cycles(cycles)) => json!({ "cycles": cycles }),
-            Some(Horizon::Days(days)) => json!({ "days": days }),
-        };
-        let setting = |variant: &Variant| {
-            let set = self.grid.keys.iter().cloned().zip(variant.values.iter().map(|value| json!(value)));
-            json!({ "set": serde_json::Map::from_iter(set), "replay": variant.replay })
-        };
-        let logs: Vec<_> = self
-            .logs
-            .iter()
-            .map(|log| {
-                let alarms = self.rows(log).cloned().collect();
-                LogResult { alarms, ..(*log).clone() }
-            })
-            .collect();
-        let document = json!({
-            "version": VERSION,
-            "end_of_life_ah": self.settings.end_of_life_ah,
-            "rated_capacity_ah": self.rated_ah,
-            "horizon": horizon,
-            "replays_per_log": self.grid.replays,
-            "settings": self.grid.variants.iter().map(setting).collect::<Vec<_>>(),
-            "summary": self.summaries(),
-            "logs": logs,
-            "failed": self.failed,
-            "notes": self.grid.notes,
-        });
-        let mut out = io::stdout().lock();
-        serde_json::to_writer_pretty(&mut out, &document)?;
-        writeln!(out)
-    }
-
-    /// A row per log, setting and alarm.
-    pub(super) fn csv(&self, path: &Path) -> io::Result<()> {
-        let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
-        let own = [
-            "log",
-            "judged_by",
-            "days",
-            "cycles",
-            "end_of_life_day",
-            "end_of_life_cycle",
-            "setting",
-            "rule",
-            "severity",
-            "threshold",
-            "raises",
-            "raised_utc",
-            "raised_day",
-            "raised_cycle",
-            "cell",
-            "value",
-            "lead_days",
-            "lead_cycles",
-            "missed",
-            "false_alarms",
-            "open",
-            "false_raises",
-            "flickers",
-        ];
-        out.write_record(own.into_iter().chain(self.grid.keys.iter().map(String::as_str)))?;
-        for log in self.logs {
-            for row in self.rows(log) {
-                let values =
-                    self.grid.variants.get(row.setting).map(|variant| variant.values.as_slice()).unwrap_or_default();
-                let set = (0..self.grid.keys.len()).map(|key| values.get(key).cloned().unwrap_or_default());
-                out.write_record(csv_row(log, row).into_iter().chain(set))?;
-            }
-        }
-        out.into_inner().map_err(|error| io::Error::other(error.to_string()))?.finish()
-    }
-}
-
-fn csv_row(log: &LogResult, row: &AlarmRow) -> Vec<String> {
-    fn text(value: Option<impl ToString>) -> String {
-        value.map(|value| value.to_string()).unwrap_or_default()
-    }
-    let (judged, first, end) = (&row.judged, row.judged.first.as_ref(), log.end_of_life.as_ref());
-    vec![
-        log.log.display().to_string(),
-        log.judged_by.words().to_owned(),
-        log.days.to_string(),
-        log.cycles.to_string(),
-        text(end.map(|end| end.days)),
-        text(end.map(|end| end.cycles)),
-        row.setting.to_string(),
-        row.rule.name().to_owned(),
-        row.severity.name().to_owned(),
-        row.threshold.to_string(),
-        judged.raises.to_string(),
-        text(first.map(|first| stamp::format_utc(Timestamp::from_secs(first.time_s)))),
-        text(first.map(|first| first.days)),
-        text(first.map(|first| first.cycles)),
-        text(first.and_then(|first| first.cell).map(|cell| cell + 1)),
-        text(first.and_then(|first| first.value)),
-        text(judged.lead_days),
-        text(judged.lead_cycles),
-        text(judged.missed),
-        text(judged.false_alarms),
-        text(judged.open),
-        text(judged.false_raises),
-        judged.flickers.to_string(),
-    ]
 }
 
 fn summary(rows: &[&AlarmRow]) -> Summary {
@@ -332,14 +214,12 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     Some([at(0.5), at(0.05), at(0.95)])
 }
 
-fn alarm_name(rule: Rule, severity: Severity) -> String {
-    format!("{} {}", rule.name(), severity.name())
-}
-
-fn verdict(row: &AlarmRow) -> String {
+fn verdict(row: &AlarmRow, end: Option<&EndOfLife>) -> String {
     let judged = &row.judged;
+    let late_days = judged.first.zip(end).map(|(first, end)| first.days - end.days).filter(|days| *days >= 0.0);
+    let missed = || late_days.map_or_else(|| "missed".to_owned(), |days| format!("missed, came {days:.2} days late"));
     let words = [
-        judged.missed.filter(|missed| *missed).map(|_| "missed".to_owned()),
+        judged.missed.filter(|missed| *missed).map(|_| missed()),
         judged.false_alarms.filter(|n| *n > 0).map(|n| format!("{n} false")),
         judged.open.filter(|n| *n > 0).map(|n| format!("{n} open")),
         judged.false_raises.filter(|n| *n > 0).map(|n| format!("{n} false raises")),
@@ -352,6 +232,10 @@ fn verdict(row: &AlarmRow) -> String {
         (true, true) => "good".to_owned(),
         (true, false) => dash(),
     }
+}
+
+fn numbered(count: usize, what: &str) -> String {
+    if count == 1 { format!("1 {what}") } else { format!("{count} {what}s") }
 }
 
 fn level(threshold: f64) -> String {

@@ -3,60 +3,28 @@
 //! In: a log and a monitor that has had no input. Out: after each input what came out, to a closure. Promise: the same
 //! inputs and ticks as `packwatch replay` gives the core, so the same results.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::atomic::Ordering;
 
-use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::Config;
-use crate::io::csv_log::CsvOptions;
-use crate::io::log::{LogCounts, LogOptions, LogSource, Record};
+use crate::io::log::{LogCounts, LogSource, Record};
 use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
-use crate::sample::VoltageSource;
 
 /// Records between two reports of progress.
 const REPORT_EVERY: u64 = 4096;
 
-/// How logs are to be read.
-#[derive(Debug, Clone)]
-pub(crate) struct Reading {
-    /// A bad line ends the reading of its log.
-    pub(crate) strict: bool,
-    /// CSV columns, role to name.
-    pub(crate) columns: Vec<(String, String)>,
-    /// A CSV's positive current is charge.
-    pub(crate) charge_positive: bool,
-    /// CSV table of the sections' start times.
-    pub(crate) start_times: Option<PathBuf>,
+/// A log to be read, and what the user should know of how.
+pub(crate) type Opened = (LogSource, Option<String>);
+
+/// How logs are read.
+#[derive(Clone, Copy)]
+pub(crate) struct Reading<'a> {
+    /// Opens a log as it is read with a configuration.
+    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
     /// A hole longer than this means that the recorder was asleep, s.
     pub(crate) sleep_gap_s: f64,
-}
-
-impl Reading {
-    /// A log as it is read with `config`.
-    pub(crate) fn source(&self, config: &Config, log: &Path) -> LogSource {
-        let sample = &config.monitor.sample;
-        let encoder = InputEncoder::new(&config.monitor.input);
-        let mut protector = InputProtector::new(&config.monitor.guards);
-        let options = LogOptions {
-            interfaces: config.interfaces.iter().map(|interface| interface.name.clone()).collect(),
-            strict: self.strict,
-            csv: CsvOptions {
-                columns: self.columns.clone(),
-                charge_positive: self.charge_positive,
-                start_times: self.start_times.clone(),
-                cells: sample.cells,
-                pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
-            },
-            encode_row: Box::new(move |values, frames| {
-                let uncarried = encoder.encode(values, frames);
-                protector.protect(frames);
-                uncarried
-            }),
-        };
-        LogSource::new([log.to_owned()], options)
-    }
 }
 
 /// What a log was.
@@ -82,7 +50,7 @@ impl Driven {
 /// # Errors
 /// When the log cannot be read, or what `each` says.
 pub(crate) fn drive(
-    mut source: LogSource,
+    (mut source, note): Opened,
     mut monitor: Monitor,
     mut out: Outputs,
     sleep_gap_s: f64,
@@ -91,6 +59,7 @@ pub(crate) fn drive(
 ) -> Result<Driven, String> {
     let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
     let (mut driven, mut records, mut told) = (Driven::default(), 0_u64, 0);
+    driven.notes.extend(note);
     let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
         while let Some(time) = ticks.pop(monitor.next_due()) {
             monitor.handle(Input::Tick { time }, &mut out);
@@ -123,6 +92,15 @@ pub(crate) fn drive(
 }
 
 impl Driven {
+    /// First and last stamp of `log`.
+    ///
+    /// # Errors
+    /// Nothing of it was read: what is known of why.
+    pub(crate) fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+        let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
+        self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
+    }
+
     fn note(&mut self, record: &Record) {
         let time = record.time();
         let (first, last) = self.span.unwrap_or((time, time));

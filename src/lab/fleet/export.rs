@@ -6,6 +6,7 @@
 //! whatever the length of the log; a log that fails leaves no file of its own and the others go on.
 
 mod columns;
+mod rows;
 mod table;
 
 use std::collections::BTreeMap;
@@ -15,14 +16,14 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde_json::json;
 
-use self::columns::{AlarmRow, EstimateRow, HalfCycleRow};
+use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned};
 use self::table::TableFile;
 use super::drive::{Driven, Reading, drive};
 use crate::config::Config;
 use crate::daemon::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
-use crate::monitor::{Event, EventKind, Monitor, Outputs};
+use crate::monitor::{Event, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
 
 pub(crate) use columns::reference;
@@ -49,10 +50,10 @@ impl Format {
 }
 
 /// What all logs have in common.
-#[derive(Debug, Clone)]
-pub(crate) struct Settings {
+#[derive(Clone)]
+pub(crate) struct Settings<'a> {
     /// How they are read.
-    pub(crate) reading: Reading,
+    pub(crate) reading: Reading<'a>,
     /// Form of the tables.
     pub(crate) format: Format,
     /// Folder for the logs' folders.
@@ -85,7 +86,7 @@ pub(crate) struct Exported {
 pub(crate) fn run(
     config: &Config,
     logs: &[PathBuf],
-    settings: &Settings,
+    settings: &Settings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<Exported, String>>, String> {
     let names = names(logs);
@@ -96,34 +97,50 @@ fn export(
     config: &Config,
     log: &Path,
     name: &str,
-    settings: &Settings,
+    settings: &Settings<'_>,
     report: &dyn Fn(u64),
 ) -> Result<Exported, String> {
     let folder = settings.out.join(name);
     std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be made: {error}", folder.display()))?;
     let mut tables = Tables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
-    let source = settings.reading.source(config, log);
-    let mut each = |_: &Monitor, out: &mut Outputs| {
-        let taken = tables.take(out);
+    let source = (settings.reading.open)(config, log);
+    let mut each = |monitor: &Monitor, out: &mut Outputs| {
+        let taken = tables.take(monitor, out);
         out.clear();
         taken
     };
     let monitor = Monitor::new(config.monitor.clone());
     let driven = drive(source, monitor, out, settings.reading.sleep_gap_s, &mut each, report)?;
-    if driven.span.is_none() {
-        return Err(format!("{}: holds no record", log.display()));
-    }
-    let rows = tables.finish(&metadata(config, log, &driven, settings))?;
-    let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes: driven.notes.clone() };
-    write_about(config, &exported, &driven, settings)?;
+    let span = driven.span_of(log)?;
+    let metadata = metadata(config, log, span, settings);
+    let mut notes = driven.notes.clone();
+    notes.extend(forget_about(&folder, log)?);
+    let rows = tables.finish(&metadata)?;
+    let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes };
+    write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }
 
+/// Takes away what an earlier export said of itself, since its tables are replaced one by one; a note when they were those
+/// of another log.
+fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
+    let path = folder.join("about.json");
+    let Ok(text) = std::fs::read(&path) else { return Ok(None) };
+    std::fs::remove_file(&path).map_err(|error| format!("{}: cannot be removed: {error}", path.display()))?;
+    let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
+    let other = about["metadata"]["packwatch.log"].as_str().filter(|other| Path::new(other) != log);
+    Ok(other.map(|other| format!("replaced the tables of {other}")))
+}
+
 /// What the files say of themselves.
-fn metadata(config: &Config, log: &Path, driven: &Driven, settings: &Settings) -> Vec<(&'static str, String)> {
+fn metadata(
+    config: &Config,
+    log: &Path,
+    (first, last): (Timestamp, Timestamp),
+    settings: &Settings<'_>,
+) -> Vec<(&'static str, String)> {
     let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
-    let (first, last) = driven.span.unwrap_or((Timestamp::ZERO, Timestamp::ZERO));
     vec![
         ("packwatch.version", env!("CARGO_PKG_VERSION").to_owned()),
         ("packwatch.config", config.path.display().to_string()),
@@ -135,8 +152,7 @@ fn metadata(config: &Config, log: &Path, driven: &Driven, settings: &Settings) -
     ]
 }
 
-fn write_about(config: &Config, exported: &Exported, driven: &Driven, settings: &Settings) -> Result<(), String> {
-    let metadata = metadata(config, &exported.log, driven, settings);
+fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
@@ -144,7 +160,7 @@ fn write_about(config: &Config, exported: &Exported, driven: &Driven, settings: 
         "metadata": metadata,
         "rows": exported.rows,
         "log": driven.counts,
-        "notes": driven.notes,
+        "notes": exported.notes,
     });
     let mut file = ResultFile::create(&exported.folder.join("about.json")).map_err(|error| error.to_string())?;
     serde_json::to_writer_pretty(&mut file, &document).map_err(|error| error.to_string())?;
@@ -156,6 +172,9 @@ fn write_about(config: &Config, exported: &Exported, driven: &Driven, settings: 
 fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
+        if log == Path::new("-") {
+            return "stdin".to_owned();
+        }
         let name = text(log.file_name());
         let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name).to_owned();
         let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned();
@@ -194,11 +213,11 @@ struct Tables {
     rated_ah: f64,
     moved_ah: Vec<f64>,
     /// A half-cycle whose capacity comes next.
-    half_cycle: Option<Event>,
+    half_cycle: Option<HalfCycle>,
 }
 
 impl Tables {
-    fn create(config: &Config, name: &str, folder: &Path, settings: &Settings) -> Result<Self, String> {
+    fn create(config: &Config, name: &str, folder: &Path, settings: &Settings<'_>) -> Result<Self, String> {
         let cells = usize::from(config.monitor.sample.cells);
         let (form, ending) = (settings.format, settings.format.ending());
         let path = |table: &str| folder.join(format!("{table}.{ending}"));
@@ -216,7 +235,7 @@ impl Tables {
         })
     }
 
-    fn take(&mut self, out: &Outputs) -> Result<(), String> {
+    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), String> {
         for estimate in &out.estimates {
             let since_ns = self.since_ns(estimate.time);
             let Some(last) = self.periods.get_mut(estimate.cell.index()) else { continue };
@@ -230,31 +249,29 @@ impl Tables {
                 })?;
             }
         }
-        out.events.iter().try_for_each(|event| self.take_event(event))
+        out.events.iter().try_for_each(|event| self.take_event(monitor, event))
     }
 
-    fn take_event(&mut self, event: &Event) -> Result<(), String> {
-        let since_s = self.since_ns(event.time) as f64 * 1e-9;
-        match event.kind {
-            EventKind::HalfCycle { cell, charge_ah, .. } => {
-                if let Some(moved_ah) = self.moved_ah.get_mut(cell.index()) {
-                    *moved_ah += charge_ah;
-                }
-                self.half_cycle = Some(*event);
+    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), String> {
+        let (log, time) = (self.log.clone(), event.time);
+        let since_s = self.since_ns(time) as f64 * 1e-9;
+        if let Some(half) = HalfCycle::of(&event.kind) {
+            if let Some(moved_ah) = self.moved_ah.get_mut(half.cell.index()) {
+                *moved_ah += half.charge_ah;
             }
-            EventKind::Capacity { cell, .. } => {
-                let Some(half_cycle) = self.half_cycle.take() else { return Ok(()) };
-                let cycles = self.cycles(cell);
-                let row = HalfCycleRow { log: self.log.clone(), since_s, cell, cycles, half_cycle, capacity: *event };
-                self.half_cycles.push(&row)?;
-            }
-            EventKind::Alarm { .. } => self.alarms.push(&AlarmRow { log: self.log.clone(), since_s, event: *event })?,
-            _ => {}
+            self.half_cycle = Some(half);
+        } else if let Some((cell, learned)) = Learned::of(&event.kind) {
+            let half = self.half_cycle.take().filter(|half| half.cell == cell);
+            let half = half.ok_or("a capacity came without its half-cycle")?;
+            let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
+            self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, learned, remaining })?;
+        } else if let Some(alarm) = Alarm::of(&event.kind) {
+            self.alarms.push(&AlarmRow { log, time, since_s, alarm })?;
         }
         Ok(())
     }
 
-    fn cycles(&self, cell: CellIndex) -> f64 {
+    fn full_cycles(&self, cell: CellIndex) -> f64 {
         self.moved_ah.get(cell.index()).map_or(f64::NAN, |moved_ah| moved_ah / (2.0 * self.rated_ah))
     }
 
@@ -280,7 +297,8 @@ mod tests {
 
     #[test]
     fn names_are_safe_and_no_two_are_the_same() {
-        let logs = ["a/life.log.gz", "b/life.csv", "c/day 1.log", "b/life.log", ".log", "x/y.z.log"].map(PathBuf::from);
-        assert_eq!(names(&logs), ["a-life", "b-life", "day_1", "b-life-2", "log", "y.z"]);
+        let logs =
+            ["a/life.log.gz", "b/life.csv", "c/day 1.log", "b/life.log", ".log", "x/y.z.log", "-"].map(PathBuf::from);
+        assert_eq!(names(&logs), ["a-life", "b-life", "day_1", "b-life-2", "log", "y.z", "stdin"]);
     }
 }

@@ -17,7 +17,8 @@ use crate::quantity::{CellIndex, Timestamp};
 /// A change of the capacity smaller than this part of it is not kept.
 const KEPT_CHANGE: f64 = 2e-4;
 /// Endings of the names looked for.
-const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", "_cycles.csv"];
+const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
+const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
 
 /// Which capacity the truth is of.
@@ -123,12 +124,32 @@ pub(crate) fn beside(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     logs.iter().map(|log| find(log, alone(log))).collect()
 }
 
+/// The table of cycles beside a CSV log, which tells when each began.
+pub(crate) fn cycles_beside(log: &Path) -> Option<PathBuf> {
+    let (stem, ending) = stem_of(log)?;
+    (ending == "csv").then(|| existing(log, [format!("{stem}{CYCLES}")])).flatten()
+}
+
 fn find(log: &Path, alone: bool) -> Option<PathBuf> {
+    if log == Path::new("-") {
+        return None;
+    }
+    let (stem, _) = stem_of(log)?;
+    let names = ENDINGS.iter().map(|ending| format!("{stem}{ending}"));
+    existing(log, names.chain(alone.then(|| "truth.csv".to_owned())))
+}
+
+/// A log's name without its endings, and what its name ends in besides compression.
+fn stem_of(log: &Path) -> Option<(&str, &str)> {
     let name = log.file_name()?.to_str()?;
     let name = COMPRESSED[1..].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(name);
-    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
-    let names = ENDINGS.iter().map(|ending| format!("{stem}{ending}")).chain(alone.then(|| "truth.csv".to_owned()));
-    let paths = names.flat_map(|name| COMPRESSED.map(|ending| log.with_file_name(format!("{name}{ending}"))));
+    Some(name.rsplit_once('.').unwrap_or((name, "")))
+}
+
+/// The first of these names, compressed or not, that is a file beside the log.
+fn existing(log: &Path, names: impl IntoIterator<Item = String>) -> Option<PathBuf> {
+    let paths =
+        names.into_iter().flat_map(|name| COMPRESSED.map(|ending| log.with_file_name(format!("{name}{ending}"))));
     paths.into_iter().find(|path| path != log && path.is_file())
 }
 
@@ -181,5 +202,7 @@ mod tests {
         let logs = ["a.log.gz", "b.csv.gz", "c.log"].map(path);
         assert_eq!(beside(&logs), [Some(path("a.truth.csv")), Some(path("b_cycles.csv.gz")), None]);
         assert_eq!(beside(&[path("c.log")]), [Some(path("truth.csv"))]);
+        let logs = ["b.csv.gz", "b.log", "a.csv"].map(path);
+        assert_eq!(logs.map(|log| cycles_beside(&log)), [Some(path("b_cycles.csv.gz")), None, None]);
     }
 }

@@ -9,10 +9,13 @@
 //! that the file has, `RULE.probability` for `when = { probability = ... }`, any other key of the rule's `[[alarm]]` tables;
 //! or any dotted key, with `[n]` from 1 for tables written several times.
 
+mod target;
+
 use std::path::Path;
 
 use toml::{Table, Value};
 
+use self::target::{Target, name_rules, rule_of, targets};
 use crate::alarm::Rule;
 use crate::config::{self, Config};
 
@@ -20,12 +23,6 @@ use crate::config::{self, Config};
 pub(crate) const MAX_COMBINATIONS: usize = 1000;
 /// Faults quoted of one combination.
 const MAX_QUOTED: usize = 3;
-/// Severities as keys, mildest first.
-const SEVERITIES: [&str; 3] = ["info", "warning", "severe"];
-/// The other keys of an `[[alarm]]` that may be set.
-const ALARM_KEYS: [&str; 8] =
-    ["when", "probability", "hysteresis", "debounce_s", "debounce_events", "latched", "spn", "fmi"];
-
 /// One `--set`.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Choice {
@@ -176,7 +173,7 @@ fn variant(
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
             rest.and_then(|rest| rest.strip_prefix(": ")).unwrap_or(fault).to_owned()
         };
-        faults.0.iter().map(without_line).collect::<Vec<_>>()
+        faults.0.iter().map(without_line).map(|fault| name_rules(fault, targets)).collect::<Vec<_>>()
     })?;
     Ok((config, replay_key(&root)))
 }
@@ -194,10 +191,6 @@ fn replay_key(root: &Table) -> String {
     }
     // A table that can be read can be written; were it not so, nothing would be shared.
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
-}
-
-fn rule_of(alarm: &Value) -> Option<&str> {
-    alarm.get("rule")?.as_str()
 }
 
 /// Every combination, the last choice changing fastest; none without choices.
@@ -220,175 +213,6 @@ fn combinations(choices: &[Choice]) -> Result<Vec<Vec<&(String, Value)>>, String
         all = all.iter().flat_map(longer).collect();
     }
     Ok(all)
-}
-
-/// What a key means.
-#[derive(Debug, Clone, PartialEq)]
-enum Target {
-    /// A threshold of a rule: severity, and `set` or `clear` of it.
-    Threshold { rule: Rule, severity: &'static str, part: &'static str },
-    /// Another key of all `[[alarm]]` of a rule.
-    Alarm { rule: Rule, key: &'static str },
-    /// Any key.
-    Key(Vec<(String, Option<usize>)>),
-}
-
-fn targets(grid: &mut Grid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
-    let mut targets: Vec<Target> = Vec::new();
-    for choice in choices {
-        let target =
-            Target::of(&choice.key, root, &mut grid.notes).map_err(|what| format!("--set {}: {what}", choice.key))?;
-        if targets.contains(&target) {
-            return Err(format!("--set {}: set twice", choice.key));
-        }
-        match target {
-            Target::Threshold { rule, .. } | Target::Alarm { rule, .. } if !grid.rules.contains(&rule) => {
-                grid.rules.push(rule)
-            }
-            Target::Threshold { .. } | Target::Alarm { .. } => {}
-            Target::Key(_) => grid.other_keys = true,
-        }
-        targets.push(target);
-    }
-    Ok(targets)
-}
-
-impl Target {
-    fn of(key: &str, root: &Table, notes: &mut Vec<String>) -> Result<Self, String> {
-        let (first, rest) = key.split_once('.').unwrap_or((key, ""));
-        let Some(rule) = Rule::ALL.into_iter().find(|rule| rule.name() == first) else {
-            return Self::key(key).map_err(|what| format!("{what}{}", rule_meant(first)));
-        };
-        let (name, part) = rest.split_once('.').unwrap_or((rest, "set"));
-        let part = ["set", "clear"].into_iter().find(|known| *known == part);
-        let severity = match name {
-            "threshold" => Some(gravest(root, rule)?),
-            _ => SEVERITIES.into_iter().find(|known| *known == name),
-        };
-        match (severity, part, ALARM_KEYS.into_iter().find(|known| *known == rest)) {
-            (Some(severity), Some(part), _) => {
-                if name == "threshold" {
-                    notes.push(format!("{first}.threshold is {first}.{severity}"));
-                }
-                Ok(Self::Threshold { rule, severity, part })
-            }
-            (_, _, Some(key)) => Ok(Self::Alarm { rule, key }),
-            _ => Err(format!(
-                "no {rest:?} of a rule, must be threshold, {} (also with .set or .clear), {}",
-                SEVERITIES.join(", "),
-                ALARM_KEYS.join(", ")
-            )),
-        }
-    }
-
-    fn key(key: &str) -> Result<Self, String> {
-        let part = |part: &str| match part.split_once('[') {
-            None => Ok((part.to_owned(), None)),
-            Some((name, number)) => {
-                let number = number.strip_suffix(']').and_then(|number| number.parse::<usize>().ok());
-                let number = number.filter(|number| *number > 0);
-                number
-                    .map(|number| (name.to_owned(), Some(number)))
-                    .ok_or_else(|| format!("{part}, must be NAME[n] from 1"))
-            }
-        };
-        let parts: Result<Vec<_>, String> = key.split('.').map(part).collect();
-        let parts = parts?;
-        if parts.len() < 2 {
-            return Err("must be TABLE.KEY or RULE.KEY".to_owned());
-        }
-        Ok(Self::Key(parts))
-    }
-
-    fn set(&self, root: &mut Table, value: &Value) -> Result<(), String> {
-        match self {
-            Self::Threshold { rule, severity, part } => set_threshold(root, *rule, severity, part, value),
-            Self::Alarm { rule, key } => {
-                let (key, value) = match *key {
-                    "probability" => {
-                        ("when", Value::Table(Table::from_iter([("probability".to_owned(), value.clone())])))
-                    }
-                    key => (key, value.clone()),
-                };
-                let mut alarms = alarms_of(root, *rule).peekable();
-                if alarms.peek().is_none() {
-                    return Err(format!("no [[alarm]] of {}", rule.name()));
-                }
-                alarms.for_each(|alarm| drop(alarm.insert(key.to_owned(), value.clone())));
-                Ok(())
-            }
-            Self::Key(parts) => set_key(root, parts, value),
-        }
-    }
-}
-
-/// A rule that may have been meant.
-fn rule_meant(found: &str) -> String {
-    let near = Rule::ALL.into_iter().map(|rule| (strsim::jaro_winkler(found, rule.name()), rule));
-    let best = near.max_by(|a, b| a.0.total_cmp(&b.0)).filter(|(similarity, _)| *similarity > 0.8);
-    best.map(|(_, rule)| format!(", did you mean {}", rule.name())).unwrap_or_default()
-}
-
-fn alarms_of(root: &mut Table, rule: Rule) -> impl Iterator<Item = &mut Table> {
-    let alarms = root.get_mut("alarm").and_then(Value::as_array_mut).into_iter().flatten();
-    alarms.filter(move |alarm| rule_of(alarm) == Some(rule.name())).filter_map(Value::as_table_mut)
-}
-
-/// The gravest severity that a rule has.
-fn gravest(root: &Table, rule: Rule) -> Result<&'static str, String> {
-    let alarms = root.get("alarm").and_then(Value::as_array).into_iter().flatten();
-    let of_rule: Vec<&Value> = alarms.filter(|alarm| rule_of(alarm) == Some(rule.name())).collect();
-    let has = |severity: &&str| of_rule.iter().any(|alarm| alarm.get(severity).is_some());
-    SEVERITIES.into_iter().rev().find(has).ok_or_else(|| {
-        format!("the configuration has no alarm of {}: say {0}.info, {0}.warning or {0}.severe", rule.name())
-    })
-}
-
-fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value: &Value) -> Result<(), String> {
-    let has = |alarm: &Table| alarm.contains_key(severity);
-    let place = alarms_of(root, rule).position(|alarm| has(alarm)).unwrap_or(0);
-    if alarms_of(root, rule).next().is_none() {
-        let alarms = root.entry("alarm").or_insert_with(|| Value::Array(Vec::new()));
-        let alarms = alarms.as_array_mut().ok_or("alarm must be tables [[alarm]]")?;
-        let new = Table::from_iter([("rule".to_owned(), Value::String(rule.name().to_owned()))]);
-        alarms.push(Value::Table(new));
-    }
-    let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
-    match (alarm.get_mut(severity), part) {
-        // The value to clear at stays as the file says it.
-        (Some(Value::Table(both)), part) => {
-            both.insert(part.to_owned(), value.clone());
-        }
-        (_, "set") => {
-            alarm.insert(severity.to_owned(), value.clone());
-        }
-        (None, _) => return Err(format!("{}.{severity} is not set, it has nothing to clear", rule.name())),
-        (Some(set), part) => {
-            let both = [("set".to_owned(), set.clone()), (part.to_owned(), value.clone())];
-            *set = Value::Table(Table::from_iter(both));
-        }
-    }
-    Ok(())
-}
-
-fn set_key(root: &mut Table, parts: &[(String, Option<usize>)], value: &Value) -> Result<(), String> {
-    let Some(((last, None), above)) = parts.split_last() else { return Err("must end in a key".to_owned()) };
-    let mut table = root;
-    for (name, number) in above {
-        let next = match number {
-            None => table.entry(name.as_str()).or_insert_with(|| Value::Table(Table::new())),
-            Some(number) => {
-                let items = table.get_mut(name.as_str()).and_then(Value::as_array_mut);
-                let count = items.as_ref().map_or(0, |items| items.len());
-                items
-                    .and_then(|items| items.get_mut(*number - 1))
-                    .ok_or_else(|| format!("{name}[{number}]: the configuration has {count} of them"))?
-            }
-        };
-        table = next.as_table_mut().ok_or_else(|| format!("{name} is no single table: write {name}[n].{last}"))?;
-    }
-    table.insert(last.clone(), value.clone());
-    Ok(())
 }
 
 #[cfg(test)]

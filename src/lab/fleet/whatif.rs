@@ -28,10 +28,10 @@ pub(crate) struct Job {
 }
 
 /// What all logs have in common.
-#[derive(Debug, Clone)]
-pub(crate) struct Settings {
+#[derive(Clone, Copy)]
+pub(crate) struct Settings<'a> {
     /// How they are read.
-    pub(crate) reading: Reading,
+    pub(crate) reading: Reading<'a>,
     /// Capacity below which a cell's life is over, Ah.
     pub(crate) end_of_life_ah: f64,
     /// How soon after a raise the end of life must come.
@@ -126,6 +126,8 @@ struct Replayed {
     driven: Driven,
     track: Track,
     lanes: Lanes,
+    /// Of the log's first replay only.
+    truth: Option<Truth>,
 }
 
 /// Replays all logs; per log its result, or why there is none. `report` is told bytes read.
@@ -135,7 +137,7 @@ struct Replayed {
 pub(crate) fn run(
     grid: &Grid,
     jobs: &[Job],
-    settings: &Settings,
+    settings: &Settings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Vec<Result<LogResult, String>>, String> {
     // The replays of one log are independent too: a fleet of one log still uses all cores.
@@ -167,18 +169,20 @@ fn replay(
     grid: &Grid,
     number: usize,
     job: &Job,
-    settings: &Settings,
+    settings: &Settings<'_>,
     report: &(dyn Fn(u64) + Sync),
 ) -> Result<Replayed, String> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
+    // Before the replay, which may take hours: a table that cannot be read is told at once.
+    let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut lanes, _) = watch(grid, number);
     let mut engines = lanes.engines(monitor.sample.cells);
     let learned = if monitor.health.usable.is_some() { Learned::Usable } else { Learned::Capacity };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
-    let source = settings.reading.source(config, &job.log);
+    let source = (settings.reading.open)(config, &job.log);
     let mut each = |_: &Monitor, out: &mut Outputs| {
         track.observe(&out.events);
         engines.take(&out.alarm_inputs, &mut lanes);
@@ -186,24 +190,26 @@ fn replay(
         Ok(())
     };
     let driven = drive(source, Monitor::new(monitor.clone()), out, settings.reading.sleep_gap_s, &mut each, report)?;
-    Ok(Replayed { driven, track, lanes })
+    Ok(Replayed { driven, track, lanes, truth })
 }
 
-fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings) -> Result<LogResult, String> {
-    let truth = job.truth.as_deref().map(Truth::read).transpose()?;
+fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings<'_>) -> Result<LogResult, String> {
     let plain = replays.first().ok_or("no replay")?;
-    let span = plain.driven.span.ok_or_else(|| format!("{}: holds no record", job.log.display()))?;
-    if let Some((from, to)) = truth.as_ref().map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
+    let truth = plain.truth.as_ref();
+    let span = plain.driven.span_of(&job.log)?;
+    if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
-        return Err(format!("{file}: tells of {a} to {b} s, must tell of the log's {c} to {d} s"));
+        return Err(format!(
+            "{file}: tells of {a} to {b} s, must tell of the log's {c} to {d} s (--start-times dates a CSV)"
+        ));
     }
-    let (judged_by, end) = end_of_life(&plain.track, truth.as_ref(), settings.end_of_life_ah);
+    let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
     let end = end.filter(|(time, _)| *time <= span.1);
     let mut alarms = Vec::new();
     for (number, replayed) in replays.iter().enumerate() {
         let end = end.map(|(time, _)| time);
-        let life = Life { track: &plain.track, truth: truth.as_ref(), span, end, horizon: settings.horizon };
+        let life = Life { track: &plain.track, truth, span, end, horizon: settings.horizon };
         for (setting, places) in watch(grid, number).1 {
             let rules = &grid.variants[setting].config.monitor.rules;
             let judged = rules.iter().zip(places).filter_map(|(config, place)| {
@@ -219,7 +225,7 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
             alarms.extend(judged);
         }
     }
-    alarms.sort_by_key(|row| (row.setting, row.rule, row.severity));
+    alarms.sort_by_key(|row| (row.rule, row.severity, row.setting));
     let end_of_life = end.map(|(time, cell)| EndOfLife {
         time_s: time.secs(),
         days: time.since(span.0) / 86_400.0,

@@ -5,13 +5,12 @@
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
-use std::sync::Arc;
 
 use serde::Serialize;
 
-use crate::alarm::{Change, Rule, Severity, State};
-use crate::monitor::{Estimate, Event, EventKind};
-use crate::quantity::{CellIndex, Mode, Timestamp};
+use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+use crate::health::Remaining;
+use crate::quantity::Timestamp;
 
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -72,30 +71,6 @@ pub(super) struct Column<R> {
     pub(super) get: for<'r> fn(&'r R) -> Field<'r>,
 }
 
-/// An estimate of a cell.
-pub(super) struct EstimateRow {
-    pub(super) log: Arc<str>,
-    pub(super) since_s: f64,
-    pub(super) estimate: Estimate,
-}
-
-/// A half-cycle of a cell, and what was learned from it.
-pub(super) struct HalfCycleRow {
-    pub(super) log: Arc<str>,
-    pub(super) since_s: f64,
-    pub(super) cell: CellIndex,
-    pub(super) cycles: f64,
-    pub(super) half_cycle: Event,
-    pub(super) capacity: Event,
-}
-
-/// Something that became of an alarm.
-pub(super) struct AlarmRow {
-    pub(super) log: Arc<str>,
-    pub(super) since_s: f64,
-    pub(super) event: Event,
-}
-
 /// Columns: name, kind, unit, `null` where it may be, meaning, value.
 macro_rules! columns {
     ($row:ty; $( $name:literal $kind:ident $unit:literal $($null:ident)?, $about:literal, $get:expr; )+) => {
@@ -138,44 +113,50 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
 /// Of `half_cycles`.
 pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when it was over", |row| Field::Time(row.half_cycle.time);
+    "time" Time "UTC", "when it was over", |row| Field::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "", "cell, from 0", |row| whole(row.cell.0);
-    "full_cycles" Real "" null, "equivalent full cycles so far: charge moved over twice the rated capacity", |row| real(row.cycles);
-    "mode" Word "", "charge or discharge", |row| half_cycle(row, |half| word(&half.mode));
-    "charge_ah" Real "Ah", "charge moved", |row| half_cycle(row, |half| real(half.charge_ah));
-    "swing" Real "fraction" null, "swing of the state of charge that the voltages tell", |row| half_cycle(row, |half| maybe(half.swing));
-    "swing_std" Real "fraction" null, "its standard deviation", |row| half_cycle(row, |half| maybe(half.swing_std));
-    "duration_s" Real "s", "duration", |row| half_cycle(row, |half| real(half.duration_s));
-    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| half_cycle(row, |half| real(half.mean_current_a));
-    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| half_cycle(row, |half| maybe(half.mean_temperature_c));
-    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| capacity(row, |told| told.0[0]);
-    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| capacity(row, |told| told.0[1]);
-    "capacity_ah" Real "Ah", "learned capacity after it", |row| capacity(row, |told| told.0[2]);
-    "capacity_std_ah" Real "Ah", "its standard deviation", |row| capacity(row, |told| told.0[3]);
-    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| capacity(row, |told| told.0[4]);
-    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| capacity(row, |told| told.0[5]);
-    "resistance_ratio" Real "", "resistance relative to new", |row| capacity(row, |told| told.0[6]);
-    "resistance_ratio_std" Real "", "its standard deviation", |row| capacity(row, |told| told.0[7]);
+    "cell" Whole "", "cell, from 0", |row| whole(row.half.cell.0);
+    "full_cycles" Real "cycles" null, "equivalent full cycles so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
+    "mode" Word "", "charge or discharge", |row| word(&row.half.mode);
+    "charge_ah" Real "Ah", "charge moved", |row| real(row.half.charge_ah);
+    "swing" Real "fraction" null, "swing of the state of charge that the voltages tell", |row| maybe(row.half.swing);
+    "swing_std" Real "fraction" null, "its standard deviation", |row| maybe(row.half.swing_std);
+    "duration_s" Real "s", "duration", |row| real(row.half.duration_s);
+    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| real(row.half.mean_current_a);
+    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| maybe(row.half.mean_temperature_c);
+    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| maybe(row.learned.measured_ah);
+    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.measured_std_ah);
+    "capacity_ah" Real "Ah", "learned capacity after it", |row| real(row.learned.capacity_ah);
+    "capacity_std_ah" Real "Ah", "its standard deviation", |row| real(row.learned.capacity_std_ah);
+    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| maybe(row.learned.usable_capacity_ah);
+    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.usable_capacity_std_ah);
+    "resistance_ratio" Real "", "resistance relative to new", |row| real(row.learned.resistance_ratio);
+    "resistance_ratio_std" Real "", "its standard deviation", |row| real(row.learned.resistance_ratio_std);
+    "remaining_cycles" Real "cycles" null, "equivalent full cycles until the cell's end of life, each of twice its capacity at the time: median; null = too little known", |row| cycles(row, |left| left.median);
+    "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
+    "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
+    "remaining_days" Real "days" null, "days until the cell's end of life, used as of late: median", |row| days(row, |left| left.median);
+    "remaining_days_low" Real "days" null, "its 5 % quantile", |row| days(row, |left| left.low);
+    "remaining_days_high" Real "days" null, "its 95 % quantile", |row| days(row, |left| left.high);
 };
 
 /// Of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when", |row| Field::Time(row.event.time);
+    "time" Time "UTC", "when", |row| Field::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "" null, "cell, from 0; null = the pack", |row| alarm(row, |told| Field::Whole(told.cell.map(|cell| cell.0.into())));
-    "rule" Word "", "what it is about", |row| alarm(row, |told| Field::Word(Some(told.rule.name().into())));
-    "severity" Word "", "info, warning or severe", |row| alarm(row, |told| Field::Word(Some(told.severity.name().into())));
-    "change" Word "", "what became of it: raised, cleared, ...", |row| alarm(row, |told| word(&told.change));
-    "state" Word "", "where it is in its life now", |row| alarm(row, |told| word(&told.state));
-    "active" Flag "", "whether it is raised now", |row| alarm(row, |told| Field::Flag(told.active));
-    "value" Real "unit" null, "the value that decided", |row| alarm(row, |told| maybe(told.value));
-    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| alarm(row, |told| maybe(told.probability));
-    "threshold" Real "unit", "what it is compared with", |row| alarm(row, |told| real(told.threshold));
-    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| alarm(row, |told| Field::Word(Some(told.rule.row().unit.symbol().into())));
-    "occurrences" Whole "", "times it was raised", |row| alarm(row, |told| Field::Whole(Some(told.occurrences)));
-    "acknowledged" Flag "", "whether somebody has seen it since", |row| alarm(row, |told| Field::Flag(told.acknowledged));
+    "cell" Whole "" null, "cell, from 0; null = the pack", |row| Field::Whole(row.alarm.cell.map(|cell| cell.0.into()));
+    "rule" Word "", "what it is about", |row| text(row.alarm.rule.name());
+    "severity" Word "", "info, warning or severe", |row| text(row.alarm.severity.name());
+    "change" Word "", "what became of it: raised, cleared, ...", |row| word(&row.alarm.change);
+    "state" Word "", "where it is in its life now", |row| word(&row.alarm.state);
+    "active" Flag "", "whether it is raised now", |row| Field::Flag(row.alarm.active);
+    "value" Real "unit" null, "the value that decided", |row| maybe(row.alarm.value);
+    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| maybe(row.alarm.probability);
+    "threshold" Real "unit", "what it is compared with", |row| real(row.alarm.threshold);
+    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.alarm.rule.row().unit.symbol());
+    "occurrences" Whole "", "times it was raised", |row| Field::Whole(Some(row.alarm.occurrences));
+    "acknowledged" Flag "", "whether somebody has seen it since", |row| Field::Flag(row.alarm.acknowledged);
 };
 
 fn real<'r>(value: f64) -> Field<'r> {
@@ -204,107 +185,12 @@ fn branch(row: &EstimateRow, index: usize) -> Field<'_> {
     maybe(row.estimate.branch_v.get(index).copied())
 }
 
-/// What a half-cycle told, under names of its own.
-struct Half {
-    mode: Mode,
-    charge_ah: f64,
-    swing: Option<f64>,
-    swing_std: Option<f64>,
-    duration_s: f64,
-    mean_current_a: f64,
-    mean_temperature_c: Option<f64>,
+fn cycles(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
+    maybe(row.remaining.and_then(|life| life.cycles).map(get))
 }
 
-fn half_cycle(row: &HalfCycleRow, get: fn(Half) -> Field<'static>) -> Field<'_> {
-    match row.half_cycle.kind {
-        EventKind::HalfCycle {
-            mode,
-            charge_ah,
-            swing,
-            swing_std,
-            duration_s,
-            mean_current_a,
-            mean_temperature_c,
-            ..
-        } => get(Half { mode, charge_ah, swing, swing_std, duration_s, mean_current_a, mean_temperature_c }),
-        _ => Field::Real(None),
-    }
-}
-
-/// Measured, learned, usable, resistance, each with its standard deviation.
-struct Told([Option<f64>; 8]);
-
-fn capacity(row: &HalfCycleRow, get: fn(Told) -> Option<f64>) -> Field<'_> {
-    let EventKind::Capacity {
-        measured_ah,
-        measured_std_ah,
-        capacity_ah,
-        capacity_std_ah,
-        usable_capacity_ah,
-        usable_capacity_std_ah,
-        resistance_ratio,
-        resistance_ratio_std,
-        ..
-    } = row.capacity.kind
-    else {
-        return Field::Real(None);
-    };
-    maybe(get(Told([
-        measured_ah,
-        measured_std_ah,
-        Some(capacity_ah),
-        Some(capacity_std_ah),
-        usable_capacity_ah,
-        usable_capacity_std_ah,
-        Some(resistance_ratio),
-        Some(resistance_ratio_std),
-    ])))
-}
-
-/// What became of an alarm.
-struct AlarmTold {
-    rule: Rule,
-    cell: Option<CellIndex>,
-    change: Change,
-    state: State,
-    active: bool,
-    severity: Severity,
-    value: Option<f64>,
-    probability: Option<f64>,
-    threshold: f64,
-    occurrences: u32,
-    acknowledged: bool,
-}
-
-fn alarm(row: &AlarmRow, get: fn(AlarmTold) -> Field<'static>) -> Field<'_> {
-    match row.event.kind {
-        EventKind::Alarm {
-            rule,
-            cell,
-            change,
-            state,
-            active,
-            severity,
-            value,
-            probability,
-            threshold,
-            occurrences,
-            acknowledged,
-        } => get(AlarmTold {
-            rule,
-            cell,
-            change,
-            state,
-            active,
-            severity,
-            value,
-            probability,
-            threshold,
-            occurrences,
-            acknowledged,
-        }),
-        _ => Field::Real(None),
-    }
+fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
+    maybe(row.remaining.and_then(|life| life.days).map(get))
 }
 
 /// The page about the columns, as Markdown.
@@ -318,7 +204,11 @@ pub(crate) fn reference() -> String {
         "An estimate of a cell, at most one per cell and `--period`: the first of each period since the log's start.",
         ESTIMATES,
     );
-    page += &section("half_cycles", "A charge or discharge of a cell, and what was learned from it.", HALF_CYCLES);
+    page += &section(
+        "half_cycles",
+        "A charge or discharge of a cell, what was learned from it, and what remained of the cell's life after it.",
+        HALF_CYCLES,
+    );
     page += &section("alarms", "Something that became of an alarm.", ALARMS);
     page
 }

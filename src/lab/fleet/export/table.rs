@@ -1,7 +1,7 @@
 //! A table being written: rows in, a Parquet or CSV file out.
 //!
 //! In: rows, and what the file says of itself. Promise: rows are kept for one row group only; the file has its name once it is
-//! complete ([`ResultFile`]); a value of another type than its column's is an error, never a wrong file.
+//! complete ([`ResultFile`]); a value that is missing or of another type than its column's is an error, never a wrong file.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -92,7 +92,11 @@ impl<R> TableFile<R> {
             Writer::Parquet { out, group, rows } => {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
                     if !values.push((column.get)(row), column.optional) {
-                        return Err(format!("{}: {} has a value of another type", self.path.display(), column.name));
+                        return Err(format!(
+                            "{}: {} has no value, or one of another type",
+                            self.path.display(),
+                            column.name
+                        ));
                     }
                 }
                 *rows += 1;

@@ -104,6 +104,7 @@ fn what_means_nothing_is_refused_with_what_may_be_meant() {
     let told = |choice: &str| made(&[choice]).expect_err("means nothing").join("; ");
     assert!(told("capacity_low.treshold=1").contains("must be threshold, info, warning, severe"));
     assert!(told("capacity_lo.warning=1").contains("did you mean capacity_low"), "{}", told("capacity_lo.warning=1"));
+    assert!(told("nothing.at_all=1").contains("no rule (rules: capacity_low, "), "{}", told("nothing.at_all=1"));
     assert!(told("estimator.nois=1").contains("estimator.nois is not a known key"));
     assert!(told("interface[3].name=a").contains("the configuration has 1 of them"));
     assert!(told("capacity_low.warning=a").contains("alarm[1].warning"), "{}", told("capacity_low.warning=a"));

@@ -3,7 +3,8 @@ use std::fs;
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 
-use super::super::columns::{ESTIMATES, EstimateRow};
+use super::super::columns::ESTIMATES;
+use super::super::rows::EstimateRow;
 use super::*;
 use crate::monitor::Estimate;
 use crate::quantity::{CellIndex, Timestamp};
@@ -22,7 +23,7 @@ fn row(index: u32) -> EstimateRow {
         resistance_ratio_std: 0.1,
         innovation_v: f64::NAN,
         innovation_std_v: f64::NAN,
-        accepted: index % 2 == 0,
+        accepted: index.is_multiple_of(2),
         voltage_v: 3.7,
         current_a: -1.0,
         temperature_c: 25.0,
