@@ -132,7 +132,7 @@ pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.usable_capacity_std_ah);
     "resistance_ratio" Real "", "resistance relative to new", |row| real(row.learned.resistance_ratio);
     "resistance_ratio_std" Real "", "its standard deviation", |row| real(row.learned.resistance_ratio_std);
-    "remaining_cycles" Real "cycles" null, "equivalent full cycles until the cell's end of life, each of twice its capacity at the time: median; null = too little known", |row| cycles(row, |left| left.median);
+    "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little known", |row| cycles(row, |left| left.median);
     "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
     "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
     "remaining_days" Real "days" null, "days until the cell's end of life, used as of late: median", |row| days(row, |left| left.median);
