@@ -3,7 +3,6 @@
 use super::data::{Data, Origin};
 use super::pictures::{self, NOT_STORED};
 use super::{Setting, forecast, summary};
-use crate::alarm::Rule;
 use crate::lab::chart::{Picture, Size, escape, variables};
 
 /// Rows of tables; all is in the pictures, and in `packwatch history`.
@@ -106,7 +105,7 @@ h2,h2+p{break-after:avoid}.scroll{overflow:visible}pre{white-space:pre-wrap}*{pr
 
 /// The page as text.
 pub fn page(data: &Data, setting: &Setting<'_>) -> String {
-    let outlook = forecast::outlook(data, pictures::threshold(data, setting, Rule::CapacityLow));
+    let outlook = forecast::outlook(data, setting);
     let summary = summary::of(data, setting, &outlook);
     let pictures = pictures::all(data, setting);
     let mut out = head(data, setting);
@@ -114,6 +113,7 @@ pub fn page(data: &Data, setting: &Setting<'_>) -> String {
     for part in &PARTS {
         self::part(&mut out, part, data, &pictures);
         match part.id {
+            "capacity" => no_forecast(&mut out, &outlook),
             "temperature" => alarms(&mut out, data, &pictures),
             "estimator" => estimator(&mut out, data),
             _ => {}
@@ -197,6 +197,21 @@ fn part(out: &mut String, part: &Part, data: &Data, pictures: &[(String, Picture
     }
     own().for_each(|(_, picture)| figure(out, picture));
     out.push_str("</section>\n");
+}
+
+/// Why the capacity chart has no forecast.
+fn no_forecast(out: &mut String, outlook: &Result<forecast::Outlook, String>) {
+    let why = match outlook {
+        Err(why) => format!("No forecast of the capacity: {why}."),
+        Ok(outlook) if outlook.life.cycles.is_some_and(|left| left.median <= 0.0) => {
+            "No forecast of the capacity: the end of life is passed.".to_owned()
+        }
+        Ok(outlook) if outlook.fan.is_empty() => {
+            "The forecast has no dates: how fast the battery is used up is not known.".to_owned()
+        }
+        Ok(_) => return,
+    };
+    out.push_str(&format!("<p class=\"none\">{}</p>\n", escape(&why)));
 }
 
 fn alarms(out: &mut String, data: &Data, pictures: &[(String, Picture)]) {

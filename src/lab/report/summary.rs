@@ -244,8 +244,8 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
         ),
         tile(
             "Remaining life",
-            outlook.as_ref().ok().map(|outlook| outlook.words.clone()),
-            outlook.as_ref().err().cloned().unwrap_or_default(),
+            outlook.as_ref().ok().map(Outlook::value),
+            outlook.as_ref().map_or_else(Clone::clone, |outlook| outlook.note(data.cells())),
         ),
         tile(
             "Use so far",
