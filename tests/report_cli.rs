@@ -79,6 +79,7 @@ fn a_store_becomes_a_page_that_says_what_it_does_not_know() {
     assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
     assert!(page.contains("unknown: the history keeps what was learned") && page.contains("all as they were written"));
     assert!(page.contains("rated capacity not known without -c"));
+    assert!(page.contains("No forecast of the capacity: the record does not say which capacity is the end of life"));
     assert!(place.page("b.html", &["--state", &state, "-c", &config()]).contains("of 2 Ah rated"));
 }
 
@@ -115,22 +116,58 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
 }
 
 #[test]
+fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said() {
+    let place = Place::new();
+    let [log, truth, events, state] = ["life.log", "truth.csv", "events.jsonl", "state"].map(|name| place.path(name));
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml").display().to_string();
+    let whole = ["--cycles", "12", "--truth", &truth, "--truth-period", "60"];
+    good(&[&["simulate", "paper", "-c", &config, "-o", &log][..], &whole].concat());
+    good(&["replay", "-c", &config, &log, "--events", &events, "--state", &state]);
+    let text = fs::read_to_string(&events).expect("events");
+    let told = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
+    let lives = told.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
+    let last = lives.last().expect("a forecast");
+    let digits = |name: &str| {
+        let value = last[name].as_f64().expect("known");
+        if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
+    };
+    let words = format!("{} cycles ({} to {})", digits("cycles"), digits("cycles_low"), digits("cycles_high"));
+    let replayed = place.page("a.html", &["-c", &config, &log, "--reference", &truth]);
+    for part in [words.as_str(), "forecast, 5 to 95 %", "end of life", "true (reference)", "measured (reference)"] {
+        assert!(replayed.contains(part), "no {part:?}");
+    }
+    let stored = place.page("b.html", &["-c", &config, "--state", &state]);
+    assert!(stored.contains(&words) && stored.contains("forecast, 5 to 95 %"), "no {words:?} from the store");
+}
+
+/// A browser that is installed here.
+fn browser() -> Option<PathBuf> {
+    let folders = std::env::var_os("PATH")?;
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    std::env::split_paths(&folders).flat_map(|folder| names.map(|name| folder.join(name))).find(|path| path.is_file())
+}
+
+#[test]
 fn a_browser_finds_nothing_to_fetch_nothing_to_complain_of_and_nothing_too_wide() {
-    let known = ["/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
-    let Some(browser) = known.map(PathBuf::from).into_iter().find(|path| path.exists()) else {
+    let Some(browser) = browser() else {
         println!("skipped: no Chromium is installed");
         return;
     };
     let place = Place::new();
-    let _ = place.page("a.html", &["-c", &config(), &place.path("cell.csv")]);
+    let (log, state) = (place.path("cell.csv"), place.path("state"));
+    good(&["replay", "-c", &config(), &log, "--state", &state]);
+    let _ = place.page("replay.html", &["-c", &config(), &log]);
+    let _ = place.page("state.html", &["-c", &config(), "--state", &state]);
     let tool = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/look_at_page.py");
-    for (width, scheme) in [("1280", "light"), ("390", "dark")] {
+    for (page, width, scheme) in
+        [("replay.html", "1280", "light"), ("replay.html", "390", "dark"), ("state.html", "390", "light")]
+    {
         let mut command = Command::new("python3");
-        command.arg(&tool).arg(&browser).arg(place.path("a.html"));
+        command.arg(&tool).arg(&browser).arg(place.path(page));
         let output = command.args([width, "900", scheme]).output().expect("python3 runs");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
         let expected = serde_json::json!({ "requests": [], "messages": [], "overflow_px": 0 });
-        assert_eq!(told, expected, "at {width} pixels, {scheme}");
+        assert_eq!(told, expected, "{page} at {width} pixels, {scheme}");
     }
 }

@@ -13,6 +13,9 @@ const MAX_TIPS: usize = 400;
 const TITLE: f64 = 24.0;
 const ROW: f64 = 18.0;
 const FOOT: f64 = 38.0;
+/// Ticks of the x axis at most, and room between their words, pixels.
+const MAX_TICKS: u32 = 10;
+const GAP: f64 = 16.0;
 /// Room at the right, pixels: half of the last tick's words.
 const RIGHT: f64 = 22.0;
 
@@ -89,10 +92,21 @@ impl Area {
         self.height * (self.y.1 - y) / (self.y.1 - self.y.0)
     }
 
+    /// As many ticks as their words have room for.
+    fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
+        let fits = |ticks: &[(f64, String)]| {
+            let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
+            ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + GAP)
+        };
+        let counts = (1..=MAX_TICKS).rev().map(f64::from);
+        let mut choices = counts.map(|count| axis.ticks(self.x, count));
+        choices.find(|ticks| fits(ticks)).unwrap_or_default()
+    }
+
     /// The x axis: grid, ticks, label.
     pub(super) fn draw_x(&self, svg: &mut Svg, axis: &Axis) {
         let bottom = self.top + self.height;
-        for (x, word) in axis.ticks(self.x, self.width / 90.0) {
+        for (x, word) in self.x_ticks(axis) {
             let at = self.left + self.px(x);
             svg.path("g", &format!("M{} {}V{}", short(at), short(self.top), short(bottom)), "");
             svg.text(at, bottom + 15.0, "t m", &word);

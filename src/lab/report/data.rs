@@ -178,7 +178,7 @@ impl Data {
                 let normalised_s = normalised_s.zip(normalised_std_s);
                 self.recharges.push(Recharge { time_s, raw_s: seconds, normalised_s });
             }
-            EventKind::Mode { .. } => self.trace.turn(time_s),
+            EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
             EventKind::Capacity { .. } | EventKind::Alarm { .. } => self.take_learned(time_s, &event.kind),
             _ => self.take_incident(time_s, &event.kind),
         }

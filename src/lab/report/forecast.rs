@@ -139,9 +139,14 @@ impl Outlook {
     /// What it means, and the days.
     pub(super) fn note(&self, cells: usize) -> String {
         let of_cell = if cells > 1 { format!(" of cell {}", self.cell + 1) } else { String::new() };
-        let days = self.life.cycles.and(self.life.days).map_or_else(String::new, |days| {
-            format!("; {} if used as of late", amount(days, "days"))
-        });
+        if self.life.cycles.is_some_and(|left| left.high <= 0.0) {
+            return format!("the capacity{of_cell} is below {:.3} Ah, the end of life", self.end_ah);
+        }
+        let days = self
+            .life
+            .cycles
+            .and(self.life.days)
+            .map_or_else(String::new, |days| format!("; {} if used as of late", amount(days, "days")));
         format!("full cycles until the capacity{of_cell} is {:.3} Ah, median and 90 % interval{days}", self.end_ah)
     }
 }
@@ -150,7 +155,7 @@ fn amount(left: Remaining, unit: &str) -> String {
     // Below ten a decimal is worth its room.
     let digits = |value: f64| if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") };
     if left.high <= 0.0 {
-        return "none: at its end".to_owned();
+        return "none".to_owned();
     }
     format!("{} {unit} ({} to {})", digits(left.median), digits(left.low), digits(left.high))
 }
@@ -238,6 +243,7 @@ mod tests {
         let mut data = worn(100, &[0.0015]);
         alarm_at(&mut data, 1.9);
         let outlook = outlook(&data, &Setting::default()).expect("known");
-        assert_eq!((outlook.value().as_str(), outlook.fan.len()), ("none: at its end", 0));
+        assert_eq!((outlook.value().as_str(), outlook.fan.len()), ("none", 0));
+        assert_eq!(outlook.note(1), "the capacity is below 1.900 Ah, the end of life");
     }
 }

@@ -12,9 +12,13 @@ use crate::lab::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Poi
 pub(super) const NOT_STORED: &str =
     "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
 
-/// A hole of this part of the whole, and of this many bins, interrupts a line.
-const MAX_HOLE_PART: usize = 200;
-const MAX_HOLE_BINS: usize = 100;
+/// A hole of this part of the whole interrupts a line, if it is this long as well: some sensors are slow.
+const MAX_HOLE_PART: usize = 100;
+const MAX_HOLE_S: f64 = 100.0;
+/// And of at least this many bins.
+const MAX_HOLE_BINS: usize = 3;
+/// The last half-cycles have a picture of their own when they are at most this part of the record.
+const MAX_RECENT: f64 = 0.9;
 
 /// Every picture that there are data for, with the name of its file.
 pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> {
@@ -139,7 +143,8 @@ fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64)
 /// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a Moment)>) -> Vec<(f64, &'a Moment)> {
     let all: Vec<(f64, &Moment)> = bins.collect();
-    let hole = (all.len() / MAX_HOLE_PART).max(MAX_HOLE_BINS);
+    let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
+    let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
         let is_filled = bin.soc.0 <= bin.soc.1;
@@ -174,6 +179,11 @@ fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
 
 fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &Moment)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
+    let (first_s, last_s) = data.ends_s()?;
+    // As good as the whole record: the picture before shows it.
+    if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
+        return None;
+    }
     let clock = Clock::between(data, moments.first()?.0, moments.last()?.0);
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
     let mut layers =
@@ -498,15 +508,18 @@ fn coverage(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
     let clock = Clock::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
+    let line: Vec<(f64, f64)> = line.collect();
+    // From 80 % where nothing lies lower.
+    let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
-        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line.collect())),
+        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line)),
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
     Some(Picture::Chart(Chart {
         title: "How sure the estimator is, and rightly".to_owned(),
         description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
         x: clock.axis,
-        y: Axis::number("readings, %").within(0.0, 102.0),
+        y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),
         layers,
     }))
 }

@@ -82,7 +82,8 @@ impl Reference {
             return Ok(());
         }
         let time = text(Some(columns.time));
-        let time_s = stamp::parse_stamp(time).ok_or_else(|| format!("time {time:?}, must be seconds or a date"))?.secs();
+        let time_s =
+            stamp::parse_stamp(time).ok_or_else(|| format!("time {time:?}, must be seconds or a date"))?.secs();
         if !capacity.is_empty() {
             let ah = number("capacity", capacity, f64::INFINITY)?;
             match self.capacities.last_mut().filter(|last| columns.has_cells && last.0 == time_s) {
