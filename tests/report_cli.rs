@@ -107,7 +107,7 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
     let (log, table) = (place.path("cell.csv"), place.path("measured.csv"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,1.9\n").expect("written");
     let page = place.page("a.html", &["-c", &config(), &log, "--reference", &table]);
-    assert!(page.contains("measured 1.900 Ah"));
+    assert!(page.contains("reference 1.900 Ah"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
     let told = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
     assert!(told.contains("measured.csv:2: capacity \"much\", must be a number"), "{told}");
@@ -133,7 +133,7 @@ fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said()
     };
     let words = format!("{} cycles ({} to {})", digits("cycles"), digits("cycles_low"), digits("cycles_high"));
     let replayed = place.page("a.html", &["-c", &config, &log, "--reference", &truth]);
-    for part in [words.as_str(), "forecast, 5 to 95 %", "end of life", "true (reference)", "measured (reference)"] {
+    for part in [words.as_str(), "forecast, 5 to 95 %", "end of life", "true (reference)"] {
         assert!(replayed.contains(part), "no {part:?}");
     }
     let stored = place.page("b.html", &["-c", &config, "--state", &state]);

@@ -27,7 +27,7 @@ pub(super) struct FanPoint {
     pub(super) high_ah: f64,
 }
 
-/// What is to come for the cell whose life ends first.
+/// What is to come for the cell whose life ends first of those whose life is known.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Outlook {
     /// Counts from 0.
@@ -37,6 +37,8 @@ pub(super) struct Outlook {
     /// Capacity at the end of life, Ah.
     pub(super) end_ah: f64,
     pub(super) life: RemainingLife,
+    /// Cells whose life is not known, and why: one of them may end first.
+    pub(super) unknown: Option<String>,
 }
 
 /// Capacity at the end of life, Ah: as configured, else the mildest limit that the record's alarms tell.
@@ -52,14 +54,14 @@ pub(super) fn outlook(data: &Data, setting: &Setting<'_>) -> Result<Outlook, Str
     let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
     let cells = cells(data, rated_ah);
     let lives: Vec<Result<RemainingLife, TooThin>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
-    if let Some((cell, why)) = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?))) {
-        return Err(too_thin(&lives, cell, why));
-    }
+    let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
+    let unknown = refused.map(|(cell, why)| too_thin(&lives, cell, why));
     let median = |life: &RemainingLife| life.cycles.or(life.days).map_or(f64::INFINITY, |left| left.median);
-    let known = lives.into_iter().filter_map(Result::ok).enumerate();
-    let first = known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1)));
-    let (cell, life) = first.ok_or("nothing was learned about the capacity yet")?;
-    Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life })
+    let known = lives.into_iter().enumerate().filter_map(|(cell, life)| Some((cell, life.ok()?)));
+    match known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1))) {
+        Some((cell, life)) => Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life, unknown }),
+        None => Err(unknown.unwrap_or_else(|| "nothing was learned about the capacity yet".to_owned())),
+    }
 }
 
 fn too_thin(lives: &[Result<RemainingLife, TooThin>], cell: usize, why: TooThin) -> String {
@@ -127,8 +129,12 @@ fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<FanPoint> 
 }
 
 impl Outlook {
-    /// "14 cycles (6 to 74)".
+    /// "14 cycles (6 to 74)"; as in the core itself, a pack's life is not known before every cell's is.
     pub(super) fn value(&self) -> String {
+        if self.unknown.is_some() { "unknown".to_owned() } else { self.left() }
+    }
+
+    fn left(&self) -> String {
         match (self.life.cycles, self.life.days) {
             (Some(left), _) => amount(left, "cycles"),
             (None, Some(left)) => amount(left, "days"),
@@ -138,6 +144,9 @@ impl Outlook {
 
     /// What it means, and the days.
     pub(super) fn note(&self, cells: usize) -> String {
+        if let Some(why) = &self.unknown {
+            return format!("{why}; shortest known: {}, cell {}", self.left(), self.cell + 1);
+        }
         let of_cell = if cells > 1 { format!(" of cell {}", self.cell + 1) } else { String::new() };
         if self.life.cycles.is_some_and(|left| left.high <= 0.0) {
             return format!("the capacity{of_cell} is below {:.3} Ah, the end of life", self.end_ah);
@@ -233,6 +242,11 @@ mod tests {
         alarm_at(&mut thin, 1.6);
         let why = outlook(&thin, &Setting::default()).unwrap_err();
         assert_eq!(why, "not known of 2 of 2 cells (cell 1: 4 capacity readings, needs 6)");
+        let mut mixed = worn(100, &[0.001, 0.0]);
+        alarm_at(&mut mixed, 1.6);
+        let outlook_of_one = outlook(&mixed, &Setting::default()).expect("of one cell");
+        assert_eq!((outlook_of_one.cell, outlook_of_one.value().as_str()), (0, "unknown"));
+        assert!(outlook_of_one.note(2).starts_with("not known of 1 of 2 cells (cell 2: capacity lost is"));
         let mut flat = worn(100, &[0.0]);
         alarm_at(&mut flat, 1.6);
         assert!(outlook(&flat, &Setting::default()).unwrap_err().starts_with("capacity lost is"));

@@ -212,10 +212,13 @@ fn about_forecast(out: &mut String, data: &Data, outlook: &Result<forecast::Outl
         }
         Ok(outlook) => {
             let of_cell = if data.cells() > 1 { format!(" for cell {}", outlook.cell + 1) } else { String::new() };
+            let doubt = outlook.unknown.as_ref().map_or_else(String::new, |why| {
+                format!(" It is the shortest life that is known; another cell's may end sooner: {why}.")
+            });
             format!(
                 "The fan is what is to come{of_cell} if the battery is used as of late: in one of two cases the end of \
                  life comes before the dashed line meets it, in nine of ten within the band. No knee that has not shown \
-                 itself is in it."
+                 itself is in it.{doubt}"
             )
         }
     };

@@ -282,10 +282,15 @@ fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer
     let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
         x: clock.x(time_s),
         y: capacity_ah,
-        tip: format!("{}: measured {capacity_ah:.3} Ah", moment(data, time_s)),
+        tip: format!("{}: reference {capacity_ah:.3} Ah", moment(data, time_s)),
     });
     let points: Vec<Point> = points.collect();
-    (!points.is_empty()).then(|| Layer::new("measured (reference)", Ink::Plain, Shape::Points(points)))
+    let words = match (setting.reference.is_loaded, data.cells() > 1) {
+        (true, _) => "measured (reference)",
+        (false, true) => "true, weakest cell (reference)",
+        (false, false) => "true (reference)",
+    };
+    (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
 }
 
 /// The true SOC between two moments: of one cell a line, of several the lowest and the highest.

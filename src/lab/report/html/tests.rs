@@ -115,7 +115,7 @@ fn alarm(half: u16, active: bool) -> EventKind {
         severity: Severity::Warning,
         value: Some(capacity_ah(half, half % 96)),
         probability: Some(0.9),
-        threshold: 2.08,
+        threshold: 1.82,
         occurrences: 1,
         acknowledged: false,
     }
