@@ -159,7 +159,7 @@ impl Data {
                 let of = cell.map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
                 let detail = row.text("detail");
                 let colon = if detail.is_empty() { "" } else { ": " };
-                self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason"))));
+                self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason").replace('_', " "))));
             }
             // A row of a cell without its number: the store writes none.
             (Kind::HalfCycle | Kind::Capacity, None) => {}

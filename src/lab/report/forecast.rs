@@ -16,6 +16,8 @@ const POINTS: usize = 60;
 /// How far a fan goes at most: medians until the end of life, and lengths of the record.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
+/// And how far it goes even where the median is near, if the end may come that late.
+const LEAST_RECORDS: f64 = 0.2;
 
 /// Capacity to come, at a moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,17 +61,30 @@ pub(super) fn outlook(data: &Data, setting: &Setting<'_>) -> Result<Outlook, Str
     let median = |life: &RemainingLife| life.cycles.or(life.days).map_or(f64::INFINITY, |left| left.median);
     let known = lives.into_iter().enumerate().filter_map(|(cell, life)| Some((cell, life.ok()?)));
     match known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1))) {
-        Some((cell, life)) => Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life, unknown }),
+        Some((cell, life)) => {
+            // No life is shorter than one that is over.
+            let unknown = unknown.filter(|_| !is_over(&life));
+            Ok(Outlook { cell, fan: fan(data, &cells[cell], &life), end_ah, life, unknown })
+        }
         None => Err(unknown.unwrap_or_else(|| "nothing was learned about the capacity yet".to_owned())),
     }
 }
 
+/// Whether the end of life is passed, for all that is known.
+fn is_over(life: &RemainingLife) -> bool {
+    life.cycles.or(life.days).is_some_and(|left| left.high <= 0.0)
+}
+
 fn too_thin(lives: &[Result<RemainingLife, TooThin>], cell: usize, why: TooThin) -> String {
     if lives.len() == 1 {
-        return why.to_string();
+        return told(why);
     }
     let unknown = lives.iter().filter(|life| life.is_err()).count();
-    format!("not known of {unknown} of {} cells (cell {}: {why})", lives.len(), cell + 1)
+    format!("not known of {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, told(why))
+}
+
+fn told(why: TooThin) -> String {
+    why.to_string().replace("+-", "\u{b1}")
 }
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
@@ -113,12 +128,13 @@ fn fed(half: &Half, row: &Learned, days: f64) -> (Passed, Option<Reading>) {
 fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<FanPoint> {
     let (Some(cycles), Some(days)) = (life.cycles, life.days) else { return Vec::new() };
     let (Some(first), Some(last)) = (data.halves.first(), data.halves.last()) else { return Vec::new() };
-    if cycles.median <= 0.0 {
+    if is_over(life) {
         return Vec::new();
     }
-    let days_per_cycle = days.median / cycles.median;
+    let days_per_cycle = days.high / cycles.high;
     let recorded = (last.time_s - first.time_s) / DAY_S / days_per_cycle;
-    let ahead = cycles.high.min(MAX_MEDIANS * cycles.median).min((MAX_RECORDS * recorded).max(cycles.median));
+    let long = (MAX_MEDIANS * cycles.median).max(LEAST_RECORDS * recorded);
+    let ahead = cycles.high.min(long).min((MAX_RECORDS * recorded).max(cycles.median));
     let at = |point: crate::health::forecast::FanPoint| FanPoint {
         time_s: last.time_s + point.ahead * days_per_cycle * DAY_S,
         low_ah: point.low_ah,
@@ -129,6 +145,10 @@ fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<FanPoint> 
 }
 
 impl Outlook {
+    pub(super) fn is_over(&self) -> bool {
+        is_over(&self.life)
+    }
+
     /// "14 cycles (6 to 74)"; as in the core itself, a pack's life is not known before every cell's is.
     pub(super) fn value(&self) -> String {
         if self.unknown.is_some() { "unknown".to_owned() } else { self.left() }
@@ -148,7 +168,7 @@ impl Outlook {
             return format!("{why}; shortest known: {}, cell {}", self.left(), self.cell + 1);
         }
         let of_cell = if cells > 1 { format!(" of cell {}", self.cell + 1) } else { String::new() };
-        if self.life.cycles.is_some_and(|left| left.high <= 0.0) {
+        if self.is_over() {
             return format!("the capacity{of_cell} is below {:.3} Ah, the end of life", self.end_ah);
         }
         let days = self

@@ -204,9 +204,7 @@ fn about_forecast(out: &mut String, data: &Data, outlook: &Result<forecast::Outl
         // The part's own words say it already.
         _ if data.learned.is_empty() => return,
         Err(why) => format!("No forecast of the capacity: {why}."),
-        Ok(outlook) if outlook.life.cycles.is_some_and(|left| left.median <= 0.0) => {
-            "No forecast of the capacity: the end of life is passed.".to_owned()
-        }
+        Ok(outlook) if outlook.is_over() => "No forecast of the capacity: the end of life is passed.".to_owned(),
         Ok(outlook) if outlook.fan.is_empty() => {
             "The forecast has no dates: how fast the battery is used up is not known.".to_owned()
         }
