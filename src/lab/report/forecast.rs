@@ -149,44 +149,43 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// "14 cycles (6 to 74)"; as in the core itself, a pack's life is not known before every cell's is.
+    /// "14 cycles"; as in the core itself, a pack's life is not known before every cell's is.
     pub(super) fn value(&self) -> String {
-        if self.unknown.is_some() { "unknown".to_owned() } else { self.left() }
-    }
-
-    fn left(&self) -> String {
-        match (self.life.cycles, self.life.days) {
-            (Some(left), _) => amount(left, "cycles"),
-            (None, Some(left)) => amount(left, "days"),
-            (None, None) => "unknown".to_owned(),
+        match self.life.cycles {
+            Some(left) if self.unknown.is_none() => median(left),
+            _ => "unknown".to_owned(),
         }
     }
 
-    /// What it means, and the days.
+    /// What it means, with the interval and the days.
     pub(super) fn note(&self, cells: usize) -> String {
+        let cycles = self.life.cycles.map_or_else(String::new, interval);
         if let Some(why) = &self.unknown {
-            return format!("{why}; shortest known: {}, cell {}", self.left(), self.cell + 1);
+            let shortest = self.life.cycles.map_or_else(String::new, median);
+            return format!("{why}; shortest known: {shortest}, {cycles}, cell {}", self.cell + 1);
         }
         let of_cell = if cells > 1 { format!(" of cell {}", self.cell + 1) } else { String::new() };
         if self.is_over() {
             return format!("the capacity{of_cell} is below {:.3} Ah, the end of life", self.end_ah);
         }
-        let days = self
-            .life
-            .cycles
-            .and(self.life.days)
-            .map_or_else(String::new, |days| format!("; {} if used as of late", amount(days, "days")));
-        format!("full cycles until the capacity{of_cell} is {:.3} Ah, median and 90 % interval{days}", self.end_ah)
+        let days = self.life.days.map_or_else(String::new, |days| {
+            format!("; if used as of late {} days, {}", digits(days.median), interval(days))
+        });
+        format!("{cycles}, until the capacity{of_cell} is {:.3} Ah{days}", self.end_ah)
     }
 }
 
-fn amount(left: Remaining, unit: &str) -> String {
-    // Below ten a decimal is worth its room.
-    let digits = |value: f64| if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") };
-    if left.high <= 0.0 {
-        return "none".to_owned();
-    }
-    format!("{} {unit} ({} to {})", digits(left.median), digits(left.low), digits(left.high))
+fn median(left: Remaining) -> String {
+    if left.high <= 0.0 { "none".to_owned() } else { format!("{} cycles", digits(left.median)) }
+}
+
+fn interval(left: Remaining) -> String {
+    format!("{} to {} in nine of ten cases", digits(left.low), digits(left.high))
+}
+
+/// Below ten a decimal is worth its room.
+fn digits(value: f64) -> String {
+    if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
 }
 
 #[cfg(test)]

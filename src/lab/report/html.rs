@@ -198,6 +198,17 @@ fn part(out: &mut String, part: &Part, data: &Data, pictures: &[(String, Picture
     out.push_str("</section>\n");
 }
 
+/// Why the fan does not begin where the estimate ends, where it does not.
+fn gap(data: &Data, outlook: &forecast::Outlook) -> &'static str {
+    let last = data.learned.iter().rev().find(|row| row.cell == outlook.cell);
+    match (last, outlook.fan.first()) {
+        (Some(last), Some(first)) if (first.median_ah - last.capacity_ah.0).abs() > 2.0 * last.capacity_ah.1 => {
+            " It begins at what the latest half-cycles say by themselves; the learned capacity is still on its way there."
+        }
+        _ => "",
+    }
+}
+
 /// What the forecast in the capacity chart is, or why there is none.
 fn about_forecast(out: &mut String, data: &Data, outlook: &Result<forecast::Outlook, String>) {
     let why = match outlook {
@@ -216,7 +227,8 @@ fn about_forecast(out: &mut String, data: &Data, outlook: &Result<forecast::Outl
             format!(
                 "The fan is what is to come{of_cell} if the battery is used as of late: in one of two cases the end of \
                  life comes before the dashed line meets it, in nine of ten within the band. No knee that has not shown \
-                 itself is in it.{doubt}"
+                 itself is in it.{}{doubt}",
+                gap(data, outlook)
             )
         }
     };

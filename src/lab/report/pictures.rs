@@ -236,9 +236,9 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
     layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
     if !fan.is_empty() {
         let band = fan.iter().map(|p| (clock.x(p.time_s), p.low_ah, p.high_ah)).collect();
-        layers.push(Layer::new("forecast, 5 to 95 %", Ink::Purple, Shape::Band(band)));
+        layers.push(Layer::new("forecast, 5 to 95 %, and its median", Ink::Purple, Shape::Band(band)));
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
-        layers.push(Layer::new("forecast, median", Ink::Purple, Shape::Dashed(median)));
+        layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
     // Measured capacities are under load, unless there is no such estimate to set them beside.
     if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {

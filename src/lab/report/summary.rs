@@ -78,7 +78,7 @@ pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, S
         Some("warning") => Verdict::Plan,
         Some(_) => Verdict::Watch,
         None if !knows => Verdict::Unknown,
-        None if !measuring.is_empty() => Verdict::Watch,
+        None if !measuring.is_empty() || is_over(outlook) => Verdict::Watch,
         None => Verdict::Good,
     };
     Summary {
@@ -88,6 +88,11 @@ pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, S
         what: what(verdict, worst, &measuring),
         tiles: tiles(data, setting, outlook, &raised),
     }
+}
+
+/// Whether the capacity has passed the end of life, whatever the alarms say.
+fn is_over(outlook: &Result<Outlook, String>) -> bool {
+    outlook.as_ref().is_ok_and(Outlook::is_over)
 }
 
 fn raised(data: &Data) -> Vec<Raised<'_>> {
@@ -154,6 +159,9 @@ pub(super) fn words(row: &AlarmRow) -> String {
 fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], data: &Data) -> String {
     let head = match verdict {
         Verdict::Good => "Good: no limit is passed.",
+        Verdict::Watch if worst.is_none() && measuring.is_empty() => {
+            "No limit is passed, but the capacity is below that of the end of life."
+        }
         Verdict::Watch if worst.is_none() => "The battery passes no limit, but its measuring is not in order.",
         Verdict::Watch => "Worth watching.",
         Verdict::Plan => "Worn: plan a visit to the workshop.",
@@ -213,6 +221,7 @@ fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>])
         (None, None) if verdict == Verdict::Unknown => {
             "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
         }
+        (None, None) if verdict == Verdict::Watch => "Plan its replacement.".to_owned(),
         (None, None) => "Nothing.".to_owned(),
         (advice, measure) => advice.into_iter().chain(measure).collect::<Vec<_>>().join(" "),
     }
