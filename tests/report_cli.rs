@@ -127,8 +127,8 @@ fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said()
     good(&["replay", "-c", &config, &log, "--events", &events, "--state", &state]);
     let text = fs::read_to_string(&events).expect("events");
     let told = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
-    let lives = told.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
-    let last = lives.last().expect("a forecast");
+    let mut lives = told.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
+    let last = lives.next_back().expect("a forecast");
     let digits = |name: &str| {
         let value = last[name].as_f64().expect("known");
         if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }

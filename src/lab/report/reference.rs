@@ -113,9 +113,10 @@ fn number(name: &str, text: &str, most: f64) -> Result<f64, String> {
 /// Leaves the points at which the capacity has changed, and the last.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
-    let mut kept_ah = f64::NAN;
+    let mut kept_ah = f64::INFINITY;
     points.retain(|(_, ah)| {
-        let is_kept = !((ah - kept_ah).abs() <= KEPT_CHANGE * kept_ah);
+        // The first is infinitely far from what was kept before it.
+        let is_kept = (ah - kept_ah).abs() > KEPT_CHANGE * ah;
         kept_ah = if is_kept { *ah } else { kept_ah };
         is_kept
     });

@@ -278,9 +278,9 @@ fn recharge_tile(data: &Data) -> Tile {
     let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
     let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
     let minutes = |seconds: f64| format!("{:.1} min", seconds / 60.0);
-    let (first, last, how) = match normalised().last() {
+    let (first, last, how) = match normalised().next_back() {
         Some(last) => (normalised().next(), Some(last), "normalised; "),
-        None => (raw().next(), raw().last(), "as it was; "),
+        None => (raw().next(), raw().next_back(), "as it was; "),
     };
     let note = match (first, data.source.origin) {
         (Some(first), _) => format!("{how}{} at first", minutes(first)),
