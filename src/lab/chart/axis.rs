@@ -7,7 +7,7 @@ const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
 /// Steps of a date axis below a month, s.
-const STEPS_S: [f64; 17] = [
+const STEPS_S: [f64; 19] = [
     1.0,
     5.0,
     15.0,
@@ -18,6 +18,8 @@ const STEPS_S: [f64; 17] = [
     30.0 * MINUTE,
     HOUR,
     2.0 * HOUR,
+    3.0 * HOUR,
+    4.0 * HOUR,
     6.0 * HOUR,
     12.0 * HOUR,
     DAY,
