@@ -65,7 +65,9 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
     {
         assert!(page.contains(part), "no {part:?}");
     }
-    assert!(!page.contains("NaN") && !page.contains("<script") && !page.contains("http"), "not self-contained");
+    for foreign in ["NaN", "<script", "http:", "https:", "url("] {
+        assert!(!page.contains(foreign), "{foreign} in the page");
+    }
     assert_eq!(page, place.page("b.html", &["-c", &config(), &log, "--title", "cell <1>"]));
     assert!(page.len() < 600_000, "{} bytes", page.len());
 }
@@ -79,6 +81,7 @@ fn a_store_becomes_a_page_that_says_what_it_does_not_know() {
     assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
     assert!(page.contains("unknown: the history keeps what was learned") && page.contains("all as they were written"));
     assert!(page.contains("rated capacity not known without -c"));
+    assert!(page.contains("No forecast of the capacity: the record does not say which capacity is the end of life"));
     assert!(place.page("b.html", &["--state", &state, "-c", &config()]).contains("of 2 Ah rated"));
 }
 
@@ -106,7 +109,7 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
     let (log, table) = (place.path("cell.csv"), place.path("measured.csv"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,1.9\n").expect("written");
     let page = place.page("a.html", &["-c", &config(), &log, "--reference", &table]);
-    assert!(page.contains("measured 1.900 Ah"));
+    assert!(page.contains("reference 1.900 Ah"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
     let told = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
     assert!(told.contains("measured.csv:2: capacity \"much\", must be a number"), "{told}");
@@ -115,22 +118,62 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
 }
 
 #[test]
+fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said() {
+    let place = Place::new();
+    let [log, truth, events, state] = ["life.log", "truth.csv", "events.jsonl", "state"].map(|name| place.path(name));
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml").display().to_string();
+    let whole = ["--cycles", "8", "--truth", &truth, "--truth-period", "60"];
+    good(&[&["simulate", "paper", "-c", &config, "-o", &log][..], &whole].concat());
+    good(&["replay", "-c", &config, &log, "--events", &events, "--state", &state]);
+    let text = fs::read_to_string(&events).expect("events");
+    let told = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
+    let mut lives = told.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
+    let last = lives.next_back().expect("a forecast");
+    let digits = |name: &str| {
+        let value = last[name].as_f64().expect("known");
+        if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
+    };
+    let words = format!("{} to {} in nine of ten cases", digits("cycles_low"), digits("cycles_high"));
+    let median = format!("{} cycles<", digits("cycles"));
+    let replayed = place.page("a.html", &["-c", &config, &log, "--reference", &truth]);
+    for part in [words.as_str(), &median, "forecast, 5 to 95 %", "end of life", "true (reference)"] {
+        assert!(replayed.contains(part), "no {part:?}");
+    }
+    let stored = place.page("b.html", &["-c", &config, "--state", &state]);
+    assert!(
+        stored.contains(&words) && stored.contains(&median) && stored.contains("forecast, 5 to 95 %"),
+        "no {words:?} from the store"
+    );
+}
+
+/// A browser that is installed here.
+fn browser() -> Option<PathBuf> {
+    let folders = std::env::var_os("PATH")?;
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    std::env::split_paths(&folders).flat_map(|folder| names.map(|name| folder.join(name))).find(|path| path.is_file())
+}
+
+#[test]
 fn a_browser_finds_nothing_to_fetch_nothing_to_complain_of_and_nothing_too_wide() {
-    let known = ["/usr/bin/chromium", "/usr/bin/chromium-browser", "/usr/bin/google-chrome"];
-    let Some(browser) = known.map(PathBuf::from).into_iter().find(|path| path.exists()) else {
+    let Some(browser) = browser() else {
         println!("skipped: no Chromium is installed");
         return;
     };
     let place = Place::new();
-    let _ = place.page("a.html", &["-c", &config(), &place.path("cell.csv")]);
+    let (log, state) = (place.path("cell.csv"), place.path("state"));
+    good(&["replay", "-c", &config(), &log, "--state", &state]);
+    let _ = place.page("replay.html", &["-c", &config(), &log]);
+    let _ = place.page("state.html", &["-c", &config(), "--state", &state]);
     let tool = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/look_at_page.py");
-    for (width, scheme) in [("1280", "light"), ("390", "dark")] {
+    for (page, width, scheme) in
+        [("replay.html", "1280", "light"), ("replay.html", "390", "dark"), ("state.html", "390", "light")]
+    {
         let mut command = Command::new("python3");
-        command.arg(&tool).arg(&browser).arg(place.path("a.html"));
+        command.arg(&tool).arg(&browser).arg(place.path(page));
         let output = command.args([width, "900", scheme]).output().expect("python3 runs");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
         let expected = serde_json::json!({ "requests": [], "messages": [], "overflow_px": 0 });
-        assert_eq!(told, expected, "at {width} pixels, {scheme}");
+        assert_eq!(told, expected, "{page} at {width} pixels, {scheme}");
     }
 }

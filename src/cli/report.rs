@@ -34,8 +34,9 @@ pub(crate) struct Args {
     /// Write every picture as SVG and PNG into this folder as well
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Measured capacities to show beside the estimates: CSV with capacity_ah (or capacity_ah_source), Ah, and time_s (s),
-    /// start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data
+    /// Truth to show beside the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
+    /// or both, and time_s (s), start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data; with a column
+    /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
     #[arg(long, value_name = "TABLE.csv")]
     reference: Option<PathBuf>,
     /// Title of the page [default: the name of the log or folder]
@@ -58,7 +59,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let mut provenance = provenance;
     provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
-    provenance.extend(args.reference.iter().map(|path| ("Measured capacities".to_owned(), path.display().to_string())));
+    provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
     let setting = Setting {
         title: args.title(),
         config: config.as_ref(),

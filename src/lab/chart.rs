@@ -31,7 +31,7 @@ pub(crate) struct Size {
 
 impl Size {
     /// For a screen or a page.
-    pub(crate) const WIDE: Self = Self { width: 960.0, height: 300.0 };
+    pub(crate) const WIDE: Self = Self { width: 840.0, height: 290.0 };
     /// For a phone.
     pub(crate) const NARROW: Self = Self { width: 350.0, height: 270.0 };
 }

@@ -31,8 +31,8 @@ pub struct Setting<'a> {
     pub config: Option<&'a Config>,
     /// The configuration file's text, for the page's end.
     pub config_text: Option<String>,
-    /// Measured capacities.
-    pub reference: Vec<Reference>,
+    /// What was measured, or is known to be true.
+    pub reference: Reference,
     /// Lines of the provenance: what, and which.
     pub provenance: Vec<(String, String)>,
 }

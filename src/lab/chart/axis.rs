@@ -7,7 +7,7 @@ const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
 /// Steps of a date axis below a month, s.
-const STEPS_S: [f64; 16] = [
+const STEPS_S: [f64; 19] = [
     1.0,
     5.0,
     15.0,
@@ -18,12 +18,15 @@ const STEPS_S: [f64; 16] = [
     30.0 * MINUTE,
     HOUR,
     2.0 * HOUR,
+    3.0 * HOUR,
+    4.0 * HOUR,
     6.0 * HOUR,
     12.0 * HOUR,
     DAY,
     2.0 * DAY,
     5.0 * DAY,
     10.0 * DAY,
+    20.0 * DAY,
 ];
 /// Steps above, months.
 const STEPS_MONTHS: [i64; 7] = [1, 2, 3, 6, 12, 24, 60];

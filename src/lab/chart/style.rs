@@ -107,7 +107,7 @@ fn classes() -> String {
         );
     }
     for (step, colour) in STEPS.iter().enumerate() {
-        let _ = write!(text, ".h-{step}{{fill:{colour}}}");
+        let _ = write!(text, ".h-{step}{{fill:{colour};shape-rendering:crispEdges}}");
     }
     text
 }

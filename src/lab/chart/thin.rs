@@ -40,7 +40,8 @@ fn binning(mut xs: impl DoubleEndedIterator<Item = f64>, bins: usize) -> impl Fn
     let first = xs.next().unwrap_or(0.0);
     let last = xs.next_back().unwrap_or(first);
     let width = ((last - first) / bins.max(1) as f64).max(f64::MIN_POSITIVE);
-    move |x| ((x - first) / width).floor()
+    // The last point belongs to the last bin, not to one of its own.
+    move |x| ((x - first) / width).floor().min(bins.max(1) as f64 - 1.0)
 }
 
 #[cfg(test)]

@@ -37,6 +37,8 @@ pub(super) struct Learned {
     pub(super) cell: usize,
     /// What this half-cycle alone said, Ah.
     pub(super) measured_ah: Option<f64>,
+    /// Its standard deviation, Ah.
+    pub(super) measured_std_ah: Option<f64>,
     /// Mean and standard deviation, Ah.
     pub(super) capacity_ah: (f64, f64),
     pub(super) usable_ah: Option<(f64, f64)>,
@@ -138,6 +140,7 @@ impl Data {
                 time_s,
                 cell,
                 measured_ah: row.number("measured_ah"),
+                measured_std_ah: row.number("measured_std_ah"),
                 capacity_ah: row.pair("capacity_ah", "capacity_std_ah").unwrap_or((f64::NAN, f64::NAN)),
                 usable_ah: row.pair("usable_capacity_ah", "usable_capacity_std_ah"),
                 resistance: row.pair("resistance_ratio", "resistance_ratio_std").unwrap_or((f64::NAN, f64::NAN)),
@@ -156,7 +159,7 @@ impl Data {
                 let of = cell.map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
                 let detail = row.text("detail");
                 let colon = if detail.is_empty() { "" } else { ": " };
-                self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason"))));
+                self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason").replace('_', " "))));
             }
             // A row of a cell without its number: the store writes none. And the forecast is made anew here.
             (Kind::HalfCycle | Kind::Capacity, None) | (Kind::RemainingLife, _) => {}
@@ -175,7 +178,7 @@ impl Data {
                 let normalised_s = normalised_s.zip(normalised_std_s);
                 self.recharges.push(Recharge { time_s, raw_s: seconds, normalised_s });
             }
-            EventKind::Mode { .. } => self.trace.turn(time_s),
+            EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
             EventKind::Capacity { .. } | EventKind::Alarm { .. } => self.take_learned(time_s, &event.kind),
             _ => self.take_incident(time_s, &event.kind),
         }
@@ -186,6 +189,7 @@ impl Data {
             EventKind::Capacity {
                 cell,
                 measured_ah,
+                measured_std_ah,
                 capacity_ah,
                 capacity_std_ah,
                 usable_capacity_ah,
@@ -197,6 +201,7 @@ impl Data {
                 time_s,
                 cell: cell.index(),
                 measured_ah,
+                measured_std_ah,
                 capacity_ah: (capacity_ah, capacity_std_ah),
                 usable_ah: usable_capacity_ah.zip(usable_capacity_std_ah),
                 resistance: (resistance_ratio, resistance_ratio_std),
@@ -228,11 +233,21 @@ impl Data {
                 )
             }
             EventKind::Trust { cell, trusted: true, .. } => format!("estimate of cell {} trusted again", number(cell)),
-            EventKind::PackReplaced { .. } => "another pack was connected".to_owned(),
+            EventKind::PackReplaced { .. } => {
+                self.forget_pack();
+                "another pack was connected: what was learned of the one before is not shown".to_owned()
+            }
             EventKind::TimeBackwards { seconds } => format!("the clock was set back by {seconds:.0} s"),
             _ => return,
         };
         self.incidents.push((time_s, what));
+    }
+
+    /// Like a store's report, a replay's is about the pack that is connected at its end.
+    fn forget_pack(&mut self) {
+        self.halves.clear();
+        self.learned.clear();
+        self.recharges.clear();
     }
 
     /// Takes an estimate of a replay.

@@ -12,17 +12,21 @@ use crate::lab::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Poi
 pub(super) const NOT_STORED: &str =
     "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
 
-/// A hole of this part of the whole, and of this many bins, interrupts a line.
-const MAX_HOLE_PART: usize = 200;
-const MAX_HOLE_BINS: usize = 100;
+/// A hole of this part of the whole interrupts a line, if it is this long as well: some sensors are slow.
+const MAX_HOLE_PART: usize = 100;
+const MAX_HOLE_S: f64 = 100.0;
+/// And of at least this many bins.
+const MAX_HOLE_BINS: usize = 3;
+/// The last half-cycles have a picture of their own when they are at most this part of the record.
+const MAX_RECENT: f64 = 0.9;
 
 /// Every picture that there are data for, with the name of its file.
 pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> {
-    let outlook = forecast::outlook(data, threshold(data, setting, Rule::CapacityLow));
+    let outlook = forecast::outlook(data, setting);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
     [
-        named("soc", soc(data)),
-        named("soc_recent", soc_recent(data)),
+        named("soc", soc(data, setting)),
+        named("soc_recent", soc_recent(data, setting)),
         named("capacity", capacity(data, setting, outlook.as_ref().ok())),
         named("usable_capacity", usable(data, setting)),
         named("recharge_period", recharge(data, setting)),
@@ -139,7 +143,8 @@ fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64)
 /// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
 fn filled<'a>(bins: impl Iterator<Item = (f64, &'a Moment)>) -> Vec<(f64, &'a Moment)> {
     let all: Vec<(f64, &Moment)> = bins.collect();
-    let hole = (all.len() / MAX_HOLE_PART).max(MAX_HOLE_BINS);
+    let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
+    let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
     let mut empty = 0;
     let wanted = all.into_iter().filter(|(_, bin)| {
         let is_filled = bin.soc.0 <= bin.soc.1;
@@ -154,15 +159,15 @@ fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
 
-fn soc(data: &Data) -> Option<Picture> {
+fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
     let clock = Clock::of(data);
     let bins = filled(life.iter());
     let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
-    let layers = vec![
-        Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0))),
-        Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))),
-    ];
+    let mut layers =
+        vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0)))];
+    layers.extend(true_soc(setting, &clock, data.ends_s()?));
+    layers.push(Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))));
     Some(Picture::Chart(Chart {
         title: "State of charge over the whole record".to_owned(),
         description: format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s()),
@@ -172,12 +177,18 @@ fn soc(data: &Data) -> Option<Picture> {
     }))
 }
 
-fn soc_recent(data: &Data) -> Option<Picture> {
+fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &Moment)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
+    let (first_s, last_s) = data.ends_s()?;
+    // As good as the whole record: the picture before shows it.
+    if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
+        return None;
+    }
     let clock = Clock::between(data, moments.first()?.0, moments.last()?.0);
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
+    layers.extend(true_soc(setting, &clock, (moments.first()?.0, moments.last()?.0)));
     if data.cells() > 1 {
         layers.push(Layer::new("highest cell", Ink::Green, Shape::Line(soc.iter().map(|p| (p.0, p.2)).collect())));
         layers.push(Layer::new("lowest cell", Ink::Blue, Shape::Line(soc.iter().map(|p| (p.0, p.1)).collect())));
@@ -225,15 +236,20 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
     layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
     if !fan.is_empty() {
         let band = fan.iter().map(|p| (clock.x(p.time_s), p.low_ah, p.high_ah)).collect();
-        layers.push(Layer::new("forecast, 90 %", Ink::Purple, Shape::Band(band)));
+        layers.push(Layer::new("forecast, 5 to 95 %, and its median", Ink::Purple, Shape::Band(band)));
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
-        layers.push(Layer::new("forecast, median", Ink::Purple, Shape::Dashed(median)));
+        layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
     // Measured capacities are under load, unless there is no such estimate to set them beside.
-    if series::steps(data, series::usable, false).is_empty() {
+    if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
         layers.extend(references(data, &clock, setting));
     }
-    layers.extend(levels(data, setting, Rule::CapacityLow));
+    let limits: Vec<Layer> = levels(data, setting, Rule::CapacityLow).collect();
+    let end = forecast::end_of_life_ah(data, setting).map(Shape::Level);
+    // A limit at the same height would hide it, or it the limit.
+    let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
+    layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
+    layers.extend(limits);
     layers.extend(raised(data, &clock, Rule::CapacityLow));
     Some(Picture::Chart(Chart {
         title: "Capacity between full and empty, over life".to_owned(),
@@ -254,9 +270,6 @@ fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
             Shape::Points(points) if layer.ink == Ink::Plain => {
                 (low, high) = points.iter().fold((low, high), |(low, high), p| (low.min(p.y), high.max(p.y)));
             }
-            Shape::Dashed(points) => {
-                (low, high) = points.iter().fold((low, high), |(low, high), p| (low.min(p.1), high.max(p.1)));
-            }
             _ => {}
         }
     }
@@ -265,13 +278,35 @@ fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
 }
 
 fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer> {
-    let points = setting.reference.iter().map(|reference| Point {
-        x: clock.x(reference.time_s),
-        y: reference.capacity_ah,
-        tip: format!("{}: measured {:.3} Ah", moment(data, reference.time_s), reference.capacity_ah),
+    let capacities = &setting.reference.capacities;
+    let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
+        x: clock.x(time_s),
+        y: capacity_ah,
+        tip: format!("{}: reference {capacity_ah:.3} Ah", moment(data, time_s)),
     });
     let points: Vec<Point> = points.collect();
-    (!points.is_empty()).then(|| Layer::new("measured (reference)", Ink::Plain, Shape::Points(points)))
+    let words = match (setting.reference.is_loaded, data.cells() > 1) {
+        (true, _) => "measured (reference)",
+        (false, true) => "true, weakest cell (reference)",
+        (false, false) => "true (reference)",
+    };
+    (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
+}
+
+/// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
+fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
+    let within = setting.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
+    let rows: Vec<(f64, f64, f64)> =
+        within.map(|&(time_s, low, high)| (clock.x(time_s), 100.0 * low, 100.0 * high)).collect();
+    let line = |pick: fn(&(f64, f64, f64)) -> f64| Shape::Line(rows.iter().map(|row| (row.0, pick(row))).collect());
+    match rows.iter().any(|row| row.1 < row.2) {
+        _ if rows.is_empty() => Vec::new(),
+        false => vec![Layer::new("true (reference)", Ink::Plain, line(|row| row.1))],
+        true => vec![
+            Layer::new("true, lowest and highest cell (reference)", Ink::Plain, line(|row| row.1)),
+            Layer::new("", Ink::Plain, line(|row| row.2)),
+        ],
+    }
 }
 
 fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
@@ -281,7 +316,9 @@ fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }
     let clock = Clock::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Orange, "weakest");
-    layers.extend(references(data, &clock, setting));
+    if setting.reference.is_loaded {
+        layers.extend(references(data, &clock, setting));
+    }
     layers.extend(levels(data, setting, Rule::UsableCapacityLow));
     layers.extend(raised(data, &clock, Rule::UsableCapacityLow));
     let load = setting.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
@@ -476,15 +513,18 @@ fn coverage(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
     let clock = Clock::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
+    let line: Vec<(f64, f64)> = line.collect();
+    // From 80 % where nothing lies lower.
+    let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
-        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line.collect())),
+        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line)),
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
     Some(Picture::Chart(Chart {
         title: "How sure the estimator is, and rightly".to_owned(),
         description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
         x: clock.axis,
-        y: Axis::number("readings, %").within(0.0, 102.0),
+        y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),
         layers,
     }))
 }

@@ -106,6 +106,7 @@ mod tests {
                 time_s,
                 cell,
                 measured_ah: None,
+                measured_std_ah: None,
                 capacity_ah: (ah, 0.01),
                 usable_ah: None,
                 resistance: (1.0, 0.1),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::data::{AlarmRow, Data};
+use super::data::{AlarmRow, Data, Origin};
 use super::forecast::Outlook;
 use super::{Setting, series};
 use crate::alarm::{Rule, Severity};
@@ -78,7 +78,7 @@ pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, S
         Some("warning") => Verdict::Plan,
         Some(_) => Verdict::Watch,
         None if !knows => Verdict::Unknown,
-        None if !measuring.is_empty() => Verdict::Watch,
+        None if !measuring.is_empty() || is_over(outlook) => Verdict::Watch,
         None => Verdict::Good,
     };
     Summary {
@@ -88,6 +88,11 @@ pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, S
         what: what(verdict, worst, &measuring),
         tiles: tiles(data, setting, outlook, &raised),
     }
+}
+
+/// Whether the capacity has passed the end of life, whatever the alarms say.
+fn is_over(outlook: &Result<Outlook, String>) -> bool {
+    outlook.as_ref().is_ok_and(Outlook::is_over)
 }
 
 fn raised(data: &Data) -> Vec<Raised<'_>> {
@@ -135,19 +140,28 @@ fn unit(name: &str) -> &'static str {
     rule(name).map_or("", |rule| rule.row().unit.symbol())
 }
 
+/// A rule's value with its unit, without digits that say nothing.
+pub(super) fn amount(value: f64, rule: &str) -> String {
+    let digits = format!("{value:.3}");
+    let digits = digits.trim_end_matches('0').trim_end_matches('.');
+    format!("{digits} {}", unit(rule).replace("degrees C", "\u{b0}C")).trim_end().to_owned()
+}
+
 /// "a cell's usable capacity is 1.38 Ah, limit 1.4 Ah (cell 3)".
 pub(super) fn words(row: &AlarmRow) -> String {
-    let unit = unit(&row.rule);
-    let amount = |value: f64| format!("{value:.3}").trim_end_matches('0').trim_end_matches('.').to_owned() + " " + unit;
+    let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
     let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
     let cell = row.cell.map_or_else(String::new, |cell| format!(" (cell {})", cell + 1));
-    format!("{} was {}, limit {}{cell}", about(&row.rule), value.trim_end(), limit.trim_end())
+    format!("{} was {}, limit {}{cell}", about(&row.rule), value, limit)
 }
 
 fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], data: &Data) -> String {
     let head = match verdict {
         Verdict::Good => "Good: no limit is passed.",
+        Verdict::Watch if worst.is_none() && measuring.is_empty() => {
+            "No limit is passed, but the capacity is below that of the end of life."
+        }
         Verdict::Watch if worst.is_none() => "The battery passes no limit, but its measuring is not in order.",
         Verdict::Watch => "Worth watching.",
         Verdict::Plan => "Worn: plan a visit to the workshop.",
@@ -207,6 +221,7 @@ fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>])
         (None, None) if verdict == Verdict::Unknown => {
             "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
         }
+        (None, None) if verdict == Verdict::Watch => "Plan its replacement.".to_owned(),
         (None, None) => "Nothing.".to_owned(),
         (advice, measure) => advice.into_iter().chain(measure).collect::<Vec<_>>().join(" "),
     }
@@ -223,7 +238,7 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
         |step: &series::Step| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
     let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));
     let resistance = last(series::resistance, true);
-    let figure = |step: &series::Step| format!("{:.3} \u{b1} {:.3} Ah", step.worst.0, step.worst.1);
+    let figure = |step: &series::Step| format!("{:.3} Ah", step.worst.0);
     let health = capacity.zip(rated_ah).map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
     let health_note = match (rated_ah, capacity) {
         (None, _) => "rated capacity not known without -c".to_owned(),
@@ -231,7 +246,8 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
         (Some(rated), Some(step)) => format!("of {rated} Ah rated{}", of_cell(&step)),
     };
     let note = |step: Option<series::Step>, none: &str| {
-        step.map_or_else(|| none.to_owned(), |step| format!("one standard deviation{}", of_cell(&step)))
+        let std = |step: series::Step| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
+        step.map_or_else(|| none.to_owned(), std)
     };
     vec![
         tile("State of health", health, health_note),
@@ -242,10 +258,11 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
             resistance.map(|step| format!("{:.2} \u{d7} new", step.worst.0)),
             note(resistance, "not learned yet"),
         ),
+        recharge_tile(data),
         tile(
             "Remaining life",
-            outlook.as_ref().ok().map(|outlook| outlook.words.clone()),
-            outlook.as_ref().err().cloned().unwrap_or_default(),
+            outlook.as_ref().ok().map(Outlook::value),
+            outlook.as_ref().map_or_else(Clone::clone, |outlook| outlook.note(data.cells())),
         ),
         tile(
             "Use so far",
@@ -256,10 +273,26 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
     ]
 }
 
+/// The latest recharge period, normalised where it is known, beside the first.
+fn recharge_tile(data: &Data) -> Tile {
+    let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
+    let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
+    let minutes = |seconds: f64| format!("{:.1} min", seconds / 60.0);
+    let (first, last, how) = match normalised().next_back() {
+        Some(last) => (normalised().next(), Some(last), "normalised; "),
+        None => (raw().next(), raw().next_back(), "as it was; "),
+    };
+    let note = match (first, data.source.origin) {
+        (Some(first), _) => format!("{how}{} at first", minutes(first)),
+        (None, Origin::Store) => "the history does not keep it".to_owned(),
+        (None, Origin::Replay) => "no charge covered enough of the window".to_owned(),
+    };
+    tile("Recharge period", last.map(minutes), note)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::report::Origin;
 
     fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRow {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());

@@ -7,8 +7,8 @@ use crate::monitor::Estimate;
 
 /// Half of a 95 % interval, standard deviations.
 pub(super) const OF_95: f64 = 1.96;
-/// Half-cycles kept in detail, the last ones.
-const DETAILED: usize = 4;
+/// Charges and discharges kept in detail, the last ones, each with the rest after it.
+const DETAILED: usize = 6;
 
 /// The estimates of a stretch of time, of all cells.
 #[derive(Debug, Clone)]
@@ -129,7 +129,7 @@ impl Trace {
         self.last_soc[cell] = Some((estimate.soc, estimate.soc_std));
     }
 
-    /// The pack's mode changed.
+    /// A charge or discharge begins.
     pub(super) fn turn(&mut self, time_s: f64) {
         self.recent.push_back(Bins::new(time_s));
         while self.recent.len() > DETAILED {
