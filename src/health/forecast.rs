@@ -42,6 +42,9 @@ const RECOVERY_CYCLES: f64 = 10.0;
 const RECOVERY_IN_REST: f64 = 0.02;
 /// Rest after which it has come, e-fold, days; also what takes it away where the use is not known.
 const RECOVERY_DAYS: f64 = 1.0;
+/// Rest that is assumed where nobody knows how long a cell has rested, days: all that comes back has come back.
+const LONG_REST_DAYS: f64 = 30.0;
+const DAY_S: f64 = 86_400.0;
 /// Standard deviation of a reading's own noise beyond its stated variance, part of the reference.
 const READING_NOISE: f64 = 0.003;
 /// Standard deviation of the level before the first reading, part of the reference: as good as unknown.
@@ -85,7 +88,7 @@ pub enum Axis {
 /// What passed since the reading before.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Passed {
-    /// Equivalent full cycles; not looked at on the axis of days.
+    /// Equivalent full cycles, each twice the rated capacity moved; not looked at on the axis of days.
     pub cycles: f64,
     /// Days, rest included.
     pub days: f64,
@@ -187,6 +190,21 @@ pub struct Forecast {
     shared_variance: f64,
     /// Equivalent full cycles and days of late.
     recent: [f64; 2],
+}
+
+impl Passed {
+    /// In a half-cycle that moved this charge (Ah) in this time, and so long after the one before (seconds from end to
+    /// end; `None` = not known: it may have rested long).
+    pub fn in_half_cycle(charge_ah: f64, duration_s: f64, since_before_s: Option<f64>, rated_capacity_ah: f64) -> Self {
+        let used_days = duration_s / DAY_S;
+        let known = since_before_s.map(|seconds| (seconds / DAY_S - used_days).max(0.0));
+        Self {
+            cycles: charge_ah / (2.0 * rated_capacity_ah),
+            // A rest nobody knows says nothing of how much the cell is used of late.
+            days: used_days + known.unwrap_or(0.0),
+            rest_days: known.unwrap_or(LONG_REST_DAYS),
+        }
+    }
 }
 
 impl Forecast {

@@ -2,17 +2,13 @@
 //!
 //! What feeds a forecast is what each half-cycle alone says of the capacity, not the learned capacity: learned capacities
 //! that follow each other are mostly the same evidence. What all half-cycles have wrong alike (the current sensor's gain)
-//! goes in as the shared part of the deviation. An equivalent full cycle moves twice the rated capacity.
+//! goes in as the shared part of the deviation.
 
 use super::{CellSlot, Event, EventKind, Monitor, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::health::{Axis, CapacityUpdate, Forecast, HalfCycle, Passed, Reading, Remaining, RemainingLife, TooThin};
 use crate::quantity::CellIndex;
 
-/// Seconds in a day.
-const DAY_S: f64 = 86_400.0;
-/// Rest that is assumed where nobody knows how long a cell has rested, days: all that comes back has come back.
-const LONG_REST_DAYS: f64 = 30.0;
 /// Deviations of a normal distribution between its median and its 5 % quantile.
 const LOW_DEVIATIONS: f64 = 1.645;
 
@@ -43,14 +39,8 @@ impl CellLife {
         since_before_s: Option<f64>,
         update: Option<&CapacityUpdate>,
     ) {
-        let used_days = half.duration_s / DAY_S;
-        let rest_days = since_before_s.map_or(LONG_REST_DAYS, |seconds| (seconds / DAY_S - used_days).max(0.0));
-        let passed = Passed {
-            cycles: half.charge_ah / (2.0 * config.model.rated_capacity_ah),
-            // A rest nobody knows says nothing of how much the cell is used of late.
-            days: used_days + since_before_s.map_or(0.0, |_| rest_days),
-            rest_days,
-        };
+        let rated_ah = config.model.rated_capacity_ah;
+        let passed = Passed::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
         let reading = update.and_then(|update| {
             let z = update.measurement?;
             let gain_ah = config.health.capacity.current_gain_std * update.capacity.mean;

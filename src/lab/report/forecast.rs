@@ -5,12 +5,14 @@
 
 use std::collections::BTreeMap;
 
-use super::data::{Data, Half, Learned};
+use super::data::{Data, Learned};
 use super::{Setting, pictures};
 use crate::alarm::Rule;
 use crate::health::{Axis, Forecast, Passed, Reading, Remaining, RemainingLife, TooThin};
 
 const DAY_S: f64 = 86_400.0;
+/// Deviation of the current sensor's gain where no configuration tells one: what `capacity.current_gain_std` is by default.
+const USUAL_GAIN_STD: f64 = 0.005;
 /// Points of a fan.
 const POINTS: usize = 60;
 /// How far a fan goes at most: medians until the end of life, and lengths of the record.
@@ -53,8 +55,7 @@ pub(super) fn end_of_life_ah(data: &Data, setting: &Setting<'_>) -> Option<f64> 
 pub(super) fn outlook(data: &Data, setting: &Setting<'_>) -> Result<Outlook, String> {
     let end_ah = end_of_life_ah(data, setting)
         .ok_or("the record does not say which capacity is the end of life; a configuration (-c) does")?;
-    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
-    let cells = cells(data, rated_ah);
+    let cells = cells(data, setting);
     let lives: Vec<Result<RemainingLife, TooThin>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
     let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
     let unknown = refused.map(|(cell, why)| too_thin(&lives, cell, why));
@@ -88,19 +89,21 @@ fn told(why: TooThin) -> String {
 }
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
-pub(super) fn cells(data: &Data, rated_ah: Option<f64>) -> Vec<Forecast> {
+pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
+    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let gain_std = setting.config.map_or(USUAL_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &Learned> = data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
-    let scale_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);
-    let mut cells = vec![Forecast::new(Axis::Cycles, scale_ah); data.cells()];
-    let mut before_s = None;
+    let rated_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);
+    let mut cells = vec![Forecast::new(Axis::Cycles, rated_ah); data.cells()];
+    let mut before_s: Option<f64> = None;
     for halves in data.halves.chunk_by(|a, b| a.time_s == b.time_s) {
         let now_s = halves[0].time_s;
-        let days = before_s.map_or(0.0, |before_s| (now_s - before_s) / DAY_S);
+        let since_before_s = before_s.map(|before_s| now_s - before_s);
         for half in halves {
             if let Some(row) = learned.get(&key(half.time_s, half.cell)) {
-                let (passed, reading) = fed(half, row, days);
-                cells[half.cell].update(passed, reading);
+                let passed = Passed::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
+                cells[half.cell].update(passed, reading(row, gain_std));
             }
         }
         before_s = Some(now_s);
@@ -108,20 +111,10 @@ pub(super) fn cells(data: &Data, rated_ah: Option<f64>) -> Vec<Forecast> {
     cells
 }
 
-fn fed(half: &Half, row: &Learned, days: f64) -> (Passed, Option<Reading>) {
-    let used_days = half.duration_s / DAY_S;
-    let (capacity_ah, std_ah) = row.capacity_ah;
-    let passed = Passed {
-        cycles: half.charge_ah / (2.0 * capacity_ah),
-        days: days.max(used_days),
-        rest_days: (days - used_days).max(0.0),
-    };
-    let reading = row.measured_ah.zip(row.measured_std_ah).map(|(capacity_ah, own_ah)| Reading {
-        capacity_ah,
-        variance_ah2: own_ah * own_ah,
-        shared_variance_ah2: std_ah * std_ah,
-    });
-    (passed, reading)
+fn reading(row: &Learned, gain_std: f64) -> Option<Reading> {
+    let (capacity_ah, std_ah) = row.measured_ah.zip(row.measured_std_ah)?;
+    let gain_ah = gain_std * row.capacity_ah.0;
+    Some(Reading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
 /// From the last half-cycle until the last moment the end of life may come, within reason.
@@ -192,6 +185,7 @@ fn digits(value: f64) -> String {
 mod tests {
     use super::*;
     use crate::lab::report::Origin;
+    use crate::lab::report::data::Half;
 
     /// Full cycles of three hours each, twice a day, each cell losing its own share of 2 Ah per half-cycle.
     fn worn(halves: u32, losses: &[f64]) -> Data {
