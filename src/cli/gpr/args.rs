@@ -65,9 +65,9 @@ impl From<BasisName> for Basis {
 /// How a model is made.
 #[derive(Debug, clap::Args)]
 pub(super) struct ModelArgs {
-    /// Mean function [default: constant, of forecasts linear]
-    #[arg(long, value_enum)]
-    basis: Option<BasisName>,
+    /// Mean function
+    #[arg(long, value_enum, default_value = "constant")]
+    basis: BasisName,
     /// A length scale for every input instead of one for all
     #[arg(long)]
     ard: bool,
@@ -105,7 +105,7 @@ impl ModelArgs {
             None if settings.form == Form::Exact => Form::Exact,
             None => Form::Nearest { neighbours: self.neighbours },
         };
-        settings.basis = self.basis.map_or(Basis::Constant, Into::into);
+        settings.basis = self.basis.into();
         (settings.ard, settings.restarts, settings.seed) = (self.ard, self.restarts, self.seed);
         settings.max_iterations = self.max_iterations;
         settings.threads = threads(self.threads);
@@ -115,11 +115,6 @@ impl ModelArgs {
     /// Whether the form follows from the number of rows.
     pub(super) fn by_rows(&self) -> bool {
         self.form.is_none()
-    }
-
-    /// Whether nobody named a basis.
-    pub(super) fn no_basis(&self) -> bool {
-        self.basis.is_none()
     }
 }
 

@@ -14,7 +14,7 @@ use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, 
 use super::{PartColumn, Table, Wanted, failure, make_folder, quiet, read};
 use crate::lab::gpr::forecast::{self, Forecast, Horizon, MAX_LAGS, MAX_STEPS, OutputForecast, Plan, Steps, horizons};
 use crate::lab::gpr::{self, peak_kib};
-use crate::regress::{Basis, Kernel};
+use crate::regress::Kernel;
 
 /// Arguments of `gpr forecast`.
 #[derive(Debug, clap::Args)]
@@ -82,10 +82,7 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let begin = Instant::now();
     make_folder(args.plots.as_deref())?;
     let table = args.table()?;
-    let mut settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
-    if args.model.no_basis() {
-        settings.basis = Basis::Linear;
-    }
+    let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
     let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);
     let plan = Plan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
     let bar = Bar::new(outputs * horizons(args.steps).len());

@@ -95,7 +95,17 @@ impl Table {
             table.read_file(path, wanted, part).map_err(|what| GprError(format!("{}{what}", path.display())))?;
             table.files.push((path.clone(), table.lines.len()));
         }
+        table.mend_parts(part);
         Ok(table)
+    }
+
+    /// A usual part column that differs from row to row counts the rows: it cuts nothing.
+    fn mend_parts(&mut self, part: &PartColumn) {
+        if *part == PartColumn::Usual && self.parts.len() == self.len() {
+            let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));
+            self.parts = begins.filter(|begin| *begin < self.lines.len()).collect();
+            self.parts.dedup();
+        }
     }
 
     /// Rows.
@@ -372,6 +382,24 @@ mod tests {
             let refused = read(&text, &["a"], Missing::Skipped).expect_err(wrong);
             assert_eq!(refused, format!("cell.csv:3: column a: found {wrong:?}, must be a finite number"));
         }
+    }
+
+    #[test]
+    fn rows_that_a_part_column_counts_belong_together() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("cell.csv");
+        let parts = |text: &str, part: &PartColumn| {
+            std::fs::write(&path, text).expect("written");
+            let columns = ["a".to_owned()];
+            let wanted = Wanted { columns: &columns, optional: &[], missing: Missing::Refused };
+            let table = Table::read(&[path.clone(), path.clone()], &wanted, part).expect("reads");
+            assert_eq!((table.after(0, 1).is_some(), table.file_of(3)), (table.parts.len() < 6, path.as_path()));
+            (table.every(2).lines, table.parts)
+        };
+        let counted = "ref,a\n1,1\n2,1\n3,1\n";
+        assert_eq!(parts(counted, &PartColumn::Usual), (vec![2, 4, 2, 4], vec![0, 3]));
+        assert_eq!(parts(counted, &PartColumn::Named("ref".into())).1, [0, 1, 2, 3, 4, 5]);
+        assert_eq!(parts("ref,a\n1,1\n1,1\n2,1\n", &PartColumn::Usual), (vec![2, 4, 2, 4], vec![0, 2, 3, 5]));
     }
 
     #[test]
