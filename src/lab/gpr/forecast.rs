@@ -37,6 +37,8 @@ const HELD_OUT: usize = 5000;
 const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 /// Steps of a search that begins where the horizon before it ended.
 const WARM_STEPS: usize = 20;
+/// Fractions of its multiples fill a stretch evenly and never repeat.
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
 /// Half width of a Gaussian 95 % interval, standard deviations.
 const GAUSSIAN: f64 = 1.959_963_984_540_054;
 
@@ -51,7 +53,7 @@ pub struct Plan {
     pub steps: usize,
     /// Part of the rows that is known: above 0, up to 1.
     pub origin: f64,
-    /// Most windows a process is fitted to, taken evenly from all there are.
+    /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
     pub rows: usize,
     /// Kernel and search.
     pub settings: Settings,
@@ -314,10 +316,13 @@ pub fn write(path: &Path, data: &Table, forecast: &Forecast) -> Result<(), GprEr
     finish(out)
 }
 
-/// At most so many of them, evenly.
+/// At most so many of them, one from each of so many equal stretches, at a place in it that differs from stretch to
+/// stretch: a fixed stride would meet rows that repeat, as those of cycles do, always at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
-    (0..count).map(|k| all[k * all.len() / count]).collect()
+    let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * GOLDEN).fract() };
+    let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
+    (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
 }
 
 #[cfg(test)]
@@ -330,6 +335,18 @@ mod tests {
         let many = horizons(100);
         assert!(many.len() <= MAX_HORIZONS && many[0] == 1 && many.last() == Some(&100), "{many:?}");
         assert!(many.is_sorted_by(|a, b| a < b));
+    }
+
+    #[test]
+    fn chosen_rows_are_spread_over_all_and_over_every_phase() {
+        let all: Vec<usize> = (100..10_100).collect();
+        let some = chosen(&all, 100);
+        assert!(some.len() == 100 && some.is_sorted_by(|a, b| a < b) && some[0] == 100 && some[99] >= 10_000);
+        // Rows that repeat every hundred: all tenths of the phase are met about as often.
+        let mut met = [0; 10];
+        some.iter().for_each(|row| met[row % 100 / 10] += 1);
+        assert!(met.iter().all(|count| (8..=12).contains(count)), "{met:?}");
+        assert_eq!((chosen(&all[..7], 7), chosen(&all, 0)), (all[..7].to_vec(), vec![]));
     }
 
     #[test]
