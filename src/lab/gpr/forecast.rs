@@ -7,10 +7,11 @@
 //! back to the mean change, so to persistence.
 //!
 //! The interval comes from forecasts that really were made: the process is fitted again to the beginning of the training
-//! rows and judged on the block that follows, block after block; the 95 % quantile of |error| / standard deviation over
-//! these is the interval's factor. (Rows left out one by one would not do: windows overlap, and each row's neighbours
-//! give it away.) No row after the origin is looked at.
+//! rows and judged on the block that follows, block after block; how wide it is, and where, follows from |error| /
+//! standard deviation of these ([`spread`]). (Rows left out one by one would not do: windows overlap, and each row's
+//! neighbours give it away.) No row after the origin is looked at.
 
+mod spread;
 mod windows;
 
 use std::path::Path;
@@ -20,6 +21,7 @@ pub use windows::{Steps, Windows};
 
 use super::{GprError, Table, create, finish};
 use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
+use spread::Spread;
 
 /// Most lagged values of a column.
 pub const MAX_LAGS: usize = 200;
@@ -30,7 +32,7 @@ pub const MAX_HORIZONS: usize = 10;
 /// Fewest windows to train on.
 const FEWEST: usize = 20;
 /// Most windows of a block that are judged for the interval.
-const BLOCK_WINDOWS: usize = 400;
+const BLOCK_WINDOWS: usize = 750;
 /// Most windows after the origin that are judged.
 const HELD_OUT: usize = 5000;
 /// Where the blocks for the interval begin and end, parts of the training rows.
@@ -39,8 +41,6 @@ const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
 const WARM_STEPS: usize = 20;
 /// Fractions of its multiples fill a stretch evenly and never repeat.
 const GOLDEN: f64 = 0.618_033_988_749_894_9;
-/// Half width of a Gaussian 95 % interval, standard deviations.
-const GAUSSIAN: f64 = 1.959_963_984_540_054;
 
 /// What to forecast.
 #[derive(Debug, Clone)]
@@ -90,7 +90,7 @@ pub struct Horizon {
     pub trained: usize,
     /// Forecasts that the interval's factor comes from.
     pub calibrated: usize,
-    /// Half width of the interval in standard deviations.
+    /// Half width of the interval in standard deviations, where errors are as large as on the whole.
     pub factor: f64,
     /// Time of fit and calibration, s.
     pub fit_s: f64,
@@ -184,10 +184,9 @@ impl Task<'_> {
                  least as many: give fewer lags or steps, a later origin or more rows"
             ))
         })?;
-        let ratios = self.ratios(&model, watcher)?;
-        let factor = factor(&ratios);
+        let spread = self.spread(&model, watcher)?;
         let fit_s = begin.elapsed().as_secs_f64();
-        let predict = |rows: &[usize]| self.predict(&model, rows, factor);
+        let predict = |rows: &[usize]| self.predict(&model, rows, &spread);
         let at_origin = predict(&[from])?.remove(0);
         let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), HELD_OUT);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
@@ -195,8 +194,8 @@ impl Task<'_> {
         let horizon = Horizon {
             steps: self.steps,
             trained,
-            calibrated: ratios.len(),
-            factor,
+            calibrated: spread.count(),
+            factor: spread.factor,
             fit_s,
             jitter: model.jitter(),
             at_origin,
@@ -236,35 +235,40 @@ impl Task<'_> {
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
-    /// |error| / standard deviation of forecasts of block after block from what came before it.
-    fn ratios(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Vec<f64>, GprError> {
+    /// From forecasts of block after block by what came before it.
+    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, GprError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
-        let mut ratios = Vec::new();
+        let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            let rows = chosen(&self.windows.between(begin - 1, end, self.steps), BLOCK_WINDOWS);
+            let rows = chosen(&self.windows.between(begin, end, self.steps), BLOCK_WINDOWS);
             let Some((before, _)) = self.fitted(begin, &[], Some(&fixed), watcher)? else { continue };
-            let forecasts = before.predict(&self.windows.features(&rows))?;
+            let windows = self.windows.features(&rows);
+            let forecasts = before.predict(&windows)?;
             ratios.extend(rows.iter().zip(forecasts).map(|(row, p)| {
                 (self.windows.change(*row, self.column, self.steps) - p.mean).abs() / p.measurement_variance.sqrt()
             }));
+            judged.extend(rows);
+            features.extend(windows);
         }
-        Ok(ratios)
+        Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
     }
 
     /// Forecasts of the value itself from some rows.
-    fn predict(&self, model: &Model, rows: &[usize], factor: f64) -> Result<Vec<Prediction>, GprError> {
+    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, GprError> {
         if rows.is_empty() {
             return Ok(Vec::new());
         }
-        let found = model.predict(&self.windows.features(rows))?;
-        let value = |(row, change): (&usize, Prediction)| {
+        let features = self.windows.features(rows);
+        let found = model.predict(&features)?;
+        let windows = features.chunks_exact(self.windows.width());
+        let value = |((row, window), change): ((&usize, &[f64]), Prediction)| {
             let mean = self.windows.value(*row, self.column) + change.mean;
-            let half = factor * change.measurement_variance.sqrt();
+            let half = spread.half_width(window) * change.measurement_variance.sqrt();
             Prediction { mean, low_95: mean - half, high_95: mean + half, ..change }
         };
-        Ok(rows.iter().zip(found).map(value).collect())
+        Ok(rows.iter().zip(windows).zip(found).map(value).collect())
     }
 
     fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<Score>, Option<f64>) {
@@ -277,17 +281,6 @@ impl Task<'_> {
         let squares = held_out.iter().map(|(row, _)| self.windows.change(*row, self.column, self.steps).powi(2));
         let persistence = (squares.sum::<f64>() / held_out.len() as f64).sqrt();
         (Some(score(&predictions, &truth)), Some(persistence))
-    }
-}
-
-/// The 95 % quantile, with the correction for few; never below the Gaussian one when there are too few to say.
-fn factor(ratios: &[f64]) -> f64 {
-    let mut sorted = ratios.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let rank = ((sorted.len() + 1) as f64 * 0.95).ceil() as usize;
-    match sorted.get(rank - 1) {
-        Some(quantile) => *quantile,
-        None => sorted.last().copied().unwrap_or(GAUSSIAN).max(GAUSSIAN),
     }
 }
 
@@ -347,12 +340,5 @@ mod tests {
         some.iter().for_each(|row| met[row % 100 / 10] += 1);
         assert!(met.iter().all(|count| (8..=12).contains(count)), "{met:?}");
         assert_eq!((chosen(&all[..7], 7), chosen(&all, 0)), (all[..7].to_vec(), vec![]));
-    }
-
-    #[test]
-    fn the_factor_is_a_quantile_and_never_narrow_for_lack_of_forecasts() {
-        let ratios: Vec<f64> = (1..=99).map(|k| f64::from(k) / 10.0).collect();
-        assert_eq!(factor(&ratios), 9.5);
-        assert_eq!((factor(&[]), factor(&[0.1, 0.2]), factor(&[0.1, 7.0])), (GAUSSIAN, GAUSSIAN, 7.0));
     }
 }
