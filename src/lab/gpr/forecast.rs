@@ -242,7 +242,13 @@ impl Task<'_> {
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            let rows = chosen(&self.windows.between(begin, end, self.steps), BLOCK_WINDOWS);
+            // What came may lie beyond the block: a block may be shorter than the horizon.
+            let mut rows = self.windows.between(begin, self.origin, self.steps);
+            rows.retain(|row| *row < end);
+            let rows = chosen(&rows, BLOCK_WINDOWS);
+            if rows.is_empty() {
+                continue;
+            }
             let Some((before, _)) = self.fitted(begin, &[], Some(&fixed), watcher)? else { continue };
             let windows = self.windows.features(&rows);
             let forecasts = before.predict(&windows)?;
