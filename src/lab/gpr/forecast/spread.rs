@@ -12,7 +12,7 @@ pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
 const NEAR: usize = 20;
 /// Weight of the mean of all among them, in windows.
 const SHRINKAGE: f64 = 4.0;
-/// With fewer judged windows the interval is as wide everywhere.
+/// With fewer judged windows the interval is as wide everywhere, and at least the Gaussian one.
 const FEWEST: usize = 100;
 
 /// Judged windows.
@@ -55,6 +55,9 @@ impl Spread {
 
     /// Half of the interval at a window, standard deviations.
     pub(super) fn half_width(&self, features: &[f64]) -> f64 {
+        if self.rows.len() < FEWEST {
+            return self.factor;
+        }
         self.factor * self.at(&scaled(features, &self.units), None)
     }
 
@@ -90,11 +93,13 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// The 95 % quantile, with the correction for few; never below the Gaussian one when there are too few to say.
+/// The 95 % quantile, with the correction for few; never below the Gaussian one when these are few: their luck could
+/// otherwise make it narrow.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);
     let rank = ((ratios.len() + 1) as f64 * 0.95).ceil() as usize;
     match ratios.get(rank - 1) {
+        Some(quantile) if ratios.len() < FEWEST => quantile.max(GAUSSIAN),
         Some(quantile) => *quantile,
         None => ratios.last().copied().unwrap_or(GAUSSIAN).max(GAUSSIAN),
     }
@@ -110,6 +115,9 @@ mod tests {
             |ratios: Vec<f64>| Spread::new((0..ratios.len()).collect(), &vec![0.0; ratios.len()], ratios, 1).factor;
         assert_eq!(of((1..=99).map(|k| f64::from(k) / 10.0).collect()), 9.5);
         assert_eq!((of(vec![]), of(vec![0.1, 0.2]), of(vec![0.1, 7.0])), (GAUSSIAN, GAUSSIAN, 7.0));
+        assert_eq!(of((1..=50).map(|k| f64::from(k) / 100.0).collect()), GAUSSIAN);
+        let none = Spread::new(vec![], &[], vec![], 1);
+        assert_eq!((none.half_width(&[1.0, 2.0]), none.count()), (GAUSSIAN, 0));
     }
 
     #[test]
