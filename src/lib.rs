@@ -19,7 +19,7 @@
 //! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
 //! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
-//! | 5 | `lab` | measured files against truth, remaining life of capacity histories, plots (feature `lab`) |
+//! | 5 | `lab` | measured files against truth, remaining life of capacity histories, Gaussian processes on files, plots (feature `lab`) |
 //! | 6 | [`cli`] | one file per command |
 //!
 //! # Invariants

@@ -16,6 +16,8 @@ mod fit;
 #[cfg(feature = "lab")]
 mod fleet;
 mod generate;
+#[cfg(feature = "lab")]
+mod gpr;
 mod history;
 mod replay;
 #[cfg(feature = "lab")]
@@ -93,6 +95,9 @@ enum Command {
     /// Forecast the remaining useful life of measured capacity histories, and judge forecasts made during the life
     #[cfg(feature = "lab")]
     Rul(rul::Args),
+    /// Gaussian process regression on CSV files: cross-validate, train, predict, forecast
+    #[cfg(feature = "lab")]
+    Gpr(Box<gpr::Args>),
     /// Tell when the alarms would have come with other settings, over many logs
     #[cfg(feature = "lab")]
     Whatif(Box<whatif::Args>),
@@ -152,6 +157,8 @@ pub fn main() -> ExitCode {
         Command::Score(args) => score::run(&args),
         #[cfg(feature = "lab")]
         Command::Rul(args) => rul::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Gpr(args) => gpr::run(&args),
         #[cfg(feature = "lab")]
         Command::Whatif(args) => whatif::run(&args),
         #[cfg(feature = "lab")]

@@ -10,7 +10,7 @@
 //! | `squared_exponential` | exp(-r^2 / 2) |
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
-//! `a + b * (c + d)` reads as usual. Every shape has its own length scales; it has its own standard deviation unless that
+//! `a + b * (c + d)` reads as usual; in names a dash does for a low line. Every shape has its own length scales; it has its own standard deviation unless that
 //! could not be told from another's (in a product, only the first factor has one).
 
 use std::fmt;
@@ -163,8 +163,10 @@ impl Reader<'_> {
             return Ok(inside);
         }
         let start = self.rest.trim_start();
-        let word = start.split(|c: char| !c.is_ascii_alphanumeric() && c != '_').next().unwrap_or("");
-        let Some(shape) = Shape::ALL.into_iter().find(|shape| shape.name() == word) else {
+        let word = start.split(|c: char| !c.is_ascii_alphanumeric() && c != '_' && c != '-').next().unwrap_or("");
+        // There is no minus among kernels: a dash joins words as well.
+        let name = word.replace('-', "_");
+        let Some(shape) = Shape::ALL.into_iter().find(|shape| shape.name() == name) else {
             let names: Vec<&str> = Shape::ALL.iter().map(|shape| shape.name()).collect();
             return Err(self.fault(start, &names.join(", ")));
         };
@@ -216,6 +218,7 @@ mod tests {
             ),
             ("(matern32 + matern52) * exponential", "(matern32 + matern52) * exponential"),
             ("((matern32)) + (exponential + matern52)", "matern32 + exponential + matern52"),
+            ("squared-exponential*rational-quadratic", "squared_exponential * rational_quadratic"),
         ] {
             let kernel: Kernel = text.parse().expect(text);
             assert_eq!(kernel.to_string(), written);
