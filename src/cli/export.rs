@@ -119,7 +119,7 @@ fn table(good: &[Exported]) -> io::Result<()> {
     let heads = ["log", "folder", "days", "estimates", "half-cycles", "alarms"];
     let mut rows = vec![heads.map(str::to_owned).to_vec()];
     rows.extend(good.iter().map(row));
-    write_table(&mut text, &rows)?;
+    write_table(&mut text, &rows, 2)?;
     for exported in good {
         exported.notes.iter().try_for_each(|note| writeln!(text, "note: {}: {note}", exported.log.display()))?;
     }

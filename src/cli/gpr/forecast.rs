@@ -8,7 +8,7 @@ use std::time::Instant;
 use serde_json::{Value, json};
 
 use super::super::Failure;
-use super::super::fleet::write_table;
+use super::super::score::write_table;
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
 use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
 use super::{PartColumn, Table, Wanted, failure, make_folder, quiet, read};
@@ -200,7 +200,9 @@ fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
             .chain([horizon.trained.to_string()])
             .collect()
     };
-    write_table(out, &heads, 0, &output.horizons.iter().map(line).collect::<Vec<Vec<String>>>())
+    let rows: Vec<Vec<String>> =
+        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
+    write_table(out, &rows, 0)
 }
 
 /// Forecasts of what nobody knows.
@@ -212,7 +214,9 @@ fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
         let own = [horizon.steps.to_string()];
         own.into_iter().chain(numbers).chain([horizon.trained.to_string()]).collect()
     };
-    write_table(out, &heads, 0, &output.horizons.iter().map(line).collect::<Vec<Vec<String>>>())
+    let rows: Vec<Vec<String>> =
+        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
+    write_table(out, &rows, 0)
 }
 
 fn horizon_json(horizon: &Horizon) -> Value {

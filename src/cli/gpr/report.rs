@@ -7,7 +7,7 @@ use std::path::Path;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value, json};
 
-use super::super::fleet::write_table;
+use super::super::score::write_table;
 use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
 use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
 
@@ -160,7 +160,9 @@ impl Cv<'_> {
                 validated.folds.predictions.len().to_string(),
             ]
         };
-        write_table(&mut out, &heads, 1, &self.all.iter().map(line).collect::<Vec<_>>())?;
+        let rows: Vec<Vec<String>> =
+            std::iter::once(heads.map(str::to_owned).to_vec()).chain(self.all.iter().map(line)).collect();
+        write_table(&mut out, &rows, 1)?;
         for validated in self.all {
             let jitter = jitter(validated);
             if jitter.matrices > 0 {

@@ -64,7 +64,7 @@ pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
             amount(life.and_then(|life| life.days)),
         ]
     }));
-    write_table(&mut out, &rows)?;
+    write_table(&mut out, &rows, 2)?;
     for now in forecasts {
         if let Some(why) = &now.refused {
             writeln!(out, "{}, {:.3} Ah: no forecast: {why}", now.name, now.threshold_ah)?;
@@ -100,7 +100,7 @@ pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
         rows.extend(file.judged.iter().map(|judged| judged_row(file, judged)));
     }
     if rows.len() > 1 {
-        write_table(&mut out, &rows)?;
+        write_table(&mut out, &rows, 2)?;
         writeln!(out)?;
     }
     notes(&mut out, files)?;

@@ -107,7 +107,7 @@ impl Shown<'_> {
         writeln!(out)?;
         let mut rows = vec![self.heads(SUMMARY_HEADS)];
         rows.extend(self.summaries().iter().map(row));
-        write_table(out, &rows)
+        write_table(out, &rows, 2)
     }
 
     fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
@@ -121,7 +121,7 @@ impl Shown<'_> {
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
         let mut rows = vec![self.heads(LOG_HEADS)];
         rows.extend(self.rows(log).map(|row| self.log_row(log, row)));
-        write_table(out, &rows)
+        write_table(out, &rows, 2)
     }
 
     fn log_row(&self, log: &LogResult, row: &AlarmRow) -> Vec<String> {
