@@ -80,7 +80,7 @@ pub(crate) struct InputArgs {
     #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
     pub(crate) sleep_gap: f64,
     /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
-    /// with {n}, one per cell or sensor from 1, as voltage{n}=U{n}
+    /// the letter n in braces in the names stands for the number of the cell or sensor, from 1
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
     /// Sign of a CSV's current
