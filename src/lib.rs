@@ -7,10 +7,11 @@
 //! | --- | --- | --- |
 //! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
 //! | 1 | [`filter`] | unscented and linear Kalman filters: pure numbers |
+//! | 1 | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | 1 | [`can`] | frame, signal layout, decode, encode, end-to-end protection, bound on frames, J1939 |
 //! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
 //! | 2 | [`cell`] | equivalent circuit, thermal model, estimator |
-//! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity |
+//! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity, remaining life |
 //! | 2 | [`alarm`] | rules over named values, the life of an alarm |
 //! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |
 //! | 3 | [`sim`] | truth model, sensor errors, scenarios |
@@ -18,7 +19,7 @@
 //! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
 //! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
-//! | 5 | `lab` | measured files against truth, plots (feature `lab`) |
+//! | 5 | `lab` | measured files against truth, remaining life of capacity histories, Gaussian processes on files, plots (feature `lab`) |
 //! | 6 | [`cli`] | one file per command |
 //!
 //! # Invariants
@@ -42,5 +43,7 @@ pub mod io;
 pub mod lab;
 pub mod monitor;
 pub mod quantity;
+#[cfg(feature = "lab")]
+pub mod regress;
 pub mod sample;
 pub mod sim;

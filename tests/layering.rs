@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 const TABLE: &[(&str, &[&str], Core)] = &[
     ("quantity", &[], Core::Pure),
     ("filter", &[], Core::Pure),
+    ("regress", &[], Core::Pure),
     ("can", &["quantity"], Core::Pure),
     ("sample", &["quantity"], Core::Pure),
     ("cell", &["quantity", "filter", "sample"], Core::Pure),
@@ -20,7 +21,7 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("monitor", &["quantity", "filter", "can", "sample", "cell", "health", "alarm"], Core::Pure),
     ("sim", &["quantity", "can", "cell"], Core::Pure),
     ("doctor", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
-    ("ident", &["quantity", "filter", "cell"], Core::Pure),
+    ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("config", BELOW_CONFIG, Core::Shell),
     ("io", BELOW_IO, Core::Shell),
     ("daemon", BELOW_DAEMON, Core::Shell),
@@ -30,14 +31,14 @@ const TABLE: &[(&str, &[&str], Core)] = &[
 ];
 
 /// Every module below `cli`, lowest first.
-const LAYERS: [&str; 15] = [
-    "quantity", "filter", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "doctor", "ident", "config",
-    "io", "daemon", "lab",
+const LAYERS: [&str; 16] = [
+    "quantity", "filter", "regress", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "doctor", "ident",
+    "config", "io", "daemon", "lab",
 ];
-const BELOW_CONFIG: &[&str] = LAYERS.split_at(11).0;
-const BELOW_IO: &[&str] = LAYERS.split_at(12).0;
-const BELOW_DAEMON: &[&str] = LAYERS.split_at(13).0;
-const BELOW_LAB: &[&str] = LAYERS.split_at(14).0;
+const BELOW_CONFIG: &[&str] = LAYERS.split_at(12).0;
+const BELOW_IO: &[&str] = LAYERS.split_at(13).0;
+const BELOW_DAEMON: &[&str] = LAYERS.split_at(14).0;
+const BELOW_LAB: &[&str] = LAYERS.split_at(15).0;
 const BELOW_CLI: &[&str] = &LAYERS;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

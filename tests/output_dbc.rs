@@ -159,6 +159,7 @@ impl Maker {
         let (capacity, std, soh) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(2.0));
         let (period, normalised) = (self.below(60_000.0), self.below(60_000.0));
         let (usable, usable_std, ratio) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(4.0));
+        let (cycles, cycles_low, days) = (self.below(60_000.0), self.below(60_000.0), self.below(8_000.0));
         let fields = HealthFields {
             capacity_ah: Some(capacity),
             capacity_std_ah: Some(std),
@@ -168,13 +169,20 @@ impl Maker {
             usable_capacity_ah: Some(usable),
             usable_capacity_std_ah: Some(usable_std),
             resistance_ratio: Some(ratio),
+            remaining_cycles: Some(cycles),
+            remaining_cycles_low: Some(cycles_low),
+            remaining_days: Some(days),
         };
         let mut wanted = match page {
             0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
             1 => self.wanted("Health", &[("RechargePeriod", period), ("NormalizedRechargePeriod", normalised)]),
-            _ => self.wanted(
+            2 => self.wanted(
                 "Health",
                 &[("UsableCapacity", usable), ("UsableCapacityStd", usable_std), ("ResistanceRatio", 100.0 * ratio)],
+            ),
+            _ => self.wanted(
+                "Health",
+                &[("RemainingCycles", cycles), ("RemainingCyclesLow", cycles_low), ("RemainingDays", days)],
             ),
         };
         wanted.push(("Page".to_owned(), f64::from(u8::try_from(page).unwrap()), 0.0));
@@ -253,7 +261,7 @@ fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a
         for turn in 0..FRAMES {
             let (frame, wanted) = maker.status();
             made.push((1, "PACKWATCH_Status", frame, wanted));
-            let (frame, wanted) = maker.health(turn % 3);
+            let (frame, wanted) = maker.health(turn % 4);
             made.push((2, "PACKWATCH_Health", frame, wanted));
             let (frame, wanted) = maker.alarm(turn % 14 + 1);
             made.push((3, "PACKWATCH_Alarm", frame, wanted));

@@ -7,15 +7,18 @@
 //! * [`judge`] compares a value with a threshold;
 //! * [`machine`] holds the life of one alarm as a transition table;
 //! * [`engine`] holds one such machine per rule and cell;
+//! * [`input`] makes values of what an engine is told, so that others can be told the same;
 //! * [`selector`] says which alarms a command of people means.
 
 pub mod engine;
+pub mod input;
 pub mod judge;
 pub mod machine;
 pub mod rule;
 pub mod selector;
 
 pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmState, StoredAlarm, ThresholdState};
+pub use input::AlarmInput;
 pub use judge::{Observation, RuleConfig, When};
 pub use machine::{Change, Refusal, State};
 pub use rule::{Direction, Rule, Scope, Severity, Unit};

@@ -39,7 +39,7 @@ pub(crate) struct Args {
 enum What {
     /// Write rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over capacities, alarms and resets; names the first row that is not as it was written
+    /// Check the hash chain over capacities, remaining lives, alarms and resets; names the first row that is not as it was written
     Verify(VerifyArgs),
 }
 
@@ -83,6 +83,8 @@ enum KindName {
     HalfCycle,
     /// Capacities learned
     Capacity,
+    /// What remained of the life of the cell whose life ends first
+    RemainingLife,
     /// Alarms
     Alarm,
     /// Resets, other packs, damages
@@ -94,6 +96,7 @@ impl From<KindName> for Kind {
         match name {
             KindName::HalfCycle => Self::HalfCycle,
             KindName::Capacity => Self::Capacity,
+            KindName::RemainingLife => Self::RemainingLife,
             KindName::Alarm => Self::Alarm,
             KindName::Reset => Self::Reset,
         }
@@ -137,7 +140,7 @@ fn list(reader: &Reader, args: &Args) -> Result<(), Failure> {
     if entries.is_empty() {
         return print("no rows\n");
     }
-    let head = format!("{:<26}  {:>4}  {:<10}  {:>4}  {}\n", "time (UTC)", "pack", "kind", "cell", "what");
+    let head = format!("{:<26}  {:>4}  {:<14}  {:>4}  {}\n", "time (UTC)", "pack", "kind", "cell", "what");
     print(&entries.iter().fold(head, |text, entry| text + &line(entry)))
 }
 
@@ -146,7 +149,7 @@ fn line(entry: &Entry) -> String {
     // Cells count from 1 for people.
     let cell =
         entry.values.first().and_then(Value::as_u64).map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
-    format!("{time:<26}  {:>4}  {:<10}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), words(entry))
+    format!("{time:<26}  {:>4}  {:<14}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), words(entry))
 }
 
 /// The values of a row for people.
@@ -181,6 +184,16 @@ fn words(entry: &Entry) -> String {
             number("resistance_ratio_std", 1.0, 2),
             number("measured_ah", 1.0, 3),
             number("measured_std_ah", 1.0, 3)
+        ),
+        Kind::RemainingLife if value("cycles").is_null() => "not known any longer".to_owned(),
+        Kind::RemainingLife => format!(
+            "{} cycles ({} to {}), {} days ({} to {})",
+            number("cycles", 1.0, 0),
+            number("cycles_low", 1.0, 0),
+            number("cycles_high", 1.0, 0),
+            number("days", 1.0, 0),
+            number("days_low", 1.0, 0),
+            number("days_high", 1.0, 0)
         ),
         Kind::Alarm => format!(
             "{} {} {}, value {}, threshold {}, raised {} times",

@@ -8,19 +8,31 @@ mod control_args;
 mod dbc;
 mod demo;
 mod doctor;
+#[cfg(feature = "lab")]
+mod export;
 mod exporter;
 #[cfg(feature = "lab")]
 mod fit;
+#[cfg(feature = "lab")]
+mod fleet;
 mod generate;
+#[cfg(feature = "lab")]
+mod gpr;
 mod history;
 mod replay;
+#[cfg(feature = "lab")]
+mod report;
 mod reset;
+#[cfg(feature = "lab")]
+mod rul;
 mod run;
 #[cfg(feature = "lab")]
 mod score;
 mod simulate;
 mod status;
 mod test_alarm;
+#[cfg(feature = "lab")]
+mod whatif;
 
 use std::process::ExitCode;
 
@@ -80,6 +92,21 @@ enum Command {
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
+    /// Forecast the remaining useful life of measured capacity histories, and judge forecasts made during the life
+    #[cfg(feature = "lab")]
+    Rul(rul::Args),
+    /// Gaussian process regression on CSV files: cross-validate, train, predict, forecast
+    #[cfg(feature = "lab")]
+    Gpr(Box<gpr::Args>),
+    /// Tell when the alarms would have come with other settings, over many logs
+    #[cfg(feature = "lab")]
+    Whatif(Box<whatif::Args>),
+    /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
+    #[cfg(feature = "lab")]
+    Export(Box<export::Args>),
+    /// Write a page that shows how a battery is and was, from a history or a replay
+    #[cfg(feature = "lab")]
+    Report(Box<report::Args>),
 }
 
 /// Why a command ended without success: what to print and the exit code.
@@ -128,6 +155,16 @@ pub fn main() -> ExitCode {
         Command::Fit(args) => fit::run(&args),
         #[cfg(feature = "lab")]
         Command::Score(args) => score::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Rul(args) => rul::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Gpr(args) => gpr::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Whatif(args) => whatif::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Export(args) => export::run(&args),
+        #[cfg(feature = "lab")]
+        Command::Report(args) => report::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

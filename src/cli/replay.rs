@@ -6,7 +6,7 @@ mod report;
 use std::io;
 use std::path::Path;
 
-pub(crate) use args::{Args, CsvSign, column};
+pub(crate) use args::{Args, CsvSign, InputArgs, column};
 pub(crate) use report::Bar;
 
 use super::Failure;
@@ -26,7 +26,7 @@ use crate::sample::VoltageSource;
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = config::load(&args.config)?;
-    let mut source = LogSource::new(args.logs.clone(), log_options(args, &config));
+    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, &config));
     let settings = settings(args, &config)?;
     let result = match &args.to {
         Some(interface) => play(args, &mut source, &settings, interface),
@@ -44,6 +44,7 @@ fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: Set
         estimates: create(args.estimates.as_deref())?,
         events: create(args.events.as_deref())?,
         frames: create(args.frames.as_deref())?,
+        watch: None,
     };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor);
@@ -67,7 +68,7 @@ fn play(args: &Args, source: &mut LogSource, settings: &Settings, interface: &st
     Ok(())
 }
 
-fn log_options(args: &Args, config: &Config) -> LogOptions {
+pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let sample = &config.monitor.sample;
     let encoder = InputEncoder::new(&config.monitor.input);
     let mut protector = InputProtector::new(&config.monitor.guards);
@@ -97,7 +98,7 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
         speed: speed.filter(|speed| speed.is_finite()),
         from: args.from,
         until: args.until,
-        sleep_gap_s: args.sleep_gap,
+        sleep_gap_s: args.input.sleep_gap,
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,

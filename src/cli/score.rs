@@ -5,7 +5,8 @@ mod report;
 
 use std::path::{Path, PathBuf};
 
-pub(crate) use args::Args;
+pub(crate) use args::{Args, names};
+pub(crate) use report::write_table;
 
 use super::Failure;
 use crate::config::{self, Config, ConfigFaults};
@@ -105,7 +106,7 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
 }
 
 fn jobs(args: &Args) -> Result<Vec<Job>, Failure> {
-    let names = args::names(&args.files);
+    let names = names(&args.files);
     let tables = args.cycles.iter().map(|path| CycleTable::read(path).map(Some));
     let tables: Result<Vec<_>, _> = tables.collect();
     let mut tables = tables.map_err(|error| Failure::new(error.to_string()))?;

@@ -145,6 +145,7 @@ pub(crate) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: 
             transition: transition(raw.transition.as_ref()?, rated_ah * f64::from(pack.strings)),
             capacity: capacity(raw.capacity.as_ref()?, rated_ah),
             recharge: recharge(raw.recharge.as_ref()?, rated_ah),
+            end_of_life_ah: raw.capacity.as_ref()?.end_of_life * rated_ah,
             usable: raw.usable.as_ref().map(|keys| usable(keys, rated_ah)),
         },
         rules,

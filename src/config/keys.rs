@@ -398,6 +398,8 @@ section! {
         fade_std_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
         /// How fast the fade may change: standard deviation gained per equivalent full cycle.
         fade_noise_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
+        /// Part of the rated capacity at which a cell is at the end of its life: what remains until then is forecast.
+        end_of_life: f64, "fraction", Above(0.0, 1.0), Default("0.8");
     }
 }
 

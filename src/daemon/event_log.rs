@@ -72,7 +72,10 @@ impl EventLog {
         match event.kind {
             EventKind::Bus { bus, what } => self.log_bus(event.time, bus.index(), what),
             EventKind::Alarm { .. } => log_alarm(&event.kind),
-            EventKind::HalfCycle { .. } | EventKind::Capacity { .. } | EventKind::RechargePeriod { .. } => {
+            EventKind::HalfCycle { .. }
+            | EventKind::Capacity { .. }
+            | EventKind::RemainingLife { .. }
+            | EventKind::RechargePeriod { .. } => {
                 log_learned(&event.kind);
             }
             EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
@@ -221,6 +224,9 @@ fn log_learned(kind: &EventKind) {
                 resistance_ratio,
                 "capacity"
             );
+        }
+        EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, .. } => {
+            tracing::info!(cell = cell.map(number), cycles, cycles_low, cycles_high, days, "remaining life");
         }
         EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
             tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");

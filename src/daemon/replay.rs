@@ -86,6 +86,17 @@ pub struct Sinks {
     pub events: Option<ResultFile>,
     /// candump lines of what would be sent.
     pub frames: Option<ResultFile>,
+    /// Somebody who looks at everything that comes out.
+    pub watch: Option<Watch>,
+}
+
+/// Is shown what came out of each input.
+pub struct Watch(pub Box<dyn FnMut(&Outputs)>);
+
+impl std::fmt::Debug for Watch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Watch")
+    }
 }
 
 /// Why a replay ended early.
@@ -247,7 +258,8 @@ impl Replay {
         if let Some(file) = &mut sinks.estimates {
             write_estimates_header(file)?;
         }
-        let out = Outputs { want_estimates: sinks.estimates.is_some(), ..Outputs::default() };
+        let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some();
+        let out = Outputs { want_estimates, ..Outputs::default() };
         Ok(Self {
             monitor,
             out,
@@ -353,6 +365,9 @@ impl Replay {
 
     fn write_out(&mut self) -> io::Result<()> {
         let out = &mut self.out;
+        if let Some(Watch(watch)) = &mut self.sinks.watch {
+            watch(out);
+        }
         if let Some(file) = &mut self.sinks.estimates {
             self.summary.estimates += out.estimates.len() as u64;
             out.estimates.iter().try_for_each(|estimate| write_estimate(file, estimate))?;
@@ -427,6 +442,7 @@ fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f6
             usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
             "capacity"
         }
+        EventKind::RemainingLife { .. } => "remaining_life",
         EventKind::RechargePeriod { .. } => "recharge_period",
         EventKind::Alarm { change, .. } => {
             if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {

@@ -101,6 +101,8 @@ pub struct HealthConfig {
     pub capacity: CapacityConfig,
     /// Recharge period.
     pub recharge: RechargeConfig,
+    /// Capacity at which a cell is at the end of its life, Ah.
+    pub end_of_life_ah: f64,
     /// Usable capacity; `None` = not reported.
     pub usable: Option<UsableConfig>,
 }

@@ -2,6 +2,7 @@
 
 pub mod config;
 pub mod drift;
+pub mod forecast;
 pub mod learner;
 pub mod pack;
 pub mod recharge;
@@ -11,6 +12,7 @@ pub mod usable;
 pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
+pub use forecast::{Axis, Forecast, Passed, Reading, Remaining, RemainingLife, TooThin};
 pub use learner::{CapacityUpdate, HalfCycle, Learner, Observed};
 pub use pack::{CellShare, PackState};
 pub use recharge::{Charged, RechargeTimer};

@@ -4,7 +4,7 @@
 //! which is not known goes in as a bound: it can raise an alarm, but never say that all is well.
 
 use super::{Command, Event, EventKind, Monitor, MonitorConfig, Outputs, Source};
-use crate::alarm::{Alarm, AlarmChange, Observation, Rule, Selector, Severity};
+use crate::alarm::{Alarm, AlarmChange, AlarmInput, Observation, Outcome, Rule, Selector, Severity};
 use crate::can::Frame;
 use crate::can::encode::{self, CommandFields};
 use crate::filter::Belief;
@@ -68,7 +68,7 @@ impl Monitor {
         self.observe_alarm(Rule::BusFault, None, bus, out);
         let store = Observation::new(self.store.failing_s(self.now));
         self.observe_alarm(Rule::StoreFailed, None, store, out);
-        self.alarms.poll(self.now, &mut self.scratch.alarm_changes);
+        self.tell_alarms(AlarmInput::Poll, out);
         self.report_alarms(out);
         // Whether every value is known may have changed without an alarm.
         self.tell_j1939();
@@ -121,14 +121,14 @@ impl Monitor {
             let valid = self.inputs_valid(cell);
             all_valid &= valid;
             for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
-                self.alarms.set_inputs_valid(self.now, rule, Some(cell), valid, &mut self.scratch.alarm_changes);
+                self.tell_alarms(AlarmInput::InputsValid { rule, cell: Some(cell), valid }, out);
             }
             if !valid || self.cells[index].estimator.soc().is_none() {
                 self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::default(), out);
             }
         }
         for rule in [Rule::RechargePeriodLow, Rule::RemainingLifeLow] {
-            self.alarms.set_inputs_valid(self.now, rule, None, all_valid, &mut self.scratch.alarm_changes);
+            self.tell_alarms(AlarmInput::InputsValid { rule, cell: None, valid: all_valid }, out);
         }
         self.report_alarms(out);
     }
@@ -248,6 +248,7 @@ impl Monitor {
             let period = Observation { is_new: false, ..period };
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
         }
+        self.observe_life(false, out);
     }
 
     /// The last recharge period, of the kind the rule about it compares.
@@ -260,8 +261,16 @@ impl Monitor {
 
     /// Takes a value into the rules; what becomes of it goes out at once.
     pub(super) fn observe_alarm(&mut self, rule: Rule, cell: Option<CellIndex>, seen: Observation, out: &mut Outputs) {
-        self.alarms.observe(self.now, rule, cell, &seen, &mut self.scratch.alarm_changes);
+        self.tell_alarms(AlarmInput::Observe { rule, cell, seen }, out);
         self.report_alarms(out);
+    }
+
+    /// Tells the alarms, and whoever wants to know what they were told; the changes wait to be reported.
+    pub(super) fn tell_alarms(&mut self, input: AlarmInput, out: &mut Outputs) -> Outcome {
+        if out.want_alarm_inputs {
+            out.alarm_inputs.push((self.now, input));
+        }
+        self.alarms.apply(self.now, &input, &mut self.scratch.alarm_changes)
     }
 
     /// Tells what became of alarms, and sends each as it stands now.
@@ -296,29 +305,27 @@ impl Monitor {
 
     /// Does what somebody asks for.
     pub(super) fn handle_command(&mut self, source: Source, command: Command, out: &mut Outputs) {
-        let mut changes = std::mem::take(&mut self.scratch.alarm_changes);
         let (changed, refused) = match command {
             Command::Acknowledge(which) => {
-                let outcome = self.alarms.acknowledge(&which, &mut changes);
+                let outcome = self.tell_alarms(AlarmInput::Acknowledge(which), out);
                 (outcome.changed, outcome.refused)
             }
             Command::Clear(which) => {
-                let outcome = self.alarms.clear(&which, &mut changes);
+                let outcome = self.tell_alarms(AlarmInput::Clear(which), out);
                 (outcome.changed, outcome.refused)
             }
             Command::PackReplaced => {
-                self.replace_pack(&mut changes, out);
-                (u32::try_from(changes.len()).unwrap_or(u32::MAX), 0)
+                self.replace_pack(out);
+                (u32::try_from(self.scratch.alarm_changes.len()).unwrap_or(u32::MAX), 0)
             }
             Command::Test { rule, seconds } => (0, u32::from(!self.start_test(rule, seconds, out))),
         };
-        self.scratch.alarm_changes = changes;
         out.events.push(Event { time: self.now, kind: EventKind::Command { source, command, changed, refused } });
         self.report_alarms(out);
     }
 
     /// What was learned of the old pack is told once more and does not hold for the new one.
-    fn replace_pack(&mut self, changes: &mut Vec<AlarmChange>, out: &mut Outputs) {
+    fn replace_pack(&mut self, out: &mut Outputs) {
         let capacity = self.weakest_capacity();
         let kind = EventKind::PackReplaced {
             capacity_ah: capacity.map(|capacity| capacity.mean),
@@ -326,7 +333,7 @@ impl Monitor {
         };
         out.events.push(Event { time: self.now, kind });
         self.forget_learned();
-        self.alarms.forget_learned(changes);
+        self.tell_alarms(AlarmInput::ForgetLearned, out);
     }
 }
 

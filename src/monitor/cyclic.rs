@@ -163,6 +163,8 @@ impl Monitor {
         let capacity = self.weakest_capacity();
         let usable = self.cells.iter().filter_map(|slot| slot.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
         let log_resistance = self.cells.iter().map(|slot| slot.estimator.log_resistance().mean).max_by(f64::total_cmp);
+        let life = self.pack_remaining_life().map(|(_, life)| life);
+        let cycles = life.and_then(|life| life.cycles);
         HealthFields {
             capacity_ah: capacity.map(|c| c.mean),
             capacity_std_ah: capacity.map(|c| c.std()),
@@ -172,6 +174,9 @@ impl Monitor {
             usable_capacity_ah: usable.map(|u| u.mean),
             usable_capacity_std_ah: usable.map(|u| u.std()),
             resistance_ratio: log_resistance.map(libm::exp),
+            remaining_cycles: cycles.map(|cycles| cycles.median),
+            remaining_cycles_low: cycles.map(|cycles| cycles.low),
+            remaining_days: life.and_then(|life| life.days).map(|days| days.median),
         }
     }
 

@@ -33,14 +33,19 @@ impl Monitor {
         let mut half_cycles = std::mem::take(&mut self.scratch.half_cycles);
         let rated_ah = self.config.model.rated_capacity_ah;
         self.learner.complete(&self.config.health.transition, rated_ah, change.from, &mut half_cycles);
+        let life_before = self.pack_remaining_life();
+        let since_before_s = self.learned_at.map(|before| self.now.since(before));
+        let mut is_new = false;
         for (index, half_cycle) in half_cycles.iter().enumerate() {
-            self.learn_cell(index, half_cycle, out);
+            is_new |= self.learn_cell(index, half_cycle, since_before_s, out);
         }
         if change.from == Mode::Charge {
             self.finish_charge(!half_cycles.is_empty(), out);
         }
         if !half_cycles.is_empty() {
             self.learner.finish();
+            self.learned_at = Some(self.now);
+            self.tell_life(life_before.is_some(), is_new, out);
             half_cycles.clear();
         }
         self.scratch.half_cycles = half_cycles;
@@ -49,11 +54,19 @@ impl Monitor {
         }
     }
 
-    fn learn_cell(&mut self, index: usize, half_cycle: &HalfCycle, out: &mut Outputs) {
+    /// What a half-cycle teaches a cell, so long after the one before (`None` = not known); whether its capacity was measured.
+    fn learn_cell(
+        &mut self,
+        index: usize,
+        half_cycle: &HalfCycle,
+        since_before_s: Option<f64>,
+        out: &mut Outputs,
+    ) -> bool {
         let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
         let slot = &mut self.cells[index];
         if slot.estimator.soc().is_none() {
-            return;
+            slot.life.learn(&self.config, half_cycle, since_before_s, None);
+            return false;
         }
         let update = self.learner.learn(
             &self.config.model,
@@ -62,6 +75,7 @@ impl Monitor {
             &mut slot.estimator,
             half_cycle,
         );
+        slot.life.learn(&self.config, half_cycle, since_before_s, Some(&update));
         if half_cycle.mode == Mode::Charge && slot.tapered {
             slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
         }
@@ -87,6 +101,7 @@ impl Monitor {
         if let Some(resistance) = resistance.filter(|_| half_cycle.mode == Mode::Discharge) {
             self.observe_alarm(Rule::ResistanceHigh, Some(cell), learned(resistance), out);
         }
+        update.measurement.is_some()
     }
 
     /// Notes that a charge has tapered off at the highest voltage: what it leaves is "full".

@@ -13,6 +13,7 @@ mod identity;
 mod intake;
 mod j1939;
 mod learning;
+mod life;
 mod output;
 mod reconfigure;
 mod snapshot;
@@ -33,9 +34,10 @@ use alarms::StoreState;
 use buses::Buses;
 use cyclic::{Schedule, Test};
 use intake::Intake;
+use life::CellLife;
 use snapshot::{PendingRestore, Taken};
 
-use crate::alarm::{AlarmChange, AlarmEngine, Observation, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Observation, Rule, RuleConfig};
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
@@ -96,14 +98,15 @@ struct CellSlot {
     usable: Option<Belief>,
     /// Resistance relative to new as the last discharge left it.
     discharge_resistance: Option<Belief>,
+    life: CellLife,
     updated_in_round: bool,
 }
 
 impl CellSlot {
     /// A cell of which nothing is known.
-    fn new(config: &EstimatorConfig) -> Self {
+    fn new(config: &MonitorConfig) -> Self {
         Self {
-            estimator: CellEstimator::new(config),
+            estimator: CellEstimator::new(&config.estimator),
             consumed: None,
             latest: None,
             trusted: true,
@@ -111,6 +114,7 @@ impl CellSlot {
             tapered: false,
             usable: None,
             discharge_resistance: None,
+            life: CellLife::new(config),
             updated_in_round: false,
         }
     }
@@ -149,6 +153,8 @@ pub struct Monitor {
     cells: Vec<CellSlot>,
     detector: TransitionDetector,
     learner: Learner,
+    /// When the last half-cycle taught something; `None` = never, or nobody knows how long ago.
+    learned_at: Option<Timestamp>,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
     normalised_recharge: Option<Belief>,
@@ -198,7 +204,7 @@ impl Monitor {
     /// A monitor that knows nothing yet.
     pub fn new(config: MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
-        let slot = CellSlot::new(&config.estimator);
+        let slot = CellSlot::new(&config);
         Self {
             intake: Intake::new(&config),
             identity: identity::Identity::default(),
@@ -211,6 +217,7 @@ impl Monitor {
             now: Timestamp::ZERO,
             time_backwards: 0,
             detector: TransitionDetector::default(),
+            learned_at: None,
             recharge: RechargeTimer::default(),
             recharge_period_s: None,
             normalised_recharge: None,
@@ -355,9 +362,10 @@ impl Monitor {
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
     fn forget_learned(&mut self) {
-        let slot = CellSlot::new(&self.config.estimator);
+        let slot = CellSlot::new(&self.config);
         self.learner = Learner::new(&self.config.health.capacity, self.cells.len(), slot.estimator.capacity());
         self.cells.fill(slot);
+        self.learned_at = None;
         self.detector = TransitionDetector::default();
         self.recharge = RechargeTimer::default();
         (self.recharge_period_s, self.normalised_recharge) = (None, None);
@@ -390,7 +398,7 @@ impl Monitor {
     fn fall_asleep(&mut self, out: &mut Outputs) {
         self.intake.restart(self.now, out);
         self.observe_current(None, out);
-        self.alarms.handle_gap();
+        self.tell_alarms(AlarmInput::Gap, out);
         self.recharge.interrupt();
         self.cells.iter_mut().for_each(|cell| cell.estimator.note_asleep());
         self.forget_pack();
@@ -411,6 +419,7 @@ impl Monitor {
         if let Some(change) = self.detector.settle() {
             self.complete_mode(change, out);
         }
+        self.learned_at = None;
         self.now = time;
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
         self.sampler.handle_gap(time);

@@ -66,6 +66,9 @@ impl Monitor {
             let period = self.known_recharge_period().unwrap_or_default();
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
         }
+        if old.health.end_of_life_ah != self.config.health.end_of_life_ah {
+            self.observe_life(false, out);
+        }
         self.tell_j1939();
         let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);
         out.events.push(Event { time: now.max(self.now), kind: EventKind::Reconfigured { alarms_ended: alarms } });
@@ -106,6 +109,9 @@ impl Monitor {
         if old.recharge != new.recharge {
             self.observe_alarm(Rule::RechargePeriodLow, None, Observation::default(), out);
             self.restate_recharge(&old.recharge, &new.recharge);
+        }
+        if old.end_of_life_ah != new.end_of_life_ah {
+            self.restate_lives(out);
         }
         if old.usable == new.usable {
             return;
@@ -183,13 +189,14 @@ impl MonitorConfig {
         let limits = |sample: &super::SampleConfig| {
             (sample.current, sample.voltage, sample.temperature, sample.reported_soc, sample.reported_soh)
         };
+        let capacity = |config: &Self| (config.health.capacity, config.health.end_of_life_ah);
         let same = [
             ("[pack]", self.model == new.model && old_sample.ambient_c == new_sample.ambient_c),
             ("[input]", self.flood == new.flood && self.guards == new.guards),
             ("[limits]", limits(old_sample) == limits(new_sample)),
             ("[estimator]", self.estimator == new.estimator),
             ("[transition]", self.health.transition == new.health.transition),
-            ("[capacity]", self.health.capacity == new.health.capacity),
+            ("[capacity]", capacity(self) == capacity(new)),
             ("[recharge]", self.health.recharge == new.health.recharge),
             ("[usable]", self.health.usable == new.health.usable),
             ("[[alarm]]", self.rules == new.rules),

@@ -6,11 +6,14 @@ use super::buses::Buses;
 use super::cyclic::Schedule;
 use super::identity::Identity;
 use super::intake::IntakeState;
-use super::{Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
+use super::life::CellLife;
+use super::{
+    Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, MonitorConfig, Outputs, Statistics,
+};
 use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
-use crate::health::{Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{Axis, Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{Timestamp, Unsound};
 use crate::sample::SamplerState;
 
@@ -29,6 +32,8 @@ pub struct Snapshot {
     sampler: SamplerState,
     detector: TransitionDetector,
     learner: Learner,
+    #[serde(default)]
+    learned_at: Option<Timestamp>,
     recharge: RechargeTimer,
     recharge_period_s: Option<f64>,
     #[serde(default)]
@@ -59,6 +64,9 @@ struct CellDocument {
     usable: Option<Belief>,
     #[serde(default)]
     discharge_resistance: Option<Belief>,
+    /// A state of before there were forecasts has none: it begins with the next reading.
+    #[serde(default)]
+    forecast: Option<Forecast>,
     updated_in_round: bool,
 }
 
@@ -132,6 +140,7 @@ impl Monitor {
             sampler: self.sampler.snapshot(),
             detector: self.detector.clone(),
             learner: self.learner.clone(),
+            learned_at: self.learned_at,
             recharge: self.recharge.clone(),
             recharge_period_s: self.recharge_period_s,
             normalised_recharge: self.normalised_recharge,
@@ -188,12 +197,13 @@ impl Monitor {
         snapshot.rebase(by_nanos);
         let branches = self.config.model.branches.len();
         for (slot, document) in self.cells.iter_mut().zip(&snapshot.cells) {
-            slot.take_up(document, branches);
+            slot.take_up(document, branches, &self.config);
         }
         // Checked in `restore`.
         let _ = self.sampler.restore(&snapshot.sampler);
         self.detector = snapshot.detector;
         self.learner = snapshot.learner;
+        self.learned_at = snapshot.learned_at;
         self.recharge = snapshot.recharge;
         self.recharge_period_s = snapshot.recharge_period_s;
         self.normalised_recharge = snapshot.normalised_recharge;
@@ -251,6 +261,7 @@ impl Snapshot {
         self.sampler.rebase(by_nanos);
         self.detector.rebase(by_nanos);
         self.learner.rebase(by_nanos);
+        self.learned_at = self.learned_at.map(|at| at.plus_nanos(by_nanos));
         self.recharge.rebase(by_nanos);
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
@@ -264,6 +275,7 @@ impl CellDocument {
         Unsound::unless_number("the SOC of a full cell", self.full_soc)?;
         check_belief("the usable capacity", self.usable)?;
         check_belief("the resistance of discharge", self.discharge_resistance)?;
+        self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         Unsound::unless_number("the charge taken in", charge_as)?;
         Unsound::unless_number("the unmeasured time taken in", unmeasured_s)
@@ -287,11 +299,12 @@ impl CellSlot {
             tapered: self.tapered,
             usable: self.usable,
             discharge_resistance: self.discharge_resistance,
+            forecast: Some(self.life.forecast.clone()),
             updated_in_round: self.updated_in_round,
         }
     }
 
-    fn take_up(&mut self, document: &CellDocument, branches: usize) {
+    fn take_up(&mut self, document: &CellDocument, branches: usize, config: &MonitorConfig) {
         if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
             self.estimator = estimator;
         }
@@ -301,6 +314,8 @@ impl CellSlot {
         self.tapered = document.tapered;
         self.usable = document.usable;
         self.discharge_resistance = document.discharge_resistance;
+        let forecast = document.forecast.clone();
+        self.life = forecast.map_or_else(|| CellLife::new(config), |forecast| CellLife::of(forecast, config));
         self.updated_in_round = document.updated_in_round;
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::alarm::{Change, Rule, Selector, Severity, State};
+use crate::alarm::{AlarmInput, Change, Rule, Selector, Severity, State};
 use crate::can::decode::Channel;
 use crate::can::e2e::Status;
 use crate::can::j1939::NodeEvent;
@@ -256,6 +256,24 @@ pub enum EventKind {
         /// Its standard deviation.
         resistance_ratio_std: f64,
     },
+    /// A half-cycle is over: what remains of the life of the cell whose life ends first. Told while it is known, and once
+    /// when it no longer is (nothing in it, then).
+    RemainingLife {
+        /// Which cell.
+        cell: Option<CellIndex>,
+        /// Equivalent full cycles until its capacity passes the end of life, median.
+        cycles: Option<f64>,
+        /// 5 % quantile.
+        cycles_low: Option<f64>,
+        /// 95 % quantile.
+        cycles_high: Option<f64>,
+        /// Days, if it goes on being used as of late, median.
+        days: Option<f64>,
+        /// 5 % quantile.
+        days_low: Option<f64>,
+        /// 95 % quantile.
+        days_high: Option<f64>,
+    },
     /// A charge is over that covered the recharge window, or enough of it to be told.
     RechargePeriod {
         /// Seconds between the two configured SOC values; `None` = it did not cover the whole window in one go.
@@ -486,6 +504,10 @@ pub struct Outputs {
     pub estimates: Vec<Estimate>,
     /// Whether anybody wants `estimates`.
     pub want_estimates: bool,
+    /// What the alarm engine was told, only when `want_alarm_inputs`; not what a restore or another configuration did to it.
+    pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
+    /// Whether anybody wants `alarm_inputs`.
+    pub want_alarm_inputs: bool,
 }
 
 impl Outputs {
@@ -494,5 +516,6 @@ impl Outputs {
         self.frames.clear();
         self.events.clear();
         self.estimates.clear();
+        self.alarm_inputs.clear();
     }
 }

@@ -2,6 +2,7 @@
 
 use super::{Monitor, Statistics, Validity};
 use crate::filter::Belief;
+use crate::health::{RemainingLife, TooThin};
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 
@@ -24,6 +25,8 @@ pub struct CellView {
     pub usable_capacity: Option<Belief>,
     /// Resistance relative to new, while its voltage is fresh.
     pub resistance_ratio: Option<Belief>,
+    /// What remains until the end of life, or why that is not known.
+    pub remaining_life: Result<RemainingLife, TooThin>,
     /// Whether its innovations agree with their covariance; `None` while there is no SOC.
     pub trusted: Option<bool>,
 }
@@ -51,6 +54,8 @@ pub struct PackView {
     pub usable_capacity: Option<Belief>,
     /// Capacity relative to rated, likewise.
     pub soh: Option<f64>,
+    /// The cell whose life ends first, and when, once every cell's is known.
+    pub remaining_life: Option<(CellIndex, RemainingLife)>,
     /// Last recorded recharge period, s.
     pub recharge_period_s: Option<f64>,
     /// What the reference charger would need, s.
@@ -96,6 +101,7 @@ impl Monitor {
             capacity: self.learner.has_learned(cell.index()).then(|| self.capacity(cell)),
             usable_capacity: slot.usable.filter(|_| self.learner.has_learned(cell.index())),
             resistance_ratio: soc.map(|_| slot.resistance()),
+            remaining_life: self.remaining_life(cell),
             trusted: soc.map(|_| slot.trusted),
         }
     }
@@ -132,6 +138,7 @@ impl Monitor {
                 .zip(health.usable_capacity_std_ah)
                 .map(|(mean, std)| Belief::from_std(mean, std)),
             soh: health.soh,
+            remaining_life: self.pack_remaining_life(),
             recharge_period_s: self.recharge_period_s,
             normalised_recharge_period: self.normalised_recharge,
             reported_soc: self.sampler.reported(Channel::ReportedSoc, self.now),

@@ -72,6 +72,7 @@ class Life:
         self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
         self.recharge = None  # the last told
         self.normalised = None
+        self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
 
     def take_estimate(self, row):
         cell = int(row["cell"])
@@ -102,6 +103,9 @@ class Life:
                 self.usable[cell] = event["usable_capacity_ah"], event["usable_capacity_std_ah"]
             if event["measured_ah"] is not None:
                 self.learned.add(cell)
+        elif kind == "remaining_life":
+            self.life = {"RemainingCycles": event["cycles"], "RemainingCyclesLow": event["cycles_low"],
+                         "RemainingDays": event["days"]}
         elif kind == "recharge_period":
             self.recharge = event["seconds"] if event["seconds"] is not None else self.recharge
             self.normalised = event["normalised_s"] if event["normalised_s"] is not None else self.normalised
@@ -143,6 +147,7 @@ class Life:
             known = {"Capacity": ah, "CapacityStd": std, "Soh": 100 * ah / self.rated_ah, "UsableCapacity": usable,
                      "UsableCapacityStd": usable_std, "ResistanceRatio": 100 * ratio,
                      "NormalizedRechargePeriod": self.normalised}
+        known |= self.life if len(self.learned) >= self.cells else dict.fromkeys(self.life)
         return known | {"RechargePeriod": self.recharge}
 
 

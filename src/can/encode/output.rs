@@ -100,6 +100,12 @@ pub struct HealthFields {
     pub usable_capacity_std_ah: Option<f64>,
     /// Relative to new, 1 = as new.
     pub resistance_ratio: Option<f64>,
+    /// Equivalent full cycles until the end of life, median. As the next two, only where the DBC has a signal for it.
+    pub remaining_cycles: Option<f64>,
+    /// Its 5 % quantile.
+    pub remaining_cycles_low: Option<f64>,
+    /// Days, median.
+    pub remaining_days: Option<f64>,
 }
 
 /// Contents of one alarm frame.
@@ -229,6 +235,9 @@ impl OutputPlan {
             "UsableCapacity" => fields.usable_capacity_ah,
             "UsableCapacityStd" => fields.usable_capacity_std_ah,
             "ResistanceRatio" => fields.resistance_ratio,
+            "RemainingCycles" => fields.remaining_cycles,
+            "RemainingCyclesLow" => fields.remaining_cycles_low,
+            "RemainingDays" => fields.remaining_days,
             _ => None,
         })
     }

@@ -26,9 +26,8 @@ pub(crate) struct Args {
     /// Journals, candump logs or CSV files, also .gz or .zst, read one after another; - is standard input
     #[arg(required = true, value_name = "LOG")]
     pub(crate) logs: Vec<PathBuf>,
-    /// End at the first malformed line
-    #[arg(long)]
-    pub(crate) strict: bool,
+    #[command(flatten)]
+    pub(crate) input: InputArgs,
     /// Times real time (1 = real time); as fast as possible when not given, real time with --to
     #[arg(long, value_name = "X", value_parser = positive)]
     pub(crate) speed: Option<f64>,
@@ -69,11 +68,19 @@ pub(crate) struct Args {
     /// Leave out what is after; as --snapshot-at
     #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
     pub(crate) until: Option<When>,
+}
+
+/// How logs are read.
+#[derive(Debug, clap::Args)]
+pub(crate) struct InputArgs {
+    /// End at the first malformed line
+    #[arg(long)]
+    pub(crate) strict: bool,
     /// A hole in the record longer than this means that the recorder was asleep: no ticks, no frames
     #[arg(long, value_name = "S", default_value_t = 30.0, value_parser = positive)]
     pub(crate) sleep_gap: f64,
     /// CSV column of time, current, voltage, temperature or section (empty = none), as current=Current(A);
-    /// with {n}, one per cell or sensor from 1, as voltage{n}=U{n}
+    /// the letter n in braces in the names stands for the number of the cell or sensor, from 1
     #[arg(long = "column", value_name = "ROLE=NAME", value_parser = column)]
     pub(crate) columns: Vec<(String, String)>,
     /// Sign of a CSV's current

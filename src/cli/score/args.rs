@@ -135,7 +135,7 @@ impl Args {
 }
 
 /// Short names that tell the files apart: folder and name without endings, the whole path where two are the same.
-pub(super) fn names(files: &[PathBuf]) -> Vec<String> {
+pub(crate) fn names(files: &[PathBuf]) -> Vec<String> {
     let short = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         let name = name.split('.').next().unwrap_or_default().to_owned();

@@ -119,11 +119,11 @@ impl Shown<'_> {
                 out,
                 "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min"
             )?;
-            write_table(&mut out, &self.soc_rows())?;
+            write_table(&mut out, &self.soc_rows(), 2)?;
         }
         if self.scores.iter().any(|score| score.life.is_some()) {
             writeln!(out, "\nusable capacity after {} discharges", settings.skip_cycles)?;
-            write_table(&mut out, &self.life_rows())?;
+            write_table(&mut out, &self.life_rows(), 2)?;
         }
         self.notes(&mut out)
     }
@@ -329,8 +329,8 @@ fn percent(value: f64) -> String {
     if value.is_finite() { format!("{:.1} %", 100.0 * value) } else { "-".to_owned() }
 }
 
-/// Columns as wide as their widest entry: the first two to the left, numbers to the right.
-fn write_table(out: &mut impl Write, rows: &[Vec<String>]) -> io::Result<()> {
+/// Columns as wide as their widest entry: the first `left` to the left, numbers to the right.
+pub(crate) fn write_table(out: &mut impl Write, rows: &[Vec<String>], left: usize) -> io::Result<()> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
     let widths: Vec<usize> =
@@ -338,7 +338,7 @@ fn write_table(out: &mut impl Write, rows: &[Vec<String>]) -> io::Result<()> {
     for row in rows {
         let cells = widths.iter().enumerate().map(|(column, &width)| {
             let text = entry(row, column);
-            if column < 2 { format!("{text:<width$}") } else { format!("{text:>width$}") }
+            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
         });
         writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
     }

@@ -6,7 +6,7 @@ use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
 use crate::cli::alarms::{cell as cell_name, severity, state_name, with_unit};
 use crate::daemon::status::counters::LATENCY_BOUNDS_S;
-use crate::daemon::status::document::{Cell, Document};
+use crate::daemon::status::document::{Cell, Document, Pack};
 use crate::io::stamp;
 
 /// Up to so many cells all are listed: more do not fit a screen beside the rest.
@@ -63,6 +63,19 @@ fn pack(text: &mut String, document: &Document) {
         shown(pack.recharge_period_s, 0, " s"),
         with_std(pack.normalised_recharge_period_s, pack.normalised_recharge_period_std_s, 0, " s"),
     );
+    let _ = writeln!(text, "life       {}", remaining(pack));
+}
+
+/// What remains of the life of the cell whose life ends first.
+fn remaining(pack: &Pack) -> String {
+    let (Some(cycles), Some(low), Some(high)) =
+        (pack.remaining_cycles, pack.remaining_cycles_low, pack.remaining_cycles_high)
+    else {
+        return "not known".to_owned();
+    };
+    let cell = pack.shortest_lived_cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)));
+    let days = shown(pack.remaining_days, 0, " days");
+    format!("{cycles:.0} equivalent full cycles (90 %: {low:.0} to {high:.0}){cell}, {days} at the use of late")
 }
 
 fn interfaces(text: &mut String, document: &Document) {

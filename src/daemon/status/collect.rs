@@ -14,6 +14,7 @@ use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::daemon::control::answer;
 use crate::filter::Belief;
+use crate::health::{Remaining, RemainingLife};
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkCounters, LinkOutput};
 use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor, Statistics};
@@ -198,12 +199,18 @@ fn std(belief: Option<&Belief>) -> Option<f64> {
     belief.and_then(|belief| finite(belief.std()))
 }
 
+/// Cycles and days, as far as they are known.
+fn remaining(life: Option<RemainingLife>) -> (Option<Remaining>, Option<Remaining>) {
+    (life.and_then(|life| life.cycles), life.and_then(|life| life.days))
+}
+
 fn pack(monitor: &Monitor) -> Pack {
     let view = monitor.pack_view();
     let soc = view.soc.as_ref();
     let edge = |sign: f64| soc.and_then(|soc| finite((soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0)));
     let weakest = view.weakest.as_ref();
     let normalised = view.normalised_recharge_period.as_ref();
+    let (cycles, days) = remaining(view.remaining_life.map(|(_, life)| life));
     Pack {
         validity: view.validity,
         mode: view.mode,
@@ -219,6 +226,11 @@ fn pack(monitor: &Monitor) -> Pack {
         capacity_ah: mean(weakest.map(|(_, capacity)| capacity)),
         capacity_std_ah: std(weakest.map(|(_, capacity)| capacity)),
         soh: view.soh.and_then(finite),
+        shortest_lived_cell: view.remaining_life.map(|(cell, _)| cell.0),
+        remaining_cycles: cycles.map(|cycles| cycles.median).and_then(finite),
+        remaining_cycles_low: cycles.map(|cycles| cycles.low).and_then(finite),
+        remaining_cycles_high: cycles.map(|cycles| cycles.high).and_then(finite),
+        remaining_days: days.map(|days| days.median).and_then(finite),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
         recharge_period_s: view.recharge_period_s.and_then(finite),
@@ -230,6 +242,7 @@ fn pack(monitor: &Monitor) -> Pack {
 }
 
 fn cell(view: CellView) -> Cell {
+    let (cycles, days) = remaining(view.remaining_life.ok());
     Cell {
         cell: view.cell.0,
         voltage_v: view.voltage_v.and_then(finite),
@@ -241,6 +254,11 @@ fn cell(view: CellView) -> Cell {
         capacity_std_ah: std(view.capacity.as_ref()),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
+        remaining_cycles: cycles.map(|cycles| cycles.median).and_then(finite),
+        remaining_cycles_low: cycles.map(|cycles| cycles.low).and_then(finite),
+        remaining_cycles_high: cycles.map(|cycles| cycles.high).and_then(finite),
+        remaining_days: days.map(|days| days.median).and_then(finite),
+        remaining_unknown: view.remaining_life.err().map(|why| why.to_string()),
         resistance_ratio: mean(view.resistance_ratio.as_ref()),
         resistance_ratio_std: std(view.resistance_ratio.as_ref()),
         trusted: view.trusted,

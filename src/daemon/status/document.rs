@@ -135,6 +135,21 @@ pub(crate) struct Pack {
     pub(crate) capacity_std_ah: Option<f64>,
     /// Capacity relative to rated.
     pub(crate) soh: Option<f64>,
+    /// The cell whose life ends first, once every cell's is known.
+    #[serde(default)]
+    pub(crate) shortest_lived_cell: Option<u16>,
+    /// Equivalent full cycles until its end of life, median.
+    #[serde(default)]
+    pub(crate) remaining_cycles: Option<f64>,
+    /// 5 % quantile of that.
+    #[serde(default)]
+    pub(crate) remaining_cycles_low: Option<f64>,
+    /// 95 % quantile.
+    #[serde(default)]
+    pub(crate) remaining_cycles_high: Option<f64>,
+    /// Days until then, if it goes on being used as of late, median.
+    #[serde(default)]
+    pub(crate) remaining_days: Option<f64>,
     /// Least usable capacity at the configured load.
     pub(crate) usable_capacity_ah: Option<f64>,
     /// Its standard deviation.
@@ -174,6 +189,21 @@ pub(crate) struct Cell {
     pub(crate) usable_capacity_ah: Option<f64>,
     /// Its standard deviation.
     pub(crate) usable_capacity_std_ah: Option<f64>,
+    /// Equivalent full cycles until the end of life, median.
+    #[serde(default)]
+    pub(crate) remaining_cycles: Option<f64>,
+    /// 5 % quantile of that.
+    #[serde(default)]
+    pub(crate) remaining_cycles_low: Option<f64>,
+    /// 95 % quantile.
+    #[serde(default)]
+    pub(crate) remaining_cycles_high: Option<f64>,
+    /// Days until then, if it goes on being used as of late, median.
+    #[serde(default)]
+    pub(crate) remaining_days: Option<f64>,
+    /// Why that is not known.
+    #[serde(default)]
+    pub(crate) remaining_unknown: Option<String>,
     /// Resistance relative to new.
     pub(crate) resistance_ratio: Option<f64>,
     /// Its standard deviation.

@@ -238,6 +238,26 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
         ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
+        ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
+        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", pack.remaining_cycles),
+        (
+            "pack_remaining_cycles_low",
+            "",
+            "5 % quantile of the cycles until the end of life",
+            pack.remaining_cycles_low,
+        ),
+        (
+            "pack_remaining_cycles_high",
+            "",
+            "95 % quantile of the cycles until the end of life",
+            pack.remaining_cycles_high,
+        ),
+        (
+            "pack_remaining_life",
+            "seconds",
+            "Time until the end of life at the use of late, median",
+            pack.remaining_days.map(|d| 86_400.0 * d),
+        ),
         ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
         (
             "pack_usable_capacity_std",
@@ -267,7 +287,7 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
 /// Name, unit, help, and where the value is.
 type CellRow = (&'static str, &'static str, &'static str, fn(&Cell) -> Option<f64>);
 
-const CELL_ROWS: [CellRow; 12] = [
+const CELL_ROWS: &[CellRow] = &[
     ("cell_voltage", "volts", "Voltage", |cell| cell.voltage_v),
     ("cell_current", "amperes", "Current, positive when discharging", |cell| cell.current_a),
     ("cell_temperature", "celsius", "Temperature of the cell's sensor", |cell| cell.temperature_c),
@@ -275,6 +295,13 @@ const CELL_ROWS: [CellRow; 12] = [
     ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
     ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
+    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| cell.remaining_cycles),
+    ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| {
+        cell.remaining_cycles_low
+    }),
+    ("cell_remaining_cycles_high", "", "95 % quantile of the cycles until the end of life", |cell| {
+        cell.remaining_cycles_high
+    }),
     ("cell_usable_capacity", "amperehours", "Usable capacity", |cell| cell.usable_capacity_ah),
     ("cell_usable_capacity_std", "amperehours", "Standard deviation of the usable capacity", |cell| {
         cell.usable_capacity_std_ah

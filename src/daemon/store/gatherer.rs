@@ -33,6 +33,13 @@ struct Written {
     allowance: Allowance,
 }
 
+/// A remaining life as last written: its median, and a deviation of it; `None` = it was not known.
+#[derive(Debug, Clone, Copy)]
+struct WrittenLife {
+    cycles: Option<(f64, f64)>,
+    allowance: Allowance,
+}
+
 /// What one input's events are worth.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Worth {
@@ -48,6 +55,7 @@ pub(crate) enum Worth {
 #[derive(Debug)]
 pub(crate) struct Gatherer {
     written: BTreeMap<CellIndex, Written>,
+    written_life: WrittenLife,
     own_commits: BTreeMap<Subject, Allowance>,
     shared_commits: Allowance,
     carried: Allowance,
@@ -58,6 +66,7 @@ impl Default for Gatherer {
     fn default() -> Self {
         Self {
             written: BTreeMap::new(),
+            written_life: WrittenLife { cycles: None, allowance: Allowance::new(CAPACITIES) },
             own_commits: BTreeMap::new(),
             shared_commits: Allowance::new(SHARED_COMMITS),
             carried: Allowance::new(CARRIED),
@@ -117,9 +126,31 @@ impl Gatherer {
         self.deferred.push(row);
     }
 
+    /// As for capacities: when there have been many, one that has hardly moved is no news.
+    fn is_news_of_life(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
+        let written = &mut self.written_life;
+        let has_moved = match (written.cycles, cycles) {
+            (Some((before, _)), Some((median, std))) => (median - before).abs() > NEWS_STD * std,
+            (before, now) => before.is_some() != now.is_some(),
+        };
+        let is_news = written.allowance.take(now) || has_moved;
+        if is_news {
+            written.cycles = cycles;
+        }
+        is_news
+    }
+
     /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news; nor is, when
     /// there have been many, one that has hardly moved.
     fn is_news(&mut self, kind: &EventKind, now: Timestamp) -> bool {
+        if matches!(kind, EventKind::PackReplaced { .. }) {
+            self.written_life.cycles = None;
+        }
+        if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
+            // Half of the interval's lower part: a little less than a deviation.
+            return self
+                .is_news_of_life(cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))), now);
+        }
         let EventKind::Capacity {
             cell, measured_ah, capacity_ah, capacity_std_ah, usable_capacity_ah: usable_ah, ..
         } = *kind
@@ -152,6 +183,7 @@ fn is_learned(kind: &EventKind) -> bool {
     match kind {
         EventKind::HalfCycle { .. }
         | EventKind::Capacity { .. }
+        | EventKind::RemainingLife { .. }
         | EventKind::RechargePeriod { .. }
         | EventKind::AlarmDropped { .. }
         | EventKind::FilterReset { .. }
@@ -164,7 +196,7 @@ fn is_learned(kind: &EventKind) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use super::super::rows::tests::{alarm, capacity, half_cycle};
+    use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
     use super::*;
     use crate::alarm::{Rule, Severity};
 
@@ -206,6 +238,34 @@ mod tests {
     }
 
     #[test]
+    fn remaining_lives_are_written_until_there_are_many_and_then_when_they_move() {
+        let day = |per_minute: f64| {
+            let (mut gatherer, mut rows) = (Gatherer::default(), 0);
+            for minute in 0..1440 {
+                let kinds = [half_cycle(0), remaining_life(per_minute * f64::from(100_000 - minute))];
+                rows += take(&mut gatherer, f64::from(minute) * 60.0, &kinds).unwrap() - 1;
+            }
+            assert!((64 + 22..=64 + 24).contains(&rows), "{rows} rows");
+            gatherer
+        };
+        // Nothing any more, and slowly less.
+        day(0.0);
+        let mut gatherer = day(0.01);
+        assert_eq!(take(&mut gatherer, 86_341.0, &[half_cycle(0), remaining_life(700.0)]), Some(2), "far");
+        let unknown = EventKind::RemainingLife {
+            cell: None,
+            cycles: None,
+            cycles_low: None,
+            cycles_high: None,
+            days: None,
+            days_low: None,
+            days_high: None,
+        };
+        assert_eq!(take(&mut gatherer, 86_342.0, &[half_cycle(0), unknown]), Some(2), "not known any longer");
+        assert_eq!(take(&mut gatherer, 86_343.0, &[half_cycle(0), unknown]), Some(1));
+    }
+
+    #[test]
     fn an_alarm_that_flickers_without_end_is_written_now_and_then_with_its_ends() {
         let mut gatherer = Gatherer::default();
         let (mut commits, mut rows) = (0, 0);
@@ -222,24 +282,12 @@ mod tests {
     #[test]
     fn what_misfits_keeps_no_other_alarm_from_the_disk() {
         let mut gatherer = Gatherer::default();
-        let of = |rule, severity, cell| {
-            let EventKind::Alarm { change, state, active, value, probability, threshold, .. } = alarm(Change::Raised)
-            else {
-                panic!()
-            };
-            EventKind::Alarm {
-                rule,
-                cell,
-                change,
-                state,
-                active,
-                severity,
-                value,
-                probability,
-                threshold,
-                occurrences: 1,
-                acknowledged: false,
+        let of = |of_rule, of_severity, of_cell| {
+            let mut kind = alarm(Change::Raised);
+            if let EventKind::Alarm { rule, severity, cell, .. } = &mut kind {
+                (*rule, *severity, *cell) = (of_rule, of_severity, of_cell);
             }
+            kind
         };
         let noisy = of(Rule::SocLow, Severity::Warning, Some(CellIndex(0)));
         let mut commits = 0;

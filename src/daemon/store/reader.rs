@@ -57,6 +57,8 @@ pub enum Kind {
     HalfCycle,
     /// Capacities learned.
     Capacity,
+    /// What remained of the life of the cell whose life ends first.
+    RemainingLife,
     /// Alarms.
     Alarm,
     /// Resets, packs, damages.
@@ -65,12 +67,13 @@ pub enum Kind {
 
 impl Kind {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::HalfCycle, Self::Capacity, Self::Alarm, Self::Reset];
+    pub const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
 
     const fn table(self) -> Table {
         match self {
             Self::HalfCycle => Table::HalfCycle,
             Self::Capacity => Table::Capacity,
+            Self::RemainingLife => Table::RemainingLife,
             Self::Alarm => Table::Alarm,
             Self::Reset => Table::Reset,
         }
@@ -178,6 +181,9 @@ impl Reader {
 
     fn read(&self, kind: Kind, filter: &Filter, order: &str, take: &mut dyn FnMut(Entry)) -> rusqlite::Result<()> {
         let table = kind.table();
+        if !table.is_in(schema::version(&self.connection)?) {
+            return Ok(());
+        }
         let (seq, by) = match kind {
             Kind::HalfCycle => ("NULL", format!("r.moment {order}, r.cell {order}")),
             _ => ("r.seq", format!("r.seq {order}")),

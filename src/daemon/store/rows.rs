@@ -38,6 +38,8 @@ pub(crate) enum Table {
     HalfCycle,
     /// Capacities learned; chained, never thinned.
     Capacity,
+    /// What remained of the life of the cell whose life ends first; chained, never thinned.
+    RemainingLife,
     /// Alarms; chained, never thinned.
     Alarm,
     /// Resets, other packs, damages; chained, never thinned.
@@ -46,15 +48,21 @@ pub(crate) enum Table {
 
 impl Table {
     /// All, in the order in which they are shown.
-    pub(crate) const ALL: [Self; 4] = [Self::HalfCycle, Self::Capacity, Self::Alarm, Self::Reset];
+    pub(crate) const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
     /// Those whose rows are chained by hash.
-    pub(crate) const CHAINED: [Self; 3] = [Self::Capacity, Self::Alarm, Self::Reset];
+    pub(crate) const CHAINED: [Self; 4] = [Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+
+    /// Whether a database of this layout's version has it.
+    pub(super) const fn is_in(self, version: i32) -> bool {
+        version >= if matches!(self, Self::RemainingLife) { 2 } else { 1 }
+    }
 
     /// Its name in the database.
     pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::HalfCycle => "half_cycle",
             Self::Capacity => "capacity",
+            Self::RemainingLife => "remaining_life",
             Self::Alarm => "alarm",
             Self::Reset => "reset",
         }
@@ -84,6 +92,7 @@ impl Table {
                 "resistance_ratio",
                 "resistance_ratio_std",
             ],
+            Self::RemainingLife => &["cell", "cycles", "cycles_low", "cycles_high", "days", "days_low", "days_high"],
             Self::Alarm => &[
                 "cell",
                 "rule",
@@ -175,6 +184,11 @@ fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
     Some(match *kind {
         EventKind::HalfCycle { .. } => (Table::HalfCycle, half_cycle_values(kind)?),
         EventKind::Capacity { .. } => (Table::Capacity, capacity_values(kind)?),
+        EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, days_low, days_high } => {
+            let mut values = vec![cell.map_or(Value::Null, |cell| whole(cell.0))];
+            values.extend([cycles, cycles_low, cycles_high, days, days_low, days_high].map(maybe));
+            (Table::RemainingLife, values)
+        }
         EventKind::Alarm { .. } => (Table::Alarm, alarm_values(kind)?),
         EventKind::AlarmDropped { rule, severity, cell, active: _, occurrences } => {
             (Table::Alarm, dropped_values(rule, severity, cell, occurrences))
@@ -348,6 +362,19 @@ pub(super) mod tests {
         }
     }
 
+    /// What remains of the pack's life, cycles.
+    pub(in crate::daemon::store) fn remaining_life(cycles: f64) -> EventKind {
+        EventKind::RemainingLife {
+            cell: Some(CellIndex(2)),
+            cycles: Some(cycles),
+            cycles_low: Some(0.5 * cycles),
+            cycles_high: Some(2.0 * cycles),
+            days: None,
+            days_low: None,
+            days_high: None,
+        }
+    }
+
     /// An alarm of the pack.
     pub(in crate::daemon::store) fn alarm(change: Change) -> EventKind {
         EventKind::Alarm {
@@ -371,6 +398,7 @@ pub(super) mod tests {
         let kinds = [
             half_cycle(3),
             capacity(3, None, 2.4),
+            remaining_life(100.0),
             alarm(Change::Raised),
             EventKind::AlarmDropped {
                 rule: Rule::SocLow,

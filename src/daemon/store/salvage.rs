@@ -30,6 +30,7 @@ const STEP_ROWS: usize = 2_000;
 #[derive(Debug, Default)]
 pub(super) struct Saved {
     pub(super) capacities: usize,
+    pub(super) lives: usize,
     pub(super) alarms: usize,
     pub(super) resets: usize,
     pub(super) half_cycles: usize,
@@ -40,12 +41,12 @@ pub(super) struct Saved {
 
 impl fmt::Display for Saved {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { capacities, alarms, resets, half_cycles, refused, state } = self;
+        let Self { capacities, lives, alarms, resets, half_cycles, refused, state } = self;
         let state = if state.is_some() { "with" } else { "without" };
         write!(
             f,
-            "taken over: {capacities} capacities, {alarms} alarms, {resets} resets, {half_cycles} half-cycles, {state} its \
-             state; refused: {refused}"
+            "taken over: {capacities} capacities, {lives} remaining lives, {alarms} alarms, {resets} resets, {half_cycles} \
+             half-cycles, {state} its state; refused: {refused}"
         )
     }
 }
@@ -55,6 +56,7 @@ impl Saved {
         *match table {
             Table::HalfCycle => &mut self.half_cycles,
             Table::Capacity => &mut self.capacities,
+            Table::RemainingLife => &mut self.lives,
             Table::Alarm => &mut self.alarms,
             Table::Reset => &mut self.resets,
         } += 1;

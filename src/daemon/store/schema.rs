@@ -5,7 +5,7 @@
 //! | `pack` | a pack that was or is connected | always |
 //! | `moment` | when rows were written: wall clock, inputs' clock, boot clock, boot, pack | always |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
-//! | `capacity`, `alarm`, `reset` | something learned, raised, begun anew; numbered through and chained by hash | always |
+//! | `capacity`, `remaining_life`, `alarm`, `reset` | something learned, forecast, raised, begun anew; numbered through and chained by hash | always |
 //! | `state` | the core's state: slot 0 in full, slot 1 what has changed since | the latest |
 //! | `meta` | one row: the chain's end, counts | |
 //!
@@ -17,7 +17,7 @@ use rusqlite::{Connection, TransactionBehavior};
 const APPLICATION_ID: i32 = 0x706B_7774;
 
 /// What makes each version from the one before; the first makes it from an empty file.
-pub(super) const MIGRATIONS: &[&str] = &[VERSION_1];
+pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2];
 
 const VERSION_1: &str = "
 CREATE TABLE meta (
@@ -101,6 +101,21 @@ CREATE TABLE state (
     serial INTEGER NOT NULL,
     length INTEGER NOT NULL,
     bytes BLOB NOT NULL
+) STRICT;
+";
+
+const VERSION_2: &str = "
+CREATE TABLE remaining_life (
+    seq INTEGER PRIMARY KEY,
+    moment INTEGER NOT NULL,
+    cell INTEGER,
+    cycles REAL,
+    cycles_low REAL,
+    cycles_high REAL,
+    days REAL,
+    days_low REAL,
+    days_high REAL,
+    hash BLOB NOT NULL
 ) STRICT;
 ";
 

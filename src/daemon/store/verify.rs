@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::chain::{Hash, hex, link};
 use super::database;
 use super::rows::Table;
+use super::schema;
 
 /// What came of it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
@@ -44,8 +45,10 @@ struct Link {
 /// Goes through the chain in the order of its numbers.
 pub(super) fn verify(connection: &Connection) -> rusqlite::Result<Verdict> {
     let ledger = database::read_ledger(connection)?;
+    let version = schema::version(connection)?;
     let mut statements: Vec<(Table, Statement<'_>)> = Table::CHAINED
         .into_iter()
+        .filter(|table| table.is_in(version))
         .map(|table| {
             connection.prepare(&database::rows_sql(table, "ORDER BY r.seq")).map(|statement| (table, statement))
         })

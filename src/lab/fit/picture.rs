@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{FitFailure, Outcome};
 use crate::ident::pass::residuals;
-use crate::lab::plot::{self, Colour, Line, Panel};
+use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
 
 /// Most panels; a page of more is not looked at.
 const MAX_PANELS: usize = 40;
@@ -14,14 +14,14 @@ const MAX_PANELS: usize = 40;
 /// # Errors
 /// The file cannot be written.
 pub fn write(path: &Path, outcome: &Outcome) -> Result<(), FitFailure> {
-    let panels: Vec<Panel> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
-    plot::write(path, &panels).map_err(|error| FitFailure(error.to_string()))
+    let panels: Vec<Picture> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
+    chart::write_stack(path, &panels, Format::Svg).map_err(|error| FitFailure(error.to_string()))
 }
 
 /// One file; its stretches follow each other.
-fn panel(outcome: &Outcome, number: usize) -> Panel {
+fn panel(outcome: &Outcome, number: usize) -> Picture {
     let file = &outcome.files[number];
-    let mut line = Line { label: String::new(), colour: Colour::BLUE, points: vec![] };
+    let mut points = Vec::new();
     let mut begin_s = 0.0;
     let own = outcome.records.iter().zip(&outcome.file_of_record).filter(|(_, file)| **file == number);
     for (record, _) in own {
@@ -29,17 +29,17 @@ fn panel(outcome: &Outcome, number: usize) -> Panel {
         for (row, error) in record.rows.iter().zip(residuals(record, &outcome.fit.tables)) {
             time_s += row.dt_s;
             if row.weight_s > 0.0 {
-                line.points.push((time_s / 3600.0, 1e3 * error));
+                points.push((time_s / 3600.0, 1e3 * error));
             }
         }
         begin_s = time_s;
     }
     let name = file.path.file_name().unwrap_or_default().to_string_lossy();
-    Panel {
+    Picture::Chart(Chart {
         title: format!("{name}: RMSE {:.1} mV", 1e3 * file.residual.rmse_v),
-        x_label: "h".into(),
-        y_label: "measured - model, mV".into(),
-        lines: vec![line],
-        ..Panel::default()
-    }
+        x: Axis::number("time, h"),
+        y: Axis::number("measured - model, mV"),
+        layers: vec![Layer::new("", Ink::Blue, Shape::Line(points))],
+        ..Chart::default()
+    })
 }

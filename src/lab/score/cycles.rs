@@ -9,11 +9,11 @@ use crate::quantity::Timestamp;
 
 /// A discharge of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Discharge {
+pub(in crate::lab) struct Discharge {
     /// When it began.
-    pub(super) start: Timestamp,
+    pub(in crate::lab) start: Timestamp,
     /// Published capacity, Ah; `None` = not stated.
-    pub(super) capacity_ah: Option<f64>,
+    pub(in crate::lab) capacity_ah: Option<f64>,
 }
 
 /// When each part of a measured file began, and what its discharges delivered.
@@ -21,7 +21,7 @@ pub(super) struct Discharge {
 pub struct CycleTable {
     starts: HashMap<String, Timestamp>,
     /// In order of time; discharge number n is the n-th, from 1.
-    pub(super) discharges: Vec<Discharge>,
+    pub(in crate::lab) discharges: Vec<Discharge>,
 }
 
 impl CycleTable {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::life::{DischargeScore, LifeScore};
 use super::soc::Sample;
 use super::{Case, STD_OF_95, Start};
-use crate::lab::plot::{self, Band, Colour, Line, Panel, PlotError};
+use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Shape};
 
 /// Draws the run and gives the file's path.
 pub(super) fn draw(
@@ -22,7 +22,8 @@ pub(super) fn draw(
     }
     panels.extend(life.into_iter().flat_map(|life| life_panels(&title, &life.each)));
     let path = folder.join(format!("{}_{}.svg", name.replace('/', "_"), describe(case, "_").replace([' ', '%'], "")));
-    plot::write(&path, &panels)?;
+    let pictures: Vec<Picture> = panels.into_iter().map(Picture::Chart).collect();
+    chart::write_stack(&path, &pictures, Format::Svg)?;
     Ok(path)
 }
 
@@ -39,80 +40,84 @@ pub(super) fn describe(case: &Case, separator: &str) -> String {
     words.join(separator)
 }
 
-fn line(label: &str, colour: Colour, points: impl Iterator<Item = (f64, f64)>) -> Line {
-    Line { label: label.to_owned(), colour, points: points.collect() }
+fn line(label: &str, ink: Ink, points: impl Iterator<Item = (f64, f64)>) -> Layer {
+    Layer::new(label, ink, Shape::Line(points.collect()))
 }
 
-fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Vec<Band> {
+fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
     // (x, middle, half of the interval)
     let points = points.map(|(x, middle, half)| (x, middle - half, middle + half)).collect();
-    vec![Band { label: "95 % interval".to_owned(), colour: Colour::SKY, points }]
+    Layer::new("95 % interval", Ink::Orange, Shape::Band(points))
 }
 
-fn soc_panel(title: &str, samples: &[Sample]) -> Panel {
+fn soc_panel(title: &str, samples: &[Sample]) -> Chart {
     let over = |value: fn(&Sample) -> f64| samples.iter().map(move |s| (s.time_s / 3600.0, value(s)));
-    Panel {
+    Chart {
         title: title.to_owned(),
-        x_label: "time since the start, h".to_owned(),
-        y_label: "SOC, %".to_owned(),
-        bands: band(samples.iter().map(|s| (s.time_s / 3600.0, 100.0 * s.soc, s.half_width_points()))),
-        lines: vec![
-            line("truth", Colour::BLACK, over(|s| 100.0 * s.truth)),
-            line("estimate", Colour::ORANGE, over(|s| 100.0 * s.soc)),
+        x: Axis::number("time since the start, h"),
+        y: Axis::number("SOC, %").within(-10.0, 110.0),
+        layers: vec![
+            band(samples.iter().map(|s| (s.time_s / 3600.0, 100.0 * s.soc, s.half_width_points()))),
+            line("truth", Ink::Plain, over(|s| 100.0 * s.truth)),
+            line("estimate", Ink::Orange, over(|s| 100.0 * s.soc)),
         ],
-        y_range: Some((-10.0, 110.0)),
+        ..Chart::default()
     }
 }
 
-fn error_panel(samples: &[Sample]) -> Panel {
+fn error_panel(samples: &[Sample]) -> Chart {
     // What came before settling would dwarf the rest: the axis follows the second half of the run.
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);
-    Panel {
-        title: String::new(),
-        x_label: "time since the start, h".to_owned(),
-        y_label: "SOC error, points".to_owned(),
-        bands: band(samples.iter().map(|s| (s.time_s / 3600.0, 0.0, inside(s.half_width_points())))),
-        lines: vec![line(
-            "estimate - truth",
-            Colour::ORANGE,
-            samples.iter().map(|s| (s.time_s / 3600.0, inside(s.error_points()))),
-        )],
-        y_range: Some((-reach, reach)),
+    Chart {
+        x: Axis::number("time since the start, h"),
+        y: Axis::number("SOC error, points").within(-reach, reach),
+        layers: vec![
+            band(samples.iter().map(|s| (s.time_s / 3600.0, 0.0, inside(s.half_width_points())))),
+            line(
+                "estimate - truth",
+                Ink::Orange,
+                samples.iter().map(|s| (s.time_s / 3600.0, inside(s.error_points()))),
+            ),
+        ],
+        ..Chart::default()
     }
 }
 
-fn life_panels(title: &str, each: &[DischargeScore]) -> [Panel; 3] {
+fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
     let number = |d: &DischargeScore| d.number as f64;
-    let panel = |title: &str, y_label: &str, bands, lines| Panel {
+    let panel = |title: &str, y_label: &str, layers| Chart {
         title: title.to_owned(),
-        x_label: "discharge".to_owned(),
-        y_label: y_label.to_owned(),
-        bands,
-        lines,
-        y_range: None,
+        x: Axis::number("discharge"),
+        y: Axis::number(y_label),
+        layers,
+        ..Chart::default()
     };
     let usable = panel(
         title,
         "usable capacity, Ah",
-        band(each.iter().map(|d| (number(d), d.usable_ah, STD_OF_95 * d.usable_std_ah))),
         vec![
-            line("published", Colour::BLACK, each.iter().filter_map(|d| Some((number(d), d.truth_ah?)))),
-            line("estimate", Colour::ORANGE, each.iter().map(|d| (number(d), d.usable_ah))),
+            band(each.iter().map(|d| (number(d), d.usable_ah, STD_OF_95 * d.usable_std_ah))),
+            line("published", Ink::Plain, each.iter().filter_map(|d| Some((number(d), d.truth_ah?)))),
+            line("estimate", Ink::Orange, each.iter().map(|d| (number(d), d.usable_ah))),
         ],
     );
     let capacity = panel(
         "",
         "capacity, Ah",
-        band(each.iter().map(|d| (number(d), d.capacity_ah, STD_OF_95 * d.capacity_std_ah))),
-        vec![line("estimate", Colour::BLUE, each.iter().map(|d| (number(d), d.capacity_ah)))],
+        vec![
+            band(each.iter().map(|d| (number(d), d.capacity_ah, STD_OF_95 * d.capacity_std_ah))),
+            line("estimate", Ink::Blue, each.iter().map(|d| (number(d), d.capacity_ah))),
+        ],
     );
     let resistance = panel(
         "",
         "resistance, times new",
-        band(each.iter().map(|d| (number(d), d.resistance_ratio, STD_OF_95 * d.resistance_ratio_std))),
-        vec![line("estimate", Colour::GREEN, each.iter().map(|d| (number(d), d.resistance_ratio)))],
+        vec![
+            band(each.iter().map(|d| (number(d), d.resistance_ratio, STD_OF_95 * d.resistance_ratio_std))),
+            line("estimate", Ink::Green, each.iter().map(|d| (number(d), d.resistance_ratio))),
+        ],
     );
     [usable, capacity, resistance]
 }

@@ -3,7 +3,7 @@
 use super::super::folder::{DATABASE, Folder};
 use super::super::reader::{Filter, Kind, Reader};
 use super::super::rows::Row;
-use super::super::rows::tests::{alarm, capacity, half_cycle};
+use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
 use super::super::verify;
 use super::*;
 use crate::alarm::Change;
@@ -166,8 +166,29 @@ fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
     // And now it is a newer one: for the present program not to touch.
     let before = std::fs::read(&path).unwrap();
     let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
-    assert_eq!(newer, OpenError::Newer { found: 2, known: 1 });
+    assert_eq!(newer, OpenError::Newer { found: 3, known: 2 });
     assert_eq!(std::fs::read(&path).unwrap(), before);
+}
+
+#[test]
+fn a_history_of_before_the_remaining_lives_is_read_as_it_is_and_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(DATABASE);
+    let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..1]).unwrap();
+    let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(Row::Event).collect();
+    old.commit(&[Batch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
+    drop(old);
+    let kinds = || -> Vec<Kind> {
+        let reader = Reader::open(folder.path()).unwrap();
+        assert_eq!(reader.verify().unwrap().broken, None);
+        reader.entries(&Filter::default()).unwrap().iter().map(|entry| entry.kind).collect()
+    };
+    assert_eq!(kinds(), [Kind::Capacity]);
+    let mut database = open(folder.path());
+    let batch = Batch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
+    database.commit(&[batch], None).unwrap();
+    drop(database);
+    assert_eq!(kinds(), [Kind::Capacity, Kind::Capacity, Kind::RemainingLife]);
 }
 
 #[test]
@@ -179,7 +200,7 @@ fn a_failed_migration_changes_nothing() {
         MIGRATIONS.iter().copied().chain(["CREATE TABLE added (id); INSERT INTO nowhere VALUES (1);"]).collect();
     Database::open_with(&path, &stamp(1.0), 1000, &migrations).unwrap_err();
     let database = open(folder.path());
-    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (1, 200));
+    assert_eq!((schema::version(database.connection()).unwrap(), database.counts().chained), (2, 200));
 }
 
 #[test]

@@ -1,0 +1,102 @@
+//! What the commands over many logs have in common: the logs, how they are read, progress.
+
+use std::path::{Path, PathBuf};
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+use super::Failure;
+use super::replay::{InputArgs, log_options};
+use crate::config::Config;
+use crate::io::log::LogSource;
+use crate::lab::fleet::{Opened, truth};
+
+/// The logs and how they are read.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Logs")]
+pub(crate) struct LogArgs {
+    /// Journals, candump logs or CSV files, also .gz or .zst; each is a life or a trip of its own
+    #[arg(required = true, value_name = "LOG")]
+    pub(crate) logs: Vec<PathBuf>,
+    #[command(flatten)]
+    input: InputArgs,
+    /// Threads (default: one per core)
+    #[arg(short, long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    jobs: Option<u16>,
+}
+
+impl LogArgs {
+    /// What one argument alone cannot tell.
+    pub(crate) fn check(&self) -> Result<(), Failure> {
+        for (index, log) in self.logs.iter().enumerate() {
+            if self.logs[..index].contains(log) {
+                return Err(Failure::new(format!("{}: named twice", log.display())));
+            }
+        }
+        if self.input.start_times.is_some() && self.logs.len() > 1 {
+            let found = self.logs.len();
+            return Err(Failure::new(format!(
+                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv beside each serves as well"
+            )));
+        }
+        if self.logs.len() > 1 && self.is_stdin() {
+            return Err(Failure::new("-: standard input must be the only log"));
+        }
+        Ok(())
+    }
+
+    /// Opens a log as it is read with a configuration.
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> Opened {
+        let mut options = log_options(&self.input, config);
+        let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
+        let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));
+        options.csv.start_times = options.csv.start_times.or(beside);
+        (LogSource::new([log.to_owned()], options), note)
+    }
+
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub(crate) fn sleep_gap_s(&self) -> f64 {
+        self.input.sleep_gap
+    }
+
+    /// Whether the log is standard input, which is read once only.
+    pub(crate) fn is_stdin(&self) -> bool {
+        self.logs.iter().any(|log| log == Path::new("-"))
+    }
+
+    /// Threads asked for.
+    pub(crate) fn threads(&self) -> Option<usize> {
+        self.jobs.map(usize::from)
+    }
+
+    /// Progress in bytes, each log read `times`.
+    pub(crate) fn bar(&self, times: usize) -> Bar {
+        let size = |path: &PathBuf| std::fs::metadata(path).map_or(0, |meta| meta.len());
+        let total = self.logs.iter().map(size).sum::<u64>() * times as u64;
+        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
+        let template = "{bar:32} {bytes}/{total_bytes} eta {eta}";
+        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Bar(bar)
+    }
+}
+
+/// Progress on standard error, when that is a terminal.
+#[derive(Debug)]
+pub(crate) struct Bar(ProgressBar);
+
+impl Bar {
+    /// More bytes were read.
+    pub(crate) fn advance(&self, bytes: u64) {
+        self.0.inc(bytes);
+    }
+
+    /// Takes the bar away.
+    pub(crate) fn clear(&self) {
+        self.0.finish_and_clear();
+    }
+}
+
+/// A number above 0.
+pub(crate) fn positive(text: &str) -> Result<f64, String> {
+    let value: f64 = text.trim().parse().map_err(|_| "must be a number".to_owned())?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above 0".to_owned()) }
+}

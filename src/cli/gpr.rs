@@ -1,0 +1,236 @@
+//! `packwatch gpr`: Gaussian process regression on CSV files: cross-validate, train, predict, forecast.
+
+mod args;
+mod forecast;
+mod report;
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use super::Failure;
+use crate::lab::gpr::{self, PartColumn, Table, Trained, Wanted};
+use crate::regress::{Kernel, score};
+use args::{FileArgs, ModelArgs, whole};
+
+/// Arguments of `gpr`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    /// Predict every row from a model that has not seen it, and tell how good that is
+    Cv(Box<CvArgs>),
+    /// Fit a model to all rows and save it
+    Train(Box<TrainArgs>),
+    /// Predict rows with a saved model
+    Predict(PredictArgs),
+    /// Predict rows to come from rows that were, without inputs of the future
+    Forecast(Box<forecast::ForecastArgs>),
+}
+
+/// Arguments of `gpr cv`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = args::GRAMMAR)]
+struct CvArgs {
+    #[command(flatten)]
+    files: FileArgs,
+    #[command(flatten)]
+    columns: ColumnArgs,
+    /// Covariance functions, a comma between them; each is an experiment of its own
+    #[arg(
+        long,
+        value_name = "KERNEL,..",
+        value_delimiter = ',',
+        default_value = "exponential,squared_exponential,matern52,rational_quadratic"
+    )]
+    kernel: Vec<Kernel>,
+    /// Parts the rows are cut into at random; each is predicted from the others
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<2, 1000>)]
+    folds: usize,
+    #[command(flatten)]
+    model: ModelArgs,
+    /// Write the prediction of every row
+    #[arg(long, value_name = "FILE.csv")]
+    predictions: Option<PathBuf>,
+    /// Draw predicted against measured, a stretch with its interval, and errors, as SVG and PNG, into this folder
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+/// Arguments of `gpr train`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = args::GRAMMAR)]
+struct TrainArgs {
+    #[command(flatten)]
+    files: FileArgs,
+    #[command(flatten)]
+    columns: ColumnArgs,
+    /// Covariance function
+    #[arg(long, value_name = "KERNEL", default_value = "exponential")]
+    kernel: Kernel,
+    #[command(flatten)]
+    model: ModelArgs,
+    /// Model to write; it holds the rows it learned from
+    #[arg(short, long, value_name = "MODEL.json")]
+    out: PathBuf,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+/// Arguments of `gpr predict`.
+#[derive(Debug, clap::Args)]
+struct PredictArgs {
+    /// Model as `gpr train` wrote it
+    #[arg(value_name = "MODEL.json")]
+    model: PathBuf,
+    #[command(flatten)]
+    files: FileArgs,
+    /// Where to: CSV with file, line, inputs, the output where it is known, its mean, standard deviation and the ends of its
+    /// 95 % interval; - is standard output (what is told then goes to standard error)
+    #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
+    out: PathBuf,
+    /// Threads [default: one per core]
+    #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]
+    threads: Option<usize>,
+    /// Print one JSON document of the errors
+    #[arg(long)]
+    json: bool,
+}
+
+/// What is predicted, and from what.
+#[derive(Debug, clap::Args)]
+struct ColumnArgs {
+    /// Column that is predicted, by its name, or without its unit: voltage finds voltage_v
+    #[arg(long, value_name = "COLUMN")]
+    output: String,
+    /// Columns it is predicted from
+    #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
+    inputs: Vec<String>,
+}
+
+impl ColumnArgs {
+    /// Inputs, then the output.
+    fn table(&self, files: &FileArgs) -> Result<Table, Failure> {
+        let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
+        let wanted = Wanted { columns: &columns, optional: &[], missing: files.missing() };
+        read(&files.files, &wanted, &PartColumn::None)
+    }
+}
+
+/// Reads files; a column named twice would be known exactly, so it is refused.
+fn read(files: &[PathBuf], wanted: &Wanted<'_>, part: &PartColumn) -> Result<Table, Failure> {
+    let table = Table::read(files, wanted, part).map_err(failure)?;
+    let names = &table.names[..wanted.columns.len()];
+    if let Some((_, twice)) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
+        return Err(Failure::new(format!("column {twice} is asked for twice, must be an input or an output, once")));
+    }
+    Ok(table)
+}
+
+fn failure(error: impl std::fmt::Display) -> Failure {
+    Failure::new(error.to_string())
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    match &args.what {
+        What::Cv(args) => cv(args),
+        What::Train(args) => train(args),
+        What::Predict(args) => predict(args),
+        What::Forecast(args) => forecast::run(args),
+    }
+}
+
+fn make_folder(folder: Option<&Path>) -> Result<(), Failure> {
+    let made = folder.map_or(Ok(()), std::fs::create_dir_all);
+    made.map_err(|error| {
+        Failure::new(format!("{}: cannot be made: {error}", folder.unwrap_or(Path::new("")).display()))
+    })
+}
+
+/// The reader of our output may have seen enough: no failure.
+fn quiet(written: io::Result<()>) -> Result<(), Failure> {
+    match written {
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
+    }
+}
+
+fn cv(args: &CvArgs) -> Result<(), Failure> {
+    let begin = Instant::now();
+    make_folder(args.plots.as_deref())?;
+    let table = args.columns.table(&args.files)?;
+    let bar = report::Bar::new(args.kernel.len() * args.folds);
+    let mut all = Vec::new();
+    for (k, kernel) in args.kernel.iter().enumerate() {
+        let settings = args.model.settings(kernel, table.len());
+        let mut watcher = |progress| bar.show(&kernel.to_string(), k * args.folds, progress);
+        all.push(gpr::cross_validate(&table, &settings, args.folds, &mut watcher).map_err(failure)?);
+    }
+    bar.clear();
+    if let Some(path) = &args.predictions {
+        gpr::write_validated(path, &table, &all).map_err(failure)?;
+    }
+    if let Some(folder) = &args.plots {
+        gpr::write_cross_validation(folder, &table, &all).map_err(failure)?;
+    }
+    let settings = args.model.settings(&args.kernel[0], table.len());
+    let shown = report::Cv {
+        table: &table,
+        settings: &settings,
+        folds: args.folds,
+        all: &all,
+        default_form: args.model.by_rows(),
+    };
+    let seconds = begin.elapsed().as_secs_f64();
+    quiet(if args.json { shown.json(seconds) } else { shown.table(seconds) })
+}
+
+fn train(args: &TrainArgs) -> Result<(), Failure> {
+    let begin = Instant::now();
+    let table = args.columns.table(&args.files)?;
+    let settings = args.model.settings(&args.kernel, table.len());
+    let bar = report::Bar::new(1);
+    let mut watcher = |progress| bar.show(&args.kernel.to_string(), 0, progress);
+    let trained = Trained::fit(&table, &settings, &mut watcher).map_err(failure)?;
+    bar.clear();
+    let seconds = begin.elapsed().as_secs_f64();
+    trained.save(&args.out).map_err(failure)?;
+    let shown = report::Train { trained: &trained, table: &table, seconds, default_form: args.model.by_rows() };
+    quiet(if args.json { shown.json() } else { shown.table(&args.out) })
+}
+
+fn predict(args: &PredictArgs) -> Result<(), Failure> {
+    let to_stdout = args.out == Path::new("-");
+    if args.json && to_stdout {
+        return Err(Failure::new("--json: needs --out FILE.csv, for both would be written to standard output"));
+    }
+    let trained = Trained::load(&args.model, args::threads(args.threads)).map_err(failure)?;
+    let output = [trained.output.clone()];
+    let wanted = Wanted { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
+    let table = Table::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
+    let predictions = trained.predict(&table).map_err(failure)?;
+    match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
+        // The reader of our output has seen enough: no failure.
+        Err(error) if to_stdout && error.0.contains("Broken pipe") => return Ok(()),
+        written => written.map_err(failure)?,
+    }
+    let known = |row: &usize| !table.row(*row)[trained.inputs.len()].is_nan();
+    let rows: Vec<usize> = (0..table.len()).filter(known).collect();
+    let truth: Vec<f64> = rows.iter().map(|row| table.row(*row)[trained.inputs.len()]).collect();
+    let judged: Vec<_> = rows.iter().map(|row| predictions[*row]).collect();
+    let score = (!rows.is_empty()).then(|| score(&judged, &truth));
+    let shown = report::Predict { trained: &trained, table: &table, known: rows.len(), score };
+    if args.json {
+        return quiet(shown.json());
+    }
+    quiet(shown.text(to_stdout))
+}

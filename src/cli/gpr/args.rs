@@ -1,0 +1,130 @@
+//! What the subcommands of `gpr` have in common: files, kernel grammar, form of the model.
+
+use std::path::PathBuf;
+
+use crate::lab::gpr::Missing;
+use crate::regress::{Basis, Form, Kernel, MAX_INDUCING, MAX_NEIGHBOURS, Settings};
+
+/// Below the options.
+pub(super) const GRAMMAR: &str = "\
+KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_quadratic (a dash does for a low line), or sums and \
+products of them with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". A straight line in the \
+inputs is no kernel but a basis: --basis linear.\n\n\
+Columns are found by their name, or by their name without its unit. Length scales are in standard deviations of the inputs. The \
+95 % interval is as wide as training rows say that were predicted without themselves.";
+
+/// Files with rows.
+#[derive(Debug, clap::Args)]
+pub(super) struct FileArgs {
+    /// CSV files (.gz, .zst) with a heading; their rows follow one another
+    #[arg(required = true, value_name = "FILE.csv")]
+    pub(super) files: Vec<PathBuf>,
+    /// Leave rows out that lack a value (empty or NaN), and tell how many [default: refuse, with file and line]
+    #[arg(long)]
+    skip_missing: bool,
+}
+
+impl FileArgs {
+    pub(super) fn missing(&self) -> Missing {
+        if self.skip_missing { Missing::Skipped } else { Missing::Refused }
+    }
+}
+
+/// Form of the model, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum FormName {
+    /// All rows with all: up to some thousands
+    Exact,
+    /// Every row with its nearest (Vecchia): any number of rows
+    Nearest,
+    /// Through inducing points (FITC): smooth functions
+    Inducing,
+}
+
+/// Mean function, on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum BasisName {
+    /// 0
+    Zero,
+    /// One constant
+    Constant,
+    /// A constant and a slope for every input
+    Linear,
+}
+
+impl From<BasisName> for Basis {
+    fn from(name: BasisName) -> Self {
+        match name {
+            BasisName::Zero => Self::Zero,
+            BasisName::Constant => Self::Constant,
+            BasisName::Linear => Self::Linear,
+        }
+    }
+}
+
+/// How a model is made.
+#[derive(Debug, clap::Args)]
+pub(super) struct ModelArgs {
+    /// Mean function
+    #[arg(long, value_enum, default_value = "constant")]
+    basis: BasisName,
+    /// A length scale for every input instead of one for all
+    #[arg(long)]
+    ard: bool,
+    /// How the covariance of many rows is dealt with [default: exact up to 2000 rows, else nearest]
+    #[arg(long, value_enum)]
+    form: Option<FormName>,
+    /// Neighbours of a row in the form nearest
+    #[arg(long, value_name = "N", default_value_t = 40, value_parser = whole::<1, MAX_NEIGHBOURS>)]
+    neighbours: usize,
+    /// Inducing points in the form inducing
+    #[arg(long, value_name = "N", default_value_t = 500, value_parser = whole::<1, MAX_INDUCING>)]
+    points: usize,
+    /// Further searches for hyperparameters, from random starts
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = whole::<0, 100>)]
+    restarts: usize,
+    /// Most steps of a search
+    #[arg(long, value_name = "N", default_value_t = 60, value_parser = whole::<1, 10_000>)]
+    max_iterations: usize,
+    /// Seed of folds, starts, orders and inducing points
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    pub(super) seed: u64,
+    /// Threads [default: one per core]
+    #[arg(long, value_name = "N", value_parser = whole::<1, 1024>)]
+    threads: Option<usize>,
+}
+
+impl ModelArgs {
+    /// For so many rows.
+    pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> Settings {
+        let mut settings = Settings::new(kernel.clone(), rows);
+        settings.form = match self.form {
+            Some(FormName::Exact) => Form::Exact,
+            Some(FormName::Nearest) => Form::Nearest { neighbours: self.neighbours },
+            Some(FormName::Inducing) => Form::Inducing { points: self.points },
+            None if settings.form == Form::Exact => Form::Exact,
+            None => Form::Nearest { neighbours: self.neighbours },
+        };
+        settings.basis = self.basis.into();
+        (settings.ard, settings.restarts, settings.seed) = (self.ard, self.restarts, self.seed);
+        settings.max_iterations = self.max_iterations;
+        settings.threads = threads(self.threads);
+        settings
+    }
+
+    /// Whether the form follows from the number of rows.
+    pub(super) fn by_rows(&self) -> bool {
+        self.form.is_none()
+    }
+}
+
+/// Threads asked for, or one per core.
+pub(super) fn threads(asked: Option<usize>) -> usize {
+    asked.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
+}
+
+/// A whole number in a range.
+pub(super) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<usize, String> {
+    let number = text.trim().parse::<usize>().ok().filter(|number| (LOW..=HIGH).contains(number));
+    number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
+}

@@ -1,0 +1,238 @@
+//! `packwatch gpr forecast`: rows to come from rows that were.
+
+use std::io::{self, Write};
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use serde_json::{Value, json};
+
+use super::super::Failure;
+use super::super::score::write_table;
+use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
+use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
+use super::{PartColumn, Table, Wanted, failure, make_folder, quiet, read};
+use crate::lab::gpr::forecast::{self, Forecast, Horizon, MAX_LAGS, MAX_STEPS, OutputForecast, Plan, Steps, horizons};
+use crate::lab::gpr::{self, peak_kib};
+use crate::regress::Kernel;
+
+/// Arguments of `gpr forecast`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = GRAMMAR)]
+pub(super) struct ForecastArgs {
+    #[command(flatten)]
+    files: FileArgs,
+    /// Columns that are forecast
+    #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
+    outputs: Vec<String>,
+    /// Further columns whose past is looked at; their future is not needed
+    #[arg(long, value_name = "COLUMN,..", value_delimiter = ',')]
+    inputs: Vec<String>,
+    /// Values of each column that a forecast looks at: the one at the origin and those before it
+    #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<1, MAX_LAGS>)]
+    lags: usize,
+    /// Rows ahead: forecasts of 1 to N rows, of more than 10 for 10 of them, spread evenly in ratio
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = whole::<1, MAX_STEPS>)]
+    steps: usize,
+    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast what nobody knows
+    #[arg(long, value_name = "PERCENT", default_value_t = 70.0, value_parser = percent)]
+    origin: f64,
+    /// Take every N-th row only (of each part)
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole::<1, 1_000_000>)]
+    every: usize,
+    /// Column at whose values rows do not belong together any more; none = there is no such column [default: cycle, segment
+    /// or ref where there is one]
+    #[arg(long, value_name = "COLUMN")]
+    part: Option<String>,
+    /// Covariance function
+    #[arg(long, value_name = "KERNEL", default_value = "exponential")]
+    kernel: Kernel,
+    /// Most past moments each forecast learns from, taken evenly from all there are
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = whole::<20, 20_000>)]
+    rows: usize,
+    #[command(flatten)]
+    model: ModelArgs,
+    /// Write every forecast made
+    #[arg(long, value_name = "FILE.csv")]
+    predictions: Option<PathBuf>,
+    /// Draw the fan at the origin, error and coverage over the rows ahead, as SVG and PNG, into this folder
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+fn percent(text: &str) -> Result<f64, String> {
+    let number = text.trim().trim_end_matches('%').trim().parse::<f64>().ok().filter(|p| *p > 0.0 && *p <= 100.0);
+    number.ok_or_else(|| "must be per cent above 0, at most 100".to_owned())
+}
+
+/// What was asked and what came of it.
+struct Shown<'a> {
+    table: &'a Table,
+    plan: &'a Plan,
+    forecast: &'a Forecast,
+    steps: Option<Steps>,
+    seconds: f64,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
+    let begin = Instant::now();
+    make_folder(args.plots.as_deref())?;
+    let table = args.table()?;
+    let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
+    let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);
+    let plan = Plan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
+    let bar = Bar::new(outputs * horizons(args.steps).len());
+    let mut done = |fits, _| bar.done(fits, "forecasts");
+    let made = forecast::run(&table, &plan, &mut |_| ControlFlow::Continue(()), &mut done);
+    bar.clear();
+    let made = made.map_err(failure)?;
+    if let Some(path) = &args.predictions {
+        forecast::write(path, &table, &made).map_err(failure)?;
+    }
+    if let Some(folder) = &args.plots {
+        gpr::write_forecast(folder, &table, &made).map_err(failure)?;
+    }
+    let steps = if table.has[0] { Steps::of(&table, table.width() - 1) } else { None };
+    let seconds = begin.elapsed().as_secs_f64();
+    let shown = Shown { table: &table, plan: &plan, forecast: &made, steps, seconds };
+    quiet(if args.json { shown.json() } else { shown.table() })
+}
+
+impl ForecastArgs {
+    /// Outputs, inputs, and the time where there is one.
+    fn table(&self) -> Result<Table, Failure> {
+        let columns: Vec<String> = self.outputs.iter().chain(&self.inputs).cloned().collect();
+        let time = ["time".to_owned()];
+        let wanted = Wanted { columns: &columns, optional: &time, missing: self.files.missing() };
+        let part = match self.part.as_deref() {
+            None => PartColumn::Usual,
+            Some("none") => PartColumn::None,
+            Some(name) => PartColumn::Named(name.to_owned()),
+        };
+        Ok(read(&self.files.files, &wanted, &part)?.every(self.every))
+    }
+}
+
+impl Shown<'_> {
+    fn table(&self) -> io::Result<()> {
+        let mut out = io::stdout().lock();
+        self.head(&mut out)?;
+        for output in &self.forecast.outputs {
+            writeln!(out, "\n{}", output.name)?;
+            let judged = output.horizons.iter().any(|horizon| horizon.score.is_some());
+            if judged {
+                judged_table(&mut out, output)?
+            } else {
+                future_table(&mut out, output)?
+            }
+            for horizon in output.horizons.iter().filter(|h| h.jitter.matrices > 0) {
+                let (steps, largest) = (horizon.steps, horizon.jitter.largest);
+                writeln!(out, "{steps} ahead: jitter, at most {largest:e} of the signal variance")?;
+            }
+        }
+        writeln!(out, "\n{:.1} s in all, peak {} MiB", self.seconds, mebibytes(peak_kib()))
+    }
+
+    fn head(&self, out: &mut impl Write) -> io::Result<()> {
+        let (table, plan, forecast) = (self.table, self.plan, self.forecast);
+        let columns = table.names[..table.width() - table.has.len()].join(", ");
+        writeln!(out, "{} rows in {} parts; {} lags of {columns}", table.len(), table.parts.len(), plan.lags)?;
+        let (kernel, basis) = (&plan.settings.kernel, format!("{:?}", plan.settings.basis).to_lowercase());
+        writeln!(out, "{kernel}, {basis} basis, form {}, a process for every horizon", form(plan.settings.form))?;
+        writeln!(out, "origin: {} rows are known; forecast from {}", forecast.origin, table.place(forecast.from))?;
+        skipped(out, table)?;
+        match self.steps {
+            Some(steps) if steps.even() => writeln!(out, "a row ahead is {} of {}", short(steps.median), self.time()),
+            Some(steps) => {
+                let (median, low, high) = (short(steps.median), short(steps.range.0), short(steps.range.1));
+                writeln!(
+                    out,
+                    "note: rows are not evenly apart: {} moves by {median} (5 to 95 %: {low} to {high}); a step is a row",
+                    self.time()
+                )
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn time(&self) -> &str {
+        self.table.names.last().map_or("", String::as_str)
+    }
+
+    fn json(&self) -> io::Result<()> {
+        let (table, plan, forecast) = (self.table, self.plan, self.forecast);
+        let output = |output: &OutputForecast| json!({ "name": output.name, "horizons": output.horizons.iter().map(horizon_json).collect::<Vec<_>>() });
+        let steps =
+            self.steps.map(|s| json!({ "median": s.median, "p5": s.range.0, "p95": s.range.1, "even": s.even() }));
+        write_json(&json!({
+            "version": VERSION, "rows": table.len(), "parts": table.parts.len(), "skipped": table.skipped,
+            "columns": table.names[..table.width() - table.has.len()], "lags": plan.lags, "steps": plan.steps,
+            "kernel": plan.settings.kernel.to_string(), "form": form(plan.settings.form), "seed": plan.settings.seed,
+            "origin_rows": forecast.origin, "from": table.place(forecast.from), "time_step": steps,
+            "outputs": forecast.outputs.iter().map(output).collect::<Vec<_>>(), "seconds": self.seconds,
+            "peak_memory_kib": peak_kib(),
+        }))
+    }
+}
+
+/// Errors of forecasts made after the origin.
+fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
+    let heads =
+        ["ahead", "forecasts", "RMSE", "stays as it is", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];
+    let line = |horizon: &Horizon| {
+        let cells = horizon.score.zip(horizon.persistence_rmse).map(|(s, persistence)| {
+            [
+                short(s.rmse),
+                short(persistence),
+                format!("{:.2}", s.rmse / persistence),
+                short(s.mean_absolute_error),
+                format!("{:.1} %", 100.0 * s.coverage_95),
+                short(s.mean_width_95),
+            ]
+        });
+        let own = [horizon.steps.to_string(), horizon.held_out.len().to_string()];
+        own.into_iter()
+            .chain(cells.unwrap_or_else(|| ["-"; 6].map(str::to_owned)))
+            .chain([horizon.trained.to_string()])
+            .collect()
+    };
+    let rows: Vec<Vec<String>> =
+        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
+    write_table(out, &rows, 0)
+}
+
+/// Forecasts of what nobody knows.
+fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
+    let heads = ["ahead", "mean", "std", "low 95 %", "high 95 %", "trained on"];
+    let line = |horizon: &Horizon| {
+        let p = &horizon.at_origin;
+        let numbers = [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(short);
+        let own = [horizon.steps.to_string()];
+        own.into_iter().chain(numbers).chain([horizon.trained.to_string()]).collect()
+    };
+    let rows: Vec<Vec<String>> =
+        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
+    write_table(out, &rows, 0)
+}
+
+fn horizon_json(horizon: &Horizon) -> Value {
+    let p = &horizon.at_origin;
+    let score = horizon.score.map(|s| {
+        json!({
+            "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
+            "mean_width_95": s.mean_width_95, "persistence_rmse": horizon.persistence_rmse,
+        })
+    });
+    json!({
+        "steps": horizon.steps, "trained": horizon.trained, "calibrated": horizon.calibrated,
+        "interval_factor": horizon.factor, "seconds": horizon.fit_s, "jitter": jitter_json(horizon.jitter),
+        "at_origin": {
+            "mean": p.mean, "std": p.measurement_variance.sqrt(), "low_95": p.low_95, "high_95": p.high_95,
+        },
+        "forecasts": horizon.held_out.len(), "score": score,
+    })
+}

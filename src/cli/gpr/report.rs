@@ -1,0 +1,296 @@
+//! What `gpr` shows: progress, tables, JSON.
+
+use std::io::{self, Write};
+use std::ops::ControlFlow;
+use std::path::Path;
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use serde_json::{Map, Value, json};
+
+use super::super::score::write_table;
+use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
+use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
+
+/// Version of the JSON documents.
+pub(super) const VERSION: u32 = 1;
+/// Parts of a fold in the progress bar.
+const TICKS: usize = 100;
+
+/// Progress on standard error, when that is a terminal.
+pub(super) struct Bar(ProgressBar);
+
+impl Bar {
+    /// Of so many fits.
+    pub(super) fn new(fits: usize) -> Self {
+        let bar = ProgressBar::with_draw_target(Some((fits * TICKS) as u64), ProgressDrawTarget::stderr_with_hz(5));
+        let template = "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}";
+        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Self(bar)
+    }
+
+    /// A step of a search; `before` fits are done beside those of this cross-validation.
+    pub(super) fn show(&self, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
+        let part = (p.search - 1) * p.max_iterations + p.iteration;
+        let whole = (p.searches * p.max_iterations).max(1);
+        let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
+        self.0.set_position(done as u64);
+        self.0.set_message(format!("{what}, fold {} of {}, step {}", p.fold, p.folds, p.iteration));
+        ControlFlow::Continue(())
+    }
+
+    /// So many fits are done.
+    pub(super) fn done(&self, fits: usize, what: &str) {
+        self.0.set_position((fits * TICKS) as u64);
+        self.0.set_message(what.to_owned());
+    }
+
+    /// Takes the bar away.
+    pub(super) fn clear(&self) {
+        self.0.finish_and_clear();
+    }
+}
+
+/// A form in words.
+pub(super) fn form(form: Form) -> String {
+    match form {
+        Form::Exact => "exact".to_owned(),
+        Form::Nearest { neighbours } => format!("nearest, {neighbours} neighbours"),
+        Form::Inducing { points } => format!("inducing, {points} points"),
+    }
+}
+
+fn form_note(of: Form, default_form: bool) -> String {
+    let why = if default_form { " (chosen by the number of rows; --form says otherwise)" } else { "" };
+    format!("form {}{why}", form(of))
+}
+
+fn basis(settings: &Settings) -> String {
+    format!("{:?}", settings.basis).to_lowercase()
+}
+
+pub(super) fn mebibytes(kib: Option<u64>) -> String {
+    kib.map_or_else(|| "-".to_owned(), |kib| format!("{:.0}", kib as f64 / 1024.0))
+}
+
+pub(super) fn jitter_json(jitter: Jitter) -> Value {
+    json!({ "matrices": jitter.matrices, "largest": jitter.largest })
+}
+
+pub(super) fn skipped(out: &mut impl Write, table: &Table) -> io::Result<()> {
+    if table.skipped > 0 {
+        writeln!(out, "{} rows left out: a value is missing", table.skipped)?;
+    }
+    Ok(())
+}
+
+fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
+    all.iter().map(|h| (h.name.clone(), json!(h.value))).collect()
+}
+
+/// Writes one JSON document.
+pub(super) fn write_json(document: &Value) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    serde_json::to_writer_pretty(&mut out, document)?;
+    writeln!(out)
+}
+
+/// A number with four digits that matter.
+pub(super) fn short(value: f64) -> String {
+    let digits = (3.0 - value.abs().max(1e-12).log10().floor()).clamp(0.0, 9.0) as usize;
+    format!("{value:.digits$}")
+}
+
+/// A cross-validation.
+pub(super) struct Cv<'a> {
+    pub(super) table: &'a Table,
+    pub(super) settings: &'a Settings,
+    pub(super) folds: usize,
+    pub(super) all: &'a [Validated],
+    pub(super) default_form: bool,
+}
+
+/// Sum over the folds.
+fn total(validated: &Validated, of: impl Fn(&Fold) -> f64) -> f64 {
+    validated.folds.folds.iter().map(of).sum()
+}
+
+/// Matrices with jitter, and the most of it, over the folds.
+fn jitter(validated: &Validated) -> Jitter {
+    validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
+        matrices: all.matrices + fold.jitter.matrices,
+        largest: all.largest.max(fold.jitter.largest),
+    })
+}
+
+impl Cv<'_> {
+    fn inputs(&self) -> &[String] {
+        &self.table.names[..self.table.width() - 1]
+    }
+
+    fn output(&self) -> &str {
+        &self.table.names[self.table.width() - 1]
+    }
+
+    /// For people.
+    pub(super) fn table(&self, seconds: f64) -> io::Result<()> {
+        let mut out = io::stdout().lock();
+        let (rows, inputs, output) = (self.table.len(), self.inputs().join(", "), self.output());
+        writeln!(out, "{output} from {inputs}: {rows} rows, {} folds, seed {}", self.folds, self.settings.seed)?;
+        let (form, basis, threads) =
+            (form_note(self.settings.form, self.default_form), basis(self.settings), self.settings.threads);
+        writeln!(out, "{form}; {basis} basis; {threads} threads")?;
+        skipped(&mut out, self.table)?;
+        writeln!(
+            out,
+            "errors in the unit of {output}; inside: held-out rows inside the 95 % interval, width: its mean\n"
+        )?;
+        let heads =
+            ["kernel", "RMSE", "mean abs.", "inside", "width", "training s", "predicting s", "peak MiB", "rows"];
+        let line = |validated: &Validated| {
+            let s = &validated.score;
+            vec![
+                validated.kernel.clone(),
+                short(s.rmse),
+                short(s.mean_absolute_error),
+                format!("{:.2} %", 100.0 * s.coverage_95),
+                short(s.mean_width_95),
+                format!("{:.1}", total(validated, |fold| fold.fit_s)),
+                format!("{:.1}", total(validated, |fold| fold.predict_s)),
+                mebibytes(validated.peak_kib),
+                validated.folds.predictions.len().to_string(),
+            ]
+        };
+        let rows: Vec<Vec<String>> =
+            std::iter::once(heads.map(str::to_owned).to_vec()).chain(self.all.iter().map(line)).collect();
+        write_table(&mut out, &rows, 1)?;
+        for validated in self.all {
+            let jitter = jitter(validated);
+            if jitter.matrices > 0 {
+                let (kernel, count, most) = (&validated.kernel, jitter.matrices, jitter.largest);
+                writeln!(out, "{kernel}: jitter on {count} matrices, at most {most:e} of the signal variance")?;
+            }
+        }
+        writeln!(out, "\n{seconds:.1} s in all")
+    }
+
+    /// For programs.
+    pub(super) fn json(&self, seconds: f64) -> io::Result<()> {
+        let fold = |fold: &Fold| {
+            json!({
+                "held_out": fold.held_out, "training_s": fold.fit_s, "prediction_s": fold.predict_s,
+                "log_marginal_likelihood": fold.log_marginal_likelihood,
+                "interval_factor": fold.interval_factor, "hyperparameters": hyperparameters(&fold.hyperparameters),
+            })
+        };
+        let kernel = |validated: &Validated| {
+            let s = &validated.score;
+            json!({
+                "kernel": validated.kernel, "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error,
+                "coverage_95": s.coverage_95, "gaussian_coverage_95": s.gaussian_coverage_95,
+                "mean_width_95": s.mean_width_95, "training_s": total(validated, |fold| fold.fit_s),
+                "prediction_s": total(validated, |fold| fold.predict_s), "seconds": validated.seconds,
+                "peak_memory_kib": validated.peak_kib, "jitter": jitter_json(jitter(validated)),
+                "folds": validated.folds.folds.iter().map(fold).collect::<Vec<_>>(),
+            })
+        };
+        write_json(&json!({
+            "version": VERSION, "output": self.output(), "inputs": self.inputs(), "rows": self.table.len(),
+            "skipped": self.table.skipped, "folds": self.folds, "seed": self.settings.seed,
+            "form": form(self.settings.form), "basis": basis(self.settings), "threads": self.settings.threads,
+            "seconds": seconds, "kernels": self.all.iter().map(kernel).collect::<Vec<_>>(),
+        }))
+    }
+}
+
+/// A model that was trained.
+pub(super) struct Train<'a> {
+    pub(super) trained: &'a Trained,
+    pub(super) table: &'a Table,
+    pub(super) seconds: f64,
+    pub(super) default_form: bool,
+}
+
+impl Train<'_> {
+    /// For people.
+    pub(super) fn table(&self, path: &Path) -> io::Result<()> {
+        let mut out = io::stdout().lock();
+        let (trained, model) = (self.trained, &self.trained.model);
+        writeln!(out, "{} from {}: {} rows", trained.output, trained.inputs.join(", "), model.rows())?;
+        writeln!(out, "{}; {:?} basis", form_note(model.form(), self.default_form), model.basis())?;
+        skipped(&mut out, self.table)?;
+        for h in model.hyperparameters() {
+            writeln!(out, "  {:<40} {}", h.name, short(h.value))?;
+        }
+        if model.jitter().matrices > 0 {
+            let jitter = model.jitter();
+            writeln!(
+                out,
+                "jitter on {} matrices, at most {:e} of the signal variance",
+                jitter.matrices, jitter.largest
+            )?;
+        }
+        let (steps, likelihood) = (model.iterations(), model.log_marginal_likelihood());
+        let peak = mebibytes(peak_kib());
+        writeln!(
+            out,
+            "log marginal likelihood {likelihood:.1} after {steps} steps, {:.1} s, peak {peak} MiB",
+            self.seconds
+        )?;
+        writeln!(out, "written to {}", path.display())
+    }
+
+    /// For programs.
+    pub(super) fn json(&self) -> io::Result<()> {
+        let (trained, model) = (self.trained, &self.trained.model);
+        write_json(&json!({
+            "version": VERSION, "output": trained.output, "inputs": trained.inputs, "rows": model.rows(),
+            "skipped": self.table.skipped, "kernel": model.kernel().to_string(), "form": form(model.form()),
+            "basis": format!("{:?}", model.basis()).to_lowercase(),
+            "hyperparameters": hyperparameters(&model.hyperparameters()),
+            "log_marginal_likelihood": model.log_marginal_likelihood(), "steps": model.iterations(),
+            "interval_factor": model.interval_factor(), "jitter": jitter_json(model.jitter()),
+            "seconds": self.seconds, "peak_memory_kib": peak_kib(),
+        }))
+    }
+}
+
+/// Predictions of a saved model.
+pub(super) struct Predict<'a> {
+    pub(super) trained: &'a Trained,
+    pub(super) table: &'a Table,
+    pub(super) known: usize,
+    pub(super) score: Option<Score>,
+}
+
+impl Predict<'_> {
+    /// For people, beside the rows or instead of them.
+    pub(super) fn text(&self, to_stderr: bool) -> io::Result<()> {
+        let mut text = Vec::new();
+        let (rows, output) = (self.table.len(), &self.trained.output);
+        writeln!(text, "{rows} rows of {output} predicted, {} of them known", self.known)?;
+        skipped(&mut text, self.table)?;
+        if let Some(s) = &self.score {
+            let (rmse, mean, inside, width) =
+                (short(s.rmse), short(s.mean_absolute_error), 100.0 * s.coverage_95, short(s.mean_width_95));
+            writeln!(
+                text,
+                "RMSE {rmse}, mean absolute error {mean}, {inside:.2} % inside the 95 % interval, its mean width {width}"
+            )?;
+        }
+        if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
+    }
+
+    /// For programs.
+    pub(super) fn json(&self) -> io::Result<()> {
+        let score = self.score.map(|s| {
+            json!({
+                "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
+                "mean_width_95": s.mean_width_95,
+            })
+        });
+        write_json(&json!({
+            "version": VERSION, "output": self.trained.output, "rows": self.table.len(), "known": self.known,
+            "skipped": self.table.skipped, "score": score,
+        }))
+    }
+}

@@ -1,0 +1,166 @@
+//! `packwatch report`: a page that shows how a battery is and was, from a store's history or from a replay.
+
+use std::cell::RefCell;
+use std::fs;
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use super::Failure;
+use super::replay::{Bar, InputArgs, log_options};
+use crate::config::{self, Config};
+use crate::daemon::replay::{self, Settings, Sinks, Summary, Watch};
+use crate::daemon::store::Reader;
+use crate::io::log::LogSource;
+use crate::io::result_file::ResultFile;
+use crate::lab::report::{self, Data, Origin, Setting};
+use crate::monitor::Monitor;
+
+/// Arguments of `report`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Configuration; with --state it gives limits and rated capacity, and may be left out
+    #[arg(short, long, value_name = "FILE", required_unless_present = "state")]
+    config: Option<PathBuf>,
+    /// Journals, candump logs or CSV files to replay, also .gz or .zst, read one after another; - is standard input
+    #[arg(value_name = "LOG", required_unless_present = "state", conflicts_with = "state")]
+    logs: Vec<PathBuf>,
+    /// Folder of state and history to report on instead, also one that a daemon is using
+    #[arg(long, value_name = "DIR")]
+    state: Option<PathBuf>,
+    /// Page to write; - is standard output
+    #[arg(short, long, value_name = "FILE.html", default_value = "report.html")]
+    out: PathBuf,
+    /// Write every picture as SVG and PNG into this folder as well
+    #[arg(long, value_name = "DIR")]
+    plots: Option<PathBuf>,
+    /// Truth to show beside the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
+    /// or both, and time_s (s), start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data; with a column
+    /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
+    #[arg(long, value_name = "TABLE.csv")]
+    reference: Option<PathBuf>,
+    /// Title of the page [default: the name of the log or folder]
+    #[arg(long)]
+    title: Option<String>,
+    #[command(flatten)]
+    input: InputArgs,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    args.check()?;
+    let config = args.config.as_deref().map(config::load).transpose()?;
+    let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
+    let reference = args.reference.as_deref().map(report::read_reference).transpose().map_err(Failure::new)?;
+    let (data, provenance) = match (&args.state, &config) {
+        (Some(folder), _) => of_store(folder)?,
+        (None, Some(config)) => of_replay(args, config)?,
+        (None, None) => return Err(Failure::new("neither --state nor -c with logs, one must be given")),
+    };
+    let mut provenance = provenance;
+    provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
+    provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
+    let setting = Setting {
+        title: args.title(),
+        config: config.as_ref(),
+        config_text: config_text.map_err(|error| Failure::new(error.to_string()))?,
+        reference: reference.unwrap_or_default(),
+        provenance,
+    };
+    if let Some(folder) = &args.plots {
+        fs::create_dir_all(folder)
+            .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
+        report::write_plots(folder, &data, &setting).map_err(|error| Failure::new(error.to_string()))?;
+    }
+    match write(&args.out, &report::page(&data, &setting)) {
+        // The reader of our output has seen enough: no failure.
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.map_err(|error| Failure::new(error.to_string())),
+    }
+}
+
+impl Args {
+    /// What one argument alone cannot tell.
+    fn check(&self) -> Result<(), Failure> {
+        let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
+        if inputs.into_iter().any(|input| *input == self.out && input != Path::new("-")) {
+            return Err(Failure::new(format!("{}: is read, cannot be the page", self.out.display())));
+        }
+        Ok(())
+    }
+
+    fn title(&self) -> String {
+        let of = self.state.as_ref().or(self.logs.first());
+        let name = of.and_then(|path| path.file_name()).map(|name| name.to_string_lossy().into_owned());
+        let more = if self.logs.len() > 1 { format!(" and {} more", self.logs.len() - 1) } else { String::new() };
+        self.title.clone().unwrap_or_else(|| name.unwrap_or_else(|| "Battery".to_owned()) + &more)
+    }
+}
+
+fn write(path: &Path, page: &str) -> io::Result<()> {
+    let mut file = ResultFile::create(path)?;
+    file.write_all(page.as_bytes())?;
+    file.finish()
+}
+
+/// Lines of the provenance: what, and which.
+type Provenance = Vec<(String, String)>;
+
+fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
+    let reader = Reader::open(folder).map_err(Failure::new)?;
+    let data = Data::of_store(&reader).map_err(Failure::new)?;
+    let verdict = reader.verify().map_err(Failure::new)?;
+    let chain = match &verdict.broken {
+        None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
+        Some(broken) => format!(
+            "row {} is not as it was written: expected {}, found {}; {} rows before it are good",
+            broken.row, broken.expected, broken.found, verdict.good_rows
+        ),
+    };
+    let provenance = vec![("History".to_owned(), folder.display().to_string()), ("Hash chain".to_owned(), chain)];
+    Ok((data, provenance))
+}
+
+fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure> {
+    let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, config));
+    let data = Rc::new(RefCell::new(Data::new(Origin::Replay)));
+    let watched = Rc::clone(&data);
+    let watch: Box<dyn FnMut(&crate::monitor::Outputs)> = Box::new(move |out| {
+        let mut data = watched.borrow_mut();
+        out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
+        out.events.iter().for_each(|event| data.take_event(event));
+    });
+    let sinks = Sinks { watch: Some(Watch(watch)), ..Sinks::default() };
+    let bar = Bar::new(&args.logs);
+    let monitor = Monitor::new(config.monitor.clone());
+    let result = replay::run(&mut source, monitor, sinks, settings(args, config), &mut |progress| bar.show(progress));
+    bar.clear();
+    let (summary, _) = result.map_err(|error| Failure::new(error.to_string()))?;
+    // The replay has ended and with it the closure that shared the data.
+    let data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
+    Ok((data, provenance(args, &summary)))
+}
+
+fn settings(args: &Args, config: &Config) -> Settings {
+    Settings {
+        speed: None,
+        from: None,
+        until: None,
+        sleep_gap_s: args.input.sleep_gap,
+        snapshot: false,
+        snapshot_at: None,
+        restore: None,
+        away: None,
+        store: None,
+        interfaces: config.interfaces.iter().map(|interface| interface.name.clone()).collect(),
+    }
+}
+
+fn provenance(args: &Args, summary: &Summary) -> Provenance {
+    let mut lines: Provenance =
+        args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
+    lines.push(("Frames used".to_owned(), summary.log.frames.to_string()));
+    lines.push(("Bad readings of signals that came back".to_owned(), summary.bad_readings.to_string()));
+    lines.extend(summary.notes.iter().map(|note| ("Note".to_owned(), note.clone())));
+    lines
+}

@@ -1,0 +1,119 @@
+//! `packwatch rul`: remaining useful life from measured capacity histories, now or at parts of the life.
+
+mod report;
+
+use std::path::PathBuf;
+
+use super::Failure;
+use super::score::names;
+use crate::lab::rul::{self, Now, Scored, Threshold};
+
+/// Parts of the life asked for at most: one per per cent.
+const MAX_PARTS: usize = 99;
+
+/// Arguments of `rul`.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "A file with a type column counts its discharges as full cycles; without one its days count, and any of \
+                  them may have been rest. The end of life is where the non-increasing line of least squares through all \
+                  capacities passes the threshold: capacity that comes back after a rest and goes again neither delays nor \
+                  hastens it. Forecasts at parts of the life see nothing of what comes after."
+)]
+pub(crate) struct Args {
+    /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, rising), capacity_ah or
+    /// capacity_ah_source (Ah), and where there are type (charge, discharge) and duration_s
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Capacity at the end of life, Ah, or per cent of the file's first: 1.4 or "70 %"; several make a forecast each
+    #[arg(long, value_name = "AH|PERCENT", required = true, value_delimiter = ',', value_parser = threshold)]
+    end_of_life: Vec<Threshold>,
+    /// Parts of the life, per cent, at which forecasts are made and judged: 40,50,60,70,80 [default: one forecast, now]
+    #[arg(long, value_name = "PERCENT,..", value_delimiter = ',', value_parser = part)]
+    at: Vec<f64>,
+    /// How far the median may be from the truth to pass, fraction of what truly remained
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.2, value_parser = fraction)]
+    alpha: f64,
+    /// Print one JSON document
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    if args.at.len() > MAX_PARTS {
+        return Err(Failure::new(format!("--at: {} parts, must be at most {MAX_PARTS}", args.at.len())));
+    }
+    if let Some((index, file)) = args.files.iter().enumerate().find(|(i, file)| args.files[..*i].contains(file)) {
+        return Err(Failure::new(format!("{}: named twice, again as number {}", file.display(), index + 1)));
+    }
+    let shown = if args.at.is_empty() {
+        let forecasts: Vec<Now> = each(args, rul::now)?;
+        if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
+    } else {
+        let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);
+        let scored: Vec<Scored> = each(args, score)?;
+        if args.json { report::scored_json(&scored, args.alpha) } else { report::scored_table(&scored, args.alpha) }
+    };
+    match shown {
+        // The reader of our output has seen enough: no failure.
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
+    }
+}
+
+/// Every file with every threshold, in the order given.
+fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
+    let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
+    for (path, name) in args.files.iter().zip(names(&args.files)) {
+        let history = rul::read(path).map_err(|error| Failure::new(error.to_string()))?;
+        all.extend(args.end_of_life.iter().map(|&threshold| work(&history, &name, threshold)));
+    }
+    Ok(all)
+}
+
+fn number(text: &str) -> Option<f64> {
+    text.trim().parse::<f64>().ok().filter(|value| value.is_finite())
+}
+
+/// `1.4`, `1.4 Ah`, `70 %`.
+fn threshold(text: &str) -> Result<Threshold, String> {
+    const EXPECTED: &str =
+        "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
+    let found = match text.trim().strip_suffix('%') {
+        Some(percent) => {
+            number(percent).filter(|p| *p > 0.0 && *p < 100.0).map(|percent| Threshold::OfFirst(percent / 100.0))
+        }
+        None => number(text.trim().trim_end_matches("Ah")).filter(|ah| *ah > 0.0).map(Threshold::AmpereHours),
+    };
+    found.ok_or_else(|| EXPECTED.to_owned())
+}
+
+/// Per cent to a part.
+fn part(text: &str) -> Result<f64, String> {
+    let percent = number(text.trim().trim_end_matches('%')).filter(|p| *p > 0.0 && *p < 100.0);
+    percent.map(|percent| percent / 100.0).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
+}
+
+fn fraction(text: &str) -> Result<f64, String> {
+    number(text).filter(|f| *f > 0.0 && *f < 1.0).ok_or_else(|| "must be above 0 and below 1".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn thresholds_are_ampere_hours_or_per_cent() {
+        for (text, expected) in [
+            ("1.4", Threshold::AmpereHours(1.4)),
+            ("1.4 Ah", Threshold::AmpereHours(1.4)),
+            ("70 %", Threshold::OfFirst(0.7)),
+            ("70%", Threshold::OfFirst(0.7)),
+        ] {
+            assert_eq!(threshold(text), Ok(expected));
+        }
+        assert!(["0", "-1", "100 %", "0%", "soon", "", "inf", "nan %"].iter().all(|text| threshold(text).is_err()));
+        assert_eq!(part("40"), Ok(0.4));
+        assert!(part("100").is_err() && part("0").is_err() && fraction("0").is_err() && fraction("x").is_err());
+    }
+}

@@ -1,0 +1,176 @@
+//! What `rul` tells: tables and JSON.
+
+use std::io::{self, Write};
+
+use serde::Serialize;
+
+use super::super::score::write_table;
+use crate::health::{Axis, Remaining};
+use crate::lab::rul::{self, Judged, Now, Scored, Total, WORST_ERROR};
+
+/// Version of the JSON documents.
+const VERSION: u32 = 1;
+
+#[derive(Serialize)]
+struct NowDocument<'a> {
+    version: u32,
+    interval: [f64; 2],
+    forecasts: &'a [Now],
+}
+
+#[derive(Serialize)]
+struct ScoredDocument<'a> {
+    version: u32,
+    interval: [f64; 2],
+    alpha: f64,
+    files: &'a [Scored],
+    total: Option<Total>,
+}
+
+/// Quantiles of the interval told.
+const INTERVAL: [f64; 2] = [0.05, 0.95];
+
+/// Forecasts now, for programs.
+pub(super) fn now_json(forecasts: &[Now]) -> io::Result<()> {
+    json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
+}
+
+/// Judged forecasts, for programs.
+pub(super) fn scored_json(files: &[Scored], alpha: f64) -> io::Result<()> {
+    json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
+}
+
+fn json(document: &impl Serialize) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    serde_json::to_writer_pretty(&mut out, document)?;
+    writeln!(out)
+}
+
+/// Forecasts now, for people.
+pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the rate of use of late\n")?;
+    let heads = ["file", "end of life", "readings", "capacity", "loss per unit", "cycles", "days"];
+    let mut rows = vec![heads.map(str::to_owned).to_vec()];
+    rows.extend(forecasts.iter().map(|now| {
+        let life = now.remaining;
+        vec![
+            now.name.clone(),
+            format!("{:.3} Ah", now.threshold_ah),
+            now.readings.to_string(),
+            format!("{:.3} +- {:.3} Ah", now.level_ah.0, now.level_ah.1),
+            format!("{:.2} +- {:.2} mAh/{}", 1e3 * now.rate_ah.0, 1e3 * now.rate_ah.1, unit(now.axis)),
+            amount(life.and_then(|life| life.cycles)),
+            amount(life.and_then(|life| life.days)),
+        ]
+    }));
+    write_table(&mut out, &rows, 2)?;
+    for now in forecasts {
+        if let Some(why) = &now.refused {
+            writeln!(out, "{}, {:.3} Ah: no forecast: {why}", now.name, now.threshold_ah)?;
+        }
+    }
+    Ok(())
+}
+
+/// Judged forecasts, for people.
+pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    let percent = 100.0 * alpha;
+    writeln!(out, "remaining: median (5 to 95 %); passes when the median is within {percent:.0} % of the truth")?;
+    writeln!(out, "errors are |median - truth| as a part of the life, at most {:.0} %\n", 100.0 * WORST_ERROR)?;
+    let heads = [
+        "file",
+        "end of life",
+        "at",
+        "readings",
+        "unit",
+        "truth",
+        "forecast",
+        "alpha",
+        "interval",
+        "error",
+        "line",
+        "error",
+        "double exp.",
+        "error",
+    ];
+    let mut rows = vec![heads.map(str::to_owned).to_vec()];
+    for file in files {
+        rows.extend(file.judged.iter().map(|judged| judged_row(file, judged)));
+    }
+    if rows.len() > 1 {
+        write_table(&mut out, &rows, 2)?;
+        writeln!(out)?;
+    }
+    notes(&mut out, files)?;
+    match rul::total(files) {
+        Some(total) => totals(&mut out, &total),
+        None => writeln!(out, "no forecast was judged"),
+    }
+}
+
+fn judged_row(file: &Scored, judged: &Judged) -> Vec<String> {
+    let forecast = judged.forecast.map(|[low, median, high]| Remaining { low, median, high });
+    let baseline = |said: Option<f64>| said.map_or("never".to_owned(), |said| format!("{said:.1}"));
+    vec![
+        file.name.clone(),
+        format!("{:.3} Ah", file.threshold_ah),
+        part(judged.at),
+        judged.readings.to_string(),
+        format!("{}s", unit(file.axis)),
+        format!("{:.1}", judged.truth),
+        amount(forecast),
+        if judged.within_alpha { "pass" } else { "fail" }.to_owned(),
+        if judged.covered { "holds" } else { "misses" }.to_owned(),
+        part(judged.error),
+        baseline(judged.straight),
+        part(judged.straight_error),
+        baseline(judged.double_exponential),
+        part(judged.double_exponential_error),
+    ]
+}
+
+/// What was not judged, and what was refused.
+fn notes(out: &mut impl Write, files: &[Scored]) -> io::Result<()> {
+    for file in files {
+        let (name, threshold_ah) = (&file.name, file.threshold_ah);
+        match file.end_of_life {
+            None => writeln!(
+                out,
+                "{name}: does not fall through {threshold_ah:.3} Ah for good (least capacity {:.3} Ah): not judged",
+                file.least_capacity_ah
+            )?,
+            Some(end) => {
+                writeln!(out, "{name}: falls through {threshold_ah:.3} Ah after {end:.1} {}s", unit(file.axis))?
+            }
+        }
+        for judged in &file.judged {
+            if let Some(why) = &judged.refused {
+                writeln!(out, "{name}, {threshold_ah:.3} Ah, at {}: no forecast: {why}", part(judged.at))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn totals(out: &mut impl Write, total: &Total) -> io::Result<()> {
+    writeln!(out, "\n{} forecasts, {} refused", total.forecasts, total.refused)?;
+    writeln!(out, "interval holds the truth  {}", part(total.coverage))?;
+    writeln!(out, "median passes alpha       {}", part(total.within_alpha))?;
+    writeln!(out, "mean error                {:.1} %", 100.0 * total.mean_error)?;
+    writeln!(out, "  straight line           {:.1} %", 100.0 * total.straight_mean_error)?;
+    writeln!(out, "  double exponential      {:.1} %", 100.0 * total.double_exponential_mean_error)
+}
+
+fn unit(axis: Axis) -> &'static str {
+    if axis == Axis::Cycles { "cycle" } else { "day" }
+}
+
+fn part(part: f64) -> String {
+    format!("{:.0} %", 100.0 * part)
+}
+
+fn amount(remaining: Option<Remaining>) -> String {
+    remaining.map_or("unknown".to_owned(), |r| format!("{:.1} ({:.1} to {:.1})", r.median, r.low, r.high))
+}

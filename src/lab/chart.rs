@@ -1,0 +1,85 @@
+//! Pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; lanes of spans; heat maps.
+//!
+//! One look for everything the program draws. In: values in the units that the labels name; what is not finite
+//! interrupts a line. Out: SVG whose colours are classes, so that a page or a file sets them, for light and dark
+//! ([`style`]). A long series is cut down to its extremes per pixel column, so that peaks survive and files stay small.
+//! Words stand above the drawing area, never on the data; `<title>` elements are tool tips without a script.
+
+mod axis;
+mod files;
+mod heat;
+mod lanes;
+mod plot;
+mod style;
+mod svg;
+mod thin;
+
+pub(crate) use axis::{Axis, Scale};
+pub(crate) use files::{Format, PlotError, write, write_stack};
+pub(crate) use heat::Heat;
+pub(crate) use lanes::{Lane, Lanes, Span};
+pub(crate) use plot::{Chart, Layer, Point, Shape};
+pub(crate) use style::{Ink, variables};
+pub(crate) use svg::escape;
+
+/// Width and height of a picture, pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Size {
+    pub(crate) width: f64,
+    pub(crate) height: f64,
+}
+
+impl Size {
+    /// For a screen or a page.
+    pub(crate) const WIDE: Self = Self { width: 840.0, height: 290.0 };
+    /// For a phone.
+    pub(crate) const NARROW: Self = Self { width: 350.0, height: 270.0 };
+}
+
+/// Anything that can be drawn.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Picture {
+    Chart(Chart),
+    Lanes(Lanes),
+    Heat(Heat),
+}
+
+impl Picture {
+    /// The elements inside an `<svg>`, and the height they take.
+    pub(crate) fn draw(&self, size: Size) -> (String, f64) {
+        match self {
+            Self::Chart(chart) => chart.draw(size),
+            Self::Lanes(lanes) => lanes.draw(size),
+            Self::Heat(heat) => heat.draw(size),
+        }
+    }
+
+    /// What it shows, in a few words.
+    pub(crate) fn title(&self) -> &str {
+        match self {
+            Self::Chart(chart) => &chart.title,
+            Self::Lanes(lanes) => &lanes.title,
+            Self::Heat(heat) => &heat.title,
+        }
+    }
+
+    /// The same for those who cannot see it.
+    fn description(&self) -> &str {
+        match self {
+            Self::Chart(chart) => &chart.description,
+            Self::Lanes(lanes) => &lanes.description,
+            Self::Heat(heat) => &heat.description,
+        }
+    }
+
+    /// An `<svg>` element to stand in a page; its colours come from the page.
+    pub(crate) fn inline(&self, size: Size, class: &str) -> String {
+        let (body, height) = self.draw(size);
+        let (width, title) = (size.width, escape(self.title()));
+        let description = escape(self.description());
+        format!(
+            "<svg class=\"{class}\" viewBox=\"0 0 {width} {height}\" role=\"img\" aria-label=\"{title}\">\
+             <desc>{description}</desc>{body}</svg>\n"
+        )
+    }
+}

@@ -1,0 +1,127 @@
+//! Heat maps: a value per row and column of time, as one of nine colours, with its legend.
+
+use super::Size;
+use super::axis::Axis;
+use super::plot::{Area, title};
+use super::style::{STEPS, step_class};
+use super::svg::{Svg, short, text_width};
+
+/// Height of a row, pixels, within these bounds.
+const ROW: (f64, f64) = (4.0, 20.0);
+/// Height of a picture with as many rows as fit, pixels.
+const WANTED: f64 = 300.0;
+
+/// Values over rows (cells, from 1) and columns of equal width.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Heat {
+    pub(crate) title: String,
+    pub(crate) description: String,
+    /// With `range`: where the columns begin and end.
+    pub(crate) x: Axis,
+    /// What the values are, with unit.
+    pub(crate) label: String,
+    /// Rows of values; `None` = not known.
+    pub(crate) rows: Vec<Vec<Option<f64>>>,
+    /// One per row; may be empty.
+    pub(crate) tips: Vec<String>,
+    /// Decimals in the legend.
+    pub(crate) decimals: usize,
+}
+
+impl Heat {
+    /// The elements, and the height they take.
+    pub(super) fn draw(&self, size: Size) -> (String, f64) {
+        let mut svg = Svg::default();
+        let top = title(&mut svg, &self.title, size.width);
+        let values = || self.rows.iter().flatten().flatten().copied().filter(|value| value.is_finite());
+        let (low, high) = Axis::default().ends(values(), false);
+        let top = self.legend(&mut svg, top, size.width, (low, high));
+        let row = (WANTED / self.rows.len().max(1) as f64).clamp(ROW.0, ROW.1).floor();
+        let left = text_width(&self.rows.len().to_string(), 11.5) + 12.0;
+        let height = row * self.rows.len() as f64;
+        let x = self.x.ends(std::iter::empty(), false);
+        let area = Area { left, top, width: size.width - left - 22.0, height, x, y: (0.0, 1.0) };
+        area.draw_x(&mut svg, &self.x);
+        let every = [1, 2, 5, 10, 20, 50, 100, 200].into_iter().find(|n| f64::from(*n) * row >= 13.0).unwrap_or(500);
+        for cell in (1..=self.rows.len()).filter(|cell| *cell == 1 || cell % every as usize == 0) {
+            svg.text(left - 6.0, top + (cell as f64 - 0.5) * row + 4.0, "t e", &cell.to_string());
+        }
+        svg.open_area((left, top), (area.width, height));
+        svg.rect((0.0, 0.0), (area.width, height), "x", "");
+        for (step, d) in self.paths(area.width, row, (low, high)).iter().enumerate() {
+            svg.path(&step_class(step), d, "");
+        }
+        for (index, tip) in self.tips.iter().enumerate() {
+            svg.rect((0.0, index as f64 * row), (area.width, row), "z", tip);
+        }
+        svg.close_area();
+        (svg.0, top + height + 40.0)
+    }
+
+    /// One path per step: rectangles over neighbours of the same step.
+    fn paths(&self, width: f64, row: f64, ends: (f64, f64)) -> Vec<String> {
+        let mut paths = vec![String::new(); STEPS.len()];
+        for (index, values) in self.rows.iter().enumerate() {
+            let column = width / values.len().max(1) as f64;
+            let steps: Vec<Option<usize>> = values.iter().map(|value| step(*value, ends)).collect();
+            let mut at = 0;
+            for run in steps.chunk_by(|a, b| a == b) {
+                if let Some(path) = run[0].and_then(|step| paths.get_mut(step)) {
+                    let (x, long) = (at as f64 * column, run.len() as f64 * column);
+                    let (x, y, long, row) = (short(x), short(index as f64 * row), short(long), short(row));
+                    path.push_str(&format!("M{x} {y}h{long}v{row}h-{long}z"));
+                }
+                at += run.len();
+            }
+        }
+        paths
+    }
+
+    fn legend(&self, svg: &mut Svg, top: f64, width: f64, (low, high): (f64, f64)) -> f64 {
+        svg.text(0.0, top + 12.0, "t", &format!("cell (from 1), {}", self.label));
+        let decimals = self.decimals;
+        let (low, high) = (format!("{low:.decimals$}"), format!("{high:.decimals$}"));
+        let needs = text_width(&low, 11.5) + text_width(&high, 11.5) + 18.0 * 9.0 + 110.0;
+        let beside = text_width(&self.label, 11.5) + 130.0;
+        let (mut x, y) = if beside + needs < width { (beside, top) } else { (0.0, top + 18.0) };
+        svg.text(x, y + 12.0, "l", &low);
+        x += text_width(&low, 11.5) + 6.0;
+        for step in 0..STEPS.len() {
+            svg.rect((x, y + 3.0), (18.0, 10.0), &step_class(step), "");
+            x += 18.0;
+        }
+        svg.text(x + 6.0, y + 12.0, "l", &high);
+        x += text_width(&high, 11.5) + 18.0;
+        svg.rect((x, y + 3.0), (14.0, 10.0), "x", "");
+        svg.text(x + 20.0, y + 12.0, "l", "unknown");
+        y + 26.0
+    }
+}
+
+/// The step of a value; `None` = not known.
+fn step(value: Option<f64>, (low, high): (f64, f64)) -> Option<usize> {
+    let part = (value.filter(|value| value.is_finite())? - low) / (high - low);
+    Some(((part * STEPS.len() as f64) as usize).min(STEPS.len() - 1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unknown_values_have_no_colour_and_neighbours_share_a_rectangle() {
+        let rows = vec![vec![Some(1.0), Some(1.0), None, Some(2.0)], vec![Some(f64::NAN), None, Some(1.5), Some(2.0)]];
+        let heat = Heat { rows, x: Axis::number("d").within(0.0, 4.0), ..Heat::default() };
+        let paths = heat.paths(40.0, 10.0, (1.0, 2.0));
+        assert_eq!((paths[0].as_str(), paths[8].as_str()), ("M0 0h20v10h-20z", "M30 0h10v10h-10zM30 10h10v10h-10z"));
+        assert_eq!(paths.iter().filter(|path| !path.is_empty()).count(), 3);
+    }
+
+    #[test]
+    fn a_pack_of_96_cells_over_120_columns_stays_small() {
+        let row = |cell: usize| (0..120).map(|column| Some((cell * 7 + column * 13) as f64 % 9.0)).collect();
+        let heat = Heat { rows: (0..96).map(row).collect(), x: Axis::number("d").within(0.0, 1.0), ..Heat::default() };
+        let (text, _) = heat.draw(Size::WIDE);
+        assert!(text.len() < 400_000, "{} bytes", text.len());
+    }
+}

@@ -1,0 +1,340 @@
+//! Lines, bands, points and thresholds over one pair of axes.
+
+use super::axis::Axis;
+use super::style::Ink;
+use super::svg::{Svg, Trail, short, text_width};
+use super::{Size, thin};
+
+/// Font size of ticks and legend, pixels, as the style sheet has it.
+const SMALL: f64 = 11.5;
+/// Most points of a layer that get a tool tip each; more are dots alone.
+const MAX_TIPS: usize = 400;
+/// Height of the title, of a row of the legend, and of what stands below the axis, pixels.
+const TITLE: f64 = 24.0;
+const ROW: f64 = 18.0;
+const FOOT: f64 = 38.0;
+/// Radius of a point, pixels.
+const DOT: f64 = 2.6;
+/// Ticks of the x axis at most, and room between their words, pixels.
+const MAX_TICKS: u32 = 10;
+const GAP: f64 = 16.0;
+/// Room at the right, pixels: half of the last tick's words.
+const RIGHT: f64 = 22.0;
+
+/// A value to be drawn as a point.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Point {
+    pub(crate) x: f64,
+    pub(crate) y: f64,
+    /// Tool tip; may be empty.
+    pub(crate) tip: String,
+}
+
+/// What is drawn; x does not fall.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Shape {
+    /// (x, y).
+    Line(Vec<(f64, f64)>),
+    /// The same, dashed.
+    Dashed(Vec<(f64, f64)>),
+    /// (x, lower, upper).
+    Band(Vec<(f64, f64, f64)>),
+    Points(Vec<Point>),
+    /// A threshold: the whole width at this y.
+    Level(f64),
+    /// Something that happened: the whole height at these x, with tool tips in the points' `tip`.
+    Moments(Vec<Point>),
+}
+
+/// One of the things drawn, later ones above earlier ones.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Layer {
+    /// For the legend; empty = not in it.
+    pub(crate) label: String,
+    pub(crate) ink: Ink,
+    pub(crate) shape: Shape,
+}
+
+impl Layer {
+    pub(crate) fn new(label: &str, ink: Ink, shape: Shape) -> Self {
+        Self { label: label.to_owned(), ink, shape }
+    }
+}
+
+/// One pair of axes.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Chart {
+    pub(crate) title: String,
+    /// For those who cannot see it.
+    pub(crate) description: String,
+    pub(crate) x: Axis,
+    pub(crate) y: Axis,
+    pub(crate) layers: Vec<Layer>,
+}
+
+/// The drawing area: where it lies and what it shows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Area {
+    pub(super) left: f64,
+    pub(super) top: f64,
+    pub(super) width: f64,
+    pub(super) height: f64,
+    pub(super) x: (f64, f64),
+    pub(super) y: (f64, f64),
+}
+
+impl Area {
+    /// Pixels from the area's left edge.
+    pub(super) fn px(&self, x: f64) -> f64 {
+        self.width * (x - self.x.0) / (self.x.1 - self.x.0)
+    }
+
+    /// Pixels from its upper edge.
+    fn py(&self, y: f64) -> f64 {
+        self.height * (self.y.1 - y) / (self.y.1 - self.y.0)
+    }
+
+    /// As many ticks as their words have room for.
+    fn x_ticks(&self, axis: &Axis) -> Vec<(f64, String)> {
+        let fits = |ticks: &[(f64, String)]| {
+            let widest = ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(0.0, f64::max);
+            ticks.windows(2).all(|pair| self.px(pair[1].0) - self.px(pair[0].0) >= widest + GAP)
+        };
+        let counts = (1..=MAX_TICKS).rev().map(f64::from);
+        let mut choices = counts.map(|count| axis.ticks(self.x, count));
+        choices.find(|ticks| fits(ticks)).unwrap_or_default()
+    }
+
+    /// The x axis: grid, ticks, label.
+    pub(super) fn draw_x(&self, svg: &mut Svg, axis: &Axis) {
+        let bottom = self.top + self.height;
+        for (x, word) in self.x_ticks(axis) {
+            let at = self.left + self.px(x);
+            svg.path("g", &format!("M{} {}V{}", short(at), short(self.top), short(bottom)), "");
+            svg.text(at, bottom + 15.0, "t m", &word);
+        }
+        svg.path("a", &format!("M{} {}h{}", short(self.left), short(bottom), short(self.width)), "");
+        svg.text(self.left + self.width, bottom + 31.0, "t e", &axis.caption(self.x));
+    }
+}
+
+impl Chart {
+    /// The elements, and the height they take.
+    pub(super) fn draw(&self, size: Size) -> (String, f64) {
+        let mut svg = Svg::default();
+        let mut top = title(&mut svg, &self.title, size.width);
+        top = self.legend(&mut svg, size.width, top) + 8.0;
+        let x = self.x.ends(self.layers.iter().flat_map(Layer::xs), false);
+        let y = self.y.ends(self.layers.iter().flat_map(Layer::ys), true);
+        let height = size.height - 60.0 - FOOT;
+        let y_ticks = self.y.ticks(y, height / 28.0);
+        let left = y_ticks.iter().map(|(_, word)| text_width(word, SMALL)).fold(16.0, f64::max) + 8.0;
+        let area = Area { left, top, width: size.width - left - RIGHT, height, x, y };
+        for (y, word) in y_ticks {
+            let at = top + area.py(y);
+            svg.path("g", &format!("M{} {}h{}", short(left), short(at), short(area.width)), "");
+            svg.text(left - 6.0, at + 4.0, "t e", &word);
+        }
+        area.draw_x(&mut svg, &self.x);
+        svg.open_area((left, top), (area.width, height));
+        self.layers.iter().for_each(|layer| layer.draw(&mut svg, &area));
+        svg.close_area();
+        (svg.0, top + height + FOOT)
+    }
+
+    /// Label of the y axis and what is what, in rows; gives where they end.
+    fn legend(&self, svg: &mut Svg, width: f64, top: f64) -> f64 {
+        svg.text(0.0, top + 12.0, "t", &self.y.label);
+        let (mut x, mut y) = (text_width(&self.y.label, SMALL) + 18.0, top);
+        for layer in self.layers.iter().filter(|layer| !layer.label.is_empty()) {
+            let needs = 26.0 + text_width(&layer.label, SMALL) + 12.0;
+            if x + needs > width && x > 0.0 {
+                (x, y) = (0.0, y + ROW);
+            }
+            layer.key(svg, x, y + 8.0);
+            svg.text(x + 26.0, y + 12.0, "l", &layer.label);
+            x += needs;
+        }
+        y + ROW
+    }
+}
+
+/// The title in as many lines as it needs; gives where it ends.
+pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
+    let mut y = 0.0;
+    for line in wrapped(text, width, 14.5) {
+        svg.text(0.0, y + 16.0, "q", &line);
+        y += 18.0;
+    }
+    if y > 0.0 { y + TITLE - 18.0 } else { 0.0 }
+}
+
+/// Words in lines of at most this width.
+pub(super) fn wrapped(text: &str, width: f64, size: f64) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if text_width(line, size) + text_width(word, size) + size < width => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
+impl Layer {
+    fn xs(&self) -> Box<dyn Iterator<Item = f64> + '_> {
+        match &self.shape {
+            Shape::Line(points) | Shape::Dashed(points) => {
+                Box::new(points.iter().filter(|p| p.1.is_finite()).map(|p| p.0))
+            }
+            Shape::Band(points) => Box::new(points.iter().filter(|p| (p.1 + p.2).is_finite()).map(|p| p.0)),
+            Shape::Points(points) | Shape::Moments(points) => Box::new(points.iter().map(|p| p.x)),
+            Shape::Level(_) => Box::new(std::iter::empty()),
+        }
+    }
+
+    fn ys(&self) -> Box<dyn Iterator<Item = f64> + '_> {
+        match &self.shape {
+            Shape::Line(points) | Shape::Dashed(points) => {
+                Box::new(points.iter().filter(|p| p.0.is_finite()).map(|p| p.1))
+            }
+            Shape::Band(points) => Box::new(points.iter().filter(|p| p.0.is_finite()).flat_map(|p| [p.1, p.2])),
+            Shape::Points(points) => Box::new(points.iter().map(|p| p.y)),
+            Shape::Moments(_) => Box::new(std::iter::empty()),
+            Shape::Level(y) => Box::new(std::iter::once(*y)),
+        }
+    }
+
+    /// Its sign in the legend, 20 pixels wide round `y`.
+    fn key(&self, svg: &mut Svg, x: f64, y: f64) {
+        let line = format!("M{} {}h20", short(x), short(y));
+        match &self.shape {
+            Shape::Line(_) => svg.path(&format!("s {}", self.ink.stroke()), &line, ""),
+            Shape::Dashed(_) | Shape::Level(_) => svg.path(&format!("s d {}", self.ink.stroke()), &line, ""),
+            Shape::Band(_) => svg.rect((x, y - 5.0), (20.0, 10.0), &self.ink.band(), ""),
+            Shape::Points(_) => svg.circle((x + 10.0, y), 3.0, &self.ink.fill(), ""),
+            Shape::Moments(_) => {
+                let d = format!("M{} {}v12", short(x + 10.0), short(y - 6.0));
+                svg.path(&format!("s {}", self.ink.stroke()), &d, "");
+            }
+        }
+    }
+
+    fn draw(&self, svg: &mut Svg, area: &Area) {
+        let bins = area.width.max(1.0) as usize;
+        match &self.shape {
+            Shape::Line(points) => {
+                svg.path(&format!("s {}", self.ink.stroke()), &line_path(points, area, bins), &self.label);
+            }
+            Shape::Dashed(points) => {
+                svg.path(&format!("s d {}", self.ink.stroke()), &line_path(points, area, bins), &self.label);
+            }
+            Shape::Band(points) => svg.path(&self.ink.band(), &band_path(points, area, bins), &self.label),
+            Shape::Points(points) => self.draw_points(svg, area, points),
+            Shape::Level(y) => {
+                let d = format!("M0 {}h{}", short(area.py(*y)), short(area.width));
+                svg.path(&format!("s d {}", self.ink.stroke()), &d, &self.label);
+            }
+            Shape::Moments(points) => {
+                for point in points.iter().filter(|point| point.x.is_finite()) {
+                    let d = format!("M{} 0v{}", short(area.px(point.x)), short(area.height));
+                    svg.path(&format!("s {}", self.ink.stroke()), &d, &point.tip);
+                }
+            }
+        }
+    }
+
+    fn draw_points(&self, svg: &mut Svg, area: &Area, points: &[Point]) {
+        let finite = || points.iter().filter(|point| point.x.is_finite() && point.y.is_finite());
+        if finite().count() <= MAX_TIPS {
+            return finite().for_each(|point| {
+                // A point at the very edge is not cut in half.
+                let x = area.px(point.x);
+                let x = if (-0.5..=area.width + 0.5).contains(&x) { x.clamp(DOT, area.width - DOT) } else { x };
+                svg.circle((x, area.py(point.y)), DOT, &self.ink.fill(), &point.tip);
+            });
+        }
+        let places: Vec<(f64, f64)> = finite().map(|point| (point.x, point.y)).collect();
+        let mut trail = Trail::default();
+        let bins = area.width.max(1.0) as usize;
+        thin::line(&places, bins).into_iter().for_each(|(x, y)| trail.dot(area.px(x), area.py(y)));
+        svg.path(&format!("o {}", self.ink.stroke()), &trail.d, &self.label);
+    }
+}
+
+fn line_path(points: &[(f64, f64)], area: &Area, bins: usize) -> String {
+    let mut trail = Trail::default();
+    for run in points.split(|p| !(p.0.is_finite() && p.1.is_finite())).filter(|run| !run.is_empty()) {
+        trail.lift();
+        let kept = thin::line(run, bins);
+        // A value alone is seen as well.
+        if let [only] = kept[..] {
+            trail.to(area.px(only.0) - 1.0, area.py(only.1));
+            trail.to(area.px(only.0) + 1.0, area.py(only.1));
+        }
+        kept.into_iter().for_each(|(x, y)| trail.to(area.px(x), area.py(y)));
+    }
+    trail.d
+}
+
+fn band_path(points: &[(f64, f64, f64)], area: &Area, bins: usize) -> String {
+    let mut trail = Trail::default();
+    for run in points.split(|p| !(p.0.is_finite() && p.1.is_finite() && p.2.is_finite())).filter(|run| !run.is_empty())
+    {
+        trail.lift();
+        let kept = thin::band(run, bins);
+        kept.iter().for_each(|p| trail.to(area.px(p.0), area.py(p.2)));
+        kept.iter().rev().for_each(|p| trail.to(area.px(p.0), area.py(p.1)));
+        trail.d.push('z');
+    }
+    trail.d
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chart(layers: Vec<Layer>) -> Chart {
+        Chart { title: "cell".into(), x: Axis::number("hours"), y: Axis::number("SOC, %"), layers, ..Chart::default() }
+    }
+
+    #[test]
+    fn a_hole_interrupts_a_line_and_does_not_stretch_the_axes() {
+        let points = vec![(0.0, 1.0), (1.0, 2.0), (2.0, f64::NAN), (3.0, 1.0), (f64::INFINITY, 9.0)];
+        let layer = Layer::new("SOC & <truth>", Ink::Blue, Shape::Line(points));
+        assert_eq!(Axis::default().ends(layer.xs(), false), (0.0, 3.0));
+        let area = Area { left: 0.0, top: 0.0, width: 300.0, height: 100.0, x: (0.0, 3.0), y: (1.0, 2.0) };
+        let Shape::Line(points) = &layer.shape else { panic!("a line") };
+        assert_eq!(line_path(points, &area, 300), "M0 100l100-100M299 100l2 0l-1 0");
+    }
+
+    #[test]
+    fn every_alarm_is_kept_and_words_are_escaped() {
+        let moments = (0..5000).map(|i| Point { x: f64::from(i), y: 0.0, tip: format!("alarm {i}") }).collect();
+        let layers = vec![
+            Layer::new("SOC & <truth>", Ink::Blue, Shape::Level(1.0)),
+            Layer::new("alarms", Ink::Red, Shape::Moments(moments)),
+        ];
+        let (text, height) = chart(layers).draw(Size::WIDE);
+        assert_eq!(text.matches("<title>alarm ").count(), 5000);
+        assert!(text.contains("SOC &amp; &lt;truth&gt;") && height > 100.0);
+    }
+
+    #[test]
+    fn nothing_to_draw_still_is_a_picture() {
+        let (text, _) = chart(Vec::new()).draw(Size::NARROW);
+        assert!(text.contains("hours") && !text.contains("NaN"), "{text}");
+    }
+
+    #[test]
+    fn a_legend_too_long_for_a_row_goes_on_in_the_next() {
+        let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
+        let chart = chart(layers.collect());
+        let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
+        // One beside the axis' name, then two in a row.
+        assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
+    }
+}

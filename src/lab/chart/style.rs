@@ -1,0 +1,113 @@
+//! Colours: classes for strokes, fills and words, and their values in light and dark.
+//!
+//! The inks are those of Okabe and Ito, which people with any colour vision can tell apart, lighter on a dark page;
+//! the steps of heat maps are those of cividis (Nuñez, Anderton, Renslow 2018), made for the same readers.
+
+use std::fmt::Write as _;
+
+/// What something is drawn with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ink {
+    /// As words: truth, measurement.
+    Plain,
+    Blue,
+    Orange,
+    Green,
+    Purple,
+    /// Thresholds, worst alarms.
+    Red,
+    /// Warnings.
+    Amber,
+    Grey,
+}
+
+/// Names and colours, light and dark.
+const COLOURS: [(&str, &str, &str); 14] = [
+    ("plain", "#1c1d20", "#eceef2"),
+    ("blue", "#0072b2", "#5ab8f0"),
+    ("orange", "#c65300", "#f59a55"),
+    ("green", "#008761", "#3ccfa4"),
+    ("purple", "#a0427f", "#e3a0cd"),
+    ("red", "#b3142b", "#ff7f8a"),
+    ("amber", "#b97a00", "#f0c04c"),
+    ("grey", "#6b7078", "#a0a6b0"),
+    ("page", "#ffffff", "#14161a"),
+    ("card", "#f5f6f8", "#1d2026"),
+    ("rule", "#d9dce1", "#353a43"),
+    ("word", "#1c1d20", "#eceef2"),
+    ("soft", "#5a5f68", "#a8aeb8"),
+    ("none", "#e6e8ec", "#2a2e36"),
+];
+
+/// Steps of a heat map from the lowest to the highest.
+pub(crate) const STEPS: [&str; 9] =
+    ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
+
+impl Ink {
+    const ALL: [Self; 8] =
+        [Self::Plain, Self::Blue, Self::Orange, Self::Green, Self::Purple, Self::Red, Self::Amber, Self::Grey];
+
+    const fn name(self) -> &'static str {
+        COLOURS[self as usize].0
+    }
+
+    /// Class of a stroke.
+    pub(crate) fn stroke(self) -> String {
+        format!("k-{}", self.name())
+    }
+
+    /// Class of a solid fill.
+    pub(crate) fn fill(self) -> String {
+        format!("f-{}", self.name())
+    }
+
+    /// Class of a see-through fill.
+    pub(crate) fn band(self) -> String {
+        format!("b-{}", self.name())
+    }
+}
+
+/// Class of a step of a heat map.
+pub(crate) fn step_class(step: usize) -> String {
+    format!("h-{step}")
+}
+
+/// The colours as variables of a page or a file: light, and dark on a screen that asks for it.
+pub(crate) fn variables() -> String {
+    let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
+        COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))
+    };
+    format!(
+        ":root{{color-scheme:light dark;{}}}@media screen and (prefers-color-scheme:dark){{:root{{{}}}}}",
+        list(|colour| colour.1),
+        list(|colour| colour.2)
+    ) + &classes()
+}
+
+/// The classes alone, light, without variables, for programs that read no such style sheets.
+pub(super) fn fixed() -> String {
+    COLOURS.iter().fold(classes(), |text, (name, light, _)| text.replace(&format!("var(--{name})"), light))
+}
+
+fn classes() -> String {
+    let mut text = String::from(
+        "text{font-family:system-ui,-apple-system,'Segoe UI',Roboto,'DejaVu Sans',sans-serif;fill:var(--word)}\
+         .t{font-size:11.5px;fill:var(--soft)}.e{text-anchor:end}.m{text-anchor:middle}\
+         .q{font-size:14px;font-weight:600}.l{font-size:11.5px}\
+         .g{stroke:var(--rule);stroke-width:1;fill:none}.a{stroke:var(--grey);stroke-width:1;fill:none}\
+         .s{fill:none;stroke-width:1.4;stroke-linejoin:round}.d{stroke-dasharray:6 4}\
+         .o{stroke-width:4.5;stroke-linecap:round;fill:none}.x{fill:var(--none)}.p{fill:var(--page)}.z{fill:none;pointer-events:all}",
+    );
+    for ink in Ink::ALL {
+        let name = ink.name();
+        // A string cannot fail to take text.
+        let _ = write!(
+            text,
+            ".k-{name}{{stroke:var(--{name})}}.f-{name}{{fill:var(--{name})}}.b-{name}{{fill:var(--{name});fill-opacity:.22}}"
+        );
+    }
+    for (step, colour) in STEPS.iter().enumerate() {
+        let _ = write!(text, ".h-{step}{{fill:{colour};shape-rendering:crispEdges}}");
+    }
+    text
+}

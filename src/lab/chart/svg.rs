@@ -1,0 +1,160 @@
+//! SVG text: elements with few digits.
+
+use std::fmt::Write as _;
+
+/// Average width of a character, parts of the font size.
+const CHARACTER: f64 = 0.56;
+
+/// Text as it may stand in an element or an attribute.
+pub(crate) fn escape(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    for character in text.chars() {
+        match character {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            '>' => out.push_str("&gt;"),
+            '"' => out.push_str("&quot;"),
+            // Not allowed in XML.
+            c if c.is_control() && c != '\n' && c != '\t' => out.push('\u{fffd}'),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+/// Width of a text in a font of this size, pixels, roughly.
+pub(super) fn text_width(text: &str, size: f64) -> f64 {
+    text.chars().count() as f64 * size * CHARACTER
+}
+
+/// A coordinate with one decimal, as short as it goes.
+pub(super) fn short(value: f64) -> String {
+    let tenths = (value * 10.0).round();
+    // Beyond any picture; keeps the text short whatever comes in.
+    let tenths = tenths.clamp(-1e6, 1e6) as i64;
+    match (tenths / 10, tenths.abs() % 10) {
+        (whole, 0) => whole.to_string(),
+        (0, tenth) => format!("{}.{tenth}", if tenths < 0 { "-" } else { "" }),
+        (whole, tenth) => format!("{whole}.{tenth}"),
+    }
+}
+
+/// Elements in the order in which they are drawn.
+#[derive(Debug, Default)]
+pub(super) struct Svg(pub(super) String);
+
+impl Svg {
+    pub(super) fn text(&mut self, x: f64, y: f64, class: &str, text: &str) {
+        let (x, y, text) = (short(x), short(y), escape(text));
+        self.push(format_args!("<text x=\"{x}\" y=\"{y}\" class=\"{class}\">{text}</text>"));
+    }
+
+    pub(super) fn rect(&mut self, (x, y): (f64, f64), (width, height): (f64, f64), class: &str, tip: &str) {
+        let (x, y, width, height) = (short(x), short(y), short(width.max(0.0)), short(height.max(0.0)));
+        self.push(format_args!("<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" class=\"{class}\""));
+        self.close("rect", tip);
+    }
+
+    pub(super) fn circle(&mut self, (x, y): (f64, f64), radius: f64, class: &str, tip: &str) {
+        let (x, y, radius) = (short(x), short(y), short(radius));
+        self.push(format_args!("<circle cx=\"{x}\" cy=\"{y}\" r=\"{radius}\" class=\"{class}\""));
+        self.close("circle", tip);
+    }
+
+    pub(super) fn path(&mut self, class: &str, d: &str, tip: &str) {
+        if d.is_empty() {
+            return;
+        }
+        self.push(format_args!("<path class=\"{class}\" d=\"{d}\""));
+        self.close("path", tip);
+    }
+
+    /// An area that clips what is drawn in it; its origin is its own upper left corner.
+    pub(super) fn open_area(&mut self, (x, y): (f64, f64), (width, height): (f64, f64)) {
+        let (x, y, width, height) = (short(x), short(y), short(width), short(height));
+        self.push(format_args!(
+            "<svg x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\">"
+        ));
+    }
+
+    pub(super) fn close_area(&mut self) {
+        self.0.push_str("</svg>");
+    }
+
+    fn close(&mut self, element: &str, tip: &str) {
+        match tip {
+            "" => self.0.push_str("/>"),
+            tip => {
+                let tip = escape(tip);
+                self.push(format_args!("><title>{tip}</title></{element}>"));
+            }
+        }
+    }
+
+    fn push(&mut self, text: std::fmt::Arguments<'_>) {
+        // A string cannot fail to take text.
+        let _ = self.0.write_fmt(text);
+    }
+}
+
+/// A path through points: absolute at its beginning, then steps, so that it is short and rounding does not add up.
+#[derive(Debug, Default)]
+pub(super) struct Trail {
+    pub(super) d: String,
+    last: Option<(f64, f64)>,
+}
+
+impl Trail {
+    pub(super) fn lift(&mut self) {
+        self.last = None;
+    }
+
+    pub(super) fn to(&mut self, x: f64, y: f64) {
+        let rounded = ((x * 10.0).round() / 10.0, (y * 10.0).round() / 10.0);
+        match self.last {
+            None => self.pair('M', rounded),
+            Some(last) if last == rounded => return,
+            Some(last) => self.pair('l', (rounded.0 - last.0, rounded.1 - last.1)),
+        }
+        self.last = Some(rounded);
+    }
+
+    /// A dot, to be drawn by a stroke with round ends.
+    pub(super) fn dot(&mut self, x: f64, y: f64) {
+        self.pair('M', (x, y));
+        self.d.push_str("h0");
+    }
+
+    fn pair(&mut self, command: char, (x, y): (f64, f64)) {
+        let (x, y) = (short(x), short(y));
+        self.d.push(command);
+        self.d.push_str(&x);
+        if !y.starts_with('-') {
+            self.d.push(' ');
+        }
+        self.d.push_str(&y);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_short_and_keep_their_sign() {
+        assert_eq!([0.0, 12.34, -0.36, -7.0, 0.04, 1e12].map(short), ["0", "12.3", "-.4", "-7", "0", "100000"]);
+    }
+
+    #[test]
+    fn steps_of_a_path_do_not_drift() {
+        let mut trail = Trail::default();
+        (0..=1000).for_each(|i| trail.to(f64::from(i) * 0.333, 0.0));
+        let sum: f64 = trail.d[1..].split(['l', ' ']).step_by(2).map(|x| x.parse::<f64>().unwrap()).sum();
+        assert!((sum - 333.0).abs() < 0.05, "{sum}");
+    }
+
+    #[test]
+    fn text_cannot_break_out() {
+        assert_eq!(escape("a<b>&\"\u{1}"), "a&lt;b&gt;&amp;&quot;\u{fffd}");
+    }
+}

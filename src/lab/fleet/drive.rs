@@ -1,0 +1,136 @@
+//! One log through one core: the loop of a replay without its files.
+//!
+//! In: a log and a monitor that has had no input. Out: after each input what came out, to a closure. Promise: the same
+//! inputs and ticks as `packwatch replay` gives the core, so the same results.
+
+use std::path::Path;
+use std::sync::atomic::Ordering;
+
+use crate::config::Config;
+use crate::io::log::{LogCounts, LogSource, Record};
+use crate::io::ticks::Ticks;
+use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
+use crate::quantity::Timestamp;
+
+/// Records between two reports of progress.
+const REPORT_EVERY: u64 = 4096;
+
+/// A log to be read, and what the user should know of how.
+pub(crate) type Opened = (LogSource, Option<String>);
+
+/// How logs are read.
+#[derive(Clone, Copy)]
+pub(crate) struct Reading<'a> {
+    /// Opens a log as it is read with a configuration.
+    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub(crate) sleep_gap_s: f64,
+}
+
+/// What a log was.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Driven {
+    /// What was read.
+    pub(crate) counts: LogCounts,
+    /// First and last stamp.
+    pub(crate) span: Option<(Timestamp, Timestamp)>,
+    /// What the user should know.
+    pub(crate) notes: Vec<String>,
+}
+
+impl Driven {
+    /// From the first stamp to the last, days.
+    pub(crate) fn days(&self) -> f64 {
+        self.span.map_or(0.0, |(first, last)| last.since(first) / 86_400.0)
+    }
+}
+
+/// Replays a log. `each` sees what came of every input and empties it; `report` is told the bytes read since it was last told.
+///
+/// # Errors
+/// When the log cannot be read, or what `each` says.
+pub(crate) fn drive(
+    (mut source, note): Opened,
+    mut monitor: Monitor,
+    mut out: Outputs,
+    sleep_gap_s: f64,
+    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), String>,
+    report: &dyn Fn(u64),
+) -> Result<Driven, String> {
+    let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
+    let (mut driven, mut records, mut told) = (Driven::default(), 0_u64, 0);
+    driven.notes.extend(note);
+    let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
+        while let Some(time) = ticks.pop(monitor.next_due()) {
+            monitor.handle(Input::Tick { time }, &mut out);
+            each(monitor, &mut out)?;
+        }
+        let Some(input) = input else { return Ok(()) };
+        monitor.handle(input, &mut out);
+        each(monitor, &mut out)
+    };
+    while let Some(record) = source.next_record().map_err(|error| error.to_string())? {
+        driven.note(&record);
+        if matches!(record, Record::UnknownGap { .. }) || source.carries_ticks() {
+            ticks.sleep();
+        } else {
+            ticks.advance(record.time());
+        }
+        tick(&mut ticks, &mut monitor, record.input())?;
+        records += 1;
+        if records.is_multiple_of(REPORT_EVERY) {
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            report(bytes - told);
+            told = bytes;
+        }
+    }
+    ticks.sleep();
+    tick(&mut ticks, &mut monitor, None)?;
+    report(source.read_bytes().load(Ordering::Relaxed) - told);
+    driven.finish(source.counts());
+    Ok(driven)
+}
+
+impl Driven {
+    /// First and last stamp of `log`.
+    ///
+    /// # Errors
+    /// Nothing of it was read: what is known of why.
+    pub(crate) fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+        let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
+        self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
+    }
+
+    fn note(&mut self, record: &Record) {
+        let time = record.time();
+        let (first, last) = self.span.unwrap_or((time, time));
+        self.span = Some((first.min(time), last.max(time)));
+        let noted = match record {
+            Record::Restore { .. } => "the recorded run began from a stored state, this one did not",
+            Record::Reload { .. } => "the recorded run took another configuration over, this one did not",
+            _ => return,
+        };
+        if !self.notes.iter().any(|note| note == noted) {
+            self.notes.push(noted.to_owned());
+        }
+    }
+
+    fn finish(&mut self, counts: &LogCounts) {
+        self.counts = counts.clone();
+        if counts.bad_lines > 0 {
+            let first = counts.first_bad_line.as_deref().unwrap_or("");
+            self.notes.push(format!("{} bad lines left out, the first: {first}", counts.bad_lines));
+        }
+        if counts.unknown_gaps > 0 {
+            self.notes.push(format!(
+                "{} gaps of unknown length: its days are fewer than those that passed",
+                counts.unknown_gaps
+            ));
+        }
+        if counts.frames == 0 {
+            let others: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
+            let others = if others.is_empty() { String::new() } else { format!(": the log has {}", others.join(", ")) };
+            self.notes.push(format!("no frame of the configured interfaces{others}"));
+        }
+    }
+}

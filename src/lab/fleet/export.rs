@@ -1,0 +1,304 @@
+//! What came out of logs, as tables any engine reads: estimates, half-cycles and alarms, Parquet or CSV.
+//!
+//! In: a configuration and logs. Out: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
+//! `.csv`; columns and units in [`columns`]) and `about.json`, which is written last: where it is, the others are whole.
+//! Promise: a file has its final name only when it is complete; memory is bounded by a row group per table and log,
+//! whatever the length of the log; a log that fails leaves no file of its own and the others go on.
+
+mod columns;
+mod rows;
+mod table;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use serde::Serialize;
+use serde_json::json;
+
+use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned};
+use self::table::TableFile;
+use super::drive::{Driven, Reading, drive};
+use crate::config::Config;
+use crate::daemon::status::document::ConfigFile;
+use crate::io::result_file::ResultFile;
+use crate::io::stamp;
+use crate::monitor::{Event, Monitor, Outputs};
+use crate::quantity::{CellIndex, Timestamp};
+
+pub(crate) use columns::reference;
+
+/// Version of `about.json`.
+const VERSION: u32 = 1;
+
+/// Form of the tables.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Format {
+    /// Apache Parquet, Snappy.
+    Parquet,
+    /// Comma-separated values with a heading.
+    Csv,
+}
+
+impl Format {
+    const fn ending(self) -> &'static str {
+        match self {
+            Self::Parquet => "parquet",
+            Self::Csv => "csv",
+        }
+    }
+}
+
+/// What all logs have in common.
+#[derive(Clone)]
+pub(crate) struct Settings<'a> {
+    /// How they are read.
+    pub(crate) reading: Reading<'a>,
+    /// Form of the tables.
+    pub(crate) format: Format,
+    /// Folder for the logs' folders.
+    pub(crate) out: PathBuf,
+    /// At most one estimate per cell in each period, s; 0 = every one.
+    pub(crate) period_s: f64,
+    /// Threads; `None` = all cores.
+    pub(crate) jobs: Option<usize>,
+}
+
+/// A log's tables.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Exported {
+    /// The log.
+    pub(crate) log: PathBuf,
+    /// Folder of its tables.
+    pub(crate) folder: PathBuf,
+    /// Rows of each table.
+    pub(crate) rows: BTreeMap<&'static str, u64>,
+    /// From the first stamp to the last, days.
+    pub(crate) days: f64,
+    /// What the user should know.
+    pub(crate) notes: Vec<String>,
+}
+
+/// Exports all logs; per log what was written, or why nothing was. `report` is told bytes read.
+///
+/// # Errors
+/// When no threads can be started.
+pub(crate) fn run(
+    config: &Config,
+    logs: &[PathBuf],
+    settings: &Settings<'_>,
+    report: &(dyn Fn(u64) + Sync),
+) -> Result<Vec<Result<Exported, String>>, String> {
+    let names = names(logs);
+    super::in_parallel(logs, settings.jobs, |index, log| export(config, log, &names[index], settings, report))
+}
+
+fn export(
+    config: &Config,
+    log: &Path,
+    name: &str,
+    settings: &Settings<'_>,
+    report: &dyn Fn(u64),
+) -> Result<Exported, String> {
+    let folder = settings.out.join(name);
+    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be made: {error}", folder.display()))?;
+    let mut tables = Tables::create(config, name, &folder, settings)?;
+    let out = Outputs { want_estimates: true, ..Outputs::default() };
+    let source = (settings.reading.open)(config, log);
+    let mut each = |monitor: &Monitor, out: &mut Outputs| {
+        let taken = tables.take(monitor, out);
+        out.clear();
+        taken
+    };
+    let monitor = Monitor::new(config.monitor.clone());
+    let driven = drive(source, monitor, out, settings.reading.sleep_gap_s, &mut each, report)?;
+    let span = driven.span_of(log)?;
+    let metadata = metadata(config, log, span, settings);
+    let mut notes = driven.notes.clone();
+    notes.extend(forget_about(&folder, log)?);
+    let rows = tables.finish(&metadata)?;
+    let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes };
+    write_about(&exported, &driven, metadata)?;
+    Ok(exported)
+}
+
+/// Takes away what an earlier export said of itself, since its tables are replaced one by one; a note when they were those
+/// of another log.
+fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
+    let path = folder.join("about.json");
+    let Ok(text) = std::fs::read(&path) else { return Ok(None) };
+    std::fs::remove_file(&path).map_err(|error| format!("{}: cannot be removed: {error}", path.display()))?;
+    let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
+    let other = about["metadata"]["packwatch.log"].as_str().filter(|other| Path::new(other) != log);
+    Ok(other.map(|other| format!("replaced the tables of {other}")))
+}
+
+/// What the files say of themselves.
+fn metadata(
+    config: &Config,
+    log: &Path,
+    (first, last): (Timestamp, Timestamp),
+    settings: &Settings<'_>,
+) -> Vec<(&'static str, String)> {
+    let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
+    vec![
+        ("packwatch.version", env!("CARGO_PKG_VERSION").to_owned()),
+        ("packwatch.config", config.path.display().to_string()),
+        ("packwatch.config_sha256", hash),
+        ("packwatch.log", log.display().to_string()),
+        ("packwatch.start_utc", stamp::format_utc_micros(first)),
+        ("packwatch.end_utc", stamp::format_utc_micros(last)),
+        ("packwatch.estimates_period_s", settings.period_s.to_string()),
+    ]
+}
+
+fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
+    let metadata: serde_json::Map<_, _> =
+        metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
+    let document = json!({
+        "version": VERSION,
+        "metadata": metadata,
+        "rows": exported.rows,
+        "log": driven.counts,
+        "notes": exported.notes,
+    });
+    let mut file = ResultFile::create(&exported.folder.join("about.json")).map_err(|error| error.to_string())?;
+    serde_json::to_writer_pretty(&mut file, &document).map_err(|error| error.to_string())?;
+    file.finish().map_err(|error| error.to_string())
+}
+
+/// A name per log that a folder can have: the file's without endings; with the folder's before it, or a number after it,
+/// where several are the same.
+fn names(logs: &[PathBuf]) -> Vec<String> {
+    let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
+    let short = |log: &PathBuf| {
+        if log == Path::new("-") {
+            return "stdin".to_owned();
+        }
+        let name = text(log.file_name());
+        let name = [".gz", ".zst"].iter().find_map(|ending| name.strip_suffix(ending)).unwrap_or(&name).to_owned();
+        let stem = name.rsplit_once('.').map_or(name.as_str(), |(stem, _)| stem).to_owned();
+        clean(if stem.is_empty() { "log" } else { &stem })
+    };
+    let all: Vec<String> = logs.iter().map(short).collect();
+    let mut names: Vec<String> = Vec::with_capacity(all.len());
+    for (log, name) in logs.iter().zip(&all) {
+        let is_twice = all.iter().filter(|other| *other == name).count() > 1;
+        let folder =
+            log.parent().map(|folder| text(folder.file_name())).filter(|folder| is_twice && !folder.is_empty());
+        let name = folder.map_or_else(|| name.clone(), |folder| format!("{}-{name}", clean(&folder)));
+        let numbered = (2..).map(|number| format!("{name}-{number}"));
+        names.extend(std::iter::once(name.clone()).chain(numbered).find(|name| !names.contains(name)));
+    }
+    names
+}
+
+/// What is safe in a file's name everywhere.
+fn clean(name: &str) -> String {
+    let safe = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '_' };
+    let name: String = name.chars().map(safe).collect();
+    if name.starts_with('.') { format!("_{name}") } else { name }
+}
+
+/// The three tables of one log.
+struct Tables {
+    log: Arc<str>,
+    estimates: TableFile<EstimateRow>,
+    half_cycles: TableFile<HalfCycleRow>,
+    alarms: TableFile<AlarmRow>,
+    period_ns: i64,
+    first: Option<Timestamp>,
+    /// Period of the last estimate written, per cell.
+    periods: Vec<Option<i64>>,
+    rated_ah: f64,
+    moved_ah: Vec<f64>,
+    /// A half-cycle whose capacity comes next.
+    half_cycle: Option<HalfCycle>,
+}
+
+impl Tables {
+    fn create(config: &Config, name: &str, folder: &Path, settings: &Settings<'_>) -> Result<Self, String> {
+        let cells = usize::from(config.monitor.sample.cells);
+        let (form, ending) = (settings.format, settings.format.ending());
+        let path = |table: &str| folder.join(format!("{table}.{ending}"));
+        Ok(Self {
+            log: name.into(),
+            estimates: TableFile::create(&path("estimates"), form, columns::ESTIMATES)?,
+            half_cycles: TableFile::create(&path("half_cycles"), form, columns::HALF_CYCLES)?,
+            alarms: TableFile::create(&path("alarms"), form, columns::ALARMS)?,
+            period_ns: (settings.period_s * 1e9) as i64,
+            first: None,
+            periods: vec![None; cells],
+            rated_ah: config.monitor.model.rated_capacity_ah,
+            moved_ah: vec![0.0; cells],
+            half_cycle: None,
+        })
+    }
+
+    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), String> {
+        for estimate in &out.estimates {
+            let since_ns = self.since_ns(estimate.time);
+            let Some(last) = self.periods.get_mut(estimate.cell.index()) else { continue };
+            let period = since_ns.checked_div(self.period_ns);
+            if period.is_none() || last.is_none_or(|last| period > Some(last)) {
+                *last = period;
+                self.estimates.push(&EstimateRow {
+                    log: self.log.clone(),
+                    since_s: since_ns as f64 * 1e-9,
+                    estimate: *estimate,
+                })?;
+            }
+        }
+        out.events.iter().try_for_each(|event| self.take_event(monitor, event))
+    }
+
+    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), String> {
+        let (log, time) = (self.log.clone(), event.time);
+        let since_s = self.since_ns(time) as f64 * 1e-9;
+        if let Some(half) = HalfCycle::of(&event.kind) {
+            if let Some(moved_ah) = self.moved_ah.get_mut(half.cell.index()) {
+                *moved_ah += half.charge_ah;
+            }
+            self.half_cycle = Some(half);
+        } else if let Some((cell, learned)) = Learned::of(&event.kind) {
+            let half = self.half_cycle.take().filter(|half| half.cell == cell);
+            let half = half.ok_or("a capacity came without its half-cycle")?;
+            let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
+            self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, learned, remaining })?;
+        } else if let Some(alarm) = Alarm::of(&event.kind) {
+            self.alarms.push(&AlarmRow { log, time, since_s, alarm })?;
+        }
+        Ok(())
+    }
+
+    fn full_cycles(&self, cell: CellIndex) -> f64 {
+        self.moved_ah.get(cell.index()).map_or(f64::NAN, |moved_ah| moved_ah / (2.0 * self.rated_ah))
+    }
+
+    /// Since the first thing that was told.
+    fn since_ns(&mut self, time: Timestamp) -> i64 {
+        let first = *self.first.get_or_insert(time);
+        time.nanos().saturating_sub(first.nanos())
+    }
+
+    /// Completes the files, each with what it says of itself; rows of each.
+    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, String> {
+        Ok(BTreeMap::from([
+            ("estimates", self.estimates.finish(metadata)?),
+            ("half_cycles", self.half_cycles.finish(metadata)?),
+            ("alarms", self.alarms.finish(metadata)?),
+        ]))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_safe_and_no_two_are_the_same() {
+        let logs =
+            ["a/life.log.gz", "b/life.csv", "c/day 1.log", "b/life.log", ".log", "x/y.z.log", "-"].map(PathBuf::from);
+        assert_eq!(names(&logs), ["a-life", "b-life", "day_1", "b-life-2", "log", "y.z", "stdin"]);
+    }
+}

@@ -1,0 +1,257 @@
+//! One alarm in one log, judged: lead before the end of life, missed, false.
+//!
+//! The words are those of `tests/alarm_tradeoff.md`, for a record that may end before the life does:
+//!
+//! * **end of life**: by the truth, the first moment a cell's capacity is below the limit; without a truth, when the weakest
+//!   learned capacity went below it for good, as the end of the record shows it.
+//! * **true raise**: a raise before the end of life, with the end coming within the horizon (if one is given).
+//! * **false alarm**: a raise with which the end of life did not come within the horizon; without a horizon, one in a
+//!   record that has no end of life. Raises at or after the end are neither.
+//! * **open**: a raise less than the horizon before the end of a record that has no end of life: nobody can say.
+//! * **lead**: from the first true raise to the end of life, in days and in equivalent full cycles.
+//! * **missed**: the end of life came without a true raise before it.
+//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; said only where
+//!   the truth has it.
+//! * **flickers**: clears before the end of life.
+//!
+//! Only rules about ageing (those whose values are learned) are judged so; of the others the raises are told.
+
+use serde::Serialize;
+
+use super::lanes::{AlarmHistory, Raise};
+use super::track::Track;
+use super::truth::{Truth, TruthKind};
+use crate::alarm::{Rule, RuleConfig};
+use crate::quantity::Timestamp;
+
+/// How soon after a raise the end of life must come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Horizon {
+    /// In equivalent full cycles.
+    Cycles(f64),
+    /// In days.
+    Days(f64),
+}
+
+/// A log's life, for the judgement.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Life<'a> {
+    /// Charge moved.
+    pub(crate) track: &'a Track,
+    /// What was true.
+    pub(crate) truth: Option<&'a Truth>,
+    /// First and last stamp.
+    pub(crate) span: (Timestamp, Timestamp),
+    /// End of life; `None` = not reached.
+    pub(crate) end: Option<Timestamp>,
+    /// How soon it must come.
+    pub(crate) horizon: Option<Horizon>,
+}
+
+/// A raise, for people and machines.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub(crate) struct First {
+    /// Stamp of the log, s.
+    pub(crate) time_s: f64,
+    /// Days after the log's first stamp.
+    pub(crate) days: f64,
+    /// Equivalent full cycles so far.
+    pub(crate) cycles: f64,
+    /// Counted from 0; `None` = the pack.
+    pub(crate) cell: Option<u16>,
+    /// The value that raised it, in the rule's unit.
+    pub(crate) value: Option<f64>,
+}
+
+/// What a threshold's alarms were worth in one log.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Judged {
+    /// The first raise.
+    pub(crate) first: Option<First>,
+    /// Raises, at any time.
+    pub(crate) raises: usize,
+    /// Lead, days.
+    pub(crate) lead_days: Option<f64>,
+    /// Lead, equivalent full cycles.
+    pub(crate) lead_cycles: Option<f64>,
+    /// The end of life came without a true raise; `None` = it did not come, or the rule is not about ageing.
+    pub(crate) missed: Option<bool>,
+    /// False alarms; `None` = the rule is not about ageing.
+    pub(crate) false_alarms: Option<usize>,
+    /// Raises that nobody can judge.
+    pub(crate) open: Option<usize>,
+    /// Raises above the true threshold; `None` = nobody knows.
+    pub(crate) false_raises: Option<usize>,
+    /// Clears before the end of life.
+    pub(crate) flickers: usize,
+    /// Raises and clears that were only counted.
+    pub(crate) not_kept: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Verdict {
+    True,
+    False,
+    Open,
+    Late,
+}
+
+/// Judges the alarms of one threshold.
+pub(crate) fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Judged {
+    let verdicts: Vec<(Verdict, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
+    let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
+    let is_ageing = config.rule.row().is_learned;
+    let first_true = verdicts.iter().find(|(verdict, _)| *verdict == Verdict::True).map(|(_, raise)| raise.time);
+    let lead = life.end.zip(first_true).filter(|_| is_ageing);
+    Judged {
+        first: history.raises.first().map(|raise| life.first(raise)),
+        raises: history.raises.len(),
+        lead_days: lead.map(|(end, raised)| end.since(raised) / 86_400.0),
+        lead_cycles: lead.map(|(end, raised)| life.track.cycles_at(end) - life.track.cycles_at(raised)),
+        missed: life.end.filter(|_| is_ageing).map(|_| first_true.is_none()),
+        false_alarms: is_ageing.then(|| count(Verdict::False)),
+        open: is_ageing.then(|| count(Verdict::Open)),
+        false_raises: life.false_raises(config, history),
+        flickers: history.clears.iter().filter(|time| life.end.is_none_or(|end| **time < end)).count(),
+        not_kept: history.not_kept,
+    }
+}
+
+impl Life<'_> {
+    fn verdict(&self, raise: &Raise) -> Verdict {
+        let within = |until: Timestamp| match self.horizon {
+            None => None,
+            Some(Horizon::Days(days)) => Some(until.since(raise.time) / 86_400.0 <= days),
+            Some(Horizon::Cycles(cycles)) => {
+                Some(self.track.cycles_at(until) - self.track.cycles_at(raise.time) <= cycles)
+            }
+        };
+        match self.end {
+            Some(end) if raise.time >= end => Verdict::Late,
+            Some(end) if within(end).unwrap_or(true) => Verdict::True,
+            Some(_) => Verdict::False,
+            None if within(self.span.1).unwrap_or(false) => Verdict::Open,
+            None => Verdict::False,
+        }
+    }
+
+    fn first(&self, raise: &Raise) -> First {
+        First {
+            time_s: raise.time.secs(),
+            days: raise.time.since(self.span.0) / 86_400.0,
+            cycles: self.track.cycles_at(raise.time),
+            cell: raise.cell.map(|cell| cell.0),
+            value: raise.value,
+        }
+    }
+
+    fn false_raises(&self, config: &RuleConfig, history: &AlarmHistory) -> Option<usize> {
+        let truth = self.truth.filter(|truth| truth.kind == TruthKind::Capacity)?;
+        let is_false = |raise: &&Raise| {
+            let true_ah = raise.cell.and_then(|cell| truth.capacity_ah(cell, raise.time));
+            true_ah.is_some_and(|true_ah| true_ah > config.threshold)
+        };
+        (config.rule == Rule::CapacityLow).then(|| history.raises.iter().filter(is_false).count())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::alarm::{Severity, When};
+    use crate::lab::fleet::track::Learned;
+    use crate::monitor::{Event, EventKind};
+    use crate::quantity::{CellIndex, Mode};
+
+    const DAY_S: f64 = 86_400.0;
+
+    fn day(day: f64) -> Timestamp {
+        Timestamp::from_secs(day * DAY_S)
+    }
+
+    /// One equivalent full cycle a day.
+    fn track() -> Track {
+        let mut track = Track::new(1.0, Learned::Capacity);
+        for end in 1..=100 {
+            let kind = EventKind::HalfCycle {
+                cell: CellIndex(0),
+                mode: Mode::Discharge,
+                charge_ah: 2.0,
+                swing: None,
+                swing_std: None,
+                duration_s: 1.0,
+                mean_current_a: 1.0,
+                mean_temperature_c: None,
+            };
+            track.observe(&[Event { time: day(f64::from(end)), kind }]);
+        }
+        track
+    }
+
+    fn rule(rule: Rule) -> RuleConfig {
+        RuleConfig {
+            rule,
+            severity: Severity::Warning,
+            threshold: 0.8,
+            clear: 0.9,
+            when: When::Mean,
+            debounce_s: 0.0,
+            debounce_events: 1,
+            is_latching: false,
+        }
+    }
+
+    fn history(raised: &[f64], cleared: &[f64]) -> AlarmHistory {
+        let raise = |at: &f64| Raise { time: day(*at), cell: Some(CellIndex(0)), value: Some(0.79) };
+        AlarmHistory {
+            raises: raised.iter().map(raise).collect(),
+            clears: cleared.iter().map(|at| day(*at)).collect(),
+            not_kept: 0,
+        }
+    }
+
+    fn judged(raised: &[f64], end: Option<f64>, horizon: Option<Horizon>) -> Judged {
+        let track = track();
+        let life = Life { track: &track, truth: None, span: (day(0.0), day(100.0)), end: end.map(day), horizon };
+        judge(&rule(Rule::CapacityLow), &history(raised, &[20.0, 95.0]), &life)
+    }
+
+    #[test]
+    fn lead_runs_from_the_first_true_raise_to_the_end() {
+        let found = judged(&[10.0, 60.0], Some(90.0), None);
+        assert_eq!((found.lead_days, found.lead_cycles, found.missed), (Some(80.0), Some(80.0), Some(false)));
+        assert_eq!((found.false_alarms, found.flickers, found.raises), (Some(0), 1, 2));
+        // With a horizon of 40 the raise at 10 was false, and lead begins at 60.
+        for horizon in [Horizon::Days(40.0), Horizon::Cycles(40.0)] {
+            let found = judged(&[10.0, 60.0], Some(90.0), Some(horizon));
+            assert_eq!((found.lead_days, found.false_alarms, found.missed), (Some(30.0), Some(1), Some(false)));
+        }
+    }
+
+    #[test]
+    fn an_end_without_a_raise_before_it_is_missed() {
+        for raised in [&[][..], &[90.0, 95.0]] {
+            let found = judged(raised, Some(90.0), None);
+            assert_eq!((found.missed, found.lead_days, found.false_alarms), (Some(true), None, Some(0)), "{raised:?}");
+        }
+        assert_eq!(judged(&[10.0], Some(90.0), Some(Horizon::Days(5.0))).missed, Some(true));
+    }
+
+    #[test]
+    fn without_an_end_a_raise_is_false_or_open() {
+        let found = judged(&[10.0, 80.0], None, None);
+        assert_eq!((found.false_alarms, found.open, found.missed), (Some(2), Some(0), None));
+        let found = judged(&[10.0, 80.0], None, Some(Horizon::Days(40.0)));
+        assert_eq!((found.false_alarms, found.open), (Some(1), Some(1)));
+    }
+
+    #[test]
+    fn a_rule_that_is_not_about_ageing_is_only_told() {
+        let track = track();
+        let life =
+            Life { track: &track, truth: None, span: (day(0.0), day(100.0)), end: Some(day(90.0)), horizon: None };
+        let found = judge(&rule(Rule::SocLow), &history(&[10.0], &[]), &life);
+        assert_eq!((found.raises, found.lead_days, found.false_alarms, found.missed), (1, None, None, None));
+        assert_eq!(found.first.map(|first| (first.days, first.cycles)), Some((10.0, 10.0)));
+    }
+}

@@ -1,0 +1,164 @@
+//! What a life came to along the way: charge moved, and the weakest capacity learned.
+//!
+//! In: the core's events. Out: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities,
+//! both known at the ends of half-cycles and interpolated between them (charge) or held (capacity).
+
+use std::collections::BTreeMap;
+
+use crate::monitor::{Event, EventKind};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Which of the capacities was learned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Learned {
+    /// At the configured load.
+    Usable,
+    /// Between the open-circuit voltages.
+    Capacity,
+}
+
+/// A life so far.
+#[derive(Debug, Clone)]
+pub(crate) struct Track {
+    rated_ah: f64,
+    learned: Learned,
+    moved_ah: BTreeMap<CellIndex, f64>,
+    capacity_ah: BTreeMap<CellIndex, f64>,
+    /// Ends of half-cycles: time and equivalent full cycles so far.
+    cycles: Vec<(Timestamp, f64)>,
+    /// The weakest learned capacity after each, and its cell.
+    weakest: Vec<(Timestamp, f64, CellIndex)>,
+}
+
+impl Track {
+    pub(crate) fn new(rated_ah: f64, learned: Learned) -> Self {
+        let none = BTreeMap::new();
+        Self { rated_ah, learned, moved_ah: none.clone(), capacity_ah: none, cycles: Vec::new(), weakest: Vec::new() }
+    }
+
+    /// Takes the events of one input.
+    pub(crate) fn observe(&mut self, events: &[Event]) {
+        for event in events {
+            match event.kind {
+                EventKind::HalfCycle { cell, charge_ah, .. } => self.move_charge(event.time, cell, charge_ah),
+                EventKind::Capacity { cell, capacity_ah, usable_capacity_ah, .. } => {
+                    let learned = match self.learned {
+                        Learned::Usable => usable_capacity_ah,
+                        Learned::Capacity => Some(capacity_ah),
+                    };
+                    self.learn(event.time, cell, learned);
+                }
+                EventKind::PackReplaced { .. } => self.capacity_ah.clear(),
+                _ => {}
+            }
+        }
+    }
+
+    fn move_charge(&mut self, time: Timestamp, cell: CellIndex, charge_ah: f64) {
+        let moved_ah = self.moved_ah.entry(cell).or_default();
+        *moved_ah += charge_ah;
+        let cycles = *moved_ah / (2.0 * self.rated_ah);
+        let most = self.cycles.last().map_or(0.0, |last| last.1);
+        // The cells of a string move the same charge; one that was not known for a while has counted less.
+        if cycles > most {
+            self.cycles.pop_if(|last| last.0 == time);
+            self.cycles.push((time, cycles));
+        }
+    }
+
+    fn learn(&mut self, time: Timestamp, cell: CellIndex, learned_ah: Option<f64>) {
+        let Some(learned_ah) = learned_ah else { return };
+        self.capacity_ah.insert(cell, learned_ah);
+        let least = self.capacity_ah.iter().min_by(|a, b| a.1.total_cmp(b.1));
+        let Some((&cell, &ah)) = least else { return };
+        self.weakest.pop_if(|last| last.0 == time);
+        self.weakest.push((time, ah, cell));
+    }
+
+    /// Equivalent full cycles up to `time`.
+    pub(crate) fn cycles_at(&self, time: Timestamp) -> f64 {
+        let after = self.cycles.partition_point(|(at, _)| *at <= time);
+        let before = after.checked_sub(1).and_then(|index| self.cycles.get(index));
+        match (before, self.cycles.get(after)) {
+            (Some(&(from, low)), Some(&(to, high))) => low + (high - low) * time.since(from) / to.since(from),
+            (Some(&(_, cycles)), None) => cycles,
+            (None, _) => 0.0,
+        }
+    }
+
+    /// Equivalent full cycles in all.
+    pub(crate) fn cycles(&self) -> f64 {
+        self.cycles.last().map_or(0.0, |last| last.1)
+    }
+
+    /// Which capacity it follows.
+    pub(crate) fn learned(&self) -> Learned {
+        self.learned
+    }
+
+    /// From when on the weakest learned capacity stayed below `end_ah` up to the end of the log; `None` = at the end it
+    /// is not below, or nothing was learned.
+    pub(crate) fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
+        let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
+        below.map(|&(time, _, cell)| (time, cell))
+    }
+
+    /// The weakest learned capacity at the end, Ah.
+    pub(crate) fn last_ah(&self) -> Option<f64> {
+        self.weakest.last().map(|last| last.1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::quantity::Mode;
+
+    fn half_cycle(time_s: f64, cell: u16, charge_ah: f64) -> Event {
+        let kind = EventKind::HalfCycle {
+            cell: CellIndex(cell),
+            mode: Mode::Charge,
+            charge_ah,
+            swing: None,
+            swing_std: None,
+            duration_s: 1.0,
+            mean_current_a: 1.0,
+            mean_temperature_c: None,
+        };
+        Event { time: Timestamp::from_secs(time_s), kind }
+    }
+
+    fn learned(time_s: f64, cell: u16, capacity_ah: f64) -> Event {
+        let kind = EventKind::Capacity {
+            cell: CellIndex(cell),
+            measured_ah: None,
+            measured_std_ah: None,
+            capacity_ah,
+            capacity_std_ah: 0.1,
+            usable_capacity_ah: Some(capacity_ah - 0.1),
+            usable_capacity_std_ah: Some(0.1),
+            resistance_ratio: 1.0,
+            resistance_ratio_std: 0.1,
+        };
+        Event { time: Timestamp::from_secs(time_s), kind }
+    }
+
+    #[test]
+    fn cycles_are_charge_over_twice_the_rated_capacity_and_run_between_ends() {
+        let mut track = Track::new(2.0, Learned::Capacity);
+        track.observe(&[half_cycle(100.0, 0, 2.0), half_cycle(100.0, 1, 1.0), half_cycle(200.0, 0, 1.0)]);
+        let at = |time_s| track.cycles_at(Timestamp::from_secs(time_s));
+        assert_eq!((at(99.0), at(100.0), at(150.0), at(300.0)), (0.0, 0.5, 0.625, 0.75));
+        assert_eq!(track.cycles(), 0.75);
+    }
+
+    #[test]
+    fn the_end_is_when_the_weakest_cell_goes_below_for_good() {
+        let mut track = Track::new(2.0, Learned::Usable);
+        let lives = [(1.0, 0, 1.4), (1.0, 1, 1.6), (2.0, 0, 1.6), (3.0, 1, 1.45), (4.0, 0, 1.55), (5.0, 1, 1.4)];
+        track.observe(&lives.map(|(time_s, cell, ah)| learned(time_s, cell, ah)));
+        assert_eq!(track.stays_below(1.4), Some((Timestamp::from_secs(3.0), CellIndex(1))));
+        assert_eq!(track.stays_below(1.25), None);
+        assert!((track.last_ah().expect("learned") - 1.3).abs() < 1e-12);
+    }
+}

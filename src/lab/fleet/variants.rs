@@ -1,0 +1,219 @@
+//! `--set KEY=V1,V2`: other values in a configuration, and the grid of all their combinations.
+//!
+//! In: the configuration's text and choices. Out: one checked configuration per combination, the one as written first, and
+//! which of them can share a replay: those that differ in nothing but `[[alarm]]` tables (of `input_missing` aside: how
+//! long a silence counts is judged before the alarms see it). A combination that is no valid configuration is left out
+//! and told.
+//!
+//! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the gravest severity
+//! that the file has, `RULE.probability` for `when = { probability = ... }`, any other key of the rule's `[[alarm]]` tables;
+//! or any dotted key, with `[n]` from 1 for tables written several times.
+
+mod target;
+
+use std::path::Path;
+
+use toml::{Table, Value};
+
+use self::target::{Target, name_rules, rule_of, targets};
+use crate::alarm::Rule;
+use crate::config::{self, Config};
+
+/// Combinations at most: a table nobody reads to its end.
+pub(crate) const MAX_COMBINATIONS: usize = 1000;
+/// Faults quoted of one combination.
+const MAX_QUOTED: usize = 3;
+/// One `--set`.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Choice {
+    /// As written.
+    pub(crate) key: String,
+    values: Vec<(String, Value)>,
+}
+
+impl std::str::FromStr for Choice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        const EXPECTED: &str = "must be KEY=VALUE[,VALUE...]";
+        let (key, values) = text.split_once('=').ok_or(EXPECTED)?;
+        let key = key.trim().to_owned();
+        let parts = split(values);
+        if key.is_empty() || key.split('.').any(str::is_empty) || parts.iter().any(|part| part.is_empty()) {
+            return Err(EXPECTED.to_owned());
+        }
+        if let Some(twice) = (1..parts.len()).find(|&index| parts[..index].contains(&parts[index])) {
+            return Err(format!("value {} given twice", parts[twice]));
+        }
+        let values = parts.into_iter().map(|part| (part.to_owned(), value(part))).collect();
+        Ok(Self { key, values })
+    }
+}
+
+/// At the commas outside of quotes and brackets.
+fn split(text: &str) -> Vec<&str> {
+    let (mut parts, mut from, mut depth, mut quote) = (Vec::new(), 0, 0_i32, None);
+    for (at, letter) in text.char_indices() {
+        match (quote, letter) {
+            (Some(open), _) => quote = if letter == open { None } else { quote },
+            (None, '"' | '\'') => quote = Some(letter),
+            (None, '{' | '[') => depth += 1,
+            (None, '}' | ']') => depth -= 1,
+            (None, ',') if depth == 0 => {
+                parts.push(text[from..at].trim());
+                from = at + 1;
+            }
+            (None, _) => {}
+        }
+    }
+    parts.push(text[from..].trim());
+    parts
+}
+
+/// As TOML; what is no TOML value is a text (`80 %`, `mean`).
+fn value(text: &str) -> Value {
+    let parsed = format!("value = {text}").parse::<Table>().ok();
+    parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
+}
+
+/// One combination.
+#[derive(Debug, Clone)]
+pub(crate) struct Variant {
+    /// What is set, as written, in the order of the choices; empty = the configuration as it is.
+    pub(crate) values: Vec<String>,
+    /// What it means.
+    pub(crate) config: Config,
+    /// Combinations with the same number share a replay.
+    pub(crate) replay: usize,
+}
+
+/// All combinations.
+#[derive(Debug, Clone)]
+pub(crate) struct Grid {
+    /// The keys, as written.
+    pub(crate) keys: Vec<String>,
+    /// The configuration as it is, then every combination.
+    pub(crate) variants: Vec<Variant>,
+    /// Replays needed per log.
+    pub(crate) replays: usize,
+    /// Rules that were named.
+    pub(crate) rules: Vec<Rule>,
+    /// Whether something else was set, too.
+    pub(crate) other_keys: bool,
+    /// What the user should know.
+    pub(crate) notes: Vec<String>,
+}
+
+/// Makes the grid.
+///
+/// # Errors
+/// When the configuration is faulty, a key names nothing, there are too many combinations, or none of them is valid.
+pub(crate) fn grid(path: &Path, choices: &[Choice]) -> Result<Grid, Vec<String>> {
+    let plain = config::load(path).map_err(|faults| faults.0)?;
+    let root = read(path).map_err(|fault| vec![fault])?;
+    let mut grid = Grid {
+        keys: choices.iter().map(|choice| choice.key.clone()).collect(),
+        variants: Vec::new(),
+        replays: 0,
+        rules: Vec::new(),
+        other_keys: false,
+        notes: Vec::new(),
+    };
+    let targets = targets(&mut grid, &root, choices).map_err(|fault| vec![fault])?;
+    let mut replays = vec![replay_key(&root)];
+    grid.variants.push(Variant { values: Vec::new(), config: plain, replay: 0 });
+    let (mut refused, mut first_refused) = (0, Vec::new());
+    for combination in combinations(choices).map_err(|fault| vec![fault])? {
+        let values = combination.iter().map(|(text, _)| text.clone()).collect();
+        match variant(path, &root, &targets, &combination) {
+            Ok((config, key)) => {
+                let known = replays.iter().position(|other| *other == key);
+                let replay = known.unwrap_or(replays.len());
+                replays.extend(known.is_none().then_some(key));
+                grid.variants.push(Variant { values, config, replay });
+            }
+            Err(faults) => {
+                refused += 1;
+                if first_refused.is_empty() {
+                    let set: Vec<_> =
+                        grid.keys.iter().zip(&combination).map(|(k, (v, _))| format!("{k}={v}")).collect();
+                    first_refused = faults.iter().take(MAX_QUOTED).map(|f| format!("{}: {f}", set.join(" "))).collect();
+                }
+            }
+        }
+    }
+    grid.replays = replays.len();
+    if refused > 0 && grid.variants.len() == 1 {
+        return Err(first_refused);
+    }
+    if refused > 0 {
+        let first = first_refused.join("; ");
+        grid.notes.push(format!("{refused} combinations are no valid configuration and are left out: {first}"));
+    }
+    Ok(grid)
+}
+
+/// The combination's configuration, and what its replay depends on.
+fn variant(
+    path: &Path,
+    root: &Table,
+    targets: &[Target],
+    combination: &[&(String, Value)],
+) -> Result<(Config, String), Vec<String>> {
+    let mut root = root.clone();
+    for (target, (_, value)) in targets.iter().zip(combination) {
+        target.set(&mut root, value).map_err(|fault| vec![fault])?;
+    }
+    let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
+    let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
+    let config = config::load_with(path, &read).map_err(|faults| {
+        // The lines are those of a text that nobody wrote.
+        let file = format!("{}:", path.display());
+        let without_line = |fault: &String| {
+            let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
+            rest.and_then(|rest| rest.strip_prefix(": ")).unwrap_or(fault).to_owned()
+        };
+        faults.0.iter().map(without_line).map(|fault| name_rules(fault, targets)).collect::<Vec<_>>()
+    })?;
+    Ok((config, replay_key(&root)))
+}
+
+fn read(path: &Path) -> Result<Table, String> {
+    let text = std::fs::read_to_string(path).map_err(|error| format!("{}: cannot be read: {error}", path.display()))?;
+    text.parse::<Table>().map_err(|error| format!("{}: {}", path.display(), error.message()))
+}
+
+/// Everything of a configuration that estimates, and the values of the rules, can depend on.
+fn replay_key(root: &Table) -> String {
+    let mut root = root.clone();
+    if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
+        alarms.retain(|alarm| rule_of(alarm) == Some(Rule::InputMissing.name()));
+    }
+    // A table that can be read can be written; were it not so, nothing would be shared.
+    toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
+}
+
+/// Every combination, the last choice changing fastest; none without choices.
+fn combinations(choices: &[Choice]) -> Result<Vec<Vec<&(String, Value)>>, String> {
+    if choices.is_empty() {
+        return Ok(Vec::new());
+    }
+    let count = choices.iter().try_fold(1_usize, |count, choice| count.checked_mul(choice.values.len()));
+    let Some(count) = count.filter(|count| *count <= MAX_COMBINATIONS) else {
+        let lists: Vec<_> = choices.iter().map(|choice| choice.values.len().to_string()).collect();
+        return Err(format!("--set: {} combinations, must be at most {MAX_COMBINATIONS}", lists.join(" x ")));
+    };
+    let mut all: Vec<Vec<&(String, Value)>> = Vec::with_capacity(count);
+    all.push(Vec::new());
+    for choice in choices {
+        let longer = |so_far: &Vec<_>| {
+            let so_far = so_far.clone();
+            choice.values.iter().map(move |value| so_far.iter().copied().chain([value]).collect())
+        };
+        all = all.iter().flat_map(longer).collect();
+    }
+    Ok(all)
+}
+
+#[cfg(test)]
+mod tests;

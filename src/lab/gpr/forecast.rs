@@ -1,0 +1,350 @@
+//! Rows to come from rows that were: a forecast that needs nothing of the future.
+//!
+//! In: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at row
+//! t is what is known then: for every column its value and its last differences ([`Plan::lags`] values in all). For every
+//! output and every horizon h there is a process of its own (a direct forecast) that predicts the change from t to t + h:
+//! errors of one step do not feed the next, and each horizon has its own noise. Without knowledge the forecast falls
+//! back to the mean change, so to persistence.
+//!
+//! The interval comes from forecasts that really were made: the process is fitted again to the beginning of the training
+//! rows and judged on the block that follows, block after block; how wide it is, and where, follows from |error| /
+//! standard deviation of these ([`spread`]). (Rows left out one by one would not do: windows overlap, and each row's
+//! neighbours give it away.) No row after the origin is looked at.
+
+mod spread;
+mod windows;
+
+use std::path::Path;
+use std::time::Instant;
+
+pub use windows::{Steps, Windows};
+
+use super::{GprError, Table, create, finish};
+use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
+use spread::Spread;
+
+/// Most lagged values of a column.
+pub const MAX_LAGS: usize = 200;
+/// Most rows ahead.
+pub const MAX_STEPS: usize = 10_000;
+/// Most horizons that get a process of their own; between them nothing is said.
+pub const MAX_HORIZONS: usize = 10;
+/// Fewest windows to train on.
+const FEWEST: usize = 20;
+/// Most windows of a block that are judged for the interval.
+const BLOCK_WINDOWS: usize = 750;
+/// Most windows after the origin that are judged.
+const HELD_OUT: usize = 5000;
+/// Where the blocks for the interval begin and end, parts of the training rows.
+const BLOCKS: [f64; 5] = [0.4, 0.55, 0.7, 0.85, 1.0];
+/// Steps of a search that begins where the horizon before it ended.
+const WARM_STEPS: usize = 20;
+/// Fractions of its multiples fill a stretch evenly and never repeat.
+const GOLDEN: f64 = 0.618_033_988_749_894_9;
+
+/// What to forecast.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// The first so many columns of the table are forecast.
+    pub outputs: usize,
+    /// Values of each column that a window has, 1 or more.
+    pub lags: usize,
+    /// Rows ahead, 1 or more.
+    pub steps: usize,
+    /// Part of the rows that is known: above 0, up to 1.
+    pub origin: f64,
+    /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
+    pub rows: usize,
+    /// Kernel and search.
+    pub settings: Settings,
+}
+
+/// What came of it.
+#[derive(Debug, Clone)]
+pub struct Forecast {
+    /// Rows that were known.
+    pub origin: usize,
+    /// Row from which the forecast at the origin is made: the last known one that has a window.
+    pub from: usize,
+    /// By output.
+    pub outputs: Vec<OutputForecast>,
+}
+
+/// Forecasts of one column.
+#[derive(Debug, Clone)]
+pub struct OutputForecast {
+    /// Its name.
+    pub name: String,
+    /// Its place in the table.
+    pub column: usize,
+    /// By rows ahead, rising.
+    pub horizons: Vec<Horizon>,
+}
+
+/// Forecasts of one column so many rows ahead.
+#[derive(Debug, Clone)]
+pub struct Horizon {
+    /// Rows ahead.
+    pub steps: usize,
+    /// Windows it learned from.
+    pub trained: usize,
+    /// Forecasts that the interval's factor comes from.
+    pub calibrated: usize,
+    /// Half width of the interval in standard deviations, where errors are as large as on the whole.
+    pub factor: f64,
+    /// Time of fit and calibration, s.
+    pub fit_s: f64,
+    /// What was added to diagonals.
+    pub jitter: Jitter,
+    /// The forecast made at the origin.
+    pub at_origin: Prediction,
+    /// Rows after the origin from which forecasts were made, and the forecasts.
+    pub held_out: Vec<(usize, Prediction)>,
+    /// Their errors; `None` when nothing comes after the origin.
+    pub score: Option<Score>,
+    /// Root of the mean squared error of "it stays as it is" over the same rows.
+    pub persistence_rmse: Option<f64>,
+}
+
+/// Rows ahead that get a process: all up to [`MAX_HORIZONS`], else so many with even ratios, the first and the last
+/// included.
+pub fn horizons(steps: usize) -> Vec<usize> {
+    if steps <= MAX_HORIZONS {
+        return (1..=steps).collect();
+    }
+    let last = (MAX_HORIZONS - 1) as f64;
+    let mut all: Vec<usize> =
+        (0..MAX_HORIZONS).map(|k| (steps as f64).powf(k as f64 / last).round() as usize).collect();
+    all.dedup();
+    all
+}
+
+/// Makes the forecasts. `done` hears of every horizon that is finished: how many, of how many.
+///
+/// # Errors
+/// Numbers out of range, too few rows for the lags and steps, or no positive definite matrix.
+pub fn run(
+    table: &Table,
+    plan: &Plan,
+    watcher: &mut Watcher<'_>,
+    done: &mut dyn FnMut(usize, usize),
+) -> Result<Forecast, GprError> {
+    check(plan)?;
+    let windows = Windows::new(table, plan.lags);
+    let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
+    let from = windows.last_before(origin).ok_or_else(|| {
+        GprError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
+    })?;
+    let list = horizons(plan.steps);
+    let mut outputs = Vec::new();
+    for column in 0..plan.outputs {
+        let mut start = Vec::new();
+        let mut horizons = Vec::new();
+        for &steps in &list {
+            let task = Task { plan, windows: &windows, column, steps, origin };
+            let (horizon, model) = task.run(&start, from, watcher)?;
+            start = model.hyperparameters().into_iter().map(|h| h.value).collect();
+            horizons.push(horizon);
+            done(column * list.len() + horizons.len(), plan.outputs * list.len());
+        }
+        outputs.push(OutputForecast { name: table.names[column].clone(), column, horizons });
+    }
+    Ok(Forecast { origin, from, outputs })
+}
+
+fn check(plan: &Plan) -> Result<(), GprError> {
+    let range = |what: &str, found: usize, most: usize| match (1..=most).contains(&found) {
+        true => Ok(()),
+        false => Err(GprError(format!("{what} = {found}, must be 1 to {most}"))),
+    };
+    range("lags", plan.lags, MAX_LAGS)?;
+    range("steps", plan.steps, MAX_STEPS)?;
+    if !(plan.origin > 0.0 && plan.origin <= 1.0) {
+        return Err(GprError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
+    }
+    Ok(())
+}
+
+/// One column so many rows ahead.
+struct Task<'a> {
+    plan: &'a Plan,
+    windows: &'a Windows<'a>,
+    column: usize,
+    steps: usize,
+    origin: usize,
+}
+
+impl Task<'_> {
+    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(Horizon, Model), GprError> {
+        let begin = Instant::now();
+        let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
+            let (lags, steps, origin) = (self.plan.lags, self.steps, self.origin);
+            GprError(format!(
+                "fewer than {FEWEST} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
+                 least as many: give fewer lags or steps, a later origin or more rows"
+            ))
+        })?;
+        let spread = self.spread(&model, watcher)?;
+        let fit_s = begin.elapsed().as_secs_f64();
+        let predict = |rows: &[usize]| self.predict(&model, rows, &spread);
+        let at_origin = predict(&[from])?.remove(0);
+        let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), HELD_OUT);
+        let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
+        let (score, persistence_rmse) = self.judge(&held_out);
+        let horizon = Horizon {
+            steps: self.steps,
+            trained,
+            calibrated: spread.count(),
+            factor: spread.factor,
+            fit_s,
+            jitter: model.jitter(),
+            at_origin,
+            held_out,
+            score,
+            persistence_rmse,
+        };
+        Ok((horizon, model))
+    }
+
+    /// A process fitted to windows that were over before row `end`, and how many; `None` when these are too few. With
+    /// `fixed` hyperparameters nothing is searched.
+    fn fitted(
+        &self,
+        end: usize,
+        start: &[f64],
+        fixed: Option<&[f64]>,
+        watcher: &mut Watcher<'_>,
+    ) -> Result<Option<(Model, usize)>, GprError> {
+        let known = self.windows.between(0, end, self.steps);
+        let features = self.windows.width();
+        if known.len() < FEWEST.max(features + 2) {
+            return Ok(None);
+        }
+        let rows = chosen(&known, self.plan.rows);
+        let inputs = self.windows.features(&rows);
+        let targets: Vec<f64> = rows.iter().map(|row| self.windows.change(*row, self.column, self.steps)).collect();
+        let mut settings = Settings { calibrate: false, ..self.plan.settings.clone() };
+        if let Some(fixed) = fixed {
+            (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
+        } else if !start.is_empty() {
+            settings.start = start.to_vec();
+            settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
+            settings.restarts = 0;
+        }
+        let rows = Rows { inputs: &inputs, dimensions: features, targets: &targets, lines: &[] };
+        Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
+    }
+
+    /// From forecasts of block after block by what came before it.
+    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, GprError> {
+        let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
+        let at = |part: f64| ((self.origin as f64) * part).round() as usize;
+        let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
+        for ends in BLOCKS.windows(2) {
+            let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
+            // What came may lie beyond the block: a block may be shorter than the horizon.
+            let mut rows = self.windows.between(begin, self.origin, self.steps);
+            rows.retain(|row| *row < end);
+            let rows = chosen(&rows, BLOCK_WINDOWS);
+            if rows.is_empty() {
+                continue;
+            }
+            let Some((before, _)) = self.fitted(begin, &[], Some(&fixed), watcher)? else { continue };
+            let windows = self.windows.features(&rows);
+            let forecasts = before.predict(&windows)?;
+            ratios.extend(rows.iter().zip(forecasts).map(|(row, p)| {
+                (self.windows.change(*row, self.column, self.steps) - p.mean).abs() / p.measurement_variance.sqrt()
+            }));
+            judged.extend(rows);
+            features.extend(windows);
+        }
+        Ok(Spread::new(judged, &features, ratios, self.steps + self.plan.lags))
+    }
+
+    /// Forecasts of the value itself from some rows.
+    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, GprError> {
+        if rows.is_empty() {
+            return Ok(Vec::new());
+        }
+        let features = self.windows.features(rows);
+        let found = model.predict(&features)?;
+        let windows = features.chunks_exact(self.windows.width());
+        let value = |((row, window), change): ((&usize, &[f64]), Prediction)| {
+            let mean = self.windows.value(*row, self.column) + change.mean;
+            let half = spread.half_width(window) * change.measurement_variance.sqrt();
+            Prediction { mean, low_95: mean - half, high_95: mean + half, ..change }
+        };
+        Ok(rows.iter().zip(windows).zip(found).map(value).collect())
+    }
+
+    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<Score>, Option<f64>) {
+        if held_out.is_empty() {
+            return (None, None);
+        }
+        let truth: Vec<f64> =
+            held_out.iter().map(|(row, _)| self.windows.value(row + self.steps, self.column)).collect();
+        let predictions: Vec<Prediction> = held_out.iter().map(|(_, prediction)| *prediction).collect();
+        let squares = held_out.iter().map(|(row, _)| self.windows.change(*row, self.column, self.steps).powi(2));
+        let persistence = (squares.sum::<f64>() / held_out.len() as f64).sqrt();
+        (Some(score(&predictions, &truth)), Some(persistence))
+    }
+}
+
+/// Writes every forecast: that at the origin and those after it, with what came where that is known.
+///
+/// # Errors
+/// The file cannot be written.
+pub fn write(path: &Path, data: &Table, forecast: &Forecast) -> Result<(), GprError> {
+    let mut out = csv::Writer::from_writer(create(path)?);
+    out.write_record(["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"])?;
+    for output in &forecast.outputs {
+        for horizon in &output.horizons {
+            let at_origin = (forecast.from, horizon.at_origin);
+            let later = horizon.held_out.iter().filter(|(row, _)| *row != forecast.from).copied();
+            for (row, p) in std::iter::once(at_origin).chain(later) {
+                let place = [data.file_of(row).display().to_string(), data.lines[row].to_string()];
+                let own = [output.name.clone(), horizon.steps.to_string()].into_iter().chain(place);
+                let value = data.row(row)[output.column];
+                let numbers = [value, p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
+                let truth = data.after(row, horizon.steps).map(|later| data.row(later)[output.column]);
+                let truth = truth.map(|truth| truth.to_string()).unwrap_or_default();
+                out.write_record(own.chain(numbers.map(|number| number.to_string())).chain([truth]))?;
+            }
+        }
+    }
+    finish(out)
+}
+
+/// At most so many of them, one from each of so many equal stretches, at a place in it that differs from stretch to
+/// stretch: a fixed stride would meet rows that repeat, as those of cycles do, always at the same phase.
+fn chosen(all: &[usize], most: usize) -> Vec<usize> {
+    let count = all.len().min(most);
+    let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * GOLDEN).fract() };
+    let at = |k: usize| ((k as f64 + place(k)) * all.len() as f64 / count as f64) as usize;
+    (0..count).map(|k| all[at(k).min(all.len() - 1)]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn horizons_are_all_or_spread_evenly_in_ratio() {
+        assert_eq!(horizons(4), [1, 2, 3, 4]);
+        let many = horizons(100);
+        assert!(many.len() <= MAX_HORIZONS && many[0] == 1 && many.last() == Some(&100), "{many:?}");
+        assert!(many.is_sorted_by(|a, b| a < b));
+    }
+
+    #[test]
+    fn chosen_rows_are_spread_over_all_and_over_every_phase() {
+        let all: Vec<usize> = (100..10_100).collect();
+        let some = chosen(&all, 100);
+        assert!(some.len() == 100 && some.is_sorted_by(|a, b| a < b) && some[0] == 100 && some[99] >= 10_000);
+        // Rows that repeat every hundred: all tenths of the phase are met about as often.
+        let mut met = [0; 10];
+        some.iter().for_each(|row| met[row % 100 / 10] += 1);
+        assert!(met.iter().all(|count| (8..=12).contains(count)), "{met:?}");
+        assert_eq!((chosen(&all[..7], 7), chosen(&all, 0)), (all[..7].to_vec(), vec![]));
+    }
+}

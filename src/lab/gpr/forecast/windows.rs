@@ -1,0 +1,128 @@
+//! What is known at a row: values and differences of the rows before it, and which rows have that.
+
+use super::super::Table;
+
+/// Windows of a table.
+#[derive(Debug)]
+pub struct Windows<'a> {
+    table: &'a Table,
+    columns: usize,
+    lags: usize,
+    /// First and one past the last row of the part of each row.
+    part: Vec<(usize, usize)>,
+}
+
+/// How far apart in time the rows are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Steps {
+    /// Median, in the unit of the time column.
+    pub median: f64,
+    /// 5 % and 95 % of the steps are below.
+    pub range: (f64, f64),
+}
+
+impl Steps {
+    /// Of a column of the table, within its parts; `None` when there are no steps or no times.
+    pub fn of(table: &Table, column: usize) -> Option<Self> {
+        let times: Vec<f64> = table.column(column).collect();
+        let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
+        let mut steps: Vec<f64> =
+            steps.map(|row| times[row] - times[row - 1]).filter(|step| step.is_finite()).collect();
+        steps.sort_by(f64::total_cmp);
+        let at = |part: f64| steps.get((part * steps.len().saturating_sub(1) as f64).round() as usize).copied();
+        Some(Self { median: at(0.5)?, range: (at(0.05)?, at(0.95)?) })
+    }
+
+    /// Whether nine of ten are as long as the median, give or take a tenth.
+    pub fn even(&self) -> bool {
+        let near = |step: f64| (step - self.median).abs() <= 0.1 * self.median.abs();
+        near(self.range.0) && near(self.range.1)
+    }
+}
+
+impl<'a> Windows<'a> {
+    /// Of the columns of the table that every row has, so many values each.
+    pub fn new(table: &'a Table, lags: usize) -> Self {
+        let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
+        let spans = table.parts.iter().copied().zip(ends);
+        let part = spans.flat_map(|(begin, end)| std::iter::repeat_n((begin, end), end - begin)).collect();
+        Self { table, columns: table.width() - table.has.len(), lags, part }
+    }
+
+    /// Numbers of a window.
+    pub fn width(&self) -> usize {
+        self.columns * self.lags
+    }
+
+    /// Rows from `begin` on that have a window and a row `steps` ahead in their part and before `end`.
+    pub fn between(&self, begin: usize, end: usize, steps: usize) -> Vec<usize> {
+        let fits = |row: &usize| {
+            let (first, last) = self.part[*row];
+            *row + 1 >= first + self.lags && row + steps < last.min(end)
+        };
+        (begin..self.table.len()).filter(fits).collect()
+    }
+
+    /// The last row before `end` that has a window.
+    pub fn last_before(&self, end: usize) -> Option<usize> {
+        (0..end.min(self.part.len())).rev().find(|row| *row + 1 >= self.part[*row].0 + self.lags)
+    }
+
+    /// A value.
+    pub fn value(&self, row: usize, column: usize) -> f64 {
+        self.table.row(row)[column]
+    }
+
+    /// What a column changes by within so many rows.
+    pub fn change(&self, row: usize, column: usize, steps: usize) -> f64 {
+        self.value(row + steps, column) - self.value(row, column)
+    }
+
+    /// Windows of rows, one after the other: of every column the value, then the differences, the youngest first.
+    pub fn features(&self, rows: &[usize]) -> Vec<f64> {
+        let mut all = Vec::with_capacity(rows.len() * self.width());
+        for &row in rows {
+            for column in 0..self.columns {
+                all.push(self.value(row, column));
+                all.extend((1..self.lags).map(|lag| self.change(row - lag, column, 1)));
+            }
+        }
+        all
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn table() -> Table {
+        Table {
+            names: vec!["a".into(), "b".into(), "time_s".into()],
+            values: (0..8).flat_map(|k| [f64::from(k * k), f64::from(10 * k), f64::from(k)]).collect(),
+            lines: (2..10).collect(),
+            has: vec![true],
+            parts: vec![0, 5],
+            ..Table::default()
+        }
+    }
+
+    #[test]
+    fn windows_hold_the_past_and_do_not_cross_parts() {
+        let table = table();
+        let windows = Windows::new(&table, 3);
+        assert_eq!(windows.features(&[4]), [16.0, 7.0, 5.0, 40.0, 10.0, 10.0]);
+        assert_eq!((windows.between(0, 8, 1), windows.between(0, 8, 2)), (vec![2, 3], vec![2]));
+        assert_eq!((windows.between(0, 4, 1), windows.between(3, 8, 0)), (vec![2], vec![3, 4, 7]));
+        assert_eq!((windows.last_before(7), windows.last_before(2), windows.width()), (Some(4), None, 6));
+        assert_eq!(windows.change(2, 0, 2), 12.0);
+    }
+
+    #[test]
+    fn steps_are_counted_within_parts() {
+        let mut uneven = table();
+        assert!(Steps::of(&uneven, 2).expect("steps").even());
+        uneven.values[3 * 5 + 2] = 1000.0;
+        let steps = Steps::of(&uneven, 2).expect("steps");
+        assert!(!steps.even() && steps.median == 1.0, "{steps:?}");
+    }
+}

@@ -1,0 +1,224 @@
+//! Pictures of regressions: predicted against measured, a stretch of rows with its interval, the error of every row; of
+//! forecasts: the fan at the origin, error and coverage over the horizon.
+
+use std::path::Path;
+
+use super::forecast::{Forecast, Horizon, OutputForecast};
+use super::{Table, Validated, table};
+use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
+
+/// Rows of the stretch that is drawn with its interval: each can be seen.
+const STRETCH: usize = 150;
+/// Most points of predicted against measured.
+const SCATTER: usize = 3000;
+/// Rows before the origin that a fan shows, at least.
+const BEFORE: usize = 60;
+
+/// Draws the cross-validation of every kernel, as SVG and PNG.
+///
+/// # Errors
+/// A file cannot be written, or there is no font for the words of a PNG.
+pub fn write_cross_validation(folder: &Path, data: &Table, all: &[Validated]) -> Result<(), PlotError> {
+    let output = data.names.last().map_or("", String::as_str);
+    let truth: Vec<f64> = data.column(data.width() - 1).collect();
+    for validated in all {
+        let charts =
+            [scatter(validated, &truth, output), stretch(validated, &truth, output), errors(validated, &truth, output)];
+        write_both(folder, &format!("cv_{}", slug(&validated.kernel)), charts.into())?;
+    }
+    Ok(())
+}
+
+/// Draws the forecasts of every output.
+///
+/// # Errors
+/// As [`write_cross_validation`].
+pub fn write_forecast(folder: &Path, data: &Table, forecast: &Forecast) -> Result<(), PlotError> {
+    for output in &forecast.outputs {
+        let mut charts = vec![fan(data, forecast, output)];
+        if output.horizons.iter().any(|horizon| horizon.score.is_some()) {
+            charts.extend([growth(output), coverage(output), held_out(data, output)]);
+        }
+        write_both(folder, &format!("forecast_{}", slug(&output.name)), charts)?;
+    }
+    Ok(())
+}
+
+fn write_both(folder: &Path, name: &str, charts: Vec<Chart>) -> Result<(), PlotError> {
+    let pictures: Vec<Picture> = charts.into_iter().map(Picture::Chart).collect();
+    chart::write_stack(&folder.join(format!("{name}.svg")), &pictures, Format::Svg)?;
+    chart::write_stack(&folder.join(format!("{name}.png")), &pictures, Format::Png)
+}
+
+/// Letters and digits, for a file's name.
+fn slug(text: &str) -> String {
+    let words: Vec<&str> = text.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
+    let joined = match text.contains('*') {
+        true => format!("{}_product", words.join("_")),
+        false => words.join("_"),
+    };
+    joined.chars().take(100).collect()
+}
+
+fn points(label: &str, ink: Ink, all: impl Iterator<Item = (f64, f64)>) -> Layer {
+    let point = |(x, y)| Point { x, y, ..Point::default() };
+    Layer::new(label, ink, Shape::Points(all.map(point).collect()))
+}
+
+fn line(label: &str, ink: Ink, all: impl Iterator<Item = (f64, f64)>) -> Layer {
+    Layer::new(label, ink, Shape::Line(all.collect()))
+}
+
+fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
+    Layer::new("95 % interval", Ink::Blue, Shape::Band(all.collect()))
+}
+
+fn scatter(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+    let every = truth.len().div_ceil(SCATTER).max(1);
+    let pairs = truth.iter().zip(&validated.folds.predictions).step_by(every);
+    let mut pairs: Vec<(f64, f64)> = pairs.map(|(y, p)| (*y, p.mean)).collect();
+    pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let ends = [pairs.first().map_or(0.0, |p| p.0), pairs.last().map_or(1.0, |p| p.0)];
+    let label = if every == 1 { "held-out row".to_owned() } else { format!("held-out row, one of {every}") };
+    let s = &validated.score;
+    let (kernel, rmse, inside) = (&validated.kernel, s.rmse, 100.0 * s.coverage_95);
+    Chart {
+        title: format!(
+            "{}, {kernel}: predicted against measured; RMSE {rmse:.4}, {inside:.1} % inside the interval",
+            stem(output)
+        ),
+        x: Axis::number(&format!("measured {}", table::label(output))),
+        y: Axis::number(&format!("predicted {}", table::label(output))),
+        layers: vec![
+            points(&label, Ink::Blue, pairs.into_iter()),
+            line("equal", Ink::Plain, ends.into_iter().map(|end| (end, end))),
+        ],
+        ..Chart::default()
+    }
+}
+
+fn stem(output: &str) -> String {
+    table::label(output).split(',').next().unwrap_or_default().to_owned()
+}
+
+fn stretch(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+    let begin = (truth.len() / 2).saturating_sub(STRETCH / 2);
+    let rows = begin..(begin + STRETCH).min(truth.len());
+    let at = |row: usize| &validated.folds.predictions[row];
+    Chart {
+        title: format!("Rows {} to {}, each predicted without itself", rows.start + 1, rows.end),
+        x: Axis::number("row"),
+        y: Axis::number(&table::label(output)),
+        layers: vec![
+            band(rows.clone().map(|row| (row as f64 + 1.0, at(row).low_95, at(row).high_95))),
+            line("predicted", Ink::Blue, rows.clone().map(|row| (row as f64 + 1.0, at(row).mean))),
+            points("measured", Ink::Orange, rows.clone().map(|row| (row as f64 + 1.0, truth[row]))),
+        ],
+        ..Chart::default()
+    }
+}
+
+fn errors(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+    let all = || truth.iter().zip(&validated.folds.predictions).enumerate();
+    let half = |p: &crate::regress::Prediction| (p.high_95 - p.low_95) / 2.0;
+    // The interval's width wobbles from row to row: its mean over a hundredth of the rows says how wide it is.
+    let width = (truth.len() / 100).max(1);
+    let halves = validated.folds.predictions.chunks(width).enumerate().map(|(k, chunk)| {
+        let mean = chunk.iter().map(half).sum::<f64>() / chunk.len() as f64;
+        ((k * width) as f64 + chunk.len() as f64 / 2.0, -mean, mean)
+    });
+    Chart {
+        title: "Error of every row (outermost ones of many at one place), and how wide the interval is".to_owned(),
+        x: Axis::number("row"),
+        y: Axis::number(&format!("predicted - measured, {}", table::label(output).split(", ").nth(1).unwrap_or(""))),
+        layers: vec![
+            points("error", Ink::Orange, all().map(|(row, (y, p))| (row as f64 + 1.0, p.mean - y))),
+            band(halves),
+        ],
+        ..Chart::default()
+    }
+}
+
+fn fan(data: &Table, forecast: &Forecast, output: &OutputForecast) -> Chart {
+    let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
+    let from = forecast.from;
+    let value = |row: usize| data.row(row)[output.column];
+    let rows = from.saturating_sub(BEFORE.max(2 * most))..(from + most + 1).min(data.len());
+    let x = |row: usize| row as f64 - from as f64;
+    let at = |horizon: &Horizon| horizon.steps as f64;
+    let now = [(0.0, value(from), value(from))];
+    let fan = output.horizons.iter().map(|h| (at(h), h.at_origin.low_95, h.at_origin.high_95));
+    let mean = output.horizons.iter().map(|h| (at(h), h.at_origin.mean));
+    Chart {
+        title: format!(
+            "{}: forecast from row {} on, which knows nothing of what follows",
+            stem(&output.name),
+            from + 1
+        ),
+        x: Axis::number("rows from the origin"),
+        y: Axis::number(&table::label(&output.name)),
+        layers: vec![
+            band(now.into_iter().chain(fan)),
+            line("measured", Ink::Plain, rows.map(|row| (x(row), value(row)))),
+            line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
+        ],
+        ..Chart::default()
+    }
+}
+
+fn growth(output: &OutputForecast) -> Chart {
+    let over = |value: &dyn Fn(&Horizon) -> Option<f64>| -> Vec<(f64, f64)> {
+        output.horizons.iter().filter_map(|h| Some((h.steps as f64, value(h)?))).collect()
+    };
+    Chart {
+        title: "Error of the forecasts made after the origin".to_owned(),
+        x: Axis::number("rows ahead"),
+        y: Axis::number(&format!("RMSE, {}", table::label(&output.name).split(", ").nth(1).unwrap_or(""))),
+        layers: vec![
+            line("it stays as it is", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
+            line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
+            line(
+                "half of the mean 95 % interval",
+                Ink::Green,
+                over(&|h| h.score.map(|s| s.mean_width_95 / 2.0)).into_iter(),
+            ),
+        ],
+        ..Chart::default()
+    }
+}
+
+fn coverage(output: &OutputForecast) -> Chart {
+    let inside = |h: &Horizon| h.score.map(|s| (h.steps as f64, 100.0 * s.coverage_95));
+    Chart {
+        title: "Part of the measured values inside the 95 % interval".to_owned(),
+        x: Axis::number("rows ahead"),
+        y: Axis::number("inside, %").within(0.0, 100.0),
+        layers: vec![
+            Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
+            line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
+        ],
+        ..Chart::default()
+    }
+}
+
+/// Forecasts of the last horizon against what came, over the rows they are for.
+fn held_out(data: &Table, output: &OutputForecast) -> Chart {
+    let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
+    let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;
+    let all = || horizon.held_out.iter();
+    Chart {
+        title: format!("{} rows ahead: forecast and measured", horizon.steps),
+        x: Axis::number("row"),
+        y: Axis::number(&table::label(&output.name)),
+        layers: vec![
+            band(all().map(|(row, p)| (for_row(*row), p.low_95, p.high_95))),
+            line(
+                "measured",
+                Ink::Plain,
+                all().map(|(row, _)| (for_row(*row), data.row(row + horizon.steps)[output.column])),
+            ),
+            line("forecast", Ink::Blue, all().map(|(row, p)| (for_row(*row), p.mean))),
+        ],
+        ..Chart::default()
+    }
+}

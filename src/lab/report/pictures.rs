@@ -1,0 +1,530 @@
+//! The report's pictures, each with the name of its file.
+
+use super::data::{Data, Origin};
+use super::forecast::{self, Outlook};
+use super::series::{self, Step};
+use super::trace::{Moment, OF_95};
+use super::{Setting, summary};
+use crate::alarm::Rule;
+use crate::lab::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Point, Scale, Shape, Span};
+
+/// Why a replay-only picture is missing from a report of a store.
+pub(super) const NOT_STORED: &str =
+    "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
+
+/// A hole of this part of the whole interrupts a line, if it is this long as well: some sensors are slow.
+const MAX_HOLE_PART: usize = 100;
+const MAX_HOLE_S: f64 = 100.0;
+/// And of at least this many bins.
+const MAX_HOLE_BINS: usize = 3;
+/// The last half-cycles have a picture of their own when they are at most this part of the record.
+const MAX_RECENT: f64 = 0.9;
+
+/// Every picture that there are data for, with the name of its file.
+pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> {
+    let outlook = forecast::outlook(data, setting);
+    let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
+    [
+        named("soc", soc(data, setting)),
+        named("soc_recent", soc_recent(data, setting)),
+        named("capacity", capacity(data, setting, outlook.as_ref().ok())),
+        named("usable_capacity", usable(data, setting)),
+        named("recharge_period", recharge(data, setting)),
+        named("resistance", resistance(data, setting)),
+        named("temperature", temperature(data, setting)),
+        named("alarms", alarms(data)),
+        named("cells_capacity", heat(data, "Capacity of every cell", "capacity, Ah", series::capacity)),
+        named("cells_resistance", heat(data, "Resistance of every cell", "resistance, times new", series::resistance)),
+        named("innovation", innovation(data)),
+        named("coverage", coverage(data)),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
+}
+
+/// The x axis: dates, or time since the start in a unit that fits.
+struct Clock {
+    axis: Axis,
+    zero_s: f64,
+    unit_s: f64,
+}
+
+impl Clock {
+    fn of(data: &Data) -> Self {
+        let (first_s, last_s) = data.ends_s().unwrap_or((0.0, 0.0));
+        Self::between(data, first_s, last_s)
+    }
+
+    fn between(data: &Data, first_s: f64, last_s: f64) -> Self {
+        if data.is_dated() {
+            let axis = Axis { scale: Scale::Date, ..Axis::number("UTC") };
+            return Self { axis: axis.within(first_s, last_s), zero_s: 0.0, unit_s: 1.0 };
+        }
+        let zero_s = data.ends_s().map_or(0.0, |ends| ends.0);
+        let (unit_s, label) = if last_s - first_s > 4.0 * 86_400.0 {
+            (86_400.0, "time since the start, days")
+        } else {
+            (3600.0, "time since the start, h")
+        };
+        let axis = Axis::number(label).within((first_s - zero_s) / unit_s, (last_s - zero_s) / unit_s);
+        Self { axis, zero_s, unit_s }
+    }
+
+    fn x(&self, time_s: f64) -> f64 {
+        (time_s - self.zero_s) / self.unit_s
+    }
+}
+
+/// The mildest threshold of a rule, as configured, else as its alarms say.
+pub(super) fn threshold(data: &Data, setting: &Setting<'_>, rule: Rule) -> Option<f64> {
+    thresholds(data, setting, rule).first().map(|(value, _)| *value)
+}
+
+/// Every threshold of a rule with its severity, the mildest first.
+fn thresholds(data: &Data, setting: &Setting<'_>, rule: Rule) -> Vec<(f64, String)> {
+    let mut all: Vec<(f64, String)> = match setting.config {
+        Some(config) => {
+            let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
+            rules.map(|row| (row.threshold, row.severity.name().to_owned())).collect()
+        }
+        None => {
+            let rows = data.alarms.iter().filter(|row| row.rule == rule.name());
+            rows.filter_map(|row| Some((row.threshold?, row.severity.clone()))).collect()
+        }
+    };
+    let rank = |severity: &str| ["info", "warning", "severe"].iter().position(|known| *known == severity);
+    all.sort_by(|a, b| rank(&a.1).cmp(&rank(&b.1)).then(a.0.total_cmp(&b.0)));
+    all.dedup();
+    all
+}
+
+fn levels(data: &Data, setting: &Setting<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
+    thresholds(data, setting, rule).into_iter().map(|(value, severity)| {
+        let ink = ink_of(&severity);
+        Layer::new(&format!("limit ({severity})"), ink, Shape::Level(value))
+    })
+}
+
+fn ink_of(severity: &str) -> Ink {
+    match severity {
+        "severe" => Ink::Red,
+        "warning" => Ink::Amber,
+        _ => Ink::Grey,
+    }
+}
+
+/// The moments at which alarms of a rule were raised.
+fn raised(data: &Data, clock: &Clock, rule: Rule) -> Option<Layer> {
+    let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
+    let points: Vec<Point> = rows
+        .map(|row| Point {
+            x: clock.x(row.time_s),
+            y: 0.0,
+            tip: format!("{} {}: {}", moment(data, row.time_s), row.severity, summary::words(row)),
+        })
+        .collect();
+    (!points.is_empty()).then(|| Layer::new("alarm raised", Ink::Red, Shape::Moments(points)))
+}
+
+fn moment(data: &Data, time_s: f64) -> String {
+    summary::moment(data, time_s)
+}
+
+/// Bins of a trace as a band and, where cells differ or bins are long, the range within.
+fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
+    let band = bins.iter().map(|(time_s, bin)| {
+        let (low, high) = pick(bin);
+        (clock.x(*time_s), factor * low, factor * high)
+    });
+    band.collect()
+}
+
+/// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
+fn filled<'a>(bins: impl Iterator<Item = (f64, &'a Moment)>) -> Vec<(f64, &'a Moment)> {
+    let all: Vec<(f64, &Moment)> = bins.collect();
+    let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
+    let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
+    let mut empty = 0;
+    let wanted = all.into_iter().filter(|(_, bin)| {
+        let is_filled = bin.soc.0 <= bin.soc.1;
+        empty = if is_filled { 0 } else { empty + 1 };
+        is_filled || empty == hole
+    });
+    wanted.collect()
+}
+
+/// Low and high of each bin in turn, as one line.
+fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
+    band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
+}
+
+fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let life = data.trace.life.as_ref()?;
+    let clock = Clock::of(data);
+    let bins = filled(life.iter());
+    let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
+    let mut layers =
+        vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0)))];
+    layers.extend(true_soc(setting, &clock, data.ends_s()?));
+    layers.push(Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))));
+    Some(Picture::Chart(Chart {
+        title: "State of charge over the whole record".to_owned(),
+        description: format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s()),
+        x: clock.axis,
+        y: Axis::number("SOC, %").within(-5.0, 105.0),
+        layers,
+    }))
+}
+
+fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let moments: Vec<(f64, &Moment)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
+    let (first_s, last_s) = data.ends_s()?;
+    // As good as the whole record: the picture before shows it.
+    if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
+        return None;
+    }
+    let clock = Clock::between(data, moments.first()?.0, moments.last()?.0);
+    let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
+    let mut layers =
+        vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
+    layers.extend(true_soc(setting, &clock, (moments.first()?.0, moments.last()?.0)));
+    if data.cells() > 1 {
+        layers.push(Layer::new("highest cell", Ink::Green, Shape::Line(soc.iter().map(|p| (p.0, p.2)).collect())));
+        layers.push(Layer::new("lowest cell", Ink::Blue, Shape::Line(soc.iter().map(|p| (p.0, p.1)).collect())));
+    } else {
+        layers.push(Layer::new("estimate", Ink::Blue, Shape::Line(zigzag(&soc))));
+    }
+    Some(Picture::Chart(Chart {
+        title: "State of charge in the last half-cycles".to_owned(),
+        description: "Estimated SOC with its 95 % interval, in percent".to_owned(),
+        x: clock.axis,
+        y: Axis::number("SOC, %").within(-5.0, 105.0),
+        layers,
+    }))
+}
+
+/// The worst cell with its 95 % interval, and the range over the cells of a pack.
+fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Vec<Layer> {
+    let interval =
+        steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
+    let mut layers = vec![Layer::new("95 % interval", ink, Shape::Band(interval.collect()))];
+    if data.cells() > 1 {
+        let range = steps.iter().map(|s| (clock.x(s.time_s), s.range.0, s.range.1));
+        layers.push(Layer::new("all cells", Ink::Grey, Shape::Band(range.collect())));
+    }
+    let name = if data.cells() > 1 { format!("{name} cell") } else { "estimate".to_owned() };
+    layers.push(Layer::new(&name, ink, Shape::Line(steps.iter().map(|s| (clock.x(s.time_s), s.worst.0)).collect())));
+    layers
+}
+
+fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
+    let steps = series::steps(data, series::capacity, false);
+    let (first_s, mut last_s) = data.ends_s().filter(|_| !steps.is_empty())?;
+    let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
+    last_s = fan.iter().map(|point| point.time_s).fold(last_s, f64::max);
+    let clock = Clock::between(data, first_s, last_s);
+    let mut layers = vec![];
+    if data.cells() == 1 {
+        let said = data.learned.iter().filter_map(|row| {
+            let y = row.measured_ah?;
+            let tip = format!("{}: this half-cycle alone {y:.3} Ah", moment(data, row.time_s));
+            Some(Point { x: clock.x(row.time_s), y, tip })
+        });
+        layers.push(Layer::new("one half-cycle alone", Ink::Grey, Shape::Points(said.collect())));
+    }
+    layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
+    if !fan.is_empty() {
+        let band = fan.iter().map(|p| (clock.x(p.time_s), p.low_ah, p.high_ah)).collect();
+        layers.push(Layer::new("forecast, 5 to 95 %, and its median", Ink::Purple, Shape::Band(band)));
+        let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
+        layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
+    }
+    // Measured capacities are under load, unless there is no such estimate to set them beside.
+    if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
+        layers.extend(references(data, &clock, setting));
+    }
+    let limits: Vec<Layer> = levels(data, setting, Rule::CapacityLow).collect();
+    let end = forecast::end_of_life_ah(data, setting).map(Shape::Level);
+    // A limit at the same height would hide it, or it the limit.
+    let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
+    layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
+    layers.extend(limits);
+    layers.extend(raised(data, &clock, Rule::CapacityLow));
+    Some(Picture::Chart(Chart {
+        title: "Capacity between full and empty, over life".to_owned(),
+        description: "Learned capacity of the weakest cell with its 95 % interval, Ah".to_owned(),
+        y: within_reason(&steps, &layers, "capacity, Ah"),
+        x: clock.axis,
+        layers,
+    }))
+}
+
+/// Single half-cycles may say anything: the axis follows what they add up to, with its interval.
+fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
+    let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
+    let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
+    for layer in layers {
+        match &layer.shape {
+            Shape::Level(y) => (low, high) = (low.min(*y), high.max(*y)),
+            Shape::Points(points) if layer.ink == Ink::Plain => {
+                (low, high) = points.iter().fold((low, high), |(low, high), p| (low.min(p.y), high.max(p.y)));
+            }
+            _ => {}
+        }
+    }
+    let room = 0.08 * (high - low).max(1e-3);
+    Axis::number(label).within((low - room).max(0.0), high + room)
+}
+
+fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer> {
+    let capacities = &setting.reference.capacities;
+    let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
+        x: clock.x(time_s),
+        y: capacity_ah,
+        tip: format!("{}: reference {capacity_ah:.3} Ah", moment(data, time_s)),
+    });
+    let points: Vec<Point> = points.collect();
+    let words = match (setting.reference.is_loaded, data.cells() > 1) {
+        (true, _) => "measured (reference)",
+        (false, true) => "true, weakest cell (reference)",
+        (false, false) => "true (reference)",
+    };
+    (!points.is_empty()).then(|| Layer::new(words, Ink::Plain, Shape::Points(points)))
+}
+
+/// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
+fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
+    let within = setting.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
+    let rows: Vec<(f64, f64, f64)> =
+        within.map(|&(time_s, low, high)| (clock.x(time_s), 100.0 * low, 100.0 * high)).collect();
+    let line = |pick: fn(&(f64, f64, f64)) -> f64| Shape::Line(rows.iter().map(|row| (row.0, pick(row))).collect());
+    match rows.iter().any(|row| row.1 < row.2) {
+        _ if rows.is_empty() => Vec::new(),
+        false => vec![Layer::new("true (reference)", Ink::Plain, line(|row| row.1))],
+        true => vec![
+            Layer::new("true, lowest and highest cell (reference)", Ink::Plain, line(|row| row.1)),
+            Layer::new("", Ink::Plain, line(|row| row.2)),
+        ],
+    }
+}
+
+fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let steps = series::steps(data, series::usable, false);
+    if steps.is_empty() {
+        return None;
+    }
+    let clock = Clock::of(data);
+    let mut layers = worst(data, &clock, &steps, Ink::Orange, "weakest");
+    if setting.reference.is_loaded {
+        layers.extend(references(data, &clock, setting));
+    }
+    layers.extend(levels(data, setting, Rule::UsableCapacityLow));
+    layers.extend(raised(data, &clock, Rule::UsableCapacityLow));
+    let load = setting.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
+        format!(" at {} A, {} \u{b0}C, down to {} V", usable.current_a, usable.temperature_c, usable.cutoff_v)
+    });
+    Some(Picture::Chart(Chart {
+        title: format!("Usable capacity{load}, over life"),
+        description: "What the weakest cell gives under load, with its 95 % interval, Ah".to_owned(),
+        y: within_reason(&steps, &layers, "usable capacity, Ah"),
+        x: clock.axis,
+        layers,
+    }))
+}
+
+fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let clock = Clock::of(data);
+    let mut layers = Vec::new();
+    let minutes = |seconds: f64| seconds / 60.0;
+    let normalised = || data.recharges.iter().filter_map(|row| Some((clock.x(row.time_s), row.normalised_s?)));
+    if normalised().count() > 0 {
+        let band = normalised().map(|(x, (mean, std))| (x, minutes(mean - OF_95 * std), minutes(mean + OF_95 * std)));
+        layers.push(Layer::new("95 % interval", Ink::Green, Shape::Band(band.collect())));
+        let line = normalised().map(|(x, (mean, _))| (x, minutes(mean)));
+        layers.push(Layer::new("normalised to the reference charger", Ink::Green, Shape::Line(line.collect())));
+    }
+    let point = |time_s: f64, seconds: f64| Point {
+        x: clock.x(time_s),
+        y: minutes(seconds),
+        tip: format!("{}: {:.1} min", moment(data, time_s), minutes(seconds)),
+    };
+    let raw: Vec<Point> = data.recharges.iter().filter_map(|row| Some(point(row.time_s, row.raw_s?))).collect();
+    if !raw.is_empty() {
+        layers.push(Layer::new("as it was", Ink::Grey, Shape::Points(raw)));
+    }
+    let is_stored = data.source.origin == Origin::Store;
+    if is_stored {
+        let charges = data.halves.chunk_by(|a, b| a.time_s == b.time_s).filter_map(|rows| rows.first());
+        let points: Vec<Point> =
+            charges.filter(|row| row.is_charge).map(|row| point(row.time_s, row.duration_s)).collect();
+        layers.extend((!points.is_empty()).then(|| Layer::new("a whole charge", Ink::Grey, Shape::Points(points))));
+    }
+    if layers.is_empty() {
+        return None;
+    }
+    if !is_stored {
+        let limits = levels(data, setting, Rule::RechargePeriodLow).map(|mut layer| {
+            if let Shape::Level(seconds) = &mut layer.shape {
+                *seconds = minutes(*seconds);
+            }
+            layer
+        });
+        layers.extend(limits);
+        layers.extend(raised(data, &clock, Rule::RechargePeriodLow));
+    }
+    let window = setting.config.map(|config| &config.monitor.health.recharge);
+    let window =
+        window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
+    let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
+    let description = "Minutes a charge took, as it was and as the reference charger would take".to_owned();
+    Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
+}
+
+fn resistance(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let steps = series::steps(data, series::resistance, true);
+    if steps.is_empty() {
+        return None;
+    }
+    let clock = Clock::of(data);
+    let mut layers = worst(data, &clock, &steps, Ink::Purple, "highest");
+    layers.extend(levels(data, setting, Rule::ResistanceHigh));
+    layers.extend(raised(data, &clock, Rule::ResistanceHigh));
+    Some(Picture::Chart(Chart {
+        title: "Resistance over life".to_owned(),
+        description: "Resistance of the worst cell relative to a new one, with its 95 % interval".to_owned(),
+        x: clock.axis,
+        y: Axis::number("resistance, times new"),
+        layers,
+    }))
+}
+
+fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+    let clock = Clock::of(data);
+    let mut layers = Vec::new();
+    if let Some(life) = &data.trace.life {
+        let bins = filled(life.iter());
+        let band = range(&bins, &clock, |bin| bin.temperature_c, 1.0);
+        layers.push(Layer::new("lowest to highest", Ink::Orange, Shape::Line(zigzag(&band))));
+    }
+    let means = series::temperatures(data);
+    if !means.is_empty() && layers.is_empty() {
+        let tip = |time_s: f64, c: f64| format!("{}: {c:.1} \u{b0}C", moment(data, time_s));
+        let points = means.iter().map(|m| Point { x: clock.x(m.0), y: m.2, tip: tip(m.0, m.2) }).collect();
+        layers.push(Layer::new("mean of a half-cycle, warmest cell", Ink::Orange, Shape::Points(points)));
+    }
+    if layers.is_empty() {
+        return None;
+    }
+    layers.extend(levels(data, setting, Rule::TemperatureHigh));
+    layers.extend(raised(data, &clock, Rule::TemperatureHigh));
+    Some(Picture::Chart(Chart {
+        title: "Temperature".to_owned(),
+        description: "Cell temperature, degrees C".to_owned(),
+        x: clock.axis,
+        y: Axis::number("temperature, \u{b0}C"),
+        layers,
+    }))
+}
+
+fn alarms(data: &Data) -> Option<Picture> {
+    let (_, last_s) = data.ends_s().filter(|_| !data.alarms.is_empty())?;
+    let clock = Clock::of(data);
+    let mut lanes: Vec<Lane> = Vec::new();
+    let mut open: Vec<(usize, &super::data::AlarmRow)> = Vec::new();
+    for row in &data.alarms {
+        let name = format!("{} ({})", row.rule, row.severity);
+        let lane = lanes.iter().position(|lane| lane.name == name).unwrap_or_else(|| {
+            lanes.push(Lane { name, spans: Vec::new() });
+            lanes.len() - 1
+        });
+        let known = open.iter().position(|(at, before)| *at == lane && before.cell == row.cell);
+        match (row.is_active, known) {
+            (true, None) => open.push((lane, row)),
+            (false, Some(index)) => {
+                let (lane, from) = open.remove(index);
+                lanes[lane].spans.push(span(data, &clock, from, row.time_s, "until"));
+            }
+            (true, Some(_)) | (false, None) => {}
+        }
+    }
+    for (lane, from) in open {
+        lanes[lane].spans.push(span(data, &clock, from, last_s, "still raised at"));
+    }
+    let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
+    Some(Picture::Lanes(Lanes {
+        title: "Alarms".to_owned(),
+        description: format!(
+            "{} changes of alarms; each bar is an alarm from when it was raised until it ended",
+            data.alarms.len()
+        ),
+        x: clock.axis,
+        lanes,
+        keys: keys.map(|(ink, word)| (ink, word.to_owned())).to_vec(),
+    }))
+}
+
+fn span(data: &Data, clock: &Clock, from: &super::data::AlarmRow, to_s: f64, end: &str) -> Span {
+    Span {
+        from: clock.x(from.time_s),
+        to: clock.x(to_s),
+        ink: ink_of(&from.severity),
+        tip: format!("{}: {}; {end} {}", moment(data, from.time_s), summary::words(from), moment(data, to_s)),
+    }
+}
+
+fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Picture> {
+    if data.cells() < 2 || data.learned.is_empty() {
+        return None;
+    }
+    let rows = series::columns(data, pick);
+    let tip = |(cell, row): (usize, &Vec<Option<f64>>)| {
+        let first = row.iter().flatten().next();
+        let last = row.last().copied().flatten();
+        let words = |value: Option<f64>| value.map_or_else(|| "unknown".to_owned(), |value| format!("{value:.3}"));
+        format!("cell {}: first {}, now {}", cell + 1, words(first.copied()), words(last))
+    };
+    let tips = rows.iter().enumerate().map(tip).collect();
+    Some(Picture::Heat(Heat {
+        title: title.to_owned(),
+        description: format!("{label} of every cell, from the start to the end of the record"),
+        x: Clock::of(data).axis,
+        label: label.to_owned(),
+        rows,
+        tips,
+        decimals: 3,
+    }))
+}
+
+fn innovation(data: &Data) -> Option<Picture> {
+    let life = data.trace.life.as_ref()?;
+    let clock = Clock::of(data);
+    let band = range(&filled(life.iter()), &clock, |bin| bin.innovation_v, 1e3);
+    Some(Picture::Chart(Chart {
+        title: "Innovation: measured minus expected voltage".to_owned(),
+        description: "Lowest and highest innovation over the cells, mV".to_owned(),
+        x: clock.axis,
+        y: Axis::number("mV"),
+        layers: vec![Layer::new("lowest to highest", Ink::Grey, Shape::Line(zigzag(&band)))],
+    }))
+}
+
+fn coverage(data: &Data) -> Option<Picture> {
+    let life = data.trace.life.as_ref()?;
+    let clock = Clock::of(data);
+    let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
+    let line: Vec<(f64, f64)> = line.collect();
+    // From 80 % where nothing lies lower.
+    let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
+    let layers = vec![
+        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line)),
+        Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
+    ];
+    Some(Picture::Chart(Chart {
+        title: "How sure the estimator is, and rightly".to_owned(),
+        description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
+        x: clock.axis,
+        y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),
+        layers,
+    }))
+}

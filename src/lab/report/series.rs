@@ -1,0 +1,125 @@
+//! Series over the life of a pack: its worst cell, the range over its cells, every cell in columns of time.
+
+use super::data::{Data, Learned};
+
+/// Columns of a heat map.
+pub(super) const COLUMNS: usize = 120;
+
+/// The cells after a transition.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Step {
+    pub(super) time_s: f64,
+    /// The worst cell, its mean and standard deviation.
+    pub(super) cell: usize,
+    pub(super) worst: (f64, f64),
+    /// Lowest and highest mean over the cells.
+    pub(super) range: (f64, f64),
+}
+
+/// What is picked of a row: mean and standard deviation.
+pub(super) type Pick = fn(&Learned) -> Option<(f64, f64)>;
+
+pub(super) fn capacity(row: &Learned) -> Option<(f64, f64)> {
+    Some(row.capacity_ah).filter(|value| value.0.is_finite())
+}
+
+pub(super) fn usable(row: &Learned) -> Option<(f64, f64)> {
+    row.usable_ah.filter(|value| value.0.is_finite())
+}
+
+pub(super) fn resistance(row: &Learned) -> Option<(f64, f64)> {
+    Some(row.resistance).filter(|value| value.0.is_finite())
+}
+
+/// The worst cell after every transition: the lowest value, or the highest where `high_is_bad`. A cell keeps its value
+/// until it has another.
+pub(super) fn steps(data: &Data, pick: Pick, high_is_bad: bool) -> Vec<Step> {
+    let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
+    let mut steps = Vec::new();
+    for rows in data.learned.chunk_by(|a, b| a.time_s == b.time_s) {
+        for row in rows {
+            if let (Some(cell), Some(value)) = (cells.get_mut(row.cell), pick(row)) {
+                *cell = Some(value);
+            }
+        }
+        let known = || cells.iter().enumerate().filter_map(|(cell, value)| Some((cell, (*value)?)));
+        let by_mean = |a: &(usize, (f64, f64)), b: &(usize, (f64, f64))| a.1.0.total_cmp(&b.1.0);
+        if let (Some(low), Some(high)) = (known().min_by(by_mean), known().max_by(by_mean)) {
+            let (cell, worst) = if high_is_bad { high } else { low };
+            steps.push(Step { time_s: rows[0].time_s, cell, worst, range: (low.1.0, high.1.0) });
+        }
+    }
+    steps
+}
+
+/// The value of every cell at the end of each column.
+pub(super) fn columns(data: &Data, pick: Pick) -> Vec<Vec<Option<f64>>> {
+    let mut rows = vec![vec![None; COLUMNS]; data.cells()];
+    let Some((first_s, last_s)) = data.ends_s() else { return rows };
+    let width_s = (last_s - first_s).max(1e-9) / COLUMNS as f64;
+    for learned in &data.learned {
+        let column = (((learned.time_s - first_s) / width_s) as usize).min(COLUMNS - 1);
+        if let (Some(row), Some((mean, _))) = (rows.get_mut(learned.cell), pick(learned)) {
+            row[column] = Some(mean);
+        }
+    }
+    for row in &mut rows {
+        let mut held = None;
+        for value in row {
+            held = value.or(held);
+            *value = held;
+        }
+    }
+    rows
+}
+
+/// Mean temperature of every half-cycle: lowest and highest over the cells.
+pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
+    let rows = data.halves.chunk_by(|a, b| a.time_s == b.time_s);
+    rows.filter_map(|rows| {
+        let known = || rows.iter().filter_map(|row| row.mean_temperature_c);
+        let (low, high) = (known().fold(f64::INFINITY, f64::min), known().fold(f64::NEG_INFINITY, f64::max));
+        (low <= high).then_some((rows[0].time_s, low, high))
+    })
+    .collect()
+}
+
+/// Equivalent full cycles of the cell that was used most: charge moved over twice its capacity.
+pub(super) fn full_cycles(data: &Data) -> Option<f64> {
+    let mut moved_ah = vec![0.0; data.cells()];
+    data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));
+    let mut capacity_ah: Vec<Option<f64>> = vec![None; moved_ah.len()];
+    data.learned.iter().for_each(|row| capacity_ah[row.cell] = capacity_ah[row.cell].or(Some(row.capacity_ah.0)));
+    let cycles = moved_ah.iter().zip(capacity_ah).filter_map(|(moved, capacity)| Some(moved / (2.0 * capacity?)));
+    cycles.filter(|cycles| cycles.is_finite()).reduce(f64::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lab::report::Origin;
+
+    fn pack() -> Data {
+        let mut data = Data::new(Origin::Store);
+        for (time_s, cell, ah) in [(10.0, 0, 2.0), (10.0, 1, 1.9), (20.0, 1, 2.1), (30.0, 0, 1.5)] {
+            data.learned.push(Learned {
+                time_s,
+                cell,
+                measured_ah: None,
+                measured_std_ah: None,
+                capacity_ah: (ah, 0.01),
+                usable_ah: None,
+                resistance: (1.0, 0.1),
+            });
+        }
+        data
+    }
+
+    #[test]
+    fn the_weakest_cell_is_followed_and_a_cell_keeps_its_value() {
+        let steps = steps(&pack(), capacity, false);
+        let seen: Vec<_> = steps.iter().map(|step| (step.cell, step.worst.0, step.range.1)).collect();
+        assert_eq!(seen, [(1, 1.9, 2.0), (0, 2.0, 2.1), (0, 1.5, 2.1)]);
+        assert!(super::steps(&pack(), usable, false).is_empty());
+    }
+}

@@ -1,0 +1,335 @@
+//! The summary at the top: how the battery is, since when, what to do; "unknown" where nothing is known.
+
+use std::collections::BTreeMap;
+
+use super::data::{AlarmRow, Data, Origin};
+use super::forecast::Outlook;
+use super::{Setting, series};
+use crate::alarm::{Rule, Severity};
+use crate::io::stamp::format_utc;
+use crate::quantity::Timestamp;
+
+/// How the battery is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Verdict {
+    Good,
+    Watch,
+    Plan,
+    Act,
+    Unknown,
+}
+
+impl Verdict {
+    /// A word for its colour.
+    pub(super) const fn class(self) -> &'static str {
+        match self {
+            Self::Good => "good",
+            Self::Watch => "watch",
+            Self::Plan => "plan",
+            Self::Act => "act",
+            Self::Unknown => "unknown",
+        }
+    }
+
+    /// A sign that needs no colour.
+    pub(super) const fn sign(self) -> &'static str {
+        match self {
+            Self::Good => "\u{2713}",
+            Self::Watch => "i",
+            Self::Plan => "!",
+            Self::Act => "!!",
+            Self::Unknown => "?",
+        }
+    }
+}
+
+/// A number with its name.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Tile {
+    pub(super) name: &'static str,
+    pub(super) value: String,
+    pub(super) note: String,
+}
+
+/// All of it.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Summary {
+    pub(super) verdict: Verdict,
+    pub(super) how: String,
+    pub(super) since: String,
+    pub(super) what: String,
+    pub(super) tiles: Vec<Tile>,
+}
+
+/// An alarm that is raised at the end of the data.
+struct Raised<'a> {
+    row: &'a AlarmRow,
+    since_s: f64,
+}
+
+/// Makes the summary.
+pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>) -> Summary {
+    let raised = raised(data);
+    let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
+    let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
+    let knows = !series::steps(data, series::capacity, false).is_empty();
+    let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
+        Some("severe") => Verdict::Act,
+        Some("warning") => Verdict::Plan,
+        Some(_) => Verdict::Watch,
+        None if !knows => Verdict::Unknown,
+        None if !measuring.is_empty() || is_over(outlook) => Verdict::Watch,
+        None => Verdict::Good,
+    };
+    Summary {
+        verdict,
+        how: how(verdict, worst, &measuring, data),
+        since: since(data, &battery, &measuring),
+        what: what(verdict, worst, &measuring),
+        tiles: tiles(data, setting, outlook, &raised),
+    }
+}
+
+/// Whether the capacity has passed the end of life, whatever the alarms say.
+fn is_over(outlook: &Result<Outlook, String>) -> bool {
+    outlook.as_ref().is_ok_and(Outlook::is_over)
+}
+
+fn raised(data: &Data) -> Vec<Raised<'_>> {
+    let mut last: BTreeMap<(&str, &str, Option<usize>), Raised<'_>> = BTreeMap::new();
+    for row in &data.alarms {
+        let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
+        // The row that raised it has the value that did; later ones may not know one any more.
+        if row.is_active {
+            last.entry(key).or_insert(Raised { row, since_s: row.time_s });
+        } else {
+            last.remove(&key);
+        }
+    }
+    last.into_values().collect()
+}
+
+fn rank(severity: &str) -> usize {
+    Severity::ALL.iter().position(|known| known.name() == severity).unwrap_or(0)
+}
+
+fn rule(name: &str) -> Option<Rule> {
+    Rule::ALL.into_iter().find(|rule| rule.name() == name)
+}
+
+/// Whether a rule speaks of the battery, not of the measuring of it.
+fn is_of_battery(name: &str) -> bool {
+    !matches!(
+        rule(name),
+        Some(
+            Rule::InputMissing
+                | Rule::InputImplausible
+                | Rule::EstimateUntrusted
+                | Rule::BmsDisagrees
+                | Rule::StoreFailed
+                | Rule::BusFault
+        )
+    )
+}
+
+fn about(name: &str) -> &str {
+    rule(name).map_or(name, |rule| rule.row().about)
+}
+
+fn unit(name: &str) -> &'static str {
+    rule(name).map_or("", |rule| rule.row().unit.symbol())
+}
+
+/// A rule's value with its unit, without digits that say nothing.
+pub(super) fn amount(value: f64, rule: &str) -> String {
+    let digits = format!("{value:.3}");
+    let digits = digits.trim_end_matches('0').trim_end_matches('.');
+    format!("{digits} {}", unit(rule).replace("degrees C", "\u{b0}C")).trim_end().to_owned()
+}
+
+/// "a cell's usable capacity is 1.38 Ah, limit 1.4 Ah (cell 3)".
+pub(super) fn words(row: &AlarmRow) -> String {
+    let amount = |value: f64| amount(value, &row.rule);
+    let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
+    let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
+    let cell = row.cell.map_or_else(String::new, |cell| format!(" (cell {})", cell + 1));
+    format!("{} was {}, limit {}{cell}", about(&row.rule), value, limit)
+}
+
+fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], data: &Data) -> String {
+    let head = match verdict {
+        Verdict::Good => "Good: no limit is passed.",
+        Verdict::Watch if worst.is_none() && measuring.is_empty() => {
+            "No limit is passed, but the capacity is below that of the end of life."
+        }
+        Verdict::Watch if worst.is_none() => "The battery passes no limit, but its measuring is not in order.",
+        Verdict::Watch => "Worth watching.",
+        Verdict::Plan => "Worn: plan a visit to the workshop.",
+        Verdict::Act => "Past its limit: act now.",
+        Verdict::Unknown => "Unknown: nothing has been learned about this battery yet.",
+    };
+    let why = worst
+        .or(measuring.first().copied())
+        .map_or(String::new(), |raised| format!(" When the alarm came, {}.", words(raised.row)));
+    let lost = data.trace.health().coverage().filter(|share| *share < 0.8);
+    let doubt = lost.map_or(String::new(), |_| {
+        " The estimator is less sure than it says (see its health below): take the figures with care.".to_owned()
+    });
+    format!("{head}{why}{doubt}")
+}
+
+/// A moment for people.
+pub(super) fn moment(data: &Data, time_s: f64) -> String {
+    if data.is_dated() {
+        format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")
+    } else {
+        let after_h = data.ends_s().map_or(0.0, |(first_s, _)| time_s - first_s) / 3600.0;
+        format!("{after_h:.1} h after the start of the record")
+    }
+}
+
+fn since(data: &Data, battery: &[&Raised<'_>], measuring: &[&Raised<'_>]) -> String {
+    let first = battery.iter().chain(if battery.is_empty() { measuring } else { &[] }).map(|raised| raised.since_s);
+    match (first.reduce(f64::min), data.ends_s()) {
+        (Some(time_s), _) => format!("The first alarm that is still raised came {}.", moment(data, time_s)),
+        (None, Some((first, last))) if data.is_dated() => {
+            format!("No alarm is raised. Watched from {} to {}.", moment(data, first), moment(data, last))
+        }
+        (None, Some((first, last))) => format!("No alarm is raised. Watched for {:.1} h.", (last - first) / 3600.0),
+        (None, None) => "Unknown: there is no record.".to_owned(),
+    }
+}
+
+fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>]) -> String {
+    let advice = worst.and_then(|raised| rule(&raised.row.rule)).map(|rule| match rule {
+        Rule::TemperatureHigh => "Check cooling and load before the next use.",
+        Rule::SocLow => "Charge it.",
+        Rule::CellImbalance => {
+            "Have the cells balanced; if that does not hold, the weakest cell is the one to look at."
+        }
+        _ if verdict == Verdict::Act => "Replace the battery or the named cell, or take it out of service.",
+        _ => "Order a replacement, and have its capacity measured at the next visit.",
+    });
+    let measure = measuring.first().map(|raised| match rule(&raised.row.rule) {
+        Some(Rule::EstimateUntrusted) => {
+            "Do not rely on these figures before the sensors and the cell model were checked."
+        }
+        Some(Rule::StoreFailed) => "Check the disk of the vehicle computer: what is learned may be lost.",
+        _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",
+    });
+    match (advice, measure) {
+        (None, None) if verdict == Verdict::Unknown => {
+            "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
+        }
+        (None, None) if verdict == Verdict::Watch => "Plan its replacement.".to_owned(),
+        (None, None) => "Nothing.".to_owned(),
+        (advice, measure) => advice.into_iter().chain(measure).collect::<Vec<_>>().join(" "),
+    }
+}
+
+fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> Tile {
+    Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into() }
+}
+
+fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, raised: &[Raised<'_>]) -> Vec<Tile> {
+    let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
+    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let of_cell =
+        |step: &series::Step| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
+    let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));
+    let resistance = last(series::resistance, true);
+    let figure = |step: &series::Step| format!("{:.3} Ah", step.worst.0);
+    let health = capacity.zip(rated_ah).map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
+    let health_note = match (rated_ah, capacity) {
+        (None, _) => "rated capacity not known without -c".to_owned(),
+        (Some(_), None) => "no capacity learned yet".to_owned(),
+        (Some(rated), Some(step)) => format!("of {rated} Ah rated{}", of_cell(&step)),
+    };
+    let note = |step: Option<series::Step>, none: &str| {
+        let std = |step: series::Step| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
+        step.map_or_else(|| none.to_owned(), std)
+    };
+    vec![
+        tile("State of health", health, health_note),
+        tile("Capacity", capacity.as_ref().map(figure), note(capacity, "no capacity learned yet")),
+        tile("Usable capacity", usable.as_ref().map(figure), note(usable, "no load configured, or none learned yet")),
+        tile(
+            "Resistance",
+            resistance.map(|step| format!("{:.2} \u{d7} new", step.worst.0)),
+            note(resistance, "not learned yet"),
+        ),
+        recharge_tile(data),
+        tile(
+            "Remaining life",
+            outlook.as_ref().ok().map(Outlook::value),
+            outlook.as_ref().map_or_else(Clone::clone, |outlook| outlook.note(data.cells())),
+        ),
+        tile(
+            "Use so far",
+            series::full_cycles(data).map(|cycles| format!("{cycles:.0} cycles")),
+            "equivalent full cycles in this record",
+        ),
+        tile("Alarms raised now", Some(raised.len().to_string()), format!("{} entries in all", data.alarms.len())),
+    ]
+}
+
+/// The latest recharge period, normalised where it is known, beside the first.
+fn recharge_tile(data: &Data) -> Tile {
+    let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
+    let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
+    let minutes = |seconds: f64| format!("{:.1} min", seconds / 60.0);
+    let (first, last, how) = match normalised().next_back() {
+        Some(last) => (normalised().next(), Some(last), "normalised; "),
+        None => (raw().next(), raw().next_back(), "as it was; "),
+    };
+    let note = match (first, data.source.origin) {
+        (Some(first), _) => format!("{how}{} at first", minutes(first)),
+        (None, Origin::Store) => "the history does not keep it".to_owned(),
+        (None, Origin::Replay) => "no charge covered enough of the window".to_owned(),
+    };
+    tile("Recharge period", last.map(minutes), note)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRow {
+        let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());
+        AlarmRow { time_s, rule, severity, cell: Some(2), change, is_active, value: Some(1.38), threshold: Some(1.4) }
+    }
+
+    fn summary(alarms: Vec<AlarmRow>) -> Summary {
+        let mut data = Data::new(Origin::Store);
+        data.alarms = alarms;
+        of(&data, &Setting::default(), &Err("too little".into()))
+    }
+
+    #[test]
+    fn nothing_known_is_unknown_and_neither_good_nor_bad() {
+        let summary = summary(Vec::new());
+        assert_eq!(summary.verdict, Verdict::Unknown);
+        assert!(summary.tiles.iter().filter(|tile| tile.value == "unknown").count() >= 5, "{:?}", summary.tiles);
+        assert!(summary.since.starts_with("Unknown"));
+    }
+
+    #[test]
+    fn the_worst_raised_alarm_decides_and_one_that_is_over_does_not() {
+        let over = vec![alarm(1.0, "capacity_low", "severe", true), alarm(2.0, "capacity_low", "severe", false)];
+        assert_eq!(summary(over.clone()).verdict, Verdict::Unknown);
+        let mut both = over;
+        both.push(alarm(3.0e8, "usable_capacity_low", "warning", true));
+        let plan = summary(both.clone());
+        assert_eq!(plan.verdict, Verdict::Plan);
+        assert!(plan.how.contains("a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"), "{}", plan.how);
+        both.push(alarm(4.0e8, "resistance_high", "severe", true));
+        assert_eq!(summary(both).verdict, Verdict::Act);
+    }
+
+    #[test]
+    fn a_missing_input_says_nothing_bad_of_the_battery() {
+        let summary = summary(vec![alarm(1.0, "input_missing", "severe", true)]);
+        assert_eq!(summary.verdict, Verdict::Unknown);
+        assert!(summary.what.contains("Check sensors"), "{}", summary.what);
+    }
+}

@@ -1,0 +1,147 @@
+//! What a replay's estimates come to: SOC, temperature and the estimator's own consistency, in bins.
+
+use std::collections::VecDeque;
+
+use super::bins::{Bin, Bins};
+use crate::monitor::Estimate;
+
+/// Half of a 95 % interval, standard deviations.
+pub(super) const OF_95: f64 = 1.96;
+/// Charges and discharges kept in detail, the last ones, each with the rest after it.
+const DETAILED: usize = 6;
+
+/// The estimates of a stretch of time, of all cells.
+#[derive(Debug, Clone)]
+pub(super) struct Moment {
+    /// Lowest and highest SOC, fraction.
+    pub(super) soc: (f64, f64),
+    /// Lowest and highest end of a 95 % interval.
+    pub(super) soc_band: (f64, f64),
+    /// Degrees C.
+    pub(super) temperature_c: (f64, f64),
+    /// V.
+    pub(super) innovation_v: (f64, f64),
+    pub(super) health: Health,
+}
+
+/// How the innovations compare with what the filter expected.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Health {
+    pub(super) count: u64,
+    /// Within their own 95 % interval.
+    pub(super) inside: u64,
+    /// Beyond the gate: they moved nothing.
+    pub(super) gated: u64,
+    /// Sum of squares of innovation over its standard deviation.
+    pub(super) squares: f64,
+}
+
+const NOTHING: (f64, f64) = (f64::INFINITY, f64::NEG_INFINITY);
+
+impl Default for Moment {
+    fn default() -> Self {
+        let health = Health::default();
+        Self { soc: NOTHING, soc_band: NOTHING, temperature_c: NOTHING, innovation_v: NOTHING, health }
+    }
+}
+
+fn grow(range: &mut (f64, f64), (low, high): (f64, f64)) {
+    *range = (range.0.min(low), range.1.max(high));
+}
+
+impl Moment {
+    fn take(&mut self, e: &Estimate) {
+        grow(&mut self.soc, (e.soc, e.soc));
+        grow(&mut self.soc_band, (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std));
+        grow(&mut self.temperature_c, (e.temperature_c, e.temperature_c));
+        grow(&mut self.innovation_v, (e.innovation_v, e.innovation_v));
+        self.health.take(e);
+    }
+}
+
+impl Bin for Moment {
+    fn join(&mut self, later: &Self) {
+        grow(&mut self.soc, later.soc);
+        grow(&mut self.soc_band, later.soc_band);
+        grow(&mut self.temperature_c, later.temperature_c);
+        grow(&mut self.innovation_v, later.innovation_v);
+        self.health.add(&later.health);
+    }
+}
+
+impl Health {
+    fn take(&mut self, e: &Estimate) {
+        let parts = e.innovation_v / e.innovation_std_v;
+        if !parts.is_finite() {
+            return;
+        }
+        self.count += 1;
+        self.inside += u64::from(parts.abs() <= OF_95);
+        self.gated += u64::from(!e.accepted);
+        self.squares += parts * parts;
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.count += other.count;
+        self.inside += other.inside;
+        self.gated += other.gated;
+        self.squares += other.squares;
+    }
+
+    /// Share of innovations within their own 95 % interval.
+    pub(super) fn coverage(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.inside as f64 / self.count as f64)
+    }
+
+    /// Mean normalised innovation squared: 1 where the filter is right about itself.
+    pub(super) fn mean_nis(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.squares / self.count as f64)
+    }
+}
+
+/// All of it.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Trace {
+    pub(super) life: Option<Bins<Moment>>,
+    /// The last half-cycles, each in its own bins.
+    pub(super) recent: VecDeque<Bins<Moment>>,
+    pub(super) cells: Vec<Health>,
+    /// The last estimate of each cell: SOC and its standard deviation.
+    pub(super) last_soc: Vec<Option<(f64, f64)>>,
+}
+
+impl Trace {
+    pub(super) fn take(&mut self, estimate: &Estimate) {
+        let time_s = estimate.time.secs();
+        self.life.get_or_insert_with(|| Bins::new(time_s)).at(time_s).take(estimate);
+        if self.recent.is_empty() {
+            self.recent.push_back(Bins::new(time_s));
+        }
+        if let Some(bins) = self.recent.back_mut() {
+            bins.at(time_s).take(estimate);
+        }
+        let cell = estimate.cell.index();
+        if self.cells.len() <= cell {
+            self.cells.resize(cell + 1, Health::default());
+            self.last_soc.resize(cell + 1, None);
+        }
+        self.cells[cell].take(estimate);
+        self.last_soc[cell] = Some((estimate.soc, estimate.soc_std));
+    }
+
+    /// A charge or discharge begins.
+    pub(super) fn turn(&mut self, time_s: f64) {
+        self.recent.push_back(Bins::new(time_s));
+        while self.recent.len() > DETAILED {
+            self.recent.pop_front();
+        }
+    }
+
+    /// Of all cells over all time.
+    pub(super) fn health(&self) -> Health {
+        self.cells.iter().fold(Health::default(), |mut all, cell| {
+            all.add(cell);
+            all
+        })
+    }
+}

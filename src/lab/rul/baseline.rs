@@ -1,0 +1,125 @@
+//! What forecasts are compared with: a straight line through the last points, and a double exponential of least squares.
+//!
+//! Points are [use, capacity]. Both answer with the use at which their curve first passes the threshold.
+
+/// The straight line goes through this part of the points, the last ones.
+const LAST_PART: f64 = 0.3;
+/// And through no fewer than this, if there are as many.
+const LAST_POINTS: usize = 5;
+/// A curve is followed until this many times the use so far.
+const FOLLOWED: f64 = 20.0;
+/// Steps it is followed in.
+const STEPS: u32 = 20_000;
+/// Where the search for the exponents starts, e-folds over the use so far: both falling, one rising, nearly straight.
+const STARTS: [[f64; 2]; 4] = [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]];
+/// First step of that search, and when it is done.
+const SEARCH: (f64, f64) = (0.5, 1e-4);
+/// Moves of that search at most: those that need more creep along a valley in which nothing changes.
+const MAX_MOVES: u32 = 400;
+/// Exponents beyond this are not tried: e-folds over the use so far.
+const STEEPEST: f64 = 50.0;
+/// A determinant less than this part of its terms: both exponentials are one.
+const SINGULAR: f64 = 1e-12;
+
+/// Straight line of least squares through the last points; `None` = it does not fall.
+pub(super) fn straight(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
+    let wanted = ((LAST_PART * points.len() as f64) as usize).max(LAST_POINTS);
+    let last = &points[points.len().saturating_sub(wanted)..];
+    let count = last.len() as f64;
+    let [used, capacity] = [0, 1].map(|axis| last.iter().map(|point| point[axis]).sum::<f64>() / count);
+    let (mut square, mut product) = (0.0, 0.0);
+    for point in last {
+        square += (point[0] - used) * (point[0] - used);
+        product += (point[0] - used) * (point[1] - capacity);
+    }
+    let slope = product / square;
+    (slope < 0.0).then(|| used + (threshold - capacity) / slope)
+}
+
+/// C = a e^(b t) + c e^(d t): for given exponents a and c are linear, the exponents are searched for.
+pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<f64> {
+    let scale = points.last()?[0];
+    if points.len() < 4 || scale <= 0.0 {
+        return None;
+    }
+    let fit = |exponents: [f64; 2]| linear(points, scale, exponents);
+    let found = STARTS.iter().filter_map(|&start| search(start, &fit));
+    let (_, [a, c], [b, d]) = found.min_by(|x, y| x.0.total_cmp(&y.0))?;
+    let capacity = |used: f64| a * (b * used / scale).exp() + c * (d * used / scale).exp();
+    let step = (FOLLOWED - 1.0) * scale / f64::from(STEPS);
+    (0..=STEPS).map(|index| scale + step * f64::from(index)).find(|&used| capacity(used) < threshold)
+}
+
+/// Sum of squares, factors, exponents.
+type Fit = (f64, [f64; 2], [f64; 2]);
+
+/// Pattern search: a better neighbour is taken and the step doubled, without one it is halved.
+fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<Fit>) -> Option<Fit> {
+    const NEIGHBOURS: [[f64; 2]; 8] =
+        [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
+    let (mut best, mut step) = (fit(start)?, SEARCH.0);
+    for _ in 0..MAX_MOVES {
+        if step < SEARCH.1 {
+            break;
+        }
+        let around = NEIGHBOURS.iter().map(|n| [0, 1].map(|i| (best.2[i] + step * n[i]).clamp(-STEEPEST, STEEPEST)));
+        match around.filter_map(fit).min_by(|x, y| x.0.total_cmp(&y.0)) {
+            Some(better) if better.0 < best.0 => (best, step) = (better, 2.0 * step),
+            _ => step *= 0.5,
+        }
+    }
+    Some(best)
+}
+
+/// The factors that fit best with these exponents; `None` = they cannot be told apart.
+fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Fit> {
+    let at = |used: f64| exponents.map(|exponent| (exponent * used / scale).exp());
+    let (mut xx, mut xy, mut yy, mut xc, mut yc) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for &[used, capacity] in points {
+        let [x, y] = at(used);
+        xx += x * x;
+        xy += x * y;
+        yy += y * y;
+        xc += x * capacity;
+        yc += y * capacity;
+    }
+    let determinant = xx * yy - xy * xy;
+    // Not above covers NaN too.
+    if !matches!(determinant.partial_cmp(&(SINGULAR * xx * yy)), Some(std::cmp::Ordering::Greater)) {
+        return None;
+    }
+    let factors = [(xc * yy - yc * xy) / determinant, (yc * xx - xc * xy) / determinant];
+    let squares = points.iter().map(|&[used, capacity]| {
+        let [x, y] = at(used);
+        let error = capacity - factors[0] * x - factors[1] * y;
+        error * error
+    });
+    Some((squares.sum(), factors, exponents))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_line_goes_through_the_last_points_alone() {
+        let points: Vec<[f64; 2]> =
+            (0..20).map(f64::from).map(|t| [t, if t < 10.0 { 9.0 } else { 4.0 - 0.1 * t }]).collect();
+        assert!((straight(&points, 1.0).expect("falls") - 30.0).abs() < 1e-9);
+        assert_eq!(straight(&[[0.0, 1.0], [1.0, 1.0]], 0.5), None);
+    }
+
+    #[test]
+    fn a_double_exponential_is_found_again() {
+        let capacity = |t: f64| 2.0 * (-0.003 * t).exp() - 0.01 * (0.02 * t).exp();
+        let points: Vec<[f64; 2]> = (0..140).map(f64::from).map(|t| [t, capacity(t)]).collect();
+        let crossing = double_exponential(&points, 1.0).expect("falls");
+        assert!((capacity(crossing) - 1.0).abs() < 0.02, "{crossing} {}", capacity(crossing));
+    }
+
+    #[test]
+    fn one_that_levels_off_never_gets_there() {
+        let points: Vec<[f64; 2]> = (0..100).map(f64::from).map(|t| [t, 1.5 + 0.5 * (-0.1 * t).exp()]).collect();
+        assert_eq!(double_exponential(&points, 1.0), None);
+    }
+}

@@ -1,0 +1,140 @@
+//! The mean function and its generalised least squares.
+//!
+//! With W a square root of the inverse covariance, the coefficients are those of ordinary least squares of `W y` on `W H`.
+//! Every form of the process gives `G = [y H]' K^-1 [y H]`; from it come the coefficients, their covariance and the
+//! squared norm of the residual.
+
+use serde::{Deserialize, Serialize};
+
+use super::Fault;
+
+/// Mean function.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Basis {
+    /// 0 everywhere.
+    Zero,
+    /// One constant.
+    Constant,
+    /// A constant and a slope for every input.
+    Linear,
+}
+
+impl Basis {
+    /// Number of coefficients.
+    pub fn size(self, dimensions: usize) -> usize {
+        match self {
+            Self::Zero => 0,
+            Self::Constant => 1,
+            Self::Linear => 1 + dimensions,
+        }
+    }
+
+    /// Value of the k-th function at a (standardised) row.
+    pub(super) fn value(self, row: &[f64], k: usize) -> f64 {
+        if k == 0 { 1.0 } else { row[k - 1] }
+    }
+}
+
+/// Coefficients with their covariance.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Coefficients {
+    pub beta: Vec<f64>,
+    /// Inverse of `H' K^-1 H`, row after row.
+    pub covariance: Vec<f64>,
+    /// `(y - H beta)' K^-1 (y - H beta)`.
+    pub squared_norm: f64,
+}
+
+impl Coefficients {
+    /// From `G`, symmetric, row after row, of size (1 + coefficients)^2, target first.
+    pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, Fault> {
+        let width = size + 1;
+        let fault =
+            || Fault::range("basis", format!("{size} functions"), "such that the rows tell its functions apart");
+        // Cholesky of the part that belongs to the basis, scaled by its diagonal.
+        let scale: Vec<f64> = (1..width).map(|k| g[k * width + k].sqrt()).collect();
+        if scale.iter().any(|s| !(*s > 0.0 && s.is_finite())) {
+            return Err(fault());
+        }
+        let mut l = vec![0.0; size * size];
+        for i in 0..size {
+            for j in 0..=i {
+                let dot: f64 = (0..j).map(|k| l[i * size + k] * l[j * size + k]).sum();
+                let rest = g[(i + 1) * width + j + 1] / (scale[i] * scale[j]) - dot;
+                l[i * size + j] = if i > j {
+                    rest / l[j * size + j]
+                } else if rest > 1e-12 {
+                    rest.sqrt()
+                } else {
+                    return Err(fault());
+                };
+            }
+        }
+        let inverse = inverse_from_factor(&l, size);
+        let covariance: Vec<f64> =
+            (0..size * size).map(|at| inverse[at] / (scale[at / size] * scale[at % size])).collect();
+        let beta: Vec<f64> = (0..size).map(|i| (0..size).map(|j| covariance[i * size + j] * g[j + 1]).sum()).collect();
+        let squared_norm = g[0] - (0..size).map(|j| beta[j] * g[j + 1]).sum::<f64>();
+        Ok(Self { beta, covariance, squared_norm: squared_norm.max(0.0) })
+    }
+
+    /// Value of the mean function at a row.
+    pub(super) fn mean(&self, basis: Basis, row: &[f64]) -> f64 {
+        (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
+    }
+
+    /// Variance that comes from not knowing the coefficients; `rest` = h(x) - H' K^-1 k(x).
+    pub(super) fn variance(&self, rest: &[f64]) -> f64 {
+        let size = self.beta.len();
+        (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
+    }
+}
+
+/// `(L L')^-1`, row after row.
+fn inverse_from_factor(l: &[f64], size: usize) -> Vec<f64> {
+    let mut inverse = vec![0.0; size * size];
+    for column in 0..size {
+        let mut x = vec![0.0; size];
+        for i in column..size {
+            let unit = if i == column { 1.0 } else { 0.0 };
+            x[i] = (unit - (column..i).map(|k| l[i * size + k] * x[k]).sum::<f64>()) / l[i * size + i];
+        }
+        for i in (0..size).rev() {
+            x[i] = (x[i] - (i + 1..size).map(|k| l[k * size + i] * x[k]).sum::<f64>()) / l[i * size + i];
+        }
+        for i in 0..size {
+            inverse[i * size + column] = x[i];
+        }
+    }
+    inverse
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coefficients_are_those_of_least_squares() {
+        // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance, last one off by 1.
+        let rows = [(2.0, 0.0), (5.0, 1.0), (8.0, 2.0), (12.0, 3.0)];
+        let mut g = vec![0.0; 9];
+        for (y, x) in rows {
+            let v = [y, 1.0, x];
+            for at in 0..9 {
+                g[at] += v[at / 3] * v[at % 3];
+            }
+        }
+        let found = Coefficients::solve(&g, 2).expect("well posed");
+        assert!((found.beta[0] - 1.8).abs() < 1e-9 && (found.beta[1] - 3.3).abs() < 1e-9, "{found:?}");
+        assert!((found.squared_norm - 0.3).abs() < 1e-9);
+        assert!((found.covariance[3] - 0.2).abs() < 1e-9 && (found.covariance[1] + 0.3).abs() < 1e-9);
+        assert!((found.variance(&[1.0, 2.0]) - 0.3).abs() < 1e-9);
+    }
+
+    #[test]
+    fn functions_that_the_rows_cannot_tell_apart_are_refused() {
+        let g = [3.0, 1.0, 2.0, 1.0, 1.0, 2.0, 2.0, 2.0, 4.0];
+        assert!(Coefficients::solve(&g, 2).is_err());
+    }
+}

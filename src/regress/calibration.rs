@@ -1,0 +1,119 @@
+//! How wide an interval has to be to hold a stated part of the measurements.
+//!
+//! A Gaussian interval holds what it says only if the residuals are Gaussian and as wide as the model says, everywhere.
+//! Measured residuals seldom are: those of a cell's voltage are twice as wide at rest as while it is charged. So training
+//! rows speak: each of a seeded choice is predicted without itself, which gives a ratio |residual| / standard deviation.
+//! *Spread* at a row is the mean ratio of the nearest of them, shrunk towards and relative to that of all; the factor is
+//! the quantile of ratio / spread (with the correction of split conformal prediction for few rows). Half the interval is
+//! factor x spread x standard deviation. No held-out row is looked at.
+
+use super::nearest::Data;
+use super::tree::Tree;
+
+/// Part of the measurements that an interval is to hold.
+pub(super) const LEVEL: f64 = 0.95;
+/// Half width of the Gaussian interval of that level, in standard deviations.
+pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
+/// Rows that are left out, one at a time; the factor's own standard error is then below 1 %.
+pub(super) const ROWS: usize = 8000;
+/// Rows that speak for the spread at a place: a twentieth of them, not more than so many.
+const MOST_NEAR: usize = 200;
+/// Fewer do not say anything: the spread is then 1 everywhere.
+const FEWEST_NEAR: usize = 20;
+/// Weight of the mean of all in the spread at a place, in rows.
+const SHRINKAGE: f64 = 20.0;
+
+/// The factor and the spread.
+#[derive(Debug, Clone)]
+pub(super) struct Calibration {
+    pub factor: f64,
+    /// Rows that were left out, by number, and their ratios.
+    pub rows: Vec<u32>,
+    pub ratios: Vec<f64>,
+    near: usize,
+    mean: f64,
+    tree: Option<Tree>,
+}
+
+impl Calibration {
+    /// Gaussian intervals.
+    pub(super) fn none() -> Self {
+        Self { factor: GAUSSIAN, rows: vec![], ratios: vec![], near: 0, mean: 1.0, tree: None }
+    }
+
+    /// From rows and their ratios when predicted without themselves. Without rows: Gaussian.
+    pub(super) fn new(data: &Data, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
+        let near = (ratios.len() / 20).min(MOST_NEAR);
+        let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
+        let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
+        let tree = (near >= FEWEST_NEAR && mean > 0.0).then(|| Tree::new(&inputs, &inverse_deviations(&inputs, data)));
+        let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
+        let d = data.dimensions;
+        let relative = |(k, ratio): (usize, &f64)| ratio / calibration.spread(&inputs[k * d..][..d], Some(k));
+        let mut relative: Vec<f64> = calibration.ratios.iter().enumerate().map(relative).collect();
+        relative.sort_by(f64::total_cmp);
+        let rank = ((relative.len() + 1) as f64 * LEVEL).ceil() as usize;
+        // Too few rows to say: the Gaussian one.
+        if rank > 0 && rank <= relative.len() {
+            calibration.factor = relative[rank - 1];
+        }
+        calibration
+    }
+
+    /// How wide residuals are at a standardised row, relative to what the model says on the whole.
+    fn spread(&self, row: &[f64], but: Option<usize>) -> f64 {
+        let Some(tree) = &self.tree else { return 1.0 };
+        let near = tree.nearest(row, self.near, self.ratios.len(), but);
+        let sum: f64 = near.iter().map(|k| self.ratios[*k as usize]).sum();
+        (sum + SHRINKAGE * self.mean) / (near.len() as f64 + SHRINKAGE) / self.mean
+    }
+
+    /// Half of the interval at a standardised row, in standard deviations of a measurement.
+    pub(super) fn half_width(&self, row: &[f64]) -> f64 {
+        self.factor * self.spread(row, None)
+    }
+}
+
+/// Weights that make all inputs count alike.
+fn inverse_deviations(inputs: &[f64], data: &Data) -> Vec<f64> {
+    let (d, n) = (data.dimensions, inputs.len() as f64 / data.dimensions as f64);
+    let of = |column: usize| {
+        let values = || inputs.iter().skip(column).step_by(d);
+        let mean = values().sum::<f64>() / n;
+        let variance = values().map(|x| (x - mean) * (x - mean)).sum::<f64>() / n;
+        if variance > 0.0 { variance.sqrt().recip() } else { 1.0 }
+    };
+    (0..d).map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::regress::Basis;
+
+    fn data(rows: usize) -> Data {
+        let inputs = (0..rows).map(|k| k as f64).collect();
+        Data { dimensions: 1, inputs, targets: vec![0.0; rows], basis: Basis::Zero }
+    }
+
+    #[test]
+    fn few_rows_give_one_factor_for_all_and_too_few_the_gaussian_one() {
+        let ratios: Vec<f64> = (1..=200).map(|k| f64::from(k) / 100.0).collect();
+        let of = |n: usize| Calibration::new(&data(200), (0..n as u32).collect(), ratios[..n].to_vec());
+        assert_eq!((of(200).factor, of(200).half_width(&[7.0])), (1.91, 1.91));
+        assert_eq!((of(10).factor, of(0).factor, Calibration::none().factor), (GAUSSIAN, GAUSSIAN, GAUSSIAN));
+    }
+
+    #[test]
+    fn intervals_are_wider_where_residuals_are() {
+        // Ratios between 0 and 1 in the first half, between 0 and 3 in the second.
+        let ratio = |k: u32| f64::from(k * 7919 % 1000) / 1000.0 * if k < 2000 { 1.0 } else { 3.0 };
+        let calibration = Calibration::new(&data(4000), (0..4000).collect(), (0..4000).map(ratio).collect());
+        let (narrow, wide) = (calibration.half_width(&[800.0]), calibration.half_width(&[3100.0]));
+        assert!((0.90..1.1).contains(&narrow) && (2.6..2.95).contains(&wide), "{narrow}, {wide}");
+        let held = |from: u32, half: f64| (from..from + 2000).filter(|k| ratio(*k) <= half).count();
+        // Shrinkage leaves the narrow half a little too wide and the wide one too narrow; together they hold 95 %.
+        let (first, second) = (held(0, narrow), held(2000, wide));
+        assert!(second >= 1760 && (3740..=3860).contains(&(first + second)), "{first}, {second}");
+    }
+}

@@ -1,0 +1,143 @@
+//! k-fold cross-validation: every row is predicted by a model that has not seen it.
+
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+
+use super::jitter::Jitter;
+use super::model::{Hyperparameter, Prediction, fit};
+use super::scale::check;
+use super::{Fault, Rows, Settings, Watcher};
+
+/// Most folds.
+const MAX_FOLDS: usize = 1000;
+
+/// Outcome of one fold.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fold {
+    /// Rows it held out.
+    pub held_out: usize,
+    /// Time of the fit, s, by the caller's clock.
+    pub fit_s: f64,
+    /// Time of the predictions, s.
+    pub predict_s: f64,
+    /// What was found.
+    pub hyperparameters: Vec<Hyperparameter>,
+    /// Of the rows it learned from.
+    pub log_marginal_likelihood: f64,
+    /// Half width of the 95 % interval in standard deviations.
+    pub interval_factor: f64,
+    /// What had to be added to diagonals.
+    pub jitter: Jitter,
+}
+
+/// Outcome of a cross-validation.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Folds {
+    /// Prediction of every row, in the order of the rows, by the model of the fold that held it out.
+    pub predictions: Vec<Prediction>,
+    /// Fold that held out each row, from 0.
+    pub fold_of_row: Vec<usize>,
+    /// Each fold.
+    pub folds: Vec<Fold>,
+}
+
+/// Errors of predictions, in units of the target.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Score {
+    /// Root of the mean squared error.
+    pub rmse: f64,
+    /// Mean absolute error.
+    pub mean_absolute_error: f64,
+    /// Part of the rows inside the 95 % interval.
+    pub coverage_95: f64,
+    /// Part of the rows within 1.96 standard deviations of a measurement: what a Gaussian interval would hold.
+    pub gaussian_coverage_95: f64,
+    /// Mean width of the 95 % interval.
+    pub mean_width_95: f64,
+}
+
+/// Errors of predictions of known targets, of the same length.
+pub fn score(predictions: &[Prediction], targets: &[f64]) -> Score {
+    let count = predictions.len() as f64;
+    let mean = |of: &dyn Fn(&Prediction, f64) -> f64| {
+        predictions.iter().zip(targets).map(|(p, y)| of(p, *y)).sum::<f64>() / count
+    };
+    Score {
+        rmse: mean(&|p, y| (y - p.mean).powi(2)).sqrt(),
+        mean_absolute_error: mean(&|p, y| (y - p.mean).abs()),
+        coverage_95: mean(&|p, y| if (p.low_95..=p.high_95).contains(&y) { 1.0 } else { 0.0 }),
+        gaussian_coverage_95: mean(&|p, y| {
+            let inside = (y - p.mean).abs() <= super::calibration::GAUSSIAN * p.measurement_variance.sqrt();
+            if inside { 1.0 } else { 0.0 }
+        }),
+        mean_width_95: mean(&|p, _| p.high_95 - p.low_95),
+    }
+}
+
+/// Which fold holds out each row: a seeded shuffle cut into parts of equal size, give or take a row.
+pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..rows).collect();
+    order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
+    let mut fold_of_row = vec![0; rows];
+    order.iter().enumerate().for_each(|(place, row)| fold_of_row[*row] = place * folds / rows);
+    fold_of_row
+}
+
+/// Cross-validates; `clock` gives seconds from any origin, for the times of the folds.
+pub fn cross_validate(
+    rows: &Rows,
+    settings: &Settings,
+    folds: usize,
+    clock: &dyn Fn() -> f64,
+    watcher: &mut Watcher,
+) -> Result<Folds, Fault> {
+    check(rows)?;
+    let n = rows.targets.len();
+    let most = MAX_FOLDS.min(n / 2);
+    if !(2..=most).contains(&folds) {
+        return Err(Fault::range("folds", folds, format!("2 to {most}")));
+    }
+    let fold_of_row = assign(n, folds, settings.seed);
+    let mut predictions = vec![None; n];
+    let mut done = Vec::with_capacity(folds);
+    for fold in 0..folds {
+        let mut watch = |mut progress: super::Progress| {
+            (progress.fold, progress.folds) = (fold + 1, folds);
+            watcher(progress)
+        };
+        done.push(one_fold(rows, settings, (fold, &fold_of_row), clock, &mut watch, &mut predictions)?);
+    }
+    Ok(Folds { predictions: predictions.into_iter().flatten().collect(), fold_of_row, folds: done })
+}
+
+fn one_fold(
+    rows: &Rows,
+    settings: &Settings,
+    (fold, fold_of_row): (usize, &[usize]),
+    clock: &dyn Fn() -> f64,
+    watcher: &mut Watcher,
+    predictions: &mut [Option<Prediction>],
+) -> Result<Fold, Fault> {
+    let (held, kept): (Vec<usize>, Vec<usize>) = (0..fold_of_row.len()).partition(|row| fold_of_row[*row] == fold);
+    let inputs = |some: &[usize]| -> Vec<f64> {
+        some.iter().flat_map(|row| rows.inputs[row * rows.dimensions..][..rows.dimensions].to_vec()).collect()
+    };
+    let targets: Vec<f64> = kept.iter().map(|row| rows.targets[*row]).collect();
+    let start_s = clock();
+    let training = Rows { inputs: &inputs(&kept), dimensions: rows.dimensions, targets: &targets, lines: &[] };
+    let model = fit(&training, settings, watcher)?;
+    let fitted_s = clock();
+    let found = model.predict(&inputs(&held))?;
+    let end_s = clock();
+    held.iter().zip(found).for_each(|(row, prediction)| predictions[*row] = Some(prediction));
+    Ok(Fold {
+        held_out: held.len(),
+        fit_s: fitted_s - start_s,
+        predict_s: end_s - fitted_s,
+        hyperparameters: model.hyperparameters(),
+        log_marginal_likelihood: model.log_marginal_likelihood(),
+        interval_factor: model.interval_factor(),
+        jitter: model.jitter(),
+    })
+}

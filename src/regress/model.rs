@@ -1,0 +1,461 @@
+//! A fitted process: fit, predict, what was found.
+
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use rayon::ThreadPool;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::calibration::{Calibration, ROWS};
+use super::jitter::{self, Jitter};
+use super::kernel::Kernel;
+use super::minimise::Lowest;
+use super::nearest::{Data, Factors};
+use super::plan::{Plan, Role};
+use super::scale::{Scale, check};
+use super::search::{Watched, descend, first_start, log_bounds, random_start};
+use super::{Basis, Fault, Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, Progress, Rows, Settings, Watcher};
+use super::{exact, inducing, nearest};
+
+/// Rows whose factors the search of [`Form::Nearest`] sums over; the hyperparameters' standard error from this choice is
+/// far below what a prediction can show.
+const SEARCH_ROWS: usize = 6000;
+/// Most times the neighbours or inducing points are chosen anew while the length scales move.
+const MAX_ROUNDS: usize = 4;
+/// Change of the ratio of two length scales below which the choice stands.
+const SAME_METRIC: f64 = 1.3;
+/// Most threads.
+const MAX_THREADS: usize = 1024;
+
+/// One hyperparameter: length scales in (standardised) inputs, standard deviations in units of the target.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Hyperparameter {
+    /// Such as `matern32_1.length_scale_2`: the first shape of the kernel, second input.
+    pub name: String,
+    /// Its value.
+    pub value: f64,
+}
+
+/// What is to be expected at one row.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prediction {
+    /// Mean of function and measurement.
+    pub mean: f64,
+    /// Variance of the function's value: what more rows would lower.
+    pub function_variance: f64,
+    /// Variance of a new measurement: the function's and the noise.
+    pub measurement_variance: f64,
+    /// Lower end of the interval that holds 95 % of new measurements, see [`Model::interval_factor`]: not 1.96 standard
+    /// deviations when residuals are not Gaussian or not as wide everywhere.
+    pub low_95: f64,
+    /// Its upper end.
+    pub high_95: f64,
+}
+
+/// A fitted process.
+#[derive(Debug)]
+pub struct Model {
+    pub(super) spec: Spec,
+    pub(super) scale: Scale,
+    /// Logarithms, in standardised units.
+    pub(super) theta: Vec<f64>,
+    pub(super) posterior: Posterior,
+    pub(super) outcome: Outcome,
+    pub(super) calibration: Calibration,
+    pool: ThreadPool,
+}
+
+/// A model without its threads.
+pub(super) struct Parts {
+    pub spec: Spec,
+    pub scale: Scale,
+    pub theta: Vec<f64>,
+    pub posterior: Posterior,
+    pub outcome: Outcome,
+    pub calibration: Calibration,
+}
+
+/// What a model is, apart from its numbers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Spec {
+    pub kernel: Kernel,
+    pub basis: Basis,
+    pub ard: bool,
+    pub form: Form,
+    pub dimensions: usize,
+}
+
+/// What came of the fit.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Outcome {
+    /// In standardised targets.
+    pub log_likelihood: f64,
+    pub jitter: Jitter,
+    pub iterations: usize,
+}
+
+#[derive(Debug, Clone)]
+pub(super) enum Posterior {
+    Exact(Box<exact::Posterior>),
+    Nearest(Box<nearest::Posterior>),
+    Inducing(Box<inducing::Posterior>),
+}
+
+impl Posterior {
+    pub(super) fn data(&self) -> &Data {
+        match self {
+            Self::Exact(posterior) => &posterior.data,
+            Self::Nearest(posterior) => &posterior.data,
+            Self::Inducing(posterior) => &posterior.data,
+        }
+    }
+
+    fn predict(&self, queries: &[f64]) -> Result<Vec<(f64, f64)>, Fault> {
+        match self {
+            Self::Exact(posterior) => Ok(posterior.predict(queries)),
+            Self::Nearest(posterior) => posterior.predict(queries, None),
+            Self::Inducing(posterior) => Ok(posterior.predict(queries)),
+        }
+    }
+
+    /// Residual and variance of the measurement of some rows, each predicted from the others.
+    fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, Fault> {
+        match self {
+            Self::Exact(posterior) => Ok(posterior.left_out(rows)),
+            Self::Inducing(posterior) => Ok(posterior.left_out(rows)),
+            Self::Nearest(posterior) => {
+                let data = &posterior.data;
+                let queries: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
+                let found = posterior.predict(&queries, Some(rows))?;
+                let with_row = found.into_iter().zip(rows);
+                Ok(with_row.map(|((m, v), row)| (data.targets[*row as usize] - m, v + noise_variance)).collect())
+            }
+        }
+    }
+}
+
+/// Fits a process to rows. `watcher` hears of every step and can end the work.
+pub fn fit(rows: &Rows, settings: &Settings, watcher: &mut Watcher) -> Result<Model, Fault> {
+    check(rows)?;
+    let job = Job::new(rows, settings)?;
+    let (theta, iterations) = if settings.max_iterations == 0 { (job.first_start()?, 0) } else { job.search(watcher)? };
+    job.finish(theta, iterations)
+}
+
+/// Rows and settings made ready.
+struct Job<'a> {
+    settings: &'a Settings,
+    scale: Scale,
+    data: Data,
+    plan: Plan,
+    pool: ThreadPool,
+    /// Typical standard deviation of an (otherwise) standardised input.
+    spread: f64,
+}
+
+impl<'a> Job<'a> {
+    fn new(rows: &Rows, settings: &'a Settings) -> Result<Self, Fault> {
+        let n = rows.targets.len();
+        check_settings(settings, n)?;
+        let scale = Scale::of(rows, settings.standardise, settings.basis);
+        let natural = Scale::of(rows, true, settings.basis);
+        let logs: f64 = natural.deviations.iter().zip(&scale.deviations).map(|(d, unit)| (d / unit).ln()).sum();
+        let d = rows.dimensions;
+        let mut data = Data {
+            dimensions: d,
+            inputs: scale.inputs(rows.inputs),
+            targets: scale.targets(rows.targets),
+            basis: settings.basis,
+        };
+        if matches!(settings.form, Form::Nearest { .. }) {
+            let mut order: Vec<usize> = (0..n).collect();
+            order.shuffle(&mut ChaCha8Rng::seed_from_u64(settings.seed));
+            data.inputs = order.iter().flat_map(|row| data.inputs[row * d..][..d].to_vec()).collect();
+            data.targets = order.iter().map(|row| data.targets[*row]).collect();
+        }
+        let plan = Plan::new(&settings.kernel, d, settings.ard);
+        Ok(Self { settings, scale, data, plan, pool: threads(settings.threads)?, spread: (logs / d as f64).exp() })
+    }
+
+    fn first_start(&self) -> Result<Vec<f64>, Fault> {
+        let given = &self.settings.start;
+        if given.is_empty() {
+            return Ok(first_start(&self.plan, self.spread));
+        }
+        let count = self.plan.parameters.len();
+        if given.len() != count || given.iter().any(|value| !(value.is_finite() && *value > 0.0)) {
+            return Err(Fault::range("start", format!("{given:?}"), format!("{count} positive numbers")));
+        }
+        let unit = |role| if matches!(role, Role::Signal | Role::Noise) { self.scale.target_deviation } else { 1.0 };
+        Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / unit(p.role)).ln()).collect())
+    }
+
+    /// The best of all searches, and its steps.
+    fn search(&self, watcher: &mut Watcher) -> Result<(Vec<f64>, usize), Fault> {
+        let searches = self.settings.restarts + 1;
+        let mut best: Option<Lowest> = None;
+        for k in 0..searches {
+            let start = match k {
+                0 => self.first_start()?,
+                _ => random_start(&self.plan, self.spread, self.settings.seed, k),
+            };
+            let progress = Progress {
+                fold: 1,
+                folds: 1,
+                search: k + 1,
+                searches,
+                iteration: 0,
+                max_iterations: self.settings.max_iterations,
+                log_likelihood_per_row: f64::NEG_INFINITY,
+            };
+            let rows = self.data.len().min(self.search_rows());
+            let found = self.one_search(start, &mut Watched { watcher, progress, rows })?;
+            best = match (best, found) {
+                (Some(old), Some(new)) if new.value < old.value => Some(new),
+                (None, new) => new,
+                (old, _) => old,
+            };
+        }
+        best.map(|best| (best.x, best.iterations)).ok_or(Fault::NotPositiveDefinite { jitter: jitter::LAST })
+    }
+
+    fn search_rows(&self) -> usize {
+        if matches!(self.settings.form, Form::Nearest { .. }) { SEARCH_ROWS } else { usize::MAX }
+    }
+
+    /// One search; what depends on the metric (neighbours, inducing points) is chosen anew until the metric rests.
+    fn one_search(&self, mut start: Vec<f64>, watched: &mut Watched) -> Result<Option<Lowest>, Fault> {
+        let (low, high) = log_bounds(&self.plan, self.spread);
+        let mut found: Option<Lowest> = None;
+        for _ in 0..MAX_ROUNDS {
+            let metric = self.metric(&start);
+            let Some(mut lowest) = self.one_round(&start, &metric, (&low, &high), watched)? else { break };
+            lowest.iterations += found.map_or(0, |before| before.iterations);
+            start.clone_from(&lowest.x);
+            found = Some(lowest);
+            if matches!(self.settings.form, Form::Exact) || same(&metric, &self.metric(&start)) {
+                break;
+            }
+        }
+        Ok(found)
+    }
+
+    fn metric(&self, theta: &[f64]) -> Vec<f64> {
+        self.plan.metric(&self.plan.values(theta))
+    }
+
+    fn one_round(
+        &self,
+        start: &[f64],
+        metric: &[f64],
+        bounds: (&[f64], &[f64]),
+        watched: &mut Watched,
+    ) -> Result<Option<Lowest>, Fault> {
+        let steps = self.settings.max_iterations;
+        match self.settings.form {
+            Form::Exact => descend(start, bounds, steps, watched, |theta| {
+                self.pool.install(|| {
+                    let posterior = exact::Posterior::new(self.data.clone(), self.plan.clone(), theta)?;
+                    Ok((posterior.value, posterior.gradient()))
+                })
+            }),
+            Form::Nearest { neighbours } => {
+                let rows = chosen(self.data.len(), SEARCH_ROWS);
+                let factors = self.pool.install(|| Factors::new(&self.data, rows, metric, neighbours));
+                descend(start, bounds, steps, watched, |theta| {
+                    let sums = self.pool.install(|| factors.sums(&self.data, &self.plan, theta, true))?;
+                    Ok((sums.value, sums.gradient))
+                })
+            }
+            Form::Inducing { points } => {
+                let choose = || inducing::choose(&self.data, metric, points, self.settings.seed);
+                let points = self.pool.install(choose);
+                descend(start, bounds, steps, watched, |theta| {
+                    self.pool.install(|| {
+                        let posterior = inducing::Posterior::new(&self.data, &self.plan, theta, &points)?;
+                        Ok((posterior.value, posterior.gradient()))
+                    })
+                })
+            }
+        }
+    }
+
+    fn finish(self, theta: Vec<f64>, iterations: usize) -> Result<Model, Fault> {
+        let metric = self.metric(&theta);
+        let noise_variance = self.plan.values(&theta).noise_variance;
+        let (data, plan) = (self.data, self.plan);
+        let (posterior, value, jitter) = self.pool.install(|| match self.settings.form {
+            Form::Exact => {
+                let posterior = exact::Posterior::new(data, plan, &theta)?;
+                let (value, jitter) = (posterior.value, posterior.jitter);
+                Ok((Posterior::Exact(Box::new(posterior)), value, jitter))
+            }
+            Form::Nearest { neighbours } => {
+                let factors = Factors::new(&data, chosen(data.len(), usize::MAX), &metric, neighbours);
+                let sums = factors.sums(&data, &plan, &theta, false)?;
+                let posterior = nearest::Posterior::new(data, plan, &theta, sums.coefficients, neighbours);
+                Ok((Posterior::Nearest(Box::new(posterior)), sums.value, sums.jitter))
+            }
+            Form::Inducing { points } => {
+                let points = inducing::choose(&data, &metric, points, self.settings.seed);
+                let posterior = inducing::Posterior::new(&data, &plan, &theta, &points)?;
+                let (value, jitter) = (posterior.value, posterior.jitter);
+                Ok::<_, Fault>((Posterior::Inducing(Box::new(posterior)), value, jitter))
+            }
+        })?;
+        let outcome = Outcome { log_likelihood: -value, jitter, iterations };
+        let mut calibration = Calibration::none();
+        if self.settings.calibrate {
+            let rows = chosen(posterior.data().len(), ROWS);
+            let left_out = self.pool.install(|| posterior.left_out(&rows, noise_variance))?;
+            let ratios = left_out.into_iter().map(|(residual, variance)| residual.abs() / variance.sqrt()).collect();
+            calibration = Calibration::new(posterior.data(), rows, ratios);
+        }
+        let settings = self.settings;
+        let spec = Spec {
+            kernel: settings.kernel.clone(),
+            basis: settings.basis,
+            ard: settings.ard,
+            form: settings.form,
+            dimensions: self.scale.means.len(),
+        };
+        Ok(Model { spec, scale: self.scale, theta, posterior, outcome, calibration, pool: self.pool })
+    }
+}
+
+/// At most `most` row numbers, evenly from `0..n` (rows of [`Form::Nearest`] are in random order).
+fn chosen(n: usize, most: usize) -> Vec<u32> {
+    let count = n.min(most);
+    (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()
+}
+
+/// Whether two metrics rank rows much alike: all their ratios are.
+fn same(a: &[f64], b: &[f64]) -> bool {
+    let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
+    let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
+    high - low < SAME_METRIC.ln()
+}
+
+pub(super) fn threads(count: usize) -> Result<ThreadPool, Fault> {
+    if count == 0 || count > MAX_THREADS {
+        return Err(Fault::range("threads", count, format!("1 to {MAX_THREADS}")));
+    }
+    rayon::ThreadPoolBuilder::new().num_threads(count).build().map_err(|error| Fault::Threads(error.to_string()))
+}
+
+fn check_settings(settings: &Settings, rows: usize) -> Result<(), Fault> {
+    match settings.form {
+        Form::Exact if rows > MAX_EXACT_ROWS => {
+            Err(Fault::range("rows of an exact fit", rows, format!("at most {MAX_EXACT_ROWS}; take a sparse form")))
+        }
+        Form::Nearest { neighbours } if neighbours == 0 || neighbours > MAX_NEIGHBOURS => {
+            Err(Fault::range("neighbours", neighbours, format!("1 to {MAX_NEIGHBOURS}")))
+        }
+        Form::Inducing { points } if points == 0 || points > MAX_INDUCING => {
+            Err(Fault::range("inducing points", points, format!("1 to {MAX_INDUCING}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+impl Model {
+    pub(super) fn assemble(parts: Parts, pool: ThreadPool) -> Self {
+        let Parts { spec, scale, theta, posterior, outcome, calibration } = parts;
+        Self { spec, scale, theta, posterior, outcome, calibration, pool }
+    }
+
+    /// What is to be expected at rows of inputs, one after the other.
+    pub fn predict(&self, inputs: &[f64]) -> Result<Vec<Prediction>, Fault> {
+        let d = self.spec.dimensions;
+        if !inputs.len().is_multiple_of(d) {
+            return Err(Fault::range("number of inputs", inputs.len(), format!("a multiple of {d}")));
+        }
+        if let Some(at) = inputs.iter().position(|x| !x.is_finite()) {
+            let what = format!("input {}", at % d + 1);
+            return Err(Fault::NotFinite { line: (at / d) as u64 + 1, what, found: inputs[at] });
+        }
+        let queries = self.scale.inputs(inputs);
+        self.pool.install(|| {
+            let found = self.posterior.predict(&queries)?;
+            let rows = queries.par_chunks_exact(d).with_min_len(64);
+            Ok(found
+                .into_par_iter()
+                .zip(rows)
+                .map(|((mean, variance), row)| self.prediction(row, mean, variance))
+                .collect())
+        })
+    }
+
+    fn prediction(&self, row: &[f64], mean: f64, variance: f64) -> Prediction {
+        let unit = self.scale.target_deviation;
+        let mean = self.scale.target_mean + unit * mean;
+        let noise = (2.0 * self.theta[self.theta.len() - 1]).exp();
+        let measurement_variance = (variance + noise) * unit * unit;
+        let half = self.calibration.half_width(row) * measurement_variance.sqrt();
+        Prediction {
+            mean,
+            function_variance: variance * unit * unit,
+            measurement_variance,
+            low_95: mean - half,
+            high_95: mean + half,
+        }
+    }
+
+    /// Hyperparameters as found; the noise is the last. The same order serves as a start ([`Settings::start`]).
+    pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
+        let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
+        let unit = |role| if matches!(role, Role::Signal | Role::Noise) { self.scale.target_deviation } else { 1.0 };
+        let named = plan.parameters.into_iter().zip(&self.theta);
+        named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * unit(p.role) }).collect()
+    }
+
+    /// Natural logarithm of the density of the training targets, in their units (of a sparse form: of its own density).
+    pub fn log_marginal_likelihood(&self) -> f64 {
+        self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
+    }
+
+    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals are as wide as on the
+    /// whole: 1.96 for Gaussian residuals; from training rows predicted without themselves when
+    /// [`Settings::calibrate`] is set, and then wider or narrower where such rows nearby say so.
+    pub fn interval_factor(&self) -> f64 {
+        self.calibration.factor
+    }
+
+    /// What had to be added to diagonals.
+    pub fn jitter(&self) -> Jitter {
+        self.outcome.jitter
+    }
+
+    /// Steps of the best search, over all its choices of neighbours or inducing points.
+    pub fn iterations(&self) -> usize {
+        self.outcome.iterations
+    }
+
+    /// Rows it was fitted to.
+    pub fn rows(&self) -> usize {
+        self.posterior.data().len()
+    }
+
+    /// Inputs of a row.
+    pub fn dimensions(&self) -> usize {
+        self.spec.dimensions
+    }
+
+    /// Its kernel.
+    pub fn kernel(&self) -> &Kernel {
+        &self.spec.kernel
+    }
+
+    /// Its mean function.
+    pub fn basis(&self) -> Basis {
+        self.spec.basis
+    }
+
+    /// Exact or sparse.
+    pub fn form(&self) -> Form {
+        self.spec.form
+    }
+}

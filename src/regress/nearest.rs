@@ -1,0 +1,361 @@
+//! Gaussian process by nearest neighbours (Vecchia's approximation; Vecchia 1988, Datta et al. 2016).
+//!
+//! In a seeded random order, the density of all rows is the product of the densities of each row given those before it.
+//! Here "those before it" are the nearest `m` of them. That is a proper density, exact for `m` = all; each factor needs
+//! one Cholesky factor of size `m`, whatever the number of rows. Measurements, noise included, are conditioned on.
+//!
+//! One factor, with K the covariance of neighbours and row (last), `q = K^-1 e_last`, `A = K^-1 [y H]` and
+//! `a = A (1, -beta)'`: the conditional variance is `1/q_n`, the residual `a_n/q_n`, so
+//!
+//! `-log p = -1/2 ln q_n + 1/2 a_n^2 / q_n + 1/2 ln 2 pi`,
+//! `-d log p = c q' dK q - (a_n/q_n) q' dK a`, with `c = 1/2 (1 + a_n^2/q_n) / q_n`;
+//!
+//! the coefficients beta are those of generalised least squares, where the derivative by them is 0.
+//!
+//! The search for hyperparameters may use a seeded choice of the factors (each with neighbours among all rows), which is
+//! an unbiased estimate of the sum. The neighbours are taken anew when the length scales have moved.
+
+use std::f64::consts::TAU;
+
+use rayon::prelude::*;
+
+use super::Fault;
+use super::basis::{Basis, Coefficients};
+use super::jitter::{Jitter, until_positive};
+use super::plan::{Plan, Values, Work};
+use super::tree::Tree;
+
+/// Rows that one thread takes at a time; sums are the same for any number of threads.
+const CHUNK: usize = 64;
+
+/// Standardised rows in the order of conditioning.
+#[derive(Debug, Clone)]
+pub(super) struct Data {
+    pub dimensions: usize,
+    pub inputs: Vec<f64>,
+    pub targets: Vec<f64>,
+    pub basis: Basis,
+}
+
+impl Data {
+    pub(super) fn row(&self, at: usize) -> &[f64] {
+        &self.inputs[at * self.dimensions..][..self.dimensions]
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.targets.len()
+    }
+}
+
+/// Factors: rows and their neighbours.
+#[derive(Debug, Clone)]
+pub(super) struct Factors {
+    pub rows: Vec<u32>,
+    neighbours: Vec<Vec<u32>>,
+}
+
+/// Sums over factors.
+pub(super) struct Sums {
+    /// Minus the log density.
+    pub value: f64,
+    pub gradient: Vec<f64>,
+    pub coefficients: Coefficients,
+    pub jitter: Jitter,
+}
+
+/// Some factors, with what they add to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
+struct Part {
+    factors: Vec<Factor>,
+    g: Vec<f64>,
+    log: f64,
+}
+
+/// What the first pass leaves for the second.
+struct Factor {
+    q: Vec<f64>,
+    /// `K^-1` on targets and basis, column after column.
+    a: Vec<f64>,
+    jitter: f64,
+}
+
+impl Factors {
+    /// Neighbours of the given rows among the rows before each.
+    pub(super) fn new(data: &Data, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
+        let tree = Tree::new(&data.inputs, metric);
+        let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
+        let neighbours = rows.par_iter().with_min_len(CHUNK).map(of).collect();
+        Self { rows, neighbours }
+    }
+
+    /// Minus the log density of the rows given their neighbours, its gradient (if asked for) and the coefficients.
+    pub(super) fn sums(&self, data: &Data, plan: &Plan, theta: &[f64], with_gradient: bool) -> Result<Sums, Fault> {
+        let values = plan.values(theta);
+        let size = data.basis.size(data.dimensions);
+        let width = size + 1;
+        let first: Vec<Result<Part, Fault>> = (self.rows.par_chunks(CHUNK))
+            .zip(self.neighbours.par_chunks(CHUNK))
+            .map_init(Scratch::default, |scratch, (rows, near)| scratch.part(data, plan, &values, rows, near))
+            .collect();
+        let (mut g, mut value, mut factors) = (vec![0.0; width * width], 0.0, Vec::with_capacity(first.len()));
+        let mut jitter = Jitter::default();
+        for part in first {
+            let part = part?;
+            part.factors.iter().for_each(|factor| jitter.note(factor.jitter));
+            g.iter_mut().zip(&part.g).for_each(|(total, sum)| *total += sum);
+            value += part.log;
+            factors.push(part.factors);
+        }
+        let coefficients = Coefficients::solve(&g, size)?;
+        value += 0.5 * coefficients.squared_norm;
+        let gradient =
+            if with_gradient { self.gradient(data, plan, &values, &factors, &coefficients.beta) } else { vec![] };
+        Ok(Sums { value, gradient, coefficients, jitter })
+    }
+
+    fn gradient(&self, data: &Data, plan: &Plan, values: &Values, factors: &[Vec<Factor>], beta: &[f64]) -> Vec<f64> {
+        let count = plan.parameters.len();
+        let parts: Vec<Vec<f64>> = (self.neighbours.par_chunks(CHUNK))
+            .zip(self.rows.par_chunks(CHUNK).zip(factors))
+            .map_init(Scratch::default, |scratch, (neighbours, (rows, factors))| {
+                let mut gradient = vec![0.0; count];
+                for ((near, row), factor) in neighbours.iter().zip(rows).zip(factors) {
+                    scratch.gather(data, *row, near);
+                    scratch.add_gradient(plan, values, factor, beta, &mut gradient);
+                }
+                gradient
+            })
+            .collect();
+        let mut gradient = vec![0.0; count];
+        for part in parts {
+            gradient.iter_mut().zip(part).for_each(|(total, sum)| *total += sum);
+        }
+        gradient
+    }
+}
+
+/// Memory of one thread.
+#[derive(Default)]
+struct Scratch {
+    /// Squared differences of all pairs (lower triangle, column after column), and one pair of equal rows at the end.
+    squares: Vec<f64>,
+    matrix: Vec<f64>,
+    weights: Vec<f64>,
+    rows: Vec<u32>,
+    work: Work,
+}
+
+impl Scratch {
+    fn gather(&mut self, data: &Data, row: u32, near: &[u32]) {
+        self.rows.clear();
+        self.rows.extend_from_slice(near);
+        self.rows.push(row);
+        let n = self.rows.len();
+        let pairs = n * (n - 1) / 2 + 1;
+        self.squares.clear();
+        for d in 0..data.dimensions {
+            let column: Vec<f64> = self.rows.iter().map(|r| data.inputs[*r as usize * data.dimensions + d]).collect();
+            for j in 0..n {
+                self.squares.extend(column[j + 1..].iter().map(|x| (x - column[j]) * (x - column[j])));
+            }
+            self.squares.push(0.0);
+        }
+        debug_assert_eq!(self.squares.len(), pairs * data.dimensions);
+    }
+
+    fn part(
+        &mut self,
+        data: &Data,
+        plan: &Plan,
+        values: &Values,
+        rows: &[u32],
+        neighbours: &[Vec<u32>],
+    ) -> Result<Part, Fault> {
+        let width = data.basis.size(data.dimensions) + 1;
+        let mut part = Part { factors: Vec::with_capacity(rows.len()), g: vec![0.0; width * width], log: 0.0 };
+        for (row, near) in rows.iter().zip(neighbours) {
+            let factor = self.factor(data, plan, values, *row, near)?;
+            let (n, q) = (factor.q.len(), factor.q[factor.q.len() - 1]);
+            let last: Vec<f64> = (0..width).map(|c| factor.a[c * n + n - 1]).collect();
+            (0..width * width).for_each(|at| part.g[at] += last[at / width] * last[at % width] / q);
+            part.log += 0.5 * (TAU.ln() - q.ln());
+            part.factors.push(factor);
+        }
+        Ok(part)
+    }
+
+    fn factor(&mut self, data: &Data, plan: &Plan, values: &Values, row: u32, near: &[u32]) -> Result<Factor, Fault> {
+        self.gather(data, row, near);
+        let n = self.rows.len();
+        let kernel = plan.evaluate(values, &self.squares, n * (n - 1) / 2 + 1, &mut self.work);
+        let jitter = factorise(&mut self.matrix, kernel, n, values)?;
+        let width = data.basis.size(data.dimensions) + 1;
+        let mut a = Vec::with_capacity(width * n);
+        a.extend(self.rows.iter().map(|r| data.targets[*r as usize]));
+        for k in 0..width - 1 {
+            a.extend(self.rows.iter().map(|r| data.basis.value(data.row(*r as usize), k)));
+        }
+        for column in a.chunks_exact_mut(n) {
+            forward(&self.matrix, column);
+            backward(&self.matrix, column);
+        }
+        let mut q = vec![0.0; n];
+        q[n - 1] = 1.0 / self.matrix[n * n - 1];
+        backward(&self.matrix, &mut q);
+        Ok(Factor { q, a, jitter })
+    }
+
+    fn add_gradient(&mut self, plan: &Plan, values: &Values, factor: &Factor, beta: &[f64], gradient: &mut [f64]) {
+        let (q, n) = (&factor.q, factor.q.len());
+        let mut a = factor.a[..n].to_vec();
+        for (k, coefficient) in beta.iter().enumerate() {
+            a.iter_mut().zip(&factor.a[(k + 1) * n..]).for_each(|(total, h)| *total -= coefficient * h);
+        }
+        let (an, qn) = (a[n - 1], q[n - 1]);
+        let (c, b) = (0.5 * (1.0 + an * an / qn) / qn, -an / qn);
+        self.weights.clear();
+        for j in 0..n {
+            let (cq, bq, ba) = (2.0 * c * q[j], b * q[j], b * a[j]);
+            self.weights.extend(q[j + 1..].iter().zip(&a[j + 1..]).map(|(qi, ai)| qi * (cq + ba) + bq * ai));
+        }
+        let diagonal: f64 = q.iter().zip(&a).map(|(q, a)| c * q * q + b * q * a).sum();
+        self.weights.push(diagonal);
+        plan.add_gradient(values, &self.squares, &self.weights, &mut self.work, gradient);
+        gradient[plan.parameters.len() - 1] += 2.0 * values.noise_variance * diagonal;
+    }
+}
+
+/// Cholesky factor (lower, column after column) of the kernel's lower triangle with prior and noise on the diagonal;
+/// gives the jitter that was needed, as part of the prior variance.
+fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, values: &Values) -> Result<f64, Fault> {
+    matrix.resize(n * n, 0.0);
+    until_positive(|jitter| {
+        let mut from = 0;
+        for j in 0..n {
+            matrix[j * n + j] = values.prior_variance * (1.0 + jitter) + values.noise_variance;
+            matrix[j * n + j + 1..][..n - j - 1].copy_from_slice(&kernel[from..][..n - j - 1]);
+            from += n - j - 1;
+        }
+        faer::traits::pulp::Arch::new().dispatch(|| cholesky(matrix, n))
+    })
+}
+
+/// In place, lower, column after column; `false` = not positive definite.
+#[inline(always)]
+fn cholesky(matrix: &mut [f64], n: usize) -> bool {
+    for j in 0..n {
+        let (before, rest) = matrix.split_at_mut(j * n);
+        let column = &mut rest[j..n];
+        // Four columns at a time: the loads and stores of this one are what costs.
+        let mut k = 0;
+        while k + 4 <= j {
+            let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];
+            let (c0, c1, c2, c3) = (c(0), c(1), c(2), c(3));
+            let (f0, f1, f2, f3) = (c0[0], c1[0], c2[0], c3[0]);
+            for i in 0..column.len() {
+                column[i] -= (f0 * c0[i] + f1 * c1[i]) + (f2 * c2[i] + f3 * c3[i]);
+            }
+            k += 4;
+        }
+        for k in k..j {
+            let other = &before[k * n + j..(k + 1) * n];
+            let f = other[0];
+            column.iter_mut().zip(other).for_each(|(x, o)| *x -= f * o);
+        }
+        let pivot = column[0];
+        if pivot.is_nan() || pivot <= 0.0 {
+            return false;
+        }
+        let inverse = 1.0 / pivot.sqrt();
+        column.iter_mut().for_each(|x| *x *= inverse);
+        column[0] = pivot.sqrt();
+    }
+    true
+}
+
+/// Solves `L x = b` in place.
+fn forward(matrix: &[f64], b: &mut [f64]) {
+    let n = b.len();
+    for j in 0..n {
+        b[j] /= matrix[j * n + j];
+        let f = b[j];
+        let column = &matrix[j * n + j + 1..(j + 1) * n];
+        b[j + 1..].iter_mut().zip(column).for_each(|(x, l)| *x -= f * l);
+    }
+}
+
+/// Solves `L' x = b` in place.
+fn backward(matrix: &[f64], b: &mut [f64]) {
+    let n = b.len();
+    for j in (0..n).rev() {
+        let column = &matrix[j * n + j + 1..(j + 1) * n];
+        let dot: f64 = column.iter().zip(&b[j + 1..]).map(|(l, x)| l * x).sum();
+        b[j] = (b[j] - dot) / matrix[j * n + j];
+    }
+}
+
+/// Everything a prediction needs.
+#[derive(Debug, Clone)]
+pub(super) struct Posterior {
+    pub data: Data,
+    pub plan: Plan,
+    pub values: Values,
+    pub coefficients: Coefficients,
+    pub neighbours: usize,
+    tree: Tree,
+}
+
+impl Posterior {
+    pub(super) fn new(data: Data, plan: Plan, theta: &[f64], coefficients: Coefficients, neighbours: usize) -> Self {
+        let values = plan.values(theta);
+        let tree = Tree::new(&data.inputs, &plan.metric(&values));
+        Self { data, plan, values, coefficients, neighbours, tree }
+    }
+
+    /// Mean and variance of the function at standardised rows; every row of `but` is left out for its own query.
+    pub(super) fn predict(&self, queries: &[f64], but: Option<&[u32]>) -> Result<Vec<(f64, f64)>, Fault> {
+        let d = self.data.dimensions;
+        let parts: Vec<Result<Vec<(f64, f64)>, Fault>> = (queries.par_chunks(CHUNK * d).enumerate())
+            .map_init(Scratch::default, |scratch, (chunk, rows)| {
+                let one = |(at, row): (usize, &[f64])| {
+                    self.one(scratch, row, but.map(|but| but[chunk * CHUNK + at] as usize))
+                };
+                rows.chunks_exact(d).enumerate().map(one).collect()
+            })
+            .collect();
+        let mut all = Vec::with_capacity(queries.len() / d);
+        for part in parts {
+            all.extend(part?);
+        }
+        Ok(all)
+    }
+
+    fn one(&self, scratch: &mut Scratch, row: &[f64], but: Option<usize>) -> Result<(f64, f64), Fault> {
+        let near = self.tree.nearest(row, self.neighbours, self.data.len(), but);
+        let (Some((last, rest)), n) = (near.split_last(), near.len()) else {
+            let h: Vec<f64> = (0..self.coefficients.beta.len()).map(|k| self.data.basis.value(row, k)).collect();
+            let variance = self.values.prior_variance + self.coefficients.variance(&h);
+            return Ok((self.coefficients.mean(self.data.basis, row), variance));
+        };
+        scratch.gather(&self.data, *last, rest);
+        let kernel = self.plan.evaluate(&self.values, &scratch.squares, n * (n - 1) / 2 + 1, &mut scratch.work);
+        factorise(&mut scratch.matrix, kernel, n, &self.values)?;
+        scratch.squares.clear();
+        for (d, x) in row.iter().enumerate() {
+            let value = |r: &u32| self.data.row(*r as usize)[d] - x;
+            scratch.squares.extend(near.iter().map(|r| value(r) * value(r)));
+        }
+        let mut cross = self.plan.evaluate(&self.values, &scratch.squares, n, &mut scratch.work).to_vec();
+        forward(&scratch.matrix, &mut cross);
+        let explained: f64 = cross.iter().map(|v| v * v).sum();
+        backward(&scratch.matrix, &mut cross);
+        let mut mean = self.coefficients.mean(self.data.basis, row);
+        let mut rest: Vec<f64> = (0..self.coefficients.beta.len()).map(|k| self.data.basis.value(row, k)).collect();
+        for (weight, r) in cross.iter().zip(&near) {
+            let near_row = self.data.row(*r as usize);
+            mean += weight * (self.data.targets[*r as usize] - self.coefficients.mean(self.data.basis, near_row));
+            (0..rest.len()).for_each(|k| rest[k] -= weight * self.data.basis.value(near_row, k));
+        }
+        let variance = (self.values.prior_variance - explained).max(0.0) + self.coefficients.variance(&rest);
+        Ok((mean, variance))
+    }
+}

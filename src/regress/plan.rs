@@ -1,0 +1,429 @@
+//! A kernel made ready for arithmetic: its parameters laid out in one vector, its values over a block of pairs of rows,
+//! and the derivative of any sum of them by every parameter (reverse mode, exact).
+//!
+//! A block of pairs comes as *squares*: for every input a stripe of `count` squared differences. Parameters are natural
+//! logarithms: of length scales, of `alpha`, of standard deviations (signal, then the noise, which is always the last).
+
+use faer::traits::pulp::Arch;
+
+use super::kernel::{Kernel, Node, Shape};
+use super::wide;
+
+/// What a parameter is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Role {
+    Length,
+    Alpha,
+    Signal,
+    Noise,
+}
+
+/// One parameter: what it is and how it is called in reports.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Parameter {
+    pub role: Role,
+    pub name: String,
+}
+
+#[derive(Debug, Clone)]
+struct Leaf {
+    shape: Shape,
+    /// Index of the first length scale; one for all inputs, or one each.
+    lengths: usize,
+    alpha: Option<usize>,
+    signal: Option<usize>,
+}
+
+#[derive(Debug, Clone)]
+enum Step {
+    Leaf(usize),
+    Sum(Vec<usize>),
+    Product(Vec<usize>),
+}
+
+/// The kernel's tree in the order of evaluation, and its parameters.
+#[derive(Debug, Clone)]
+pub(super) struct Plan {
+    pub dimensions: usize,
+    ard: bool,
+    leaves: Vec<Leaf>,
+    steps: Vec<Step>,
+    pub parameters: Vec<Parameter>,
+}
+
+/// Parameters of the leaves as the loops need them.
+#[derive(Debug, Clone)]
+pub(super) struct Values {
+    leaves: Vec<LeafValues>,
+    /// Variance of the function at a point.
+    pub prior_variance: f64,
+    /// Variance of the noise of a measurement.
+    pub noise_variance: f64,
+}
+
+#[derive(Debug, Clone)]
+struct LeafValues {
+    /// 1 / length^2 of every input.
+    inverse_squares: Vec<f64>,
+    alpha: f64,
+    variance: f64,
+}
+
+/// Memory of one evaluation, used again from block to block.
+#[derive(Debug, Default)]
+pub(super) struct Work {
+    values: Vec<Vec<f64>>,
+    adjoints: Vec<Vec<f64>>,
+    /// Of each leaf: derivative of the value by the squared distance, and by ln alpha.
+    slopes: Vec<Vec<f64>>,
+    alphas: Vec<Vec<f64>>,
+}
+
+impl Plan {
+    pub(super) fn new(kernel: &Kernel, dimensions: usize, ard: bool) -> Self {
+        let mut plan = Self { dimensions, ard, leaves: vec![], steps: vec![], parameters: vec![] };
+        plan.add(&kernel.root, true);
+        plan.parameters.push(Parameter { role: Role::Noise, name: "noise_sd".to_owned() });
+        plan
+    }
+
+    /// Adds a node after its children; `scaled` = it has a standard deviation of its own.
+    fn add(&mut self, node: &Node, scaled: bool) -> usize {
+        let step = match node {
+            Node::Leaf(shape) => Step::Leaf(self.add_leaf(*shape, scaled)),
+            Node::Sum(children) => {
+                Step::Sum(children.iter().enumerate().map(|(k, child)| self.add(child, scaled || k > 0)).collect())
+            }
+            Node::Product(children) => {
+                Step::Product(children.iter().enumerate().map(|(k, child)| self.add(child, scaled && k == 0)).collect())
+            }
+        };
+        self.steps.push(step);
+        self.steps.len() - 1
+    }
+
+    fn add_leaf(&mut self, shape: Shape, scaled: bool) -> usize {
+        let label = format!("{}_{}", shape.name(), self.leaves.len() + 1);
+        let lengths = self.parameters.len();
+        for d in 0..if self.ard { self.dimensions } else { 1 } {
+            let name =
+                if self.ard { format!("{label}.length_scale_{}", d + 1) } else { format!("{label}.length_scale") };
+            self.parameters.push(Parameter { role: Role::Length, name });
+        }
+        let mut optional = |wanted: bool, role, name: &str| {
+            wanted.then(|| {
+                self.parameters.push(Parameter { role, name: format!("{label}.{name}") });
+                self.parameters.len() - 1
+            })
+        };
+        let alpha = optional(shape == Shape::RationalQuadratic, Role::Alpha, "alpha");
+        let signal = optional(scaled, Role::Signal, "signal_sd");
+        self.leaves.push(Leaf { shape, lengths, alpha, signal });
+        self.leaves.len() - 1
+    }
+
+    pub(super) fn values(&self, theta: &[f64]) -> Values {
+        let leaves: Vec<LeafValues> = self.leaves.iter().map(|leaf| self.leaf_values(leaf, theta)).collect();
+        let mut values =
+            Values { leaves, prior_variance: 0.0, noise_variance: (2.0 * theta[self.parameters.len() - 1]).exp() };
+        let zero = vec![0.0; self.dimensions];
+        values.prior_variance = self.evaluate(&values, &zero, 1, &mut Work::default())[0];
+        values
+    }
+
+    fn leaf_values(&self, leaf: &Leaf, theta: &[f64]) -> LeafValues {
+        let length = |d: usize| theta[leaf.lengths + if self.ard { d } else { 0 }];
+        LeafValues {
+            inverse_squares: (0..self.dimensions).map(|d| (-2.0 * length(d)).exp()).collect(),
+            alpha: leaf.alpha.map_or(1.0, |at| theta[at].exp()),
+            variance: leaf.signal.map_or(1.0, |at| (2.0 * theta[at]).exp()),
+        }
+    }
+
+    /// Weights of the inputs in a distance that says which rows are near: of the shortest length scale of each.
+    pub(super) fn metric(&self, values: &Values) -> Vec<f64> {
+        let of = |d: usize| values.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
+        (0..self.dimensions).map(of).collect()
+    }
+
+    /// The kernel over a block of pairs.
+    pub(super) fn evaluate<'w>(&self, values: &Values, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
+        self.forward(values, squares, count, work, false);
+        &work.values[self.steps.len() - 1][..count]
+    }
+
+    /// Adds to `gradient` the derivative of `sum of weight * kernel` over a block of pairs by every parameter but the noise.
+    pub(super) fn add_gradient(
+        &self,
+        values: &Values,
+        squares: &[f64],
+        weights: &[f64],
+        work: &mut Work,
+        gradient: &mut [f64],
+    ) {
+        let count = weights.len();
+        self.forward(values, squares, count, work, true);
+        work.adjoints.resize_with(self.steps.len(), Vec::new);
+        self.set_adjoint(self.steps.len() - 1, weights, work);
+        for at in (0..self.steps.len()).rev() {
+            match &self.steps[at] {
+                Step::Leaf(leaf) => self.leaf_gradient(at, *leaf, values, squares, work, gradient),
+                Step::Sum(children) => {
+                    let (below, here) = work.adjoints.split_at_mut(at);
+                    for child in children {
+                        below[*child].clone_from(&here[0]);
+                    }
+                }
+                Step::Product(children) => product_adjoints(at, children, work),
+            }
+        }
+    }
+
+    fn set_adjoint(&self, at: usize, weights: &[f64], work: &mut Work) {
+        work.adjoints[at].clear();
+        work.adjoints[at].extend_from_slice(weights);
+    }
+
+    fn leaf_gradient(
+        &self,
+        at: usize,
+        leaf: usize,
+        values: &Values,
+        squares: &[f64],
+        work: &Work,
+        gradient: &mut [f64],
+    ) {
+        let (adjoints, numbers, leaf_values) = (&work.adjoints[at], &work.values[at], &values.leaves[leaf]);
+        let (count, slopes, leaf) = (adjoints.len(), &work.slopes[leaf], (&self.leaves[leaf], &work.alphas[leaf]));
+        let dot = |a: &[f64], b: &[f64]| Arch::new().dispatch(|| dot_product(a, b));
+        if let Some(signal) = leaf.0.signal {
+            gradient[signal] += 2.0 * dot(adjoints, &numbers[..count]);
+        }
+        if let Some(alpha) = leaf.0.alpha {
+            gradient[alpha] += dot(adjoints, &leaf.1[..count]);
+        }
+        let weighted: Vec<f64> = adjoints.iter().zip(slopes).map(|(a, s)| a * s).collect();
+        for d in 0..self.dimensions {
+            let target = leaf.0.lengths + if self.ard { d } else { 0 };
+            let sum = dot(&weighted, &squares[d * count..][..count]);
+            gradient[target] -= 2.0 * leaf_values.inverse_squares[d] * sum;
+        }
+    }
+
+    fn forward(&self, values: &Values, squares: &[f64], count: usize, work: &mut Work, slopes: bool) {
+        work.values.resize_with(self.steps.len(), Vec::new);
+        work.slopes.resize_with(self.leaves.len(), Vec::new);
+        work.alphas.resize_with(self.leaves.len(), Vec::new);
+        for at in 0..self.steps.len() {
+            let (below, here) = work.values.split_at_mut(at);
+            let out = &mut here[0];
+            out.resize(count, 0.0);
+            match &self.steps[at] {
+                Step::Leaf(leaf) => {
+                    distances(&values.leaves[*leaf].inverse_squares, squares, out);
+                    let (slope, alpha) = (&mut work.slopes[*leaf], &mut work.alphas[*leaf]);
+                    slope.resize(if slopes { count } else { 0 }, 0.0);
+                    alpha.resize(slope.len(), 0.0);
+                    shape_values(self.leaves[*leaf].shape, &values.leaves[*leaf], out, slope, alpha);
+                }
+                Step::Sum(children) => combine(below, children, out, |total, value| total + value),
+                Step::Product(children) => combine(below, children, out, |total, value| total * value),
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn dot_product(a: &[f64], b: &[f64]) -> f64 {
+    // Eight sums, so that the compiler may do them at once.
+    let mut sums = [0.0; 8];
+    let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
+    let rest: f64 = a_chunks.remainder().iter().zip(b_chunks.remainder()).map(|(x, y)| x * y).sum();
+    for (x, y) in a_chunks.zip(b_chunks) {
+        for k in 0..8 {
+            sums[k] += x[k] * y[k];
+        }
+    }
+    sums.iter().sum::<f64>() + rest
+}
+
+fn combine(below: &[Vec<f64>], children: &[usize], out: &mut [f64], join: impl Fn(f64, f64) -> f64) {
+    out.copy_from_slice(&below[children[0]][..out.len()]);
+    for child in &children[1..] {
+        for (total, value) in out.iter_mut().zip(&below[*child]) {
+            *total = join(*total, *value);
+        }
+    }
+}
+
+/// A factor's adjoint is the product's, times all other factors.
+fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
+    let (below, here) = work.adjoints.split_at_mut(at);
+    for child in children {
+        below[*child].clone_from(&here[0]);
+        for other in children.iter().filter(|other| *other != child) {
+            for (adjoint, value) in below[*child].iter_mut().zip(&work.values[*other]) {
+                *adjoint *= value;
+            }
+        }
+    }
+}
+
+/// Squared distances in units of the length scales.
+fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
+    let count = out.len();
+    Arch::new().dispatch(|| {
+        for (d, weight) in inverse_squares.iter().enumerate() {
+            let stripe = &squares[d * count..][..count];
+            if d == 0 {
+                for (total, square) in out.iter_mut().zip(stripe) {
+                    *total = weight * square;
+                }
+            } else {
+                for (total, square) in out.iter_mut().zip(stripe) {
+                    *total += weight * square;
+                }
+            }
+        }
+    });
+}
+
+/// Turns squared distances into values; slopes and alphas are filled when they have room.
+fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
+    /// Keeps the division by a distance finite; the slope is then multiplied by squares that are 0.
+    const TINY: f64 = 1e-150;
+    let (s, a) = (values.variance, values.alpha);
+    match shape {
+        Shape::Exponential => fill(out, slopes, |r2| {
+            let r = r2.sqrt();
+            let k = s * wide::exp(-r);
+            (k, -0.5 * k / r.max(TINY))
+        }),
+        Shape::Matern32 => fill(out, slopes, |r2| {
+            let u = (3.0 * r2).sqrt();
+            let e = s * wide::exp(-u);
+            ((1.0 + u) * e, -1.5 * e)
+        }),
+        Shape::Matern52 => fill(out, slopes, |r2| {
+            let u = (5.0 * r2).sqrt();
+            let e = s * wide::exp(-u);
+            ((1.0 + u + u * u / 3.0) * e, -5.0 / 6.0 * (1.0 + u) * e)
+        }),
+        Shape::SquaredExponential => fill(out, slopes, |r2| {
+            let k = s * wide::exp(-0.5 * r2);
+            (k, -0.5 * k)
+        }),
+        Shape::RationalQuadratic => {
+            let power = |r2: f64| {
+                let base = 1.0 + 0.5 / a * r2;
+                let log = wide::ln(base);
+                (s * wide::exp(-a * log), base, log)
+            };
+            if !alphas.is_empty() {
+                Arch::new().dispatch(|| {
+                    for (r2, alpha) in out.iter().zip(alphas) {
+                        let (k, base, log) = power(*r2);
+                        *alpha = a * k * ((base - 1.0) / base - log);
+                    }
+                });
+            }
+            fill(out, slopes, |r2| {
+                let (k, base, _) = power(r2);
+                (k, -0.5 * k / base)
+            });
+        }
+    }
+}
+
+fn fill(out: &mut [f64], slopes: &mut [f64], of: impl Fn(f64) -> (f64, f64)) {
+    Arch::new().dispatch(
+        #[inline(always)]
+        || {
+            if slopes.is_empty() {
+                for number in out.iter_mut() {
+                    *number = of(*number).0;
+                }
+            } else {
+                for (number, slope) in out.iter_mut().zip(slopes) {
+                    (*number, *slope) = of(*number);
+                }
+            }
+        },
+    );
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_have_their_closed_forms() {
+        for (name, expected) in [
+            ("exponential", (-1.5_f64).exp()),
+            ("matern32", (1.0 + 1.5 * 3.0_f64.sqrt()) * (-1.5 * 3.0_f64.sqrt()).exp()),
+            ("matern52", (1.0 + 1.5 * 5.0_f64.sqrt() + 3.75) * (-1.5 * 5.0_f64.sqrt()).exp()),
+            ("squared_exponential", (-1.125_f64).exp()),
+            ("rational_quadratic", (1.0 + 2.25 / 1.4_f64).powf(-0.7)),
+        ] {
+            let plan = Plan::new(&name.parse().expect(name), 1, false);
+            let theta: Vec<f64> = (plan.parameters.iter())
+                .map(|p| match p.role {
+                    Role::Length => 2.0_f64.ln(),
+                    Role::Alpha => 0.7_f64.ln(),
+                    Role::Signal => 3.0_f64.ln(),
+                    Role::Noise => 0.1_f64.ln(),
+                })
+                .collect();
+            let values = plan.values(&theta);
+            let found = plan.evaluate(&values, &[9.0], 1, &mut Work::default())[0];
+            assert!((found - 9.0 * expected).abs() < 1e-14, "{name}: {found}, expected {}", 9.0 * expected);
+            assert!((values.prior_variance - 9.0).abs() < 1e-14 && (values.noise_variance - 0.01).abs() < 1e-16);
+        }
+    }
+
+    #[test]
+    fn gradients_agree_with_finite_differences() {
+        let squares = [0.3, 0.0, 1.7, 4.0, 0.01, 0.9, 0.0, 0.2, 2.5, 0.4];
+        let weights = [1.0, -0.7, 0.3, 2.0, 0.5];
+        for text in [
+            "exponential",
+            "matern32",
+            "matern52",
+            "squared_exponential",
+            "rational_quadratic",
+            "matern32 + squared_exponential * rational_quadratic",
+            "(exponential + matern52) * (matern32 + rational_quadratic) * squared_exponential",
+        ] {
+            for ard in [false, true] {
+                let plan = Plan::new(&text.parse().expect(text), 2, ard);
+                let theta: Vec<f64> = (0..plan.parameters.len()).map(|k| 0.3 * (k as f64 * 1.7).sin()).collect();
+                let sum = |theta: &[f64]| {
+                    let mut work = Work::default();
+                    let values = plan.values(theta);
+                    dot_product(plan.evaluate(&values, &squares, 5, &mut work), &weights)
+                };
+                let mut gradient = vec![0.0; theta.len()];
+                plan.add_gradient(&plan.values(&theta), &squares, &weights, &mut Work::default(), &mut gradient);
+                for k in 0..theta.len() {
+                    let (mut low, mut high) = (theta.clone(), theta.clone());
+                    (low[k], high[k]) = (theta[k] - 1e-5, theta[k] + 1e-5);
+                    let slope = (sum(&high) - sum(&low)) / 2e-5;
+                    assert!((slope - gradient[k]).abs() < 1e-8, "{text}, ard {ard}, {:?}", plan.parameters[k]);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn every_parameter_can_be_told_from_the_others() {
+        let names = |text: &str| -> Vec<String> {
+            let plan = Plan::new(&text.parse().expect(text), 1, false);
+            plan.parameters.into_iter().filter(|p| p.role == Role::Signal).map(|p| p.name).collect()
+        };
+        assert_eq!(names("exponential * matern32"), ["exponential_1.signal_sd"]);
+        assert_eq!(
+            names("(exponential + matern32) * (matern52 + exponential)"),
+            ["exponential_1.signal_sd", "matern32_2.signal_sd", "exponential_4.signal_sd"]
+        );
+    }
+}

@@ -1,0 +1,192 @@
+//! Models as text, and back.
+//!
+//! Two lines of JSON: a header with the version and a checksum of the second line, then the model: its rows
+//! (standardised), hyperparameters and outcome. What can be computed from these is computed again when it is loaded, which
+//! takes an exact model n^3 operations.
+
+use serde::{Deserialize, Serialize};
+
+use super::basis::Coefficients;
+use super::calibration::Calibration;
+use super::model::{Model, Outcome, Parts, Posterior, Spec, threads};
+use super::nearest::Data;
+use super::plan::Plan;
+use super::scale::Scale;
+use super::{Fault, Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, exact, inducing, nearest};
+
+/// What the header says it is.
+const FORMAT: &str = "packwatch gaussian process";
+/// Version written; older ones are read as long as they exist, newer ones are refused.
+const VERSION: u32 = 1;
+
+#[derive(Debug, Serialize, Deserialize)]
+struct Header {
+    format: String,
+    version: u32,
+    #[serde(default)]
+    checksum: String,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Body {
+    spec: Spec,
+    scale: Scale,
+    theta: Vec<f64>,
+    outcome: Outcome,
+    inputs: Vec<f64>,
+    targets: Vec<f64>,
+    /// Coefficients and their covariance, of the form that does not compute them again.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    beta: Vec<f64>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    beta_covariance: Vec<f64>,
+    /// Rows that were left out for the intervals, and their ratios.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    left_out: Vec<u32>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    ratios: Vec<f64>,
+    /// Inducing points, row after row.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    points: Vec<f64>,
+}
+
+/// FNV-1a, 64 bits: finds damage, proves no origin.
+fn checksum(text: &str) -> String {
+    let hash = text
+        .bytes()
+        .fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3));
+    format!("{hash:016x}")
+}
+
+fn damaged(what: impl std::fmt::Display) -> Fault {
+    Fault::Saved(format!("damaged: {what}"))
+}
+
+impl Model {
+    /// The model as text, two lines.
+    pub fn save(&self) -> Result<String, Fault> {
+        let data = self.posterior.data();
+        let mut body = Body {
+            spec: self.spec.clone(),
+            scale: self.scale.clone(),
+            theta: self.theta.clone(),
+            outcome: self.outcome,
+            inputs: data.inputs.clone(),
+            targets: data.targets.clone(),
+            beta: vec![],
+            beta_covariance: vec![],
+            left_out: self.calibration.rows.clone(),
+            ratios: self.calibration.ratios.clone(),
+            points: vec![],
+        };
+        match &self.posterior {
+            Posterior::Exact(_) => {}
+            Posterior::Nearest(posterior) => {
+                body.beta.clone_from(&posterior.coefficients.beta);
+                body.beta_covariance.clone_from(&posterior.coefficients.covariance);
+            }
+            Posterior::Inducing(posterior) => body.points = posterior.points().to_vec(),
+        }
+        let json = |error: serde_json::Error| Fault::Saved(format!("cannot be written: {error}"));
+        let body = serde_json::to_string(&body).map_err(json)?;
+        let header = Header { format: FORMAT.to_owned(), version: VERSION, checksum: checksum(&body) };
+        Ok(format!("{}\n{body}\n", serde_json::to_string(&header).map_err(json)?))
+    }
+
+    /// A model from its text, to work with so many threads.
+    pub fn load(text: &str, thread_count: usize) -> Result<Self, Fault> {
+        let (header, rest) = text.split_once('\n').ok_or_else(|| damaged("one line only, must be two"))?;
+        let header: Header = serde_json::from_str(header).map_err(|e| damaged(format!("line 1: {e}")))?;
+        if header.format != FORMAT {
+            return Err(Fault::Saved(format!("line 1: format = {:?}, must be {FORMAT:?}", header.format)));
+        }
+        if header.version != VERSION {
+            let newer = if header.version > VERSION { "; a newer packwatch wrote it" } else { "" };
+            return Err(Fault::Saved(format!("line 1: version = {}, must be {VERSION}{newer}", header.version)));
+        }
+        let body = rest.trim_end_matches(['\n', '\r']);
+        let found = checksum(body);
+        if found != header.checksum {
+            return Err(damaged(format!("checksum of line 2 = {found}, must be {}", header.checksum)));
+        }
+        let body: Body = serde_json::from_str(body).map_err(|e| damaged(format!("line 2: {e}")))?;
+        body.check()?;
+        body.model(thread_count)
+    }
+}
+
+impl Body {
+    /// Lengths that fit, numbers that are finite: nothing later may index beyond an end.
+    fn check(&self) -> Result<(), Fault> {
+        let (d, n) = (self.spec.dimensions, self.targets.len());
+        let same = |what: &str, found: usize, expected: usize| {
+            if found == expected { Ok(()) } else { Err(damaged(format!("{what} = {found}, must be {expected}"))) }
+        };
+        if d == 0 || d > super::MAX_DIMENSIONS || n == 0 {
+            return Err(damaged(format!("{n} rows of {d} inputs")));
+        }
+        same("ratios", self.ratios.len(), self.left_out.len())?;
+        same("inputs", self.inputs.len(), d * n)?;
+        same("means", self.scale.means.len(), d)?;
+        same("deviations", self.scale.deviations.len(), d)?;
+        let plan = Plan::new(&self.spec.kernel, d, self.spec.ard);
+        same("theta", self.theta.len(), plan.parameters.len())?;
+        let size = self.spec.basis.size(d);
+        match self.spec.form {
+            Form::Exact if n > MAX_EXACT_ROWS => return Err(damaged(format!("{n} rows of an exact model"))),
+            Form::Exact => {}
+            Form::Nearest { neighbours } => {
+                if neighbours == 0 || neighbours > MAX_NEIGHBOURS {
+                    return Err(damaged(format!("neighbours = {neighbours}")));
+                }
+                same("coefficients", self.beta.len(), size)?;
+                same("their covariance", self.beta_covariance.len(), size * size)?;
+            }
+            Form::Inducing { points } => {
+                if points == 0 || points > MAX_INDUCING || self.points.is_empty() {
+                    return Err(damaged(format!("inducing points = {points}")));
+                }
+                same("their inputs", self.points.len() % d, 0)?;
+            }
+        }
+        let scale = &self.scale;
+        let numbers = [&self.inputs, &self.targets, &self.theta, &scale.means, &scale.deviations, &self.beta];
+        let finite = numbers
+            .into_iter()
+            .chain([&self.beta_covariance, &self.points, &self.ratios])
+            .flatten()
+            .all(|x| x.is_finite());
+        let positive = scale.deviations.iter().chain([&scale.target_deviation]).all(|x| *x > 0.0);
+        let small = self.theta.iter().all(|x| x.abs() < 100.0);
+        let rows = scale.target_mean.is_finite() && self.left_out.iter().all(|row| (*row as usize) < n);
+        if finite && positive && small && rows { Ok(()) } else { Err(damaged("a number out of its range")) }
+    }
+
+    fn model(self, thread_count: usize) -> Result<Model, Fault> {
+        let pool = threads(thread_count)?;
+        let (spec, theta) = (self.spec, self.theta);
+        let plan = Plan::new(&spec.kernel, spec.dimensions, spec.ard);
+        let (dimensions, basis) = (spec.dimensions, spec.basis);
+        let data = Data { dimensions, inputs: self.inputs, targets: self.targets, basis };
+        let posterior = pool.install(|| match spec.form {
+            Form::Exact => Ok(Posterior::Exact(Box::new(exact::Posterior::new(data, plan, &theta)?))),
+            Form::Nearest { neighbours } => {
+                let coefficients =
+                    Coefficients { beta: self.beta, covariance: self.beta_covariance, squared_norm: 0.0 };
+                let posterior = nearest::Posterior::new(data, plan, &theta, coefficients, neighbours);
+                Ok(Posterior::Nearest(Box::new(posterior)))
+            }
+            Form::Inducing { .. } => {
+                let posterior = inducing::Posterior::new(&data, &plan, &theta, &self.points)?;
+                Ok::<_, Fault>(Posterior::Inducing(Box::new(posterior)))
+            }
+        })?;
+        let calibration = match self.left_out.len() {
+            0 => Calibration::none(),
+            _ => Calibration::new(posterior.data(), self.left_out, self.ratios),
+        };
+        let parts = Parts { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration };
+        Ok(Model::assemble(parts, pool))
+    }
+}

@@ -1,0 +1,105 @@
+//! Checking of rows; mean and standard deviation of inputs and targets, and the way there and back.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Basis, Fault, MAX_DIMENSIONS, Rows};
+
+/// Shift and scale of every input and of the target.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Scale {
+    pub means: Vec<f64>,
+    pub deviations: Vec<f64>,
+    pub target_mean: f64,
+    pub target_deviation: f64,
+}
+
+/// Refuses rows that cannot be learned from.
+pub(super) fn check(rows: &Rows) -> Result<(), Fault> {
+    let (d, n) = (rows.dimensions, rows.targets.len());
+    if d == 0 || d > MAX_DIMENSIONS {
+        return Err(Fault::range("inputs of a row", d, format!("1 to {MAX_DIMENSIONS}")));
+    }
+    if rows.inputs.len() != d * n {
+        return Err(Fault::range("number of inputs", rows.inputs.len(), format!("{d} x {n} rows")));
+    }
+    if n < 2 {
+        return Err(Fault::range("rows", n, "2 or more"));
+    }
+    if !rows.lines.is_empty() && rows.lines.len() != n {
+        return Err(Fault::range("line numbers", rows.lines.len(), format!("none or {n}")));
+    }
+    let line = |row: usize| rows.lines.get(row).copied().unwrap_or(row as u64 + 1);
+    let bad_input = rows.inputs.iter().position(|x| !x.is_finite());
+    let bad_target = rows.targets.iter().position(|y| !y.is_finite());
+    let target_first = bad_target.is_some_and(|row| bad_input.is_none_or(|at| row < at / d));
+    match (bad_input, bad_target) {
+        (_, Some(row)) if target_first => {
+            Err(Fault::NotFinite { line: line(row), what: "target".to_owned(), found: rows.targets[row] })
+        }
+        (Some(at), _) => {
+            let what = format!("input {}", at % d + 1);
+            Err(Fault::NotFinite { line: line(at / d), what, found: rows.inputs[at] })
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Mean and standard deviation; deviation 1 where the values do not differ.
+fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
+    let count = values.clone().count() as f64;
+    let mean = values.clone().sum::<f64>() / count;
+    let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
+    let flat = deviation.is_nan() || deviation <= 1e-12 * mean.abs().max(f64::MIN_POSITIVE);
+    (mean, if flat { 1.0 } else { deviation })
+}
+
+impl Scale {
+    /// The scale of checked rows. With the zero basis the target is not shifted: 0 is then what is meant.
+    pub(super) fn of(rows: &Rows, standardise: bool, basis: Basis) -> Self {
+        let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
+        let inputs: Vec<(f64, f64)> =
+            (0..rows.dimensions).map(|d| if standardise { moments(column(d)) } else { (0.0, 1.0) }).collect();
+        let (mean, deviation) = moments(rows.targets.iter().copied());
+        Self {
+            means: inputs.iter().map(|m| m.0).collect(),
+            deviations: inputs.iter().map(|m| m.1).collect(),
+            target_mean: if basis == Basis::Zero { 0.0 } else { mean },
+            target_deviation: deviation,
+        }
+    }
+
+    pub(super) fn inputs(&self, inputs: &[f64]) -> Vec<f64> {
+        let d = self.means.len();
+        inputs.iter().enumerate().map(|(at, x)| (x - self.means[at % d]) / self.deviations[at % d]).collect()
+    }
+
+    pub(super) fn targets(&self, targets: &[f64]) -> Vec<f64> {
+        targets.iter().map(|y| (y - self.target_mean) / self.target_deviation).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_that_is_not_finite_is_refused_with_its_line() {
+        let (inputs, targets) = ([1.0, 2.0, 3.0, f64::NAN], [1.0, 2.0]);
+        let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[12, 19] };
+        assert_eq!(check(&rows).expect_err("NaN").to_string(), "line 19: input 2 = NaN, must be a finite number");
+        let rows = Rows { inputs: &inputs[..2], dimensions: 1, targets: &[1.0, f64::INFINITY], lines: &[] };
+        assert_eq!(check(&rows).expect_err("inf").to_string(), "line 2: target = inf, must be a finite number");
+        let rows = Rows { inputs: &inputs[..3], dimensions: 2, targets: &targets, lines: &[] };
+        assert_eq!(check(&rows).expect_err("short").to_string(), "number of inputs = 3, must be 2 x 2 rows");
+    }
+
+    #[test]
+    fn constant_columns_keep_their_scale() {
+        let rows = Rows { inputs: &[5.0, 5.0, 5.0], dimensions: 1, targets: &[1.0, 2.0, 6.0], lines: &[] };
+        let scale = Scale::of(&rows, true, Basis::Constant);
+        assert_eq!((scale.means[0], scale.deviations[0], scale.target_mean), (5.0, 1.0, 3.0));
+        assert_eq!(Scale::of(&rows, true, Basis::Zero).target_mean, 0.0);
+        assert_eq!(scale.inputs(&[5.0]), [0.0]);
+    }
+}
