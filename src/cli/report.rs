@@ -108,8 +108,11 @@ type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
     let reader = Reader::open(folder).map_err(Failure::new)?;
-    let data = Data::of_store(&reader).map_err(Failure::new)?;
+    let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
+    if let Some(broken) = &verdict.broken {
+        data.doubt(format!("the history was changed: row {} is not as it was written", broken.row));
+    }
     let chain = match &verdict.broken {
         None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
         Some(broken) => format!(

@@ -147,8 +147,9 @@ pub(crate) fn run(
     })?;
     let mut replays = replays.into_iter();
     let of_job = |job: &Job| {
-        let own: Result<Vec<Replayed>, String> = replays.by_ref().take(grid.replays).collect();
-        own.and_then(|own| judge_log(grid, job, own, settings))
+        // All of them, also behind one that failed: the next job's begin after them.
+        let own: Vec<Result<Replayed, String>> = replays.by_ref().take(grid.replays).collect();
+        judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
 }
@@ -205,6 +206,10 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
         ));
     }
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
+    let mut notes = plain.driven.notes.clone();
+    if end.is_some_and(|(time, _)| time <= span.0) {
+        notes.push("the life was over before the log began: nothing is judged by its end".to_owned());
+    }
     let end = end.filter(|(time, _)| *time <= span.1);
     let mut alarms = Vec::new();
     for (number, replayed) in replays.iter().enumerate() {
@@ -241,7 +246,7 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
         learned_ah: plain.track.last_ah(),
         end_of_life,
         alarms,
-        notes: plain.driven.notes.clone(),
+        notes,
     })
 }
 
