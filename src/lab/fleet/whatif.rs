@@ -34,6 +34,8 @@ pub(crate) struct Settings<'a> {
     pub(crate) reading: Reading<'a>,
     /// Capacity below which a cell's life is over, Ah.
     pub(crate) end_of_life_ah: f64,
+    /// Whether the usable capacity is compared with it, where one is configured.
+    pub(crate) judges_usable: bool,
     /// How soon after a raise the end of life must come.
     pub(crate) horizon: Option<Horizon>,
     /// Threads; `None` = all cores.
@@ -180,7 +182,8 @@ fn replay(
     let monitor = &config.monitor;
     let (mut lanes, _) = watch(grid, number);
     let mut engines = lanes.engines(monitor.sample.cells);
-    let learned = if monitor.health.usable.is_some() { Learned::Usable } else { Learned::Capacity };
+    let is_usable = settings.judges_usable && monitor.health.usable.is_some();
+    let learned = if is_usable { Learned::Usable } else { Learned::Capacity };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
     let source = (settings.reading.open)(config, &job.log);

@@ -105,7 +105,7 @@ fn knows_limits(data: &Data, setting: &Setting<'_>) -> bool {
 
 /// Why this battery cannot be called good, whatever is raised; `None` = nothing stands against it.
 fn unknown(data: &Data, setting: &Setting<'_>) -> Option<String> {
-    let cells = setting.config.map_or(0, |config| config.monitor.sample.cells).max(data.cells());
+    let cells = setting.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     let measured: BTreeSet<usize> =
         data.learned.iter().filter(|row| row.measured_ah.is_some()).map(|row| row.cell).collect();
     if let Some(doubt) = &data.source.doubt {
