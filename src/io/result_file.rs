@@ -111,7 +111,7 @@ pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathB
     // By whatever name.
     let place = fs::canonicalize(result).ok();
     let is_read = |input: &PathBuf| input == result || (place.is_some() && fs::canonicalize(input).ok() == place);
-    if inputs.any(|input| is_read(input)) {
+    if inputs.any(is_read) {
         return Err(format!("{}: is read, cannot be written too", result.display()));
     }
     Ok(())
