@@ -122,6 +122,12 @@ fn a_log_that_fails_is_told_and_the_others_go_on() {
     let output = told.get_output();
     assert!(String::from_utf8_lossy(&output.stderr).contains("none.log: cannot be read"), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
+    // Settings that need a replay each: the next log's are its own.
+    let noises = ["--set", "estimator.voltage_noise_v=0.005,0.01", "none.log", "a.log.gz"];
+    let told = bench.run(&["whatif"], &noises).code(1);
+    let output = told.get_output();
+    assert_eq!(String::from_utf8_lossy(&output.stderr).matches("none.log").count(), 1, "{output:?}");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
     std::fs::write(bench.path("other.log"), "(1700000000.000000) can9 123#00\n").unwrap();
     let told = bench.run(&["whatif"], &["other.log"]).code(1);
     let output = told.get_output();

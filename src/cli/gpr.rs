@@ -167,6 +167,7 @@ fn quiet(written: io::Result<()>) -> Result<(), Failure> {
 fn cv(args: &CvArgs) -> Result<(), Failure> {
     let begin = Instant::now();
     make_folder(args.plots.as_deref())?;
+    args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.columns.table(&args.files)?;
     let bar = report::Bar::new(args.kernel.len() * args.folds);
     let mut all = Vec::new();
@@ -196,6 +197,7 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
 
 fn train(args: &TrainArgs) -> Result<(), Failure> {
     let begin = Instant::now();
+    args.files.check_result(&args.out)?;
     let table = args.columns.table(&args.files)?;
     let settings = args.model.settings(&args.kernel, table.len());
     let bar = report::Bar::new(1);
@@ -213,6 +215,7 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     if args.json && to_stdout {
         return Err(Failure::new("--json: needs --out FILE.csv, for both would be written to standard output"));
     }
+    args.files.check_result(&args.out)?;
     let trained = Trained::load(&args.model, args::threads(args.threads)).map_err(failure)?;
     let output = [trained.output.clone()];
     let wanted = Wanted { columns: &trained.inputs, optional: &output, missing: args.files.missing() };

@@ -12,7 +12,7 @@ use crate::config::{self, Config};
 use crate::daemon::replay::{self, Settings, Sinks, Summary, Watch};
 use crate::daemon::store::Reader;
 use crate::io::log::LogSource;
-use crate::io::result_file::ResultFile;
+use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::report::{self, Data, Origin, Setting};
 use crate::monitor::Monitor;
 
@@ -67,26 +67,22 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         reference: reference.unwrap_or_default(),
         provenance,
     };
-    if let Some(folder) = &args.plots {
-        fs::create_dir_all(folder)
-            .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
-        report::write_plots(folder, &data, &setting).map_err(|error| Failure::new(error.to_string()))?;
-    }
     match write(&args.out, &report::page(&data, &setting)) {
         // The reader of our output has seen enough: no failure.
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(error.to_string())),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
+        written => written.map_err(|error| Failure::new(error.to_string()))?,
     }
+    let Some(folder) = &args.plots else { return Ok(()) };
+    fs::create_dir_all(folder)
+        .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
+    report::write_plots(folder, &data, &setting).map(drop).map_err(|error| Failure::new(error.to_string()))
 }
 
 impl Args {
     /// What one argument alone cannot tell.
     fn check(&self) -> Result<(), Failure> {
         let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
-        if inputs.into_iter().any(|input| *input == self.out && input != Path::new("-")) {
-            return Err(Failure::new(format!("{}: is read, cannot be the page", self.out.display())));
-        }
-        Ok(())
+        check_place(&self.out, inputs).map_err(Failure::new)
     }
 
     fn title(&self) -> String {
@@ -108,8 +104,11 @@ type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
     let reader = Reader::open(folder).map_err(Failure::new)?;
-    let data = Data::of_store(&reader).map_err(Failure::new)?;
+    let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
+    if let Some(broken) = &verdict.broken {
+        data.doubt(format!("the history was changed: row {} is not as it was written", broken.row));
+    }
     let chain = match &verdict.broken {
         None => format!("{} rows, all as they were written; the last has the hash {}", verdict.rows, verdict.head),
         Some(broken) => format!(

@@ -9,6 +9,7 @@ use super::Failure;
 use super::fleet::{LogArgs, positive};
 use crate::alarm::Rule;
 use crate::config::Config;
+use crate::io::result_file::check_place;
 use crate::lab::fleet::Reading;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
@@ -45,7 +46,7 @@ pub(crate) struct Args {
     #[arg(long = "set", value_name = "KEY=V1,V2")]
     set: Vec<Choice>,
     /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %" (default:
-    /// capacity.end_of_life of the configuration)
+    /// capacity.end_of_life of the configuration). A number given here is one of the usable capacity where [usable] is configured
     #[arg(long, value_name = "AH|PERCENT", value_parser = end_of_life)]
     end_of_life: Option<EndOfLife>,
     /// A raise is false when the end of life does not come this soon after it: equivalent full cycles, or days as 90d (default: the
@@ -89,6 +90,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             Some(EndOfLife::Part(part)) => part * rated_ah,
             None => plain.health.end_of_life_ah,
         },
+        // The configured end of life is one of the capacity; which one a number given here means, `[usable]` says.
+        judges_usable: args.end_of_life.is_some(),
         horizon: args.horizon,
         jobs: args.logs.threads(),
     };
@@ -116,6 +119,10 @@ impl Args {
         let (truths, logs) = (self.truth.len(), self.logs.logs.len());
         if truths != 0 && truths != logs {
             return Err(Failure::new(format!("--truth given {truths} times for {logs} logs, must be once per log")));
+        }
+        if let Some(csv) = &self.csv {
+            let inputs = self.logs.logs.iter().chain(&self.truth).chain([&self.config]);
+            check_place(csv, inputs).map_err(Failure::new)?;
         }
         if self.json && self.csv.as_deref() == Some(Path::new("-")) {
             return Err(Failure::new("only one of --json and --csv can go to standard output"));

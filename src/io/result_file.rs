@@ -96,6 +96,27 @@ impl Drop for ResultFile {
     }
 }
 
+/// Before hours of work: a result can be written where it shall be, and is none of the files that are read.
+///
+/// # Errors
+/// Names the result and what is wrong with its place.
+pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathBuf>) -> Result<(), String> {
+    if result == Path::new("-") {
+        return Ok(());
+    }
+    let folder = result.parent().filter(|folder| !folder.as_os_str().is_empty());
+    if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+        return Err(format!("{}: cannot be written: there is no folder {}", result.display(), folder.display()));
+    }
+    // By whatever name.
+    let place = fs::canonicalize(result).ok();
+    let is_read = |input: &PathBuf| input == result || (place.is_some() && fs::canonicalize(input).ok() == place);
+    if inputs.any(is_read) {
+        return Err(format!("{}: is read, cannot be written too", result.display()));
+    }
+    Ok(())
+}
+
 /// The error with the file's name; its kind is kept, so that a closed pipe is still known as one.
 fn named(path: &Path, error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::Interrupted {
@@ -118,6 +139,20 @@ mod tests {
         drop(file);
         assert_eq!(fs::read_to_string(&path).expect("readable"), "old");
         assert_eq!(fs::read_dir(folder.path()).expect("readable").count(), 1);
+    }
+
+    #[test]
+    fn a_result_has_a_folder_and_is_no_input_by_whatever_name() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [log, other] = ["a.log", "b.log"].map(|name| folder.path().join(name));
+        fs::write(&log, "").expect("written");
+        let inputs = [log.clone(), PathBuf::from("-")];
+        let told = |result: &Path| check_place(result, inputs.iter());
+        assert_eq!((told(&other), told(Path::new("-"))), (Ok(()), Ok(())));
+        let again = folder.path().join(".").join("a.log");
+        assert!(told(&again).is_err_and(|error| error.ends_with("a.log: is read, cannot be written too")));
+        let nowhere = folder.path().join("none").join("x.csv");
+        assert!(told(&nowhere).is_err_and(|error| error.contains("there is no folder")));
     }
 
     #[test]

@@ -43,6 +43,8 @@ pub(super) struct Posterior {
     /// Minus the log likelihood.
     pub value: f64,
     pub jitter: Jitter,
+    /// What was added to the diagonal this time, as part of the prior variance.
+    used_jitter: f64,
 }
 
 /// The threads of this pool for faer.
@@ -101,10 +103,11 @@ impl Posterior {
         let columns = by_column(&data.inputs, data.dimensions);
         let mut factor = vec![0.0; n * n];
         let mut jitter = Jitter::default();
-        jitter.note(until_positive(|added| {
+        let used_jitter = until_positive(|added| {
             fill(&plan, &values, &data, &columns, added, &mut factor);
             cholesky(&mut factor, n)
-        })?);
+        })?;
+        jitter.note(used_jitter);
         let mut posterior = Self {
             data,
             plan,
@@ -116,6 +119,7 @@ impl Posterior {
             basis_solved: vec![],
             value: 0.0,
             jitter,
+            used_jitter,
         };
         posterior.solve()?;
         Ok(posterior)
@@ -187,7 +191,8 @@ impl Posterior {
             diagonal += weight;
         }
         let zero = vec![0.0; self.data.dimensions];
-        self.plan.add_gradient(&self.values, &zero, &[diagonal], &mut Work::default(), &mut gradient);
+        let prior = diagonal * (1.0 + self.used_jitter);
+        self.plan.add_gradient(&self.values, &zero, &[prior], &mut Work::default(), &mut gradient);
         gradient[parameters - 1] += 2.0 * self.values.noise_variance * diagonal;
         gradient
     }

@@ -41,7 +41,7 @@ pub(super) fn minimise<E>(
 ) -> Result<Option<Lowest>, E> {
     let x: Vec<f64> =
         (start.iter().zip(limits.low.iter().zip(limits.high))).map(|(x, (l, h))| x.clamp(*l, *h)).collect();
-    let Some((value, gradient)) = objective(&x)? else { return Ok(None) };
+    let Some((value, gradient)) = objective(&x)?.filter(is_finite) else { return Ok(None) };
     let mut at = Lowest { x, value, gradient, iterations: 0 };
     let mut inverse = Inverse::new(at.x.len());
     let mut small_falls = 0;
@@ -66,6 +66,10 @@ pub(super) fn minimise<E>(
     Ok(Some(at))
 }
 
+fn is_finite((value, gradient): &(f64, Vec<f64>)) -> bool {
+    value.is_finite() && gradient.iter().all(|slope| slope.is_finite())
+}
+
 fn line_search<E>(
     at: &Lowest,
     direction: &[f64],
@@ -82,7 +86,7 @@ fn line_search<E>(
             (0..at.x.len()).map(|k| (at.x[k] + step * direction[k]).clamp(limits.low[k], limits.high[k])).collect();
         let slope: f64 = (0..x.len()).map(|k| at.gradient[k] * (x[k] - at.x[k])).sum();
         let found = objective(&x)?;
-        if let Some((value, gradient)) = found.filter(|(value, _)| value.is_finite()) {
+        if let Some((value, gradient)) = found.filter(is_finite) {
             if slope < 0.0 && value <= at.value + ARMIJO * slope {
                 return Ok(Some(Lowest { x, value, gradient, iterations: at.iterations + 1 }));
             }

@@ -27,6 +27,8 @@ const MAX_ROUNDS: usize = 4;
 const SAME_METRIC: f64 = 1.3;
 /// Most threads.
 const MAX_THREADS: usize = 1024;
+/// Searches besides the first.
+const MAX_RESTARTS: usize = 1000;
 
 /// One hyperparameter: length scales in (standardised) inputs, standard deviations in units of the target.
 #[derive(Debug, Clone, PartialEq)]
@@ -162,6 +164,9 @@ impl<'a> Job<'a> {
         check_settings(settings, n)?;
         let scale = Scale::of(rows, settings.standardise, settings.basis);
         let natural = Scale::of(rows, true, settings.basis);
+        if let Some(what) = natural.too_wide() {
+            return Err(Fault::range(&what, "values whose mean or variance overflows", "of a smaller size"));
+        }
         let logs: f64 = natural.deviations.iter().zip(&scale.deviations).map(|(d, unit)| (d / unit).ln()).sum();
         let d = rows.dimensions;
         let mut data = Data {
@@ -347,6 +352,9 @@ pub(super) fn threads(count: usize) -> Result<ThreadPool, Fault> {
 }
 
 fn check_settings(settings: &Settings, rows: usize) -> Result<(), Fault> {
+    if settings.restarts > MAX_RESTARTS {
+        return Err(Fault::range("restarts", settings.restarts, format!("at most {MAX_RESTARTS}")));
+    }
     match settings.form {
         Form::Exact if rows > MAX_EXACT_ROWS => {
             Err(Fault::range("rows of an exact fit", rows, format!("at most {MAX_EXACT_ROWS}; take a sparse form")))
@@ -380,6 +388,11 @@ impl Model {
         let queries = self.scale.inputs(inputs);
         self.pool.install(|| {
             let found = self.posterior.predict(&queries)?;
+            // An input so far away that its square overflows.
+            if let Some(row) = found.iter().position(|(mean, variance)| !mean.is_finite() || !variance.is_finite()) {
+                let far = format!("{:?}", &inputs[row * d..(row + 1) * d]);
+                return Err(Fault::range(&format!("inputs of row {}", row + 1), far, "nearer to the model's rows"));
+            }
             let rows = queries.par_chunks_exact(d).with_min_len(64);
             Ok(found
                 .into_par_iter()

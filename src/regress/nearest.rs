@@ -218,7 +218,7 @@ impl Scratch {
             self.weights.extend(q[j + 1..].iter().zip(&a[j + 1..]).map(|(qi, ai)| qi * (cq + ba) + bq * ai));
         }
         let diagonal: f64 = q.iter().zip(&a).map(|(q, a)| c * q * q + b * q * a).sum();
-        self.weights.push(diagonal);
+        self.weights.push(diagonal * (1.0 + factor.jitter));
         plan.add_gradient(values, &self.squares, &self.weights, &mut self.work, gradient);
         gradient[plan.parameters.len() - 1] += 2.0 * values.noise_variance * diagonal;
     }

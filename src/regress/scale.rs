@@ -48,7 +48,9 @@ pub(super) fn check(rows: &Rows) -> Result<(), Fault> {
 /// Mean and standard deviation; deviation 1 where the values do not differ.
 fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = values.clone().count() as f64;
-    let mean = values.clone().sum::<f64>() / count;
+    // From the first value on: the sum of many equal ones would not be exact.
+    let first = values.clone().next().unwrap_or(0.0);
+    let mean = first + values.clone().map(|v| v - first).sum::<f64>() / count;
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
     let flat = deviation.is_nan() || deviation <= 1e-12 * mean.abs().max(f64::MIN_POSITIVE);
     (mean, if flat { 1.0 } else { deviation })
@@ -69,6 +71,14 @@ impl Scale {
         }
     }
 
+    /// The first column whose spread is beyond what can be computed with: `input 2` or `target`.
+    pub(super) fn too_wide(&self) -> Option<String> {
+        let target = (!self.target_deviation.is_finite() || !self.target_mean.is_finite()).then(|| "target".to_owned());
+        let is_wide = |(mean, deviation): (&f64, &f64)| !mean.is_finite() || !deviation.is_finite();
+        let input = self.means.iter().zip(&self.deviations).position(is_wide);
+        input.map(|d| format!("input {}", d + 1)).or(target)
+    }
+
     pub(super) fn inputs(&self, inputs: &[f64]) -> Vec<f64> {
         let d = self.means.len();
         inputs.iter().enumerate().map(|(at, x)| (x - self.means[at % d]) / self.deviations[at % d]).collect()
@@ -82,6 +92,11 @@ impl Scale {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_long_column_of_one_value_is_flat() {
+        assert_eq!(moments(std::iter::repeat_n(0.1, 1_000_000)), (0.1, 1.0));
+    }
 
     #[test]
     fn a_number_that_is_not_finite_is_refused_with_its_line() {

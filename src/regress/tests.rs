@@ -274,6 +274,26 @@ fn settings_out_of_range_are_refused() {
     assert_eq!(refused(&|s| s.form = Form::Nearest { neighbours: 0 }), "neighbours = 0, must be 1 to 500");
     assert_eq!(refused(&|s| s.form = Form::Inducing { points: 9999 }), "inducing points = 9999, must be 1 to 5000");
     assert_eq!(refused(&|s| s.start = vec![1.0]), "start = [1.0], must be 3 positive numbers");
+    assert_eq!(refused(&|s| s.restarts = usize::MAX), format!("restarts = {}, must be at most 1000", usize::MAX));
     let model = fitted(Form::Exact, |_| ());
     assert!(model.predict(&[1.0]).is_err() && model.predict(&[1.0, f64::NAN]).is_err());
+}
+
+#[test]
+fn numbers_too_large_to_square_are_refused_and_not_told_as_certain() {
+    for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
+        let model = fitted(form, |_| ());
+        let told = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
+        // Either so far that nothing is known, or refused by its row.
+        match told {
+            Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
+            Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),
+        }
+    }
+    let (mut inputs, targets) = made(30, 5);
+    inputs.iter_mut().step_by(2).for_each(|x| *x *= 1e200);
+    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let settings = Settings::new("exponential".parse().expect("a kernel"), 30);
+    let fault = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect_err("too large").to_string();
+    assert_eq!(fault, "input 1 = values whose mean or variance overflows, must be of a smaller size");
 }

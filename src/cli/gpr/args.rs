@@ -1,7 +1,9 @@
 //! What the subcommands of `gpr` have in common: files, kernel grammar, form of the model.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use crate::cli::Failure;
+use crate::io::result_file::check_place;
 use crate::lab::gpr::Missing;
 use crate::regress::{Basis, Form, Kernel, MAX_INDUCING, MAX_NEIGHBOURS, Settings};
 
@@ -25,6 +27,11 @@ pub(super) struct FileArgs {
 }
 
 impl FileArgs {
+    /// A result has a place, and is none of these files.
+    pub(super) fn check_result(&self, result: &Path) -> Result<(), Failure> {
+        check_place(result, self.files.iter()).map_err(Failure::new)
+    }
+
     pub(super) fn missing(&self) -> Missing {
         if self.skip_missing { Missing::Skipped } else { Missing::Refused }
     }

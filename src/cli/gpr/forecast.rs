@@ -81,6 +81,7 @@ struct Shown<'a> {
 pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let begin = Instant::now();
     make_folder(args.plots.as_deref())?;
+    args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.table()?;
     let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
     let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);

@@ -100,7 +100,8 @@ enum Verdict {
 pub(crate) fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Judged {
     let verdicts: Vec<(Verdict, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
-    let is_ageing = config.rule.row().is_learned;
+    // Of a life that was over before there was a log nobody can tell what was missed.
+    let is_ageing = config.rule.row().is_learned && life.end.is_none_or(|end| end > life.span.0);
     let first_true = verdicts.iter().find(|(verdict, _)| *verdict == Verdict::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
     Judged {

@@ -83,11 +83,11 @@ impl Truth {
         self.cells.iter().filter_map(of_cell).min()
     }
 
-    /// The capacity of a cell at `time`, as the last row before it says.
+    /// The capacity of a cell at `time`, as the last row before it says; `None` = there is none.
     pub(crate) fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
         let points = self.cells.get(&cell)?;
         let after = points.partition_point(|(at, _)| *at <= time);
-        points.get(after.saturating_sub(1)).map(|(_, ah)| *ah)
+        points.get(after.checked_sub(1)?).map(|(_, ah)| *ah)
     }
 
     /// First and last moment it tells of.
@@ -108,7 +108,10 @@ fn read_simulated(reader: &mut csv::Reader<Box<dyn std::io::Read>>, columns: [us
         let ah = field(columns[2]).parse::<f64>().ok().filter(|ah| ah.is_finite() && *ah >= 0.0);
         let ah = ah.ok_or_else(|| bad(columns[2], "0 Ah or more"))?;
         let (first, last) = span.unwrap_or((time, time));
-        span = Some((time.min(first), time.max(last)));
+        if time < last {
+            return Err(bad(columns[0], "no earlier than the row before"));
+        }
+        span = Some((first, time));
         let points = cells.entry(cell).or_default();
         if points.last().is_none_or(|(_, kept)| (ah - kept).abs() > KEPT_CHANGE * kept) {
             points.push((time, ah));
@@ -173,6 +176,7 @@ mod tests {
         assert_eq!(truth.falls_below(1.8), Some((Timestamp::from_secs(2.0), CellIndex(1))));
         assert_eq!(truth.falls_below(1.4), None);
         assert_eq!(truth.capacity_ah(CellIndex(0), Timestamp::from_secs(2.5)), Some(1.9));
+        assert_eq!(truth.capacity_ah(CellIndex(0), Timestamp::from_secs(0.5)), None, "nobody knows yet");
         assert_eq!(truth.kind, TruthKind::Capacity);
     }
 
@@ -188,6 +192,10 @@ mod tests {
     #[test]
     fn what_is_wrong_is_told_with_its_line() {
         assert_eq!(read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"), "t.csv:2: \"x\", must be 0 Ah or more");
+        assert_eq!(
+            read("time_s,cell,capacity_ah\n5,0,2\n4,0,2\n").expect_err("bad"),
+            "t.csv:3: \"4\", must be no earlier than the row before"
+        );
         assert!(read("a,b\n1,2\n").expect_err("bad").starts_with("t.csv:1: columns a,b, must have"));
         assert!(read("time_s,cell,capacity_ah\n").expect_err("bad").contains("no row"));
     }

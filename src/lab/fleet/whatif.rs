@@ -34,6 +34,8 @@ pub(crate) struct Settings<'a> {
     pub(crate) reading: Reading<'a>,
     /// Capacity below which a cell's life is over, Ah.
     pub(crate) end_of_life_ah: f64,
+    /// Whether the usable capacity is compared with it, where one is configured.
+    pub(crate) judges_usable: bool,
     /// How soon after a raise the end of life must come.
     pub(crate) horizon: Option<Horizon>,
     /// Threads; `None` = all cores.
@@ -147,8 +149,9 @@ pub(crate) fn run(
     })?;
     let mut replays = replays.into_iter();
     let of_job = |job: &Job| {
-        let own: Result<Vec<Replayed>, String> = replays.by_ref().take(grid.replays).collect();
-        own.and_then(|own| judge_log(grid, job, own, settings))
+        // All of them, also behind one that failed: the next job's begin after them.
+        let own: Vec<Result<Replayed, String>> = replays.by_ref().take(grid.replays).collect();
+        judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
 }
@@ -179,7 +182,8 @@ fn replay(
     let monitor = &config.monitor;
     let (mut lanes, _) = watch(grid, number);
     let mut engines = lanes.engines(monitor.sample.cells);
-    let learned = if monitor.health.usable.is_some() { Learned::Usable } else { Learned::Capacity };
+    let is_usable = settings.judges_usable && monitor.health.usable.is_some();
+    let learned = if is_usable { Learned::Usable } else { Learned::Capacity };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
     let source = (settings.reading.open)(config, &job.log);
@@ -205,6 +209,10 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
         ));
     }
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
+    let mut notes = plain.driven.notes.clone();
+    if end.is_some_and(|(time, _)| time <= span.0) {
+        notes.push("the life was over before the log began: nothing is judged by its end".to_owned());
+    }
     let end = end.filter(|(time, _)| *time <= span.1);
     let mut alarms = Vec::new();
     for (number, replayed) in replays.iter().enumerate() {
@@ -241,7 +249,7 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
         learned_ah: plain.track.last_ah(),
         end_of_life,
         alarms,
-        notes: plain.driven.notes.clone(),
+        notes,
     })
 }
 

@@ -178,9 +178,9 @@ impl Task<'_> {
     fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(Horizon, Model), GprError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
-            let (lags, steps, origin) = (self.plan.lags, self.steps, self.origin);
+            let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
             GprError(format!(
-                "fewer than {FEWEST} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
+                "fewer than {fewest} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
                  least as many: give fewer lags or steps, a later origin or more rows"
             ))
         })?;
@@ -206,6 +206,11 @@ impl Task<'_> {
         Ok((horizon, model))
     }
 
+    /// Windows that a process needs: more than it has features.
+    fn fewest(&self) -> usize {
+        FEWEST.max(self.windows.width() + 2)
+    }
+
     /// A process fitted to windows that were over before row `end`, and how many; `None` when these are too few. With
     /// `fixed` hyperparameters nothing is searched.
     fn fitted(
@@ -216,8 +221,7 @@ impl Task<'_> {
         watcher: &mut Watcher<'_>,
     ) -> Result<Option<(Model, usize)>, GprError> {
         let known = self.windows.between(0, end, self.steps);
-        let features = self.windows.width();
-        if known.len() < FEWEST.max(features + 2) {
+        if known.len() < self.fewest() {
             return Ok(None);
         }
         let rows = chosen(&known, self.plan.rows);
@@ -231,7 +235,7 @@ impl Task<'_> {
             settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
             settings.restarts = 0;
         }
-        let rows = Rows { inputs: &inputs, dimensions: features, targets: &targets, lines: &[] };
+        let rows = Rows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 

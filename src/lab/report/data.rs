@@ -75,6 +75,8 @@ pub struct Source {
     pub origin: Origin,
     /// Pack of the store, from 1, and packs before it.
     pub pack: Option<i64>,
+    /// Why it may not be believed: a sentence without its full stop.
+    pub doubt: Option<String>,
 }
 
 /// Everything a report shows.
@@ -96,7 +98,7 @@ impl Data {
     /// Nothing yet.
     pub fn new(origin: Origin) -> Self {
         Self {
-            source: Source { origin, pack: None },
+            source: Source { origin, pack: None, doubt: None },
             halves: Vec::new(),
             learned: Vec::new(),
             recharges: Vec::new(),
@@ -119,6 +121,11 @@ impl Data {
         data.source.pack = pack;
         entries.iter().filter(|entry| Some(entry.pack) == pack).for_each(|entry| data.take_entry(entry));
         Ok(data)
+    }
+
+    /// The record may not be believed: a sentence without its full stop.
+    pub fn doubt(&mut self, why: String) {
+        self.source.doubt = Some(why);
     }
 
     /// Takes a row of a store.
@@ -169,6 +176,7 @@ impl Data {
     /// Takes an event of a replay.
     pub fn take_event(&mut self, event: &Event) {
         let time_s = event.time.secs();
+        self.span(time_s);
         match event.kind {
             EventKind::HalfCycle { cell, mode, charge_ah, duration_s, mean_temperature_c, .. } => {
                 let (cell, is_charge) = (cell.index(), mode == Mode::Charge);

@@ -101,10 +101,10 @@ pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
         let now_s = halves[0].time_s;
         let since_before_s = before_s.map(|before_s| now_s - before_s);
         for half in halves {
-            if let Some(row) = learned.get(&key(half.time_s, half.cell)) {
-                let passed = Passed::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-                cells[half.cell].update(passed, reading(row, gain_std));
-            }
+            let passed = Passed::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
+            // Use without a reading is use all the same: a store leaves out capacities that say nothing new.
+            let row = learned.get(&key(half.time_s, half.cell));
+            cells[half.cell].update(passed, row.and_then(|row| reading(row, gain_std)));
         }
         before_s = Some(now_s);
     }

@@ -240,7 +240,10 @@ fn alarms(out: &mut String, data: &Data, pictures: &[(String, Picture)]) {
     begin(out, "alarms", "Alarms", "");
     match pictures.iter().find(|(name, _)| name == "alarms") {
         Some((_, picture)) => figure(out, picture),
-        None => out.push_str("<p class=\"none\">no alarm was raised in this record</p>"),
+        None if data.alarms.is_empty() => {
+            out.push_str("<p class=\"none\">no alarm was raised in this record</p>");
+        }
+        None => {}
     }
     if !data.alarms.is_empty() {
         let rows = data.alarms.iter().rev().map(|row| {

@@ -84,13 +84,13 @@ pub(super) fn temperatures(data: &Data) -> Vec<(f64, f64, f64)> {
     .collect()
 }
 
-/// Equivalent full cycles of the cell that was used most: charge moved over twice its capacity.
-pub(super) fn full_cycles(data: &Data) -> Option<f64> {
+/// Equivalent full cycles of the cell that was used most: charge moved over twice the rated capacity; without one over
+/// twice the first learned.
+pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
     let mut moved_ah = vec![0.0; data.cells()];
     data.halves.iter().for_each(|half| moved_ah[half.cell] += half.charge_ah.max(0.0));
-    let mut capacity_ah: Vec<Option<f64>> = vec![None; moved_ah.len()];
-    data.learned.iter().for_each(|row| capacity_ah[row.cell] = capacity_ah[row.cell].or(Some(row.capacity_ah.0)));
-    let cycles = moved_ah.iter().zip(capacity_ah).filter_map(|(moved, capacity)| Some(moved / (2.0 * capacity?)));
+    let full_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0))?;
+    let cycles = moved_ah.iter().map(|moved| moved / (2.0 * full_ah));
     cycles.filter(|cycles| cycles.is_finite()).reduce(f64::max)
 }
 

@@ -1,10 +1,10 @@
 //! The summary at the top: how the battery is, since when, what to do; "unknown" where nothing is known.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::data::{AlarmRow, Data, Origin};
 use super::forecast::Outlook;
-use super::{Setting, series};
+use super::{Setting, forecast, series};
 use crate::alarm::{Rule, Severity};
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
@@ -72,27 +72,55 @@ pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, S
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
     let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
-    let knows = !series::steps(data, series::capacity, false).is_empty();
+    let unknown = unknown(data, setting);
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
         Some("severe") => Verdict::Act,
         Some("warning") => Verdict::Plan,
         Some(_) => Verdict::Watch,
-        None if !knows => Verdict::Unknown,
-        None if !measuring.is_empty() || is_over(outlook) => Verdict::Watch,
+        None if is_over(data, setting, outlook) => Verdict::Watch,
+        None if unknown.is_some() => Verdict::Unknown,
+        None if !measuring.is_empty() => Verdict::Watch,
         None => Verdict::Good,
     };
     Summary {
         verdict,
-        how: how(verdict, worst, &measuring, data),
+        how: how(verdict, worst, &measuring, data, unknown),
         since: since(data, &battery, &measuring),
-        what: what(verdict, worst, &measuring),
+        what: what(verdict, worst, &measuring, knows_limits(data, setting)),
         tiles: tiles(data, setting, outlook, &raised),
     }
 }
 
 /// Whether the capacity has passed the end of life, whatever the alarms say.
-fn is_over(outlook: &Result<Outlook, String>) -> bool {
-    outlook.as_ref().is_ok_and(Outlook::is_over)
+fn is_over(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>) -> bool {
+    let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
+    let is_below = least.zip(forecast::end_of_life_ah(data, setting)).is_some_and(|(least, end)| least < end);
+    is_below || outlook.as_ref().is_ok_and(Outlook::is_over)
+}
+
+/// Whether the record or a configuration says what is too little.
+fn knows_limits(data: &Data, setting: &Setting<'_>) -> bool {
+    setting.config.is_some() || !data.alarms.is_empty()
+}
+
+/// Why this battery cannot be called good, whatever is raised; `None` = nothing stands against it.
+fn unknown(data: &Data, setting: &Setting<'_>) -> Option<String> {
+    let cells = setting.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
+    let measured: BTreeSet<usize> =
+        data.learned.iter().filter(|row| row.measured_ah.is_some()).map(|row| row.cell).collect();
+    if let Some(doubt) = &data.source.doubt {
+        return Some(format!("Unknown: {doubt}."));
+    }
+    if measured.is_empty() {
+        return Some("Unknown: nothing has been learned about this battery yet.".to_owned());
+    }
+    if measured.len() < cells {
+        return Some(format!(
+            "Unknown: nothing has been learned yet about {} of {cells} cells.",
+            cells - measured.len()
+        ));
+    }
+    (!knows_limits(data, setting)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
 }
 
 fn raised(data: &Data) -> Vec<Raised<'_>> {
@@ -156,7 +184,13 @@ pub(super) fn words(row: &AlarmRow) -> String {
     format!("{} was {}, limit {}{cell}", about(&row.rule), value, limit)
 }
 
-fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], data: &Data) -> String {
+fn how(
+    verdict: Verdict,
+    worst: Option<&Raised<'_>>,
+    measuring: &[&Raised<'_>],
+    data: &Data,
+    unknown: Option<String>,
+) -> String {
     let head = match verdict {
         Verdict::Good => "Good: no limit is passed.",
         Verdict::Watch if worst.is_none() && measuring.is_empty() => {
@@ -166,7 +200,7 @@ fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], 
         Verdict::Watch => "Worth watching.",
         Verdict::Plan => "Worn: plan a visit to the workshop.",
         Verdict::Act => "Past its limit: act now.",
-        Verdict::Unknown => "Unknown: nothing has been learned about this battery yet.",
+        Verdict::Unknown => unknown.as_deref().unwrap_or("Unknown."),
     };
     let why = worst
         .or(measuring.first().copied())
@@ -175,7 +209,9 @@ fn how(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], 
     let doubt = lost.map_or(String::new(), |_| {
         " The estimator is less sure than it says (see its health below): take the figures with care.".to_owned()
     });
-    format!("{head}{why}{doubt}")
+    let changed = data.source.doubt.iter().filter(|_| verdict != Verdict::Unknown);
+    let changed: String = changed.map(|changed| format!(" But {changed}.")).collect();
+    format!("{head}{why}{doubt}{changed}")
 }
 
 /// A moment for people.
@@ -200,7 +236,7 @@ fn since(data: &Data, battery: &[&Raised<'_>], measuring: &[&Raised<'_>]) -> Str
     }
 }
 
-fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>]) -> String {
+fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], knows_limits: bool) -> String {
     let advice = worst.and_then(|raised| rule(&raised.row.rule)).map(|rule| match rule {
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
@@ -218,6 +254,9 @@ fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>])
         _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",
     });
     match (advice, measure) {
+        (None, None) if verdict == Verdict::Unknown && !knows_limits => {
+            "Make this report again with the configuration (-c), which says what is too little.".to_owned()
+        }
         (None, None) if verdict == Verdict::Unknown => {
             "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
         }
@@ -266,7 +305,7 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
         ),
         tile(
             "Use so far",
-            series::full_cycles(data).map(|cycles| format!("{cycles:.0} cycles")),
+            series::full_cycles(data, rated_ah).map(|cycles| format!("{cycles:.0} cycles")),
             "equivalent full cycles in this record",
         ),
         tile("Alarms raised now", Some(raised.len().to_string()), format!("{} entries in all", data.alarms.len())),
@@ -293,6 +332,7 @@ fn recharge_tile(data: &Data) -> Tile {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lab::report::data::Learned;
 
     fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRow {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());
@@ -324,6 +364,35 @@ mod tests {
         assert!(plan.how.contains("a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"), "{}", plan.how);
         both.push(alarm(4.0e8, "resistance_high", "severe", true));
         assert_eq!(summary(both).verdict, Verdict::Act);
+    }
+
+    fn learned(time_s: f64, cell: usize, measured_ah: Option<f64>) -> Learned {
+        let (measured_std_ah, usable_ah, resistance) = (measured_ah.map(|_| 0.01), None, (1.0, 0.1));
+        Learned { time_s, cell, measured_ah, measured_std_ah, capacity_ah: (1.2, 0.01), usable_ah, resistance }
+    }
+
+    #[test]
+    fn good_is_only_said_where_every_cell_and_a_limit_is_known() {
+        let verdict = |rows: &[Learned], alarms: Vec<AlarmRow>, doubt: Option<&str>| {
+            let mut data = Data::new(Origin::Store);
+            (data.learned, data.alarms) = (rows.to_vec(), alarms);
+            doubt.into_iter().for_each(|doubt| data.doubt(doubt.to_owned()));
+            of(&data, &Setting::default(), &Err("too little".into()))
+        };
+        let cell = |cell: usize| learned(3.0, cell, Some(1.2));
+        let limit =
+            |threshold: f64| AlarmRow { threshold: Some(threshold), ..alarm(4.0, "capacity_low", "severe", false) };
+        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.0)], None).verdict, Verdict::Good);
+        let no_limit = verdict(&[cell(0), cell(1)], Vec::new(), None);
+        assert_eq!(no_limit.verdict, Verdict::Unknown);
+        assert!(no_limit.how.contains("names no limit") && no_limit.what.contains("-c"), "{no_limit:?}");
+        let one_missing = verdict(&[cell(1)], vec![limit(1.0)], None);
+        assert_eq!(one_missing.how, "Unknown: nothing has been learned yet about 1 of 2 cells.");
+        assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Verdict::Unknown);
+        // Below the end of life, whatever no alarm has said so far.
+        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Verdict::Watch);
+        let changed = verdict(&[cell(0), cell(1)], vec![limit(1.0)], Some("the history was changed"));
+        assert_eq!(changed.how, "Unknown: the history was changed.");
     }
 
     #[test]
