@@ -6,7 +6,8 @@ mod rig;
 use packwatch::alarm::{Change, Rule, Severity, State};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
-use packwatch::monitor::{Command, EventKind, Input, MonitorConfig};
+use packwatch::health::{Axis, Forecast, Passed, Reading};
+use packwatch::monitor::{Away, Command, EventKind, Input, Monitor, MonitorConfig};
 use packwatch::quantity::CellIndex;
 use rig::{Rig, learned, load};
 
@@ -114,6 +115,42 @@ fn what_was_learned_is_compared_with_another_threshold_at_once() {
     rig.reload(|config| (config.rules[0].threshold, config.rules[0].clear) = (5.0, 5.0)).unwrap();
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Raised; 2]);
     assert_eq!([0, 1].map(|cell| rig.monitor.capacity(CellIndex(cell)).mean), capacity_ah);
+}
+
+#[test]
+fn another_end_of_life_is_not_judged_by_what_remained_until_the_old_one() {
+    let mut rig = Rig::new("[[alarm]]\nrule = \"remaining_life_low\"\nwarning = 30\n");
+    rig.seconds(2);
+    // 2.36 Ah are left, 0.004 Ah are lost in a cycle: some 70 cycles to 2.08 Ah, 135 to 1.82 Ah.
+    let mut forecast = Forecast::new(Axis::Cycles, 2.6);
+    for cycle in 0..60 {
+        let passed = Passed { cycles: 1.0, days: 0.5, rest_days: 0.0 };
+        let capacity_ah = 2.6 - 0.004 * f64::from(cycle);
+        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+    }
+    let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
+    (0..2).for_each(|cell| stored["cells"][cell]["forecast"] = serde_json::to_value(&forecast).unwrap());
+    rig.monitor = Monitor::new(rig.config.clone());
+    rig.monitor.restore(serde_json::from_value(stored).unwrap(), Away::AsStamped).unwrap();
+    rig.seconds(1);
+    let cycles = |rig: &Rig| rig.monitor.pack_remaining_life().unwrap().1.cycles.unwrap().median;
+    assert!((50.0..90.0).contains(&cycles(&rig)), "{}", cycles(&rig));
+    rig.reload(|_| ()).unwrap();
+    rig.events.clear();
+    rig.reload(|config| {
+        config.health.end_of_life_ah = 1.82;
+        (config.rules[0].threshold, config.rules[0].clear) = (100.0, 102.0);
+    })
+    .unwrap();
+    assert!(cycles(&rig) > 102.0, "{}", cycles(&rig));
+    assert_eq!(rig.changes(Rule::RemainingLifeLow), [], "what remained until the old end is below the new threshold");
+    let told = rig.events.iter().filter_map(|event| match event.kind {
+        EventKind::RemainingLife { cycles, .. } => cycles,
+        _ => None,
+    });
+    assert_eq!(told.collect::<Vec<_>>(), [cycles(&rig)]);
+    rig.reload(|config| config.health.end_of_life_ah = 2.2).unwrap();
+    assert_eq!(rig.changes(Rule::RemainingLifeLow), [Change::Raised]);
 }
 
 #[test]

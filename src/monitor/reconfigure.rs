@@ -67,7 +67,7 @@ impl Monitor {
             self.observe_alarm(Rule::RechargePeriodLow, None, period, out);
         }
         if old.health.end_of_life_ah != self.config.health.end_of_life_ah {
-            self.observe_life(false, out);
+            self.observe_life(true, out);
         }
         self.tell_j1939();
         let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);

@@ -23,7 +23,7 @@ use crate::config::Config;
 use crate::daemon::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
-use crate::monitor::{Event, Monitor, Outputs};
+use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
 
 pub(crate) use columns::reference;
@@ -265,6 +265,8 @@ impl Tables {
             let half = half.ok_or("a capacity came without its half-cycle")?;
             let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
             self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, learned, remaining })?;
+        } else if matches!(event.kind, EventKind::PackReplaced { .. }) {
+            self.moved_ah.fill(0.0);
         } else if let Some(alarm) = Alarm::of(&event.kind) {
             self.alarms.push(&AlarmRow { log, time, since_s, alarm })?;
         }

@@ -106,8 +106,6 @@ pub(super) struct Trace {
     /// The last half-cycles, each in its own bins.
     pub(super) recent: VecDeque<Bins<Moment>>,
     pub(super) cells: Vec<Health>,
-    /// The last estimate of each cell: SOC and its standard deviation.
-    pub(super) last_soc: Vec<Option<(f64, f64)>>,
 }
 
 impl Trace {
@@ -123,10 +121,8 @@ impl Trace {
         let cell = estimate.cell.index();
         if self.cells.len() <= cell {
             self.cells.resize(cell + 1, Health::default());
-            self.last_soc.resize(cell + 1, None);
         }
         self.cells[cell].take(estimate);
-        self.last_soc[cell] = Some((estimate.soc, estimate.soc_std));
     }
 
     /// A charge or discharge begins.

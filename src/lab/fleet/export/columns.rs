@@ -116,7 +116,7 @@ pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "time" Time "UTC", "when it was over", |row| Field::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
     "cell" Whole "", "cell, from 0", |row| whole(row.half.cell.0);
-    "full_cycles" Real "cycles" null, "equivalent full cycles so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
+    "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
     "mode" Word "", "charge or discharge", |row| word(&row.half.mode);
     "charge_ah" Real "Ah", "charge moved", |row| real(row.half.charge_ah);
     "swing" Real "fraction" null, "swing of the state of charge that the voltages tell", |row| maybe(row.half.swing);

@@ -1,3 +1,5 @@
+//! What values to try make of a configuration, and what is refused.
+
 use std::fs;
 use std::path::PathBuf;
 

@@ -1,3 +1,5 @@
+//! Tables as Parquet and CSV readers see them.
+
 use std::fs;
 
 use parquet::file::reader::{FileReader, SerializedFileReader};
