@@ -1,7 +1,8 @@
 //! Estimates one cell's state, sample by sample, with an unscented Kalman filter.
 //!
-//! State x = [SOC, U_1 .. U_n, ln rho, C]: state of charge (fraction), branch voltages (V), logarithm of the
-//! resistance relative to a new cell, capacity (Ah); n = 1 to 3 branches.
+//! State x = [SOC, ln rho, C, U_1 .. U_n]: state of charge (fraction), logarithm of the resistance relative to a new
+//! cell, capacity (Ah), branch voltages (V); n = 1 to 3 branches. The order is that of the sigma points: what the circuit
+//! is not linear in comes first, so that the points of the branches are moved by a linear map.
 //! Predict over the charge q (A s) and time dt that really passed since the last sample:
 //! SOC -= q / (3600 C); U_i by `circuit::BranchAt` with the mean current q/dt; ln rho and C stay.
 //! Update with the voltage: V = OCV(SOC, T) - sum U_i - rho R0(SOC, T) I. Source: the paper, section 3.3.3.
@@ -37,6 +38,13 @@ const KNOWN_VARIANCE: f64 = 1e-12;
 
 /// Variance of a SOC of which nothing is known: uniform over 0 to 1.
 const UNKNOWN_SOC_VARIANCE: f64 = 1.0 / 12.0;
+
+/// Where ln rho is in the state.
+const LOG_RESISTANCE: usize = 1;
+/// Where the capacity is.
+const CAPACITY: usize = 2;
+/// Where the branch voltages begin.
+const BRANCHES: usize = 3;
 
 /// Readings beyond the gate in a row before the filter may be called lost: one or two can be glitches.
 const MIN_REJECTED: u32 = 3;
@@ -134,9 +142,11 @@ macro_rules! each {
 }
 
 mod away;
+mod bank;
 mod noise;
 mod state;
 
+pub use bank::EstimatorBank;
 pub use state::CellState;
 
 use away::update_after_away;
@@ -197,7 +207,7 @@ impl CellEstimator {
         self.remember_load(model, config, step);
         self.memory.information_s += self.new_information_s(config, step);
         self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
-        let away_std = self.away_std();
+        let away_std = self.memory.away_std_if_any();
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
         let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
         let load_a = self.memory.load_a;
@@ -239,8 +249,8 @@ impl CellEstimator {
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
         if let Some(filter) = &self.filter {
-            self.memory.capacity = each!(filter, x => marginal(x, capacity_index(x)));
-            self.memory.log_resistance = each!(filter, x => marginal(x, log_resistance_index(x)));
+            self.memory.capacity = each!(filter, x => marginal(x, CAPACITY));
+            self.memory.log_resistance = each!(filter, x => marginal(x, LOG_RESISTANCE));
         }
         self.replace_unusable(config);
         let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
@@ -284,7 +294,7 @@ impl CellEstimator {
     fn forget_correlation(&mut self) {
         if let Some(filter) = &mut self.filter {
             each!(filter, x => {
-                let (r, c) = (log_resistance_index(x), capacity_index(x));
+                let (r, c) = (LOG_RESISTANCE, CAPACITY);
                 (x.covariance[(r, c)], x.covariance[(c, r)]) = (0.0, 0.0);
             });
         }
@@ -292,18 +302,10 @@ impl CellEstimator {
 
     /// The sensor's value, or the thermal model's from the last known one.
     fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
-        if let Some(measured) = step.temperature_c {
-            return measured;
-        }
-        let (Some(last_c), Some(thermal)) = (self.memory.temperature_c, &model.thermal) else {
-            return self.memory.temperature_c.unwrap_or(step.ambient_c);
-        };
-        let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
-        let place = model.place(self.soc().map_or(0.5, |soc| soc.mean), last_c);
-        let ohm = model.settled_ohm(&place) * libm::exp(self.log_resistance().mean);
-        let losses_w = square(mean_current_a) * ohm;
-        let loaded_c = circuit::temperature_after(thermal, last_c, step.ambient_c, losses_w, step.measured_s);
-        circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s)
+        step.temperature_c.unwrap_or_else(|| {
+            let soc = self.soc().map_or(0.5, |soc| soc.mean);
+            thermal_c(model, self.memory.temperature_c, soc, self.log_resistance().mean, step)
+        })
     }
 
     /// The record goes on after a gap of unknown length: branches may or may not have relaxed, and of the SOC
@@ -313,7 +315,7 @@ impl CellEstimator {
         let Some(filter) = &mut self.filter else { return };
         each!(filter, x => {
             x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
-            for i in 1..log_resistance_index(x) {
+            for i in BRANCHES..x.mean.len() {
                 x.mean[i] *= 0.5;
                 x.covariance[(i, i)] += square(x.mean[i]);
             }
@@ -323,7 +325,7 @@ impl CellEstimator {
     /// State of charge; `None` before the first voltage.
     pub fn soc(&self) -> Option<Belief> {
         let soc = self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, 0)))?;
-        let variance = self.away_std().map_or(soc.variance, |std| widened(soc.variance, square(std)));
+        let variance = self.memory.away_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
         Some(Belief { variance, ..soc })
     }
 
@@ -331,7 +333,7 @@ impl CellEstimator {
     pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
         let mut branch_v = [f64::NAN; MAX_BRANCHES];
         if let Some(filter) = &self.filter {
-            each!(filter, x => for i in 1..log_resistance_index(x) { branch_v[i - 1] = x.mean[i]; });
+            each!(filter, x => for i in BRANCHES..x.mean.len() { branch_v[i - BRANCHES] = x.mean[i]; });
         }
         branch_v
     }
@@ -340,19 +342,19 @@ impl CellEstimator {
     pub fn log_resistance(&self) -> Belief {
         self.filter
             .as_ref()
-            .map_or(self.memory.log_resistance, |filter| each!(filter, x => marginal(x, log_resistance_index(x))))
+            .map_or(self.memory.log_resistance, |filter| each!(filter, x => marginal(x, LOG_RESISTANCE)))
     }
 
     /// Capacity as the filter works with it now, Ah.
     pub fn capacity(&self) -> Belief {
-        self.filter.as_ref().map_or(self.memory.capacity, |filter| each!(filter, x => marginal(x, capacity_index(x))))
+        self.filter.as_ref().map_or(self.memory.capacity, |filter| each!(filter, x => marginal(x, CAPACITY)))
     }
 
     /// Covariance of capacity (Ah) and ln(resistance).
     pub fn capacity_resistance_covariance(&self) -> f64 {
         self.filter
             .as_ref()
-            .map_or(0.0, |filter| each!(filter, x => x.covariance[(log_resistance_index(x), capacity_index(x))]))
+            .map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
     }
 
     /// Voltage the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
@@ -368,10 +370,10 @@ impl CellEstimator {
         self.memory.capacity = belief;
         if let Some(filter) = &mut self.filter {
             each!(filter, x => {
-                let c = capacity_index(x);
-                x.mean[c] = belief.mean;
+                x.mean[CAPACITY] = belief.mean;
                 // Never below what goes with the other states' covariances.
-                x.covariance[(c, c)] = x.covariance[(c, c)].max(belief.variance);
+                let variance = &mut x.covariance[(CAPACITY, CAPACITY)];
+                *variance = variance.max(belief.variance);
             });
         }
     }
@@ -380,7 +382,7 @@ impl CellEstimator {
     pub fn hold_capacity(&mut self, capacity_ah: f64) {
         self.memory.capacity.mean = capacity_ah;
         if let Some(filter) = &mut self.filter {
-            each!(filter, x => { let c = capacity_index(x); x.mean[c] = capacity_ah; });
+            each!(filter, x => x.mean[CAPACITY] = capacity_ah);
         }
     }
 
@@ -394,6 +396,16 @@ impl CellEstimator {
     pub fn temperature_c(&self) -> Option<f64> {
         self.memory.temperature_c
     }
+}
+
+/// Temperature of a cell without a sensor's, degrees C: the thermal model's from the last known one.
+fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
+    let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
+    let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
+    let ohm = model.settled_ohm(&model.place(soc, last_c)) * libm::exp(log_resistance);
+    let loaded_c =
+        circuit::temperature_after(thermal, last_c, step.ambient_c, square(mean_current_a) * ohm, step.measured_s);
+    circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s)
 }
 
 /// Capacity (Ah) and ln(resistance) of a cell of which nothing was learned.
@@ -418,14 +430,6 @@ fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
 }
 
-const fn log_resistance_index<const N: usize>(_: &Gaussian<N>) -> usize {
-    N - 2
-}
-
-const fn capacity_index<const N: usize>(_: &Gaussian<N>) -> usize {
-    N - 1
-}
-
 fn marginal<const N: usize>(x: &Gaussian<N>, i: usize) -> Belief {
     Belief { mean: x.mean[i], variance: x.covariance[(i, i)] }
 }
@@ -441,10 +445,10 @@ fn fresh<const N: usize>(soc: Belief, branch_variance: f64, kept: &Kept) -> Gaus
     let mut mean = SVector::zeros();
     let mut variance = SVector::<f64, N>::repeat(branch_variance);
     (mean[0], variance[0]) = (soc.mean, soc.variance);
-    (mean[N - 2], variance[N - 2]) = (kept.log_resistance.mean, kept.log_resistance.variance);
-    (mean[N - 1], variance[N - 1]) = (kept.capacity.mean, kept.capacity.variance);
+    (mean[LOG_RESISTANCE], variance[LOG_RESISTANCE]) = (kept.log_resistance.mean, kept.log_resistance.variance);
+    (mean[CAPACITY], variance[CAPACITY]) = (kept.capacity.mean, kept.capacity.variance);
     let mut covariance = SMatrix::from_diagonal(&variance);
-    (covariance[(N - 2, N - 1)], covariance[(N - 1, N - 2)]) = (kept.covariance, kept.covariance);
+    (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) = (kept.covariance, kept.covariance);
     Gaussian { mean, covariance }
 }
 
@@ -461,7 +465,7 @@ fn predict<const N: usize>(
     gap_load_a: f64,
 ) -> Result<(), FilterError> {
     if step.measured_s > 0.0 || step.charge_as != 0.0 {
-        let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[N - 1]);
+        let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[CAPACITY]);
         let variance = square(config.soc_noise_per_sqrt_s) * step.measured_s
             + square(config.charge_noise_per_sqrt_soc) * moved_soc;
         propagate(x, model, config, temperature_c, step.measured_s, step.charge_as)?;
@@ -470,7 +474,7 @@ fn predict<const N: usize>(
     if step.unmeasured_s > 0.0 {
         // Nobody knows the current of that time: none assumed, but a load beside the gap may have gone on in it.
         propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
-        let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[N - 1]);
+        let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[CAPACITY]);
         let load_std = if gap_load_a > config.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
         let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s
             + square(config.self_discharge_per_s * step.unmeasured_s)
@@ -491,19 +495,21 @@ fn propagate<const N: usize>(
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let row = model.row(temperature_c);
+    // The branches' parameters are those at the middle of the step's SOC, as the mean capacity makes it.
+    let half_soc = 0.5 * charge_as / (3600.0 * x.mean[CAPACITY]);
+    let place = |soc: f64| model.place_in(&row, soc - half_soc);
     let f = |x: &SVector<f64, N>| {
         let mut next = *x;
-        next[0] = circuit::soc_after(x[0], charge_as, x[N - 1]);
-        // The branch's parameters at the middle of the step's SOC.
-        let place = model.place_in(&row, 0.5 * (x[0] + next[0]));
-        let ratio = libm::exp(x[N - 2]);
-        for i in 0..N - 3 {
-            let branch = BranchAt::new(model, i, &place, ratio);
-            next[1 + i] = branch.voltage_after(config.discretisation, x[1 + i], mean_current_a, dt_s);
+        next[0] = circuit::soc_after(x[0], charge_as, x[CAPACITY]);
+        let place = place(x[0]);
+        let ratio = libm::exp(x[LOG_RESISTANCE]);
+        for i in BRANCHES..N {
+            let branch = BranchAt::new(model, i - BRANCHES, &place, ratio);
+            next[i] = branch.voltage_after(config.discretisation, x[i], mean_current_a, dt_s);
         }
         next
     };
-    let q = noise::process::<N>(model, config, &model.place_in(&row, x.mean[0]), dt_s);
+    let q = noise::process::<N>(model, config, &place(x.mean[0]), dt_s);
     x.predict(&spread::<N>(config), f, &q)
 }
 
@@ -514,8 +520,8 @@ fn update<const N: usize>(
     reading: &Reading,
 ) -> Result<Update, FilterError> {
     let h = |x: &SVector<f64, N>| {
-        let branches_v: f64 = (1..N - 2).fold(0.0, |sum, i| sum + x[i]);
-        let state = (x[0], libm::exp(x[N - 2]), x[N - 1]);
+        let branches_v: f64 = (BRANCHES..N).fold(0.0, |sum, i| sum + x[i]);
+        let state = (x[0], libm::exp(x[LOG_RESISTANCE]), x[CAPACITY]);
         circuit::aged_terminal_v(model, state, &reading.row, branches_v, reading.current_a)
     };
     x.update(&spread::<N>(config), reading.voltage_v, h, &reading.noise(x, model, config))

@@ -96,11 +96,12 @@ pub const ERROR_WINDOW_S: f64 = 100.0;
 /// A temperature's place in the grid: found once, used for every SOC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Row {
-    t: usize,
+    /// Number of the lower temperature.
+    pub(super) t: usize,
     /// Weight of the upper temperature row, in [0, 1].
-    along_t: f64,
+    pub(super) along_t: f64,
     /// The same for resistances.
-    along_arrhenius: f64,
+    pub(super) along_arrhenius: f64,
 }
 
 /// The four grid corners round one (SOC, temperature) and their weights: found once, used for every table.

@@ -1,5 +1,6 @@
 //! Kalman filters as pure numbers: they know no battery.
 
+pub mod lanes;
 pub mod linear;
 pub mod unscented;
 

@@ -17,7 +17,7 @@
 use nalgebra::SMatrix;
 
 use super::noise::Reading;
-use super::{CellEstimator, square, update, widened};
+use super::{BRANCHES, CellEstimator, LOG_RESISTANCE, Memory, square, update, widened};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::CellModel;
 use crate::filter::{FilterError, Gaussian, Update};
@@ -42,12 +42,14 @@ impl CellEstimator {
 
     /// Whether the SOC is still the one from before time away: no voltage has been taken in since.
     pub fn is_of_before(&self) -> bool {
-        self.memory.is_unseen || self.away_std().is_some()
+        self.memory.is_unseen || self.memory.away_std_if_any().is_some()
     }
+}
 
+impl Memory {
     /// Standard deviation of what may have been moved, until a voltage has told; `None` when it is negligible.
-    pub(super) fn away_std(&self) -> Option<f64> {
-        (self.memory.away_std > NEGLIGIBLE_STD).then_some(self.memory.away_std)
+    pub(super) fn away_std_if_any(&self) -> Option<f64> {
+        (self.away_std > NEGLIGIBLE_STD).then_some(self.away_std)
     }
 }
 
@@ -63,7 +65,7 @@ pub(super) fn update_after_away<const N: usize>(
     let mut used = used(x, config, away_std);
     // The voltage as it is foreseen by a belief that wide, without moving anything.
     let foreseen = update(&mut used.clone(), model, config, reading)?.innovation_variance;
-    let drop_v = reading.current_a * model.r0_ohm(&model.place_in(&reading.row, before_soc)) * libm::exp(x.mean[N - 2]);
+    let drop_v = reading.current_a * model.r0_ohm(&model.place_in(&reading.row, before_soc)) * libm::exp(x.mean[LOG_RESISTANCE]);
     let reach = 3.0_f64.sqrt() * away_std;
     let soc = model.soc_of_ocv_in(&reading.row, reading.voltage_v + drop_v);
     // Everything within reach is as likely: the belief is taken to where the voltage is, so that the curve is straight there.
@@ -81,7 +83,7 @@ pub(super) fn update_after_away<const N: usize>(
 fn used<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, away_std: f64) -> Gaussian<N> {
     let mut used = *x;
     let soc_variance = widened(x.covariance[(0, 0)], square(away_std));
-    for i in 0..N - 2 {
+    for i in std::iter::once(0).chain(BRANCHES..N) {
         for j in 0..N {
             if i != j {
                 (used.covariance[(i, j)], used.covariance[(j, i)]) = (0.0, 0.0);
@@ -89,7 +91,7 @@ fn used<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, away_std: f64
         }
     }
     used.covariance[(0, 0)] = soc_variance;
-    for i in 1..N - 2 {
+    for i in BRANCHES..N {
         used.covariance[(i, i)] += square(config.initial_branch_std_v);
     }
     used

@@ -8,16 +8,16 @@
 
 use nalgebra::SMatrix;
 
-use super::{CellEstimator, CellStep, square};
+use super::{BRANCHES, CellEstimator, CellStep, LOG_RESISTANCE, square};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, ERROR_WINDOW_S, Place, Row};
 use crate::filter::{Gaussian, Noise};
 
 /// Rest after which a cell's voltage says little that is new, s: what still relaxes then is slower than the branches.
-const REST_REPEATS_S: f64 = 1000.0;
+pub(super) const REST_REPEATS_S: f64 = 1000.0;
 
 /// Longest time for which the resistance walks between two readings, s: it does not age in a gap.
-const MAX_WALK_S: f64 = 600.0;
+pub(super) const MAX_WALK_S: f64 = 600.0;
 
 /// Load, per rated capacity, that may have gone on in a gap when there is any beside it: 1 C.
 const GAP_LOAD_PER_H: f64 = 1.0;
@@ -61,13 +61,13 @@ pub(super) fn process<const N: usize>(
     dt_s: f64,
 ) -> SMatrix<f64, N, N> {
     let mut q = SMatrix::zeros();
-    for i in 0..N - 3 {
+    for i in BRANCHES..N {
         // Noise fed into a decaying branch: bounded by tau/2 however long the step.
-        let half_tau_s = 0.5 * model.branch_tau_s(i, place);
+        let half_tau_s = 0.5 * model.branch_tau_s(i - BRANCHES, place);
         let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
-        q[(1 + i, 1 + i)] = square(config.branch_noise_v_per_sqrt_s) * effective_s;
+        q[(i, i)] = square(config.branch_noise_v_per_sqrt_s) * effective_s;
     }
-    q[(N - 2, N - 2)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s.min(MAX_WALK_S);
+    q[(LOG_RESISTANCE, LOG_RESISTANCE)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s.min(MAX_WALK_S);
     q
 }
 
@@ -85,8 +85,8 @@ impl Reading {
     pub(super) fn noise<const N: usize>(&self, x: &Gaussian<N>, model: &CellModel, config: &EstimatorConfig) -> Noise {
         let place = model.place_in(&self.row, x.mean[0]);
         let slope_v = model.ocv_slope_v(&place);
-        let ratio = libm::exp(x.mean[N - 2]);
-        let drop_v = (1..N - 2).fold(model.r0_ohm(&place) * ratio * self.current_a, |sum, i| sum + x.mean[i]);
+        let ratio = libm::exp(x.mean[LOG_RESISTANCE]);
+        let drop_v = (BRANCHES..N).fold(model.r0_ohm(&place) * ratio * self.current_a, |sum, i| sum + x.mean[i]);
         let load_v = model.settled_ohm(&place) * ratio * self.load_a;
         let base_v_sqrt_s = model
             .voltage_error_v(&place)

@@ -3,7 +3,7 @@
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
-use super::{CellEstimator, Filter, Memory};
+use super::{BRANCHES, CAPACITY, CellEstimator, Filter, LOG_RESISTANCE, Memory};
 use crate::filter::Gaussian;
 use crate::quantity::Unsound;
 
@@ -11,11 +11,21 @@ use crate::quantity::Unsound;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellState {
-    /// Mean of the filter's state; empty before the first voltage.
+    /// Mean of the filter's state in the order [SOC, U_1 .. U_n, ln rho, C]; empty before the first voltage.
     mean: Vec<f64>,
-    /// Its covariance, row by row.
+    /// Its covariance in that order, row by row.
     covariance: Vec<f64>,
     memory: Memory,
+}
+
+/// Where in the filter's state the `i`-th of `n` numbers of the document is.
+const fn place_of(i: usize, n: usize) -> usize {
+    match i {
+        0 => 0,
+        i if i + 2 < n => BRANCHES + i - 1,
+        i if i + 2 == n => LOG_RESISTANCE,
+        _ => CAPACITY,
+    }
 }
 
 impl CellEstimator {
@@ -23,7 +33,7 @@ impl CellEstimator {
     pub fn snapshot(&self) -> CellState {
         let (mean, covariance) = self.filter.as_ref().map_or_else(
             Default::default,
-            |filter| each!(filter, x => (x.mean.as_slice().to_vec(), x.covariance.as_slice().to_vec())),
+            |filter| each!(filter, x => document(x)),
         );
         CellState { mean, covariance, memory: self.memory }
     }
@@ -81,15 +91,29 @@ fn check_log_resistance(log_resistance: f64) -> Result<(), Unsound> {
     Unsound::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
 }
 
+fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>) {
+    let place = |i| place_of(i, N);
+    let mean = (0..N).map(|i| x.mean[place(i)]).collect();
+    let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))]).collect();
+    (mean, covariance)
+}
+
 fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
     if state.mean.len() != N || state.covariance.len() != N * N {
         return None;
     }
-    let covariance = SMatrix::<f64, N, N>::from_column_slice(&state.covariance);
+    let mut mean = SVector::<f64, N>::zeros();
+    let mut covariance = SMatrix::<f64, N, N>::zeros();
+    for i in 0..N {
+        mean[place_of(i, N)] = state.mean[i];
+        for j in 0..N {
+            covariance[(place_of(i, N), place_of(j, N))] = state.covariance[i * N + j];
+        }
+    }
     let is_symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
     let goes_together = is_symmetric && covariance.cholesky().is_some();
     let covariance = if goes_together { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
-    Some(Gaussian { mean: SVector::from_column_slice(&state.mean), covariance })
+    Some(Gaussian { mean, covariance })
 }
 
 #[cfg(test)]

@@ -1,0 +1,104 @@
+//! How much faster the estimator of a pack is than the plain form of the same filter, as ratios: both are timed in turns
+//! in one run, so that what else the machine does is felt by both. The medians of the rounds are what is printed.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use packwatch::cell::{CellEstimator, CellStep, EstimatorBank};
+use packwatch::config;
+
+/// Turns each form is timed in.
+const ROUNDS: usize = 15;
+/// Rounds of a pack in one turn.
+const STEPS: u32 = 2000;
+const CELLS: usize = 96;
+
+fn main() {
+    // cargo test runs benches, too, to see that they do.
+    let rounds = if std::env::args().any(|argument| argument == "--bench") { ROUNDS } else { 1 };
+    let mut plain = Plain::new(1);
+    let mut plain_pack = Plain::new(CELLS);
+    let mut single = Bank::new(1);
+    let mut pack = Bank::new(CELLS);
+    let mut times = [const { Vec::new() }; 4];
+    for _ in 0..rounds {
+        times[0].push(time(|k| plain.step(k)));
+        times[1].push(time(|k| plain_pack.step(k)) / CELLS as f64);
+        times[2].push(time(|k| single.step(k)));
+        times[3].push(time(|k| pack.step(k)) / CELLS as f64);
+    }
+    let [plain_ns, plain_pack_ns, single_ns, pack_ns] = times.map(|mut times| {
+        times.sort_by(f64::total_cmp);
+        times[times.len() / 2]
+    });
+    println!("estimator step, 4 states, tables of 14 SOC x 3 temperatures ({rounds} rounds, medians)");
+    println!("form                                  ns/step   of plain  bar");
+    println!("plain nalgebra, one cell            {plain_ns:>9.1}       1.00");
+    println!("plain nalgebra, one of 96           {plain_pack_ns:>9.1}       {:.2}", plain_pack_ns / plain_ns);
+    println!("bank, one cell                      {single_ns:>9.1}       {:.3}  0.5", single_ns / plain_ns);
+    println!("bank, one of 96                     {pack_ns:>9.1}       {:.3}  0.14", pack_ns / plain_ns);
+}
+
+/// Nanoseconds per call.
+fn time(mut step: impl FnMut(u32)) -> f64 {
+    let started = Instant::now();
+    (0..STEPS).for_each(&mut step);
+    started.elapsed().as_secs_f64() * 1e9 / f64::from(STEPS)
+}
+
+fn example() -> config::Config {
+    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
+    config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
+}
+
+/// A cell of a pack under a load that turns now and then; cells differ by some millivolts.
+fn step(k: u32, cell: usize) -> CellStep {
+    let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
+    CellStep {
+        measured_s: 0.1,
+        charge_as: 0.1 * current_a,
+        unmeasured_s: 0.0,
+        current_a: Some(current_a),
+        temperature_c: Some(25.0 + (cell / 8) as f64),
+        ambient_c: 25.0,
+        voltage_v: 3.7 - 0.05 * current_a + 0.0005 * cell as f64,
+    }
+}
+
+struct Plain {
+    config: config::Config,
+    cells: Vec<CellEstimator>,
+}
+
+impl Plain {
+    fn new(cells: usize) -> Self {
+        let config = example();
+        Self { cells: vec![CellEstimator::new(&config.monitor.estimator); cells], config }
+    }
+
+    fn step(&mut self, k: u32) {
+        for (cell, estimator) in self.cells.iter_mut().enumerate() {
+            black_box(estimator.step(&self.config.monitor.model, &self.config.monitor.estimator, &step(k, cell)));
+        }
+    }
+}
+
+struct Bank {
+    bank: EstimatorBank,
+    steps: Vec<(usize, CellStep)>,
+    cells: usize,
+}
+
+impl Bank {
+    fn new(cells: usize) -> Self {
+        let config = example().monitor;
+        Self { bank: EstimatorBank::new(&config.model, &config.estimator, cells), steps: Vec::new(), cells }
+    }
+
+    fn step(&mut self, k: u32) {
+        self.steps.clear();
+        self.steps.extend((0..self.cells).map(|cell| (cell, step(k, cell))));
+        self.bank.step(black_box(&self.steps));
+        black_box(self.bank.result(0));
+    }
+}

@@ -1,0 +1,276 @@
+//! L numbers at once: the arithmetic of filters that step several cells together.
+//!
+//! Every operation works on each lane alone, in one order of IEEE 754 operations (no fused multiply-add, no library
+//! function), so a lane gives the same bits whatever L is, what its neighbours hold and how wide the machine's
+//! instructions are. The compiler makes vector instructions of the loops.
+
+use std::array::from_fn;
+use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
+
+/// L numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Lanes<const L: usize>(pub [f64; L]);
+
+/// L answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Mask<const L: usize>(pub [bool; L]);
+
+macro_rules! arithmetic {
+    ($trait:ident, $method:ident, $op:tt) => {
+        impl<const L: usize> $trait for Lanes<L> {
+            type Output = Self;
+
+            #[inline(always)]
+            fn $method(self, other: Self) -> Self {
+                Self(from_fn(|i| self.0[i] $op other.0[i]))
+            }
+        }
+
+        impl<const L: usize> $trait<f64> for Lanes<L> {
+            type Output = Self;
+
+            #[inline(always)]
+            fn $method(self, other: f64) -> Self {
+                Self(from_fn(|i| self.0[i] $op other))
+            }
+        }
+    };
+}
+
+arithmetic!(Add, add, +);
+arithmetic!(Sub, sub, -);
+arithmetic!(Mul, mul, *);
+arithmetic!(Div, div, /);
+
+impl<const L: usize> Neg for Lanes<L> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn neg(self) -> Self {
+        Self(from_fn(|i| -self.0[i]))
+    }
+}
+
+impl<const L: usize> BitAnd for Mask<L> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn bitand(self, other: Self) -> Self {
+        Self(from_fn(|i| self.0[i] & other.0[i]))
+    }
+}
+
+impl<const L: usize> Not for Mask<L> {
+    type Output = Self;
+
+    #[inline(always)]
+    fn not(self) -> Self {
+        Self(from_fn(|i| !self.0[i]))
+    }
+}
+
+impl<const L: usize> Mask<L> {
+    /// Whether every lane says yes.
+    #[inline(always)]
+    pub fn all(self) -> bool {
+        self.0.iter().all(|&lane| lane)
+    }
+
+    /// Whether any lane says yes.
+    #[inline(always)]
+    pub fn any(self) -> bool {
+        self.0.iter().any(|&lane| lane)
+    }
+}
+
+impl<const L: usize> Lanes<L> {
+    /// The same number in every lane.
+    #[inline(always)]
+    pub fn splat(value: f64) -> Self {
+        Self([value; L])
+    }
+
+    /// The first L of `values`.
+    ///
+    /// # Panics
+    /// When there are fewer.
+    #[inline(always)]
+    pub fn load(values: &[f64]) -> Self {
+        let values = &values[..L];
+        Self(from_fn(|i| values[i]))
+    }
+
+    /// Square of each lane.
+    #[inline(always)]
+    pub fn square(self) -> Self {
+        self * self
+    }
+
+    /// Square root of each lane; NaN below 0.
+    #[inline(always)]
+    pub fn sqrt(self) -> Self {
+        Self(self.0.map(f64::sqrt))
+    }
+
+    /// 1 / x.
+    #[inline(always)]
+    pub fn reciprocal(self) -> Self {
+        Self(from_fn(|i| 1.0 / self.0[i]))
+    }
+
+    /// Magnitude of each lane.
+    #[inline(always)]
+    pub fn abs(self) -> Self {
+        Self(self.0.map(f64::abs))
+    }
+
+    /// The smaller of each lane and `limit`; `limit` where the lane is NaN.
+    #[inline(always)]
+    pub fn at_most(self, limit: f64) -> Self {
+        Self(self.0.map(|x| if x < limit { x } else { limit }))
+    }
+
+    /// The larger of each lane and `limit`; `limit` where the lane is NaN.
+    #[inline(always)]
+    pub fn at_least(self, limit: f64) -> Self {
+        Self(self.0.map(|x| if x > limit { x } else { limit }))
+    }
+
+    /// Whether each lane is above the other's; no where one is NaN.
+    #[inline(always)]
+    pub fn above(self, other: Self) -> Mask<L> {
+        Mask(from_fn(|i| self.0[i] > other.0[i]))
+    }
+
+    /// The same for one limit.
+    #[inline(always)]
+    pub fn above_number(self, limit: f64) -> Mask<L> {
+        Mask(self.0.map(|x| x > limit))
+    }
+
+    /// Whether each lane is neither NaN nor infinite.
+    #[inline(always)]
+    pub fn is_finite(self) -> Mask<L> {
+        Mask(self.0.map(|x| x.abs() < f64::INFINITY))
+    }
+
+    /// Each lane of `self` where the mask says yes, else of `other`.
+    #[inline(always)]
+    pub fn or_else(self, mask: Mask<L>, other: Self) -> Self {
+        Self(from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
+    }
+
+    /// e^x to within two units in the last place; 0 below -708, finite above 709 too (e^709).
+    ///
+    /// x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n is
+    /// added to the exponent's bits.
+    #[inline(always)]
+    pub fn exp(self) -> Self {
+        Self(self.0.map(|x| {
+            let x = if x < 709.0 { x } else { 709.0 };
+            let clamped = if x > LEAST { x } else { LEAST };
+            let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
+            let n = shifted - ROUNDER;
+            let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
+            // Even and odd powers apart: two short chains instead of a long one.
+            let r2 = r * r;
+            let even = EXP_EVEN.iter().fold(1.0 / 479_001_600.0, |sum, factor| sum * r2 + factor);
+            let odd = EXP_ODD.iter().fold(1.0 / 39_916_800.0, |sum, factor| sum * r2 + factor);
+            let series = even + odd * r;
+            // The lowest bits of `shifted` are n; those above fall off.
+            let scaled = f64::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 52));
+            if x > LEAST { scaled } else { 0.0 }
+        }))
+    }
+
+    /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
+    ///
+    /// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).
+    #[inline(always)]
+    pub fn ln(self) -> Self {
+        Self(self.0.map(|x| {
+            // Subtracting the bits of sqrt(1/2) leaves e in the exponent's place.
+            let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
+            let exponent = above & 0xFFF0_0000_0000_0000;
+            let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
+            // e as a number without a conversion of integers: its low bits into the mantissa of a large one.
+            let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
+            let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
+            let s = (m - 1.0) / (m + 1.0);
+            let s2 = s * s;
+            let series = LN_SERIES.iter().fold(1.0 / 21.0, |sum, factor| sum * s2 + factor);
+            2.0 * s * series + e * std::f64::consts::LN_2
+        }))
+    }
+}
+
+/// Below this e^x is taken for 0: the bits of smaller results would not be a normal number's.
+const LEAST: f64 = -708.0;
+/// Adding it rounds a number below 2^51 to a whole one.
+const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
+/// 2^52.
+const LARGE: f64 = 4_503_599_627_370_496.0;
+const SQRT_HALF_BITS: u64 = std::f64::consts::FRAC_1_SQRT_2.to_bits();
+/// ln 2 in two parts, the first with 32 bits, so that its product with a small whole number is exact.
+const LN_2_HIGH: f64 = f64::from_bits(0x3FE6_2E42_FEE0_0000);
+const LN_2_LOW: f64 = f64::from_bits(0x3DEA_39EF_3579_3C76);
+
+/// 1/10!, 1/8! .. 1/0!.
+const EXP_EVEN: [f64; 6] = [1.0 / 3_628_800.0, 1.0 / 40_320.0, 1.0 / 720.0, 1.0 / 24.0, 0.5, 1.0];
+/// 1/9!, 1/7! .. 1/1!.
+const EXP_ODD: [f64; 5] = [1.0 / 362_880.0, 1.0 / 5_040.0, 1.0 / 120.0, 1.0 / 6.0, 1.0];
+
+/// 1/19, 1/17 .. 1/1.
+const LN_SERIES: [f64; 10] = [
+    1.0 / 19.0,
+    1.0 / 17.0,
+    1.0 / 15.0,
+    1.0 / 13.0,
+    1.0 / 11.0,
+    1.0 / 9.0,
+    1.0 / 7.0,
+    1.0 / 5.0,
+    1.0 / 3.0,
+    1.0,
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn exp_is_that_of_the_library() {
+        let mut x = -745.0;
+        while x < 709.0 {
+            let (ours, theirs) = (Lanes([x]).exp().0[0], libm::exp(x));
+            let close = (ours - theirs).abs() <= 2.0 * f64::EPSILON * theirs;
+            assert!(close || (x <= LEAST && ours == 0.0), "{x}: {ours} {theirs}");
+            x += 0.0137;
+        }
+        assert_eq!(Lanes([0.0, -0.0, f64::NEG_INFINITY, -1e300]).exp(), Lanes([1.0, 1.0, 0.0, 0.0]));
+        assert!(Lanes([1e300]).exp().0[0].is_finite());
+    }
+
+    #[test]
+    fn ln_is_that_of_the_library() {
+        let mut x = 1e-12_f64;
+        while x < 1e12 {
+            for x in [x, 1.0 + x.min(1.0)] {
+                let (ours, theirs) = (Lanes([x]).ln().0[0], libm::log(x));
+                assert!((ours - theirs).abs() <= 2.0 * f64::EPSILON * theirs.abs().max(1e-3), "{x}: {ours} {theirs}");
+            }
+            x *= 1.0171;
+        }
+        assert_eq!(Lanes([1.0]).ln(), Lanes([0.0]));
+    }
+
+    #[test]
+    fn a_lane_does_not_know_its_neighbours() {
+        let x = [0.3, -2.0, f64::NAN, 1e9, 7.5, 0.0, -1e-9, 55.0];
+        let all = Lanes(x).exp() * Lanes(x).sqrt() + Lanes(x).at_most(3.0).reciprocal();
+        for (i, x) in x.into_iter().enumerate() {
+            let alone = Lanes([x]).exp() * Lanes([x]).sqrt() + Lanes([x]).at_most(3.0).reciprocal();
+            assert_eq!(alone.0[0].to_bits(), all.0[i].to_bits());
+        }
+    }
+}
