@@ -393,6 +393,8 @@ impl Replay {
     fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
         self.ticks.sleep();
         self.make_ticks()?;
+        self.monitor.settle(&mut self.out);
+        self.write_out()?;
         if let (Some(store), Some(end)) = (self.settings.store.take(), self.span.latest) {
             store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
         }

@@ -51,15 +51,20 @@ pub struct End {
     pub load_v: f64,
 }
 
-/// A cell's new estimate.
+/// Where a cell is: at the end of a half-cycle, when it begins or ends now.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellEnd {
+    /// State of charge; `None` before the first estimate.
+    pub soc: Option<Belief>,
+    /// Voltage which the load of the last minutes drops in the cell, V.
+    pub load_v: f64,
+}
+
+/// A cell has a new estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Observed {
     /// When.
     pub time: Timestamp,
-    /// State of charge.
-    pub soc: Belief,
-    /// Voltage which the load of the last minutes drops in the cell, V.
-    pub load_v: f64,
     /// Temperature, degrees C; `None` = no valid sensor.
     pub temperature_c: Option<f64>,
     /// Time since the last estimate in which the current was measured, s.
@@ -88,6 +93,10 @@ struct CellMark {
 }
 
 impl CellMark {
+    fn put(&mut self, end: CellEnd) {
+        (self.soc, self.load_v) = (end.soc, end.load_v);
+    }
+
     fn check(&self) -> Result<(), Unsound> {
         for number in [self.load_v, self.temperature_integral, self.temperature_s] {
             Unsound::unless_number("a load or temperature at a half-cycle's end", number)?;
@@ -148,19 +157,18 @@ impl Learner {
         }
     }
 
-    /// Takes a cell's new estimate into its totals.
-    pub fn observe(&mut self, cell: usize, seen: &Observed) {
+    /// Takes a cell's new estimate into its totals; `end` tells where the cell is.
+    pub fn observe(&mut self, cell: usize, seen: &Observed, end: impl FnOnce() -> CellEnd) {
         let totals = &mut self.totals[cell];
-        (totals.soc, totals.load_v) = (Some(seen.soc), seen.load_v);
         if let Some(temperature_c) = seen.temperature_c {
             totals.temperature_integral += temperature_c * seen.measured_s;
             totals.temperature_s += seen.measured_s;
         }
-        if let Some(mark) = &mut self.candidate
+        if let Some(mark) = self.candidate.as_mut().filter(|_| seen.gap_s > 0.0)
             && seen.time.since(mark.time) < seen.gap_s
         {
             // Marked since the gap: what begins right behind it begins at this SOC, not at the one before.
-            (mark.cells[cell].soc, mark.cells[cell].load_v) = (Some(seen.soc), seen.load_v);
+            mark.cells[cell].put(end());
         }
     }
 
@@ -169,10 +177,11 @@ impl Learner {
         self.rest_s = 0.0;
     }
 
-    /// A mode that may follow the present one begins here.
-    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64) {
+    /// A mode that may follow the present one begins here; `end` tells where each cell is.
+    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, end: impl Fn(usize) -> CellEnd) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
+        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.put(end(cell)));
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
@@ -402,22 +411,21 @@ mod tests {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
         let mut learner = Learner::new(&config(), 1, Belief::from_std(2.0, 0.1));
-        let seen = |time_s: f64, soc: f64, gap_s: f64| Observed {
+        let seen = |time_s: f64, gap_s: f64| Observed {
             time: Timestamp::from_secs(time_s),
-            soc: Belief::from_std(soc, 0.01),
-            load_v: 0.0,
             temperature_c: None,
             measured_s: 10.0,
             gap_s,
         };
+        let at = |soc: f64| CellEnd { soc: Some(Belief::from_std(soc, 0.01)), load_v: 0.0 };
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
-        learner.observe(0, &seen(1000.0, 0.1, 0.0));
-        learner.mark_candidate(start, 0.0);
-        learner.observe(0, &seen(5000.1, 0.9, 4000.0));
+        learner.observe(0, &seen(1000.0, 0.0), || at(0.1));
+        learner.mark_candidate(start, 0.0, |_| at(0.1));
+        learner.observe(0, &seen(5000.1, 4000.0), || at(0.9));
         let mut found = Vec::new();
         learner.complete(&transition, 2.0, Mode::Unknown, &mut found);
-        learner.observe(0, &seen(8600.0, 0.4, 0.0));
-        learner.mark_candidate(end, 3600.0);
+        learner.observe(0, &seen(8600.0, 0.0), || at(0.4));
+        learner.mark_candidate(end, 3600.0, |_| at(0.4));
         learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
         assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");
     }

@@ -123,7 +123,7 @@ impl Monitor {
             for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
                 self.tell_alarms(AlarmInput::InputsValid { rule, cell: Some(cell), valid }, out);
             }
-            if !valid || self.cells[index].estimator.soc().is_none() {
+            if !valid || self.estimators.soc(index).is_none() {
                 self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::default(), out);
             }
         }
@@ -171,11 +171,11 @@ impl Monitor {
     /// SOC of the emptiest and the fullest of the cells whose estimate is fresh; `None` = of no cell.
     fn spread(&self) -> Option<Spread> {
         let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
-        for (slot, cell) in self.cells.iter().zip((0..).map(CellIndex)) {
+        for cell in (0..self.config.sample.cells).map(CellIndex) {
             let is_fresh = self.sampler.is_fresh(self.voltage_channel(cell), self.now);
             // A voltage that came before the first current says nothing yet.
-            let is_present = is_fresh && !slot.estimator.is_of_before();
-            let Some(soc) = slot.estimator.soc().filter(|_| is_present) else { continue };
+            let is_present = is_fresh && !self.estimators.is_of_before(cell.index());
+            let Some(soc) = self.estimators.soc(cell.index()).filter(|_| is_present) else { continue };
             known += 1;
             spread = Some(match spread {
                 None => Spread { lowest: soc, highest: soc, is_whole: false },
@@ -232,9 +232,9 @@ impl Monitor {
                 self.observe_alarm(Rule::CapacityLow, cell, old(capacity), out);
             }
             // A measured value is as old as the state; after a moment only it may still be taken for the present one.
-            if was_away_briefly && self.cells[index].estimator.soc().is_some() {
+            if was_away_briefly && self.estimators.soc(index).is_some() {
                 let mean_nis =
-                    Observation { value: Some(self.cells[index].estimator.mean_nis()), ..Observation::default() };
+                    Observation { value: Some(self.estimators.mean_nis(index)), ..Observation::default() };
                 self.observe_alarm(Rule::EstimateUntrusted, cell, mean_nis, out);
             }
             if let Some(resistance) = self.cells[index].discharge_resistance {
@@ -305,6 +305,7 @@ impl Monitor {
 
     /// Does what somebody asks for.
     pub(super) fn handle_command(&mut self, source: Source, command: Command, out: &mut Outputs) {
+        self.make_steps(out);
         let (changed, refused) = match command {
             Command::Acknowledge(which) => {
                 let outcome = self.tell_alarms(AlarmInput::Acknowledge(which), out);

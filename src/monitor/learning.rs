@@ -2,7 +2,7 @@
 //! pack's values.
 
 use super::alarms::learned;
-use super::{CellSlot, Event, EventKind, Monitor, Outputs};
+use super::{Event, EventKind, Monitor, Outputs, end_state};
 use crate::alarm::{Observation, Rule};
 use crate::filter::Belief;
 use crate::health::recharge::normalised_period;
@@ -18,12 +18,16 @@ impl Monitor {
     /// Takes the pack current into the mode detector; `None` = stale.
     pub(super) fn observe_current(&mut self, current_a: Option<f64>, out: &mut Outputs) {
         let observed = self.detector.observe(&self.config.health.transition, self.now, current_a);
+        if observed.change.is_some() || observed.candidate_begins {
+            self.make_steps(out);
+        }
         if let Some(change) = observed.change {
             self.complete_mode(change, out);
         }
         if observed.candidate_begins {
             let (charge_as, _) = self.sampler.counted(self.now);
-            self.learner.mark_candidate(self.now, charge_as);
+            let estimators = &self.estimators;
+            self.learner.mark_candidate(self.now, charge_as, |cell| end_state(estimators, cell));
         }
     }
 
@@ -64,17 +68,14 @@ impl Monitor {
     ) -> bool {
         let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
         let slot = &mut self.cells[index];
-        if slot.estimator.soc().is_none() {
+        if self.estimators.soc(index).is_none() {
             slot.life.learn(&self.config, half_cycle, since_before_s, None);
             return false;
         }
-        let update = self.learner.learn(
-            &self.config.model,
-            &self.config.health.capacity,
-            index,
-            &mut slot.estimator,
-            half_cycle,
-        );
+        let (model, config, learner) = (&self.config.model, &self.config.health.capacity, &mut self.learner);
+        let mut estimator = self.estimators.cell(index);
+        let update = learner.learn(model, config, index, &mut estimator, half_cycle);
+        self.estimators.put(index, &estimator);
         slot.life.learn(&self.config, half_cycle, since_before_s, Some(&update));
         if half_cycle.mode == Mode::Charge && slot.tapered {
             slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
@@ -83,14 +84,16 @@ impl Monitor {
         let restate = half_cycle.mode == Mode::Discharge || slot.usable.is_none();
         if let Some(config) = self.config.health.usable.as_ref().filter(|_| restate) {
             let capacity = update.capacity;
-            slot.usable = Some(usable_capacity(&self.config.model, config, &slot.estimator, capacity, slot.full_soc));
+            slot.usable = Some(usable_capacity(&self.config.model, config, &estimator, capacity, slot.full_soc));
         }
+        let resistance = self.resistance(index);
+        let slot = &mut self.cells[index];
         if half_cycle.mode == Mode::Discharge {
-            slot.discharge_resistance = Some(slot.resistance());
+            slot.discharge_resistance = Some(resistance);
         }
-        let (usable, resistance) = (slot.usable, slot.discharge_resistance);
+        let (usable, discharge_resistance) = (slot.usable, slot.discharge_resistance);
         out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
-        out.events.push(Event { time: self.now, kind: capacity_event(cell, slot, &update) });
+        out.events.push(Event { time: self.now, kind: capacity_event(cell, usable, resistance, &update) });
         if self.learner.has_learned(index) {
             let capacity = Observation { is_new: update.measurement.is_some(), ..learned(update.capacity) };
             self.observe_alarm(Rule::CapacityLow, Some(cell), capacity, out);
@@ -98,7 +101,7 @@ impl Monitor {
         if let Some(usable) = usable.filter(|_| restate) {
             self.observe_alarm(Rule::UsableCapacityLow, Some(cell), learned(usable), out);
         }
-        if let Some(resistance) = resistance.filter(|_| half_cycle.mode == Mode::Discharge) {
+        if let Some(resistance) = discharge_resistance.filter(|_| half_cycle.mode == Mode::Discharge) {
             self.observe_alarm(Rule::ResistanceHigh, Some(cell), learned(resistance), out);
         }
         update.measurement.is_some()
@@ -130,8 +133,8 @@ impl Monitor {
     /// The pack as the latest estimates of its cells make it, however old they are.
     fn combined(&self) -> Option<PackState> {
         let config = &self.config.health;
-        let shares = self.cells.iter().zip(0..).filter_map(|(slot, index)| {
-            let soc = slot.estimator.soc()?;
+        let shares = (0..self.config.sample.cells).filter_map(|index| {
+            let soc = self.estimators.soc(usize::from(index))?;
             let capacity = self.learner.capacity(&config.capacity, usize::from(index));
             Some(CellShare {
                 cell: CellIndex(index),
@@ -184,16 +187,20 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
     }
 }
 
-fn capacity_event(cell: CellIndex, slot: &CellSlot, update: &CapacityUpdate) -> EventKind {
-    let resistance = slot.resistance();
+fn capacity_event(
+    cell: CellIndex,
+    usable: Option<Belief>,
+    resistance: Belief,
+    update: &CapacityUpdate,
+) -> EventKind {
     EventKind::Capacity {
         cell,
         measured_ah: update.measurement.map(|z| z.value),
         measured_std_ah: update.measurement.map(|z| z.variance.sqrt()),
         capacity_ah: update.capacity.mean,
         capacity_std_ah: update.capacity.std(),
-        usable_capacity_ah: slot.usable.map(|usable| usable.mean),
-        usable_capacity_std_ah: slot.usable.as_ref().map(Belief::std),
+        usable_capacity_ah: usable.map(|usable| usable.mean),
+        usable_capacity_std_ah: usable.as_ref().map(Belief::std),
         resistance_ratio: resistance.mean,
         resistance_ratio_std: resistance.std(),
     }

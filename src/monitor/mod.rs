@@ -43,9 +43,9 @@ use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
 use crate::can::j1939::Node;
 use crate::can::{CanId, Frame};
-use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
+use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorBank, EstimatorConfig};
 use crate::filter::Belief;
-use crate::health::{HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{CellEnd, HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
@@ -83,13 +83,13 @@ pub struct MonitorConfig {
     pub j1939: Option<J1939Config>,
 }
 
-/// One cell's estimator and what it has consumed of the pack's totals.
+/// What is known of a cell beside its estimator, and what that has consumed of the pack's totals.
 #[derive(Debug, Clone)]
 struct CellSlot {
-    estimator: CellEstimator,
     /// Sampler totals at the last step; `None` before the first.
     consumed: Option<Consumed>,
-    latest: Option<Estimate>,
+    /// The sample of the latest estimate.
+    sample: Option<CellSample>,
     trusted: bool,
     /// SOC the last full charge left; 1 until one was seen.
     full_soc: f64,
@@ -106,9 +106,8 @@ impl CellSlot {
     /// A cell of which nothing is known.
     fn new(config: &MonitorConfig) -> Self {
         Self {
-            estimator: CellEstimator::new(&config.estimator),
             consumed: None,
-            latest: None,
+            sample: None,
             trusted: true,
             full_soc: 1.0,
             tapered: false,
@@ -117,13 +116,6 @@ impl CellSlot {
             life: CellLife::new(config),
             updated_in_round: false,
         }
-    }
-
-    /// Resistance relative to new.
-    fn resistance(&self) -> Belief {
-        let log_resistance = self.estimator.log_resistance();
-        let ratio = libm::exp(log_resistance.mean);
-        Belief::from_std(ratio, ratio * log_resistance.std())
     }
 }
 
@@ -150,7 +142,10 @@ pub struct Monitor {
     intake: Intake,
     identity: identity::Identity,
     sampler: Sampler,
+    estimators: EstimatorBank,
     cells: Vec<CellSlot>,
+    /// Samples that wait for their step, in the order in which they came, at most one of a cell.
+    waiting: Vec<CellSample>,
     detector: TransitionDetector,
     learner: Learner,
     /// When the last half-cycle taught something; `None` = never, or nobody knows how long ago.
@@ -182,6 +177,8 @@ struct Scratch {
     signal_changes: Vec<SignalChange>,
     alarm_changes: Vec<AlarmChange>,
     half_cycles: Vec<HalfCycle>,
+    steps: Vec<(usize, CellStep)>,
+    gaps_s: Vec<f64>,
 }
 
 impl MonitorConfig {
@@ -205,13 +202,16 @@ impl Monitor {
     pub fn new(config: MonitorConfig) -> Self {
         let cells = usize::from(config.sample.cells);
         let slot = CellSlot::new(&config);
+        let estimators = EstimatorBank::new(&config.model, &config.estimator, cells);
         Self {
             intake: Intake::new(&config),
             identity: identity::Identity::default(),
             sampler: Sampler::new(config.sample.clone()),
-            learner: Learner::new(&config.health.capacity, cells, slot.estimator.capacity()),
+            learner: Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity()),
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
+            estimators,
             cells: vec![slot; cells],
+            waiting: Vec::with_capacity(cells),
             started: false,
             heard: false,
             now: Timestamp::ZERO,
@@ -250,7 +250,15 @@ impl Monitor {
             self.start(time, out);
         }
         match input {
-            Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => {}
+            Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => return,
+            Input::Frame { .. } => {}
+            Input::Tick { .. }
+            | Input::Bus { .. }
+            | Input::UnknownGap { .. }
+            | Input::Command { .. }
+            | Input::Store { .. } => self.make_steps(out),
+        }
+        match input {
             Input::UnknownGap { .. } => self.handle_unknown_gap(time, out),
             Input::Tick { .. } => {
                 self.advance(time, out);
@@ -282,9 +290,10 @@ impl Monitor {
         }
     }
 
-    /// The latest estimate of every cell, for live tables; `None` before its first.
-    pub fn latest(&self) -> impl Iterator<Item = Option<&Estimate>> {
-        self.cells.iter().map(|cell| cell.latest.as_ref())
+    /// The latest estimate of every cell, for live tables; `None` before its first. What came since the last
+    /// [`settle`](Self::settle) is not in it.
+    pub fn latest(&self) -> impl Iterator<Item = Option<Estimate>> {
+        (0..self.cells.len()).map(|index| self.estimate(index))
     }
 
     /// The pack as its limiting cells make it; `None` before every cell has an estimate.
@@ -344,8 +353,13 @@ impl Monitor {
         let taken = self.apply_pending(time, out);
         let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
         if taken == Taken::Aged {
+            if !was_away_briefly {
+                // What was measured before the time away belongs before it.
+                self.make_steps(out);
+            }
             let away_s = time.since(self.now);
-            self.cells.iter_mut().for_each(|cell| cell.estimator.note_away(&self.config.estimator, away_s));
+            let config = self.config.estimator;
+            self.estimators.change_all(|estimator| estimator.note_away(&config, away_s));
         }
         if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
@@ -362,9 +376,11 @@ impl Monitor {
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
     fn forget_learned(&mut self) {
-        let slot = CellSlot::new(&self.config);
-        self.learner = Learner::new(&self.config.health.capacity, self.cells.len(), slot.estimator.capacity());
-        self.cells.fill(slot);
+        let (config, cells) = (&self.config, self.cells.len());
+        self.estimators = EstimatorBank::new(&config.model, &config.estimator, cells);
+        self.learner =
+            Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
+        self.cells.fill(CellSlot::new(config));
         self.learned_at = None;
         self.detector = TransitionDetector::default();
         self.recharge = RechargeTimer::default();
@@ -396,11 +412,12 @@ impl Monitor {
     /// Nobody listened after `now`: the mode is unknown from there, nothing is timed over it, and the pack's values
     /// wait for a new reading of every cell.
     fn fall_asleep(&mut self, out: &mut Outputs) {
+        self.make_steps(out);
         self.intake.restart(self.now, out);
         self.observe_current(None, out);
         self.tell_alarms(AlarmInput::Gap, out);
         self.recharge.interrupt();
-        self.cells.iter_mut().for_each(|cell| cell.estimator.note_asleep());
+        self.estimators.change_all(CellEstimator::note_asleep);
         self.forget_pack();
     }
 
@@ -425,10 +442,8 @@ impl Monitor {
         self.sampler.handle_gap(time);
         self.schedule.restart(time);
         self.start_j1939(self.now, out);
-        for cell in &mut self.cells {
-            cell.estimator.handle_unknown_gap();
-            cell.consumed = None;
-        }
+        self.estimators.change_all(CellEstimator::handle_unknown_gap);
+        self.cells.iter_mut().for_each(|cell| cell.consumed = None);
     }
 
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
@@ -454,7 +469,7 @@ impl Monitor {
                 self.observe_current(self.sampler.pack_current_a(self.now), out);
             }
             if let Some(sample) = sample {
-                self.step_cell(&sample, out);
+                self.note_sample(sample, out);
             }
         }
         self.scratch.readings = readings;
@@ -471,21 +486,70 @@ impl Monitor {
         }
     }
 
-    /// One voltage reading of one cell: what happened since its last one, then the estimator.
-    fn step_cell(&mut self, sample: &CellSample, out: &mut Outputs) {
+    /// Cells mostly report in rounds: their steps are made together once all have reported, or one does for the second time.
+    fn note_sample(&mut self, sample: CellSample, out: &mut Outputs) {
         let index = sample.cell.index();
+        if self.cells[index].updated_in_round {
+            self.close_round(out);
+        }
+        self.cells[index].updated_in_round = true;
+        self.waiting.push(sample);
+        self.updated_cells += 1;
+        if self.updated_cells == self.cells.len() {
+            self.close_round(out);
+        }
+    }
+
+    /// The round is over: the pack's values.
+    fn close_round(&mut self, out: &mut Outputs) {
+        self.make_steps(out);
+        self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
+        self.updated_cells = 0;
+        self.combine_pack(out);
+    }
+
+    /// Makes the steps of the cells whose voltages have come since the last time, without waiting for the others. The
+    /// core does so by itself before anything that asks for estimates; a driver does after its last input.
+    pub fn settle(&mut self, out: &mut Outputs) {
+        let told = out.events.len();
+        self.make_steps(out);
+        self.statistics.note_events(&out.events[told..]);
+    }
+
+    fn make_steps(&mut self, out: &mut Outputs) {
+        if self.waiting.is_empty() {
+            return;
+        }
+        let mut waiting = std::mem::take(&mut self.waiting);
+        let mut steps = std::mem::take(&mut self.scratch.steps);
+        let mut gaps_s = std::mem::take(&mut self.scratch.gaps_s);
+        for sample in &waiting {
+            let (step, gap_s) = self.next_step(sample.cell.index(), sample);
+            steps.push((sample.cell.index(), step));
+            gaps_s.push(gap_s);
+        }
+        self.estimators.step(&steps);
+        for ((sample, (_, step)), gap_s) in waiting.iter().zip(&steps).zip(&gaps_s) {
+            self.take_estimate(sample, step.measured_s, *gap_s, out);
+        }
+        (waiting.clear(), steps.clear(), gaps_s.clear());
+        (self.waiting, self.scratch.steps, self.scratch.gaps_s) = (waiting, steps, gaps_s);
+    }
+
+    /// What happened to a cell between the sample before and the latest one, and for how long nobody measured, s.
+    fn next_step(&mut self, index: usize, sample: &CellSample) -> (CellStep, f64) {
         let slot = &mut self.cells[index];
+        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
+        let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
         let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
         // Before the first reading, and where a record goes on after it is unknown how long, nobody measured for ever.
         let mut gap_s = f64::INFINITY;
-        if let Some(before) = slot.consumed {
-            charge_as = sample.charge_as - before.charge_as;
-            unmeasured_s = sample.unmeasured_s - before.unmeasured_s;
+        if let Some(before) = slot.consumed.replace(now) {
+            charge_as = charge - before.charge_as;
+            unmeasured_s = unmeasured - before.unmeasured_s;
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
             gap_s = unmeasured_s;
         }
-        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
-        slot.consumed = Some(Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured });
         // What charges and discharges have shown to be the sensor's, not the cell's.
         let offset_a = self.learner.current_offset_a(index);
         let step = CellStep {
@@ -497,34 +561,37 @@ impl Monitor {
             ambient_c: self.config.sample.ambient_c,
             voltage_v: sample.voltage_v,
         };
-        let result = slot.estimator.step(&self.config.model, &self.config.estimator, &step);
+        (step, gap_s)
+    }
+
+    /// What follows from a cell's step.
+    fn take_estimate(&mut self, sample: &CellSample, measured_s: f64, gap_s: f64, out: &mut Outputs) {
+        let index = sample.cell.index();
+        let result = *self.estimators.result(index);
         self.statistics.note_voltage(&result);
-        let Some(soc) = slot.estimator.soc() else { return };
+        if self.estimators.soc(index).is_none() {
+            return;
+        }
+        self.cells[index].sample = Some(*sample);
         if result.reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
             self.recharge.discard();
         }
-        let load_v = slot.estimator.load_v(&self.config.model);
-        let (time, temperature_c) = (sample.time, sample.temperature_c);
-        let seen = Observed { time, soc, load_v, temperature_c, measured_s, gap_s };
-        self.learner.observe(index, &seen);
+        let seen = Observed { time: sample.time, temperature_c: sample.temperature_c, measured_s, gap_s };
+        let estimators = &self.estimators;
+        self.learner.observe(index, &seen, || end_state(estimators, index));
         self.note_taper(sample);
         self.judge_trust(sample.cell, out);
-        let capacity = self.capacity(sample.cell);
-        let slot = &mut self.cells[index];
-        let estimate = estimate_of(sample, &slot.estimator, soc, capacity, result.update);
         if out.want_estimates {
-            out.estimates.push(estimate);
+            out.estimates.extend(self.estimate(index));
         }
-        slot.latest = Some(estimate);
-        self.close_round(index, out);
     }
 
     /// Whether the filter's innovations agree with its covariance; told on change.
     fn judge_trust(&mut self, cell: CellIndex, out: &mut Outputs) {
         let slot = &mut self.cells[cell.index()];
-        let mean_nis = slot.estimator.mean_nis();
+        let mean_nis = self.estimators.mean_nis(cell.index());
         let trusted = mean_nis <= self.config.estimator.consistency_limit;
         if trusted != slot.trusted {
             slot.trusted = trusted;
@@ -536,42 +603,40 @@ impl Monitor {
         }
     }
 
-    /// Once every cell has a new estimate, or one has its second: the pack's values.
-    fn close_round(&mut self, index: usize, out: &mut Outputs) {
-        let second = std::mem::replace(&mut self.cells[index].updated_in_round, true);
-        self.updated_cells += usize::from(!second);
-        if second || self.updated_cells == self.cells.len() {
-            self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
-            self.updated_cells = 0;
-            self.combine_pack(out);
-        }
+    /// A cell's estimate after its latest step; `None` before the first.
+    fn estimate(&self, index: usize) -> Option<Estimate> {
+        let sample = self.cells[index].sample.as_ref()?;
+        let (soc, capacity) = (self.estimators.soc(index)?, self.capacity(sample.cell));
+        let update = self.estimators.result(index).update;
+        let resistance = self.resistance(index);
+        Some(Estimate {
+            time: sample.time,
+            cell: sample.cell,
+            soc: soc.mean,
+            soc_std: soc.std(),
+            branch_v: self.estimators.branch_v(index),
+            capacity_ah: capacity.mean,
+            capacity_std_ah: capacity.std(),
+            resistance_ratio: resistance.mean,
+            resistance_ratio_std: resistance.std(),
+            innovation_v: update.map_or(f64::NAN, |u| u.innovation),
+            innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
+            accepted: update.is_some_and(|u| u.accepted),
+            voltage_v: sample.voltage_v,
+            current_a: sample.current_a.unwrap_or(f64::NAN),
+            temperature_c: self.estimators.temperature_c(index).unwrap_or(f64::NAN),
+        })
+    }
+
+    /// Resistance of a cell relative to new.
+    fn resistance(&self, index: usize) -> Belief {
+        let log_resistance = self.estimators.log_resistance(index);
+        let ratio = libm::exp(log_resistance.mean);
+        Belief::from_std(ratio, ratio * log_resistance.std())
     }
 }
 
-fn estimate_of(
-    sample: &CellSample,
-    estimator: &CellEstimator,
-    soc: Belief,
-    capacity: Belief,
-    update: Option<crate::filter::Update>,
-) -> Estimate {
-    let log_resistance = estimator.log_resistance();
-    let resistance_ratio = libm::exp(log_resistance.mean);
-    Estimate {
-        time: sample.time,
-        cell: sample.cell,
-        soc: soc.mean,
-        soc_std: soc.std(),
-        branch_v: estimator.branch_v(),
-        capacity_ah: capacity.mean,
-        capacity_std_ah: capacity.std(),
-        resistance_ratio,
-        resistance_ratio_std: resistance_ratio * log_resistance.std(),
-        innovation_v: update.map_or(f64::NAN, |u| u.innovation),
-        innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
-        accepted: update.is_some_and(|u| u.accepted),
-        voltage_v: sample.voltage_v,
-        current_a: sample.current_a.unwrap_or(f64::NAN),
-        temperature_c: estimator.temperature_c().unwrap_or(f64::NAN),
-    }
+/// Where a half-cycle that begins or ends now would begin or end for a cell.
+fn end_state(estimators: &EstimatorBank, index: usize) -> CellEnd {
+    CellEnd { soc: estimators.soc(index), load_v: estimators.load_v(index) }
 }

@@ -52,6 +52,7 @@ impl Monitor {
         let told = out.events.len();
         let changed = self.config.changed_tables(&config);
         let old = std::mem::replace(&mut self.config, config);
+        self.estimators.reconfigure(&self.config.model, &self.config.estimator);
         self.intake.reconfigure(&self.config);
         self.sampler.reconfigure(&self.config.sample);
         self.take_over_output(&old, out);

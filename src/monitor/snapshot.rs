@@ -15,7 +15,7 @@ use crate::cell::{CellEstimator, CellState};
 use crate::filter::Belief;
 use crate::health::{Axis, Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{Timestamp, Unsound};
-use crate::sample::SamplerState;
+use crate::sample::{CellSample, SamplerState};
 
 /// Layout version of [`Snapshot`].
 const SNAPSHOT_VERSION: u32 = 2;
@@ -29,6 +29,9 @@ pub struct Snapshot {
     /// When it was taken, on the clock of the inputs.
     pub time: Timestamp,
     cells: Vec<CellDocument>,
+    /// Samples whose step was not made yet.
+    #[serde(default)]
+    waiting: Vec<CellSample>,
     sampler: SamplerState,
     detector: TransitionDetector,
     learner: Learner,
@@ -136,7 +139,8 @@ impl Monitor {
         Snapshot {
             version: SNAPSHOT_VERSION,
             time: self.now,
-            cells: self.cells.iter().map(CellSlot::document).collect(),
+            cells: (0..self.cells.len()).map(|cell| self.document(cell)).collect(),
+            waiting: self.waiting.clone(),
             sampler: self.sampler.snapshot(),
             detector: self.detector.clone(),
             learner: self.learner.clone(),
@@ -171,6 +175,7 @@ impl Monitor {
         let fits = snapshot.cells.len() == self.cells.len()
             && snapshot.learner.fits(self.cells.len())
             && self.sampler.fits(&snapshot.sampler)
+            && snapshot.waiting_fits()
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
             return Err(RestoreError::Shape {
@@ -196,9 +201,13 @@ impl Monitor {
         let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
         snapshot.rebase(by_nanos);
         let branches = self.config.model.branches.len();
-        for (slot, document) in self.cells.iter_mut().zip(&snapshot.cells) {
-            slot.take_up(document, branches, &self.config);
+        for (cell, document) in snapshot.cells.iter().enumerate() {
+            self.cells[cell].take_up(document, &self.config);
+            if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
+                self.estimators.put(cell, &estimator);
+            }
         }
+        self.waiting = snapshot.waiting;
         // Checked in `restore`.
         let _ = self.sampler.restore(&snapshot.sampler);
         self.detector = snapshot.detector;
@@ -237,6 +246,13 @@ impl Monitor {
 }
 
 impl Snapshot {
+    /// Whether the samples that wait are of its cells, and each of another.
+    fn waiting_fits(&self) -> bool {
+        let mut waits = vec![false; self.cells.len()];
+        let mut is_first = |cell: usize| waits.get_mut(cell).is_some_and(|waits| !std::mem::replace(waits, true));
+        self.waiting.iter().all(|sample| is_first(sample.cell.index()))
+    }
+
     /// Whether its numbers can be gone on with.
     fn check(&self) -> Result<(), RestoreError> {
         for (cell, document) in self.cells.iter().enumerate() {
@@ -244,6 +260,7 @@ impl Snapshot {
                 |Unsound { what, found, allowed }| RestoreError::Number { what, cell: Some(cell), found, allowed };
             document.check().map_err(at_cell)?;
         }
+        self.waiting.iter().try_for_each(CellSample::check)?;
         self.sampler.check()?;
         self.learner.check()?;
         self.recharge.check()?;
@@ -258,6 +275,7 @@ impl Snapshot {
         for consumed in self.cells.iter_mut().filter_map(|cell| cell.consumed.as_mut()) {
             consumed.time = consumed.time.plus_nanos(by_nanos);
         }
+        self.waiting.iter_mut().for_each(|sample| sample.time = sample.time.plus_nanos(by_nanos));
         self.sampler.rebase(by_nanos);
         self.detector.rebase(by_nanos);
         self.learner.rebase(by_nanos);
@@ -289,25 +307,25 @@ fn check_belief(what: &'static str, belief: Option<Belief>) -> Result<(), Unsoun
     Unsound::unless_natural(what, variance)
 }
 
-impl CellSlot {
-    fn document(&self) -> CellDocument {
+impl Monitor {
+    fn document(&self, cell: usize) -> CellDocument {
+        let slot = &self.cells[cell];
         CellDocument {
-            estimator: self.estimator.snapshot(),
-            consumed: self.consumed,
-            trusted: self.trusted,
-            full_soc: self.full_soc,
-            tapered: self.tapered,
-            usable: self.usable,
-            discharge_resistance: self.discharge_resistance,
-            forecast: Some(self.life.forecast.clone()),
-            updated_in_round: self.updated_in_round,
+            estimator: self.estimators.cell(cell).snapshot(),
+            consumed: slot.consumed,
+            trusted: slot.trusted,
+            full_soc: slot.full_soc,
+            tapered: slot.tapered,
+            usable: slot.usable,
+            discharge_resistance: slot.discharge_resistance,
+            forecast: Some(slot.life.forecast.clone()),
+            updated_in_round: slot.updated_in_round,
         }
     }
+}
 
-    fn take_up(&mut self, document: &CellDocument, branches: usize, config: &MonitorConfig) {
-        if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
-            self.estimator = estimator;
-        }
+impl CellSlot {
+    fn take_up(&mut self, document: &CellDocument, config: &MonitorConfig) {
         self.consumed = document.consumed;
         self.trusted = document.trusted;
         self.full_soc = document.full_soc;

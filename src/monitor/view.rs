@@ -91,7 +91,7 @@ impl Monitor {
         let slot = &self.cells[cell.index()];
         let channel = self.voltage_channel(cell);
         let is_fresh = self.sampler.is_fresh(channel, self.now);
-        let soc = slot.estimator.soc().filter(|_| is_fresh);
+        let soc = self.estimators.soc(cell.index()).filter(|_| is_fresh);
         CellView {
             cell,
             voltage_v: self.sampler.reported(channel, self.now).filter(|_| is_fresh),
@@ -100,7 +100,7 @@ impl Monitor {
             soc,
             capacity: self.learner.has_learned(cell.index()).then(|| self.capacity(cell)),
             usable_capacity: slot.usable.filter(|_| self.learner.has_learned(cell.index())),
-            resistance_ratio: soc.map(|_| slot.resistance()),
+            resistance_ratio: soc.map(|_| self.resistance(cell.index())),
             remaining_life: self.remaining_life(cell),
             trusted: soc.map(|_| slot.trusted),
         }

@@ -20,7 +20,8 @@ use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp
 pub const FLOW_SHARE: f64 = 0.01;
 
 /// Everything a cell's update needs, at the time of its voltage.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct CellSample {
     /// Time of the voltage reading.
     pub time: Timestamp,
@@ -37,6 +38,18 @@ pub struct CellSample {
     pub unmeasured_s: f64,
     /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
     pub temperature_c: Option<f64>,
+}
+
+impl CellSample {
+    /// Whether the numbers of a stored one can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), Unsound> {
+        let known = [self.current_a, self.temperature_c].into_iter().flatten();
+        let mut numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
+        numbers.try_for_each(|found| Unsound::unless_number("a sample that waits for its step", found))
+    }
 }
 
 /// A signal turned bad (`Err`: why) or good again (`Ok`: after so many bad readings).

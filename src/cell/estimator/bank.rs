@@ -52,7 +52,7 @@ struct Cell {
 impl Cell {
     /// Whether a step that measured the current all the time can be an ordinary one.
     fn is_ordinary(&self) -> bool {
-        self.has_filter && self.memory.rejected == 0 && !self.memory.is_unseen && self.memory.away_std == 0.0
+        self.has_filter && self.memory.rejected == 0 && self.memory.away_std_if_any().is_none()
     }
 }
 
@@ -68,8 +68,14 @@ enum Filters {
 struct Lane<const N: usize, const T: usize, const W: usize> {
     tables: Tables<W>,
     blocks: Vec<State<WIDTH, N, T>>,
-    /// The time most cells last stepped over, s, and what it leaves: readings mostly come in one rhythm.
-    rhythm: (f64, Kept<1>),
+    rhythm: Rhythm,
+}
+
+/// The time cells last stepped over, s, and what it leaves: readings mostly come in one rhythm.
+#[derive(Debug, Clone)]
+struct Rhythm {
+    time_s: f64,
+    kept: Kept<1>,
 }
 
 /// Runs an expression for the pack's number of branches.
@@ -307,6 +313,18 @@ impl EstimatorBank {
     }
 }
 
+impl Rhythm {
+    #[inline(always)]
+    fn kept(&mut self, c: &Constants, time_s: &Lanes<WIDTH>) -> Kept<WIDTH> {
+        if time_s.0.iter().all(|&time_s| time_s == self.time_s) {
+            return Kept::splat(&self.kept);
+        }
+        let kept = Kept::after(c, *time_s);
+        *self = Self { time_s: time_s.0[0], kept: kept.lane(0) };
+        kept
+    }
+}
+
 /// The steps of a batch, to be made with the machine's widest instructions.
 struct StepAll<'a, const N: usize, const T: usize, const W: usize> {
     lanes: &'a mut Lane<N, T, W>,
@@ -334,7 +352,7 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         let mut mean = [zero; N];
         mean[CAPACITY] = Lanes::splat(1e3);
         let state = State { mean, covariance, memory: [zero; kernel::MEMORY] };
-        Self { tables: Tables::new(model), blocks: vec![state; blocks], rhythm: (f64::NAN, Kept::NONE) }
+        Self { tables: Tables::new(model), blocks: vec![state; blocks], rhythm: Rhythm { time_s: f64::NAN, kept: Kept::NONE } }
     }
 
     fn constants(&self, model: &CellModel, config: &EstimatorConfig) -> Constants {
@@ -350,11 +368,12 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             if count == 0 {
                 continue;
             }
+            self.tables.begin_block();
             for lane in 0..cells.len() {
                 let isotherm = self.tables.isotherm(block.temperature_c[lane], cells[lane].isotherm);
                 (cells[lane].isotherm, block.input.isotherms[lane]) = (isotherm, isotherm);
             }
-            block.input.kept = self.kept(c, &block.input.measured_s);
+            block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             if count == 1
                 && let Some(lane) = block.is_present.iter().position(|&present| present)
             {
@@ -379,16 +398,6 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 }
             }
         }
-    }
-
-    #[inline(always)]
-    fn kept(&mut self, c: &Constants, time_s: &Lanes<WIDTH>) -> Kept<WIDTH> {
-        if time_s.0.iter().all(|&time_s| time_s == self.rhythm.0) {
-            return Kept::splat(&self.rhythm.1);
-        }
-        let kept = Kept::after(c, *time_s);
-        self.rhythm = (time_s.0[0], kept.lane(0));
-        kept
     }
 
     fn filter(&self, block: usize, lane: usize, make: fn(Gaussian<N>) -> Filter) -> (Filter, [f64; kernel::MEMORY]) {
@@ -432,6 +441,7 @@ impl BlockInput {
         self.is_present[lane] = false;
         cell.memory.last_current_a = self.input.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c[lane]);
+        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
         let update = Update {
             innovation: outcome.innovation_v.0[from],
             innovation_variance: outcome.innovation_variance.0[from],

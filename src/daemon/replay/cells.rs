@@ -35,7 +35,7 @@ pub(super) fn summaries(
     monitor: &Monitor,
     usable: &BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
 ) -> Vec<CellSummary> {
-    let of = |estimate: &Estimate| {
+    let of = |estimate: Estimate| {
         let (usable_capacity_ah, usable_capacity_std_ah) = usable.get(&estimate.cell).copied().unwrap_or_default();
         CellSummary {
             cell: estimate.cell.0,

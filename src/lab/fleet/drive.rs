@@ -86,6 +86,8 @@ pub(crate) fn drive(
     }
     ticks.sleep();
     tick(&mut ticks, &mut monitor, None)?;
+    monitor.settle(&mut out);
+    each(&monitor, &mut out)?;
     report(source.read_bytes().load(Ordering::Relaxed) - told);
     driven.finish(source.counts());
     Ok(driven)

@@ -2,7 +2,7 @@
 //!
 //! Per interval of SOC one row with the line of every quantity (value at SOC 0 and slope), so that one place gives all of
 //! them without a division. Temperatures change slowly and are shared by cells: the rows of a temperature are made once
-//! and kept ([`KEPT`] temperatures, the oldest makes room).
+//! and kept until room is needed for another ([`KEPT`] of them).
 
 use crate::cell::model::CellModel;
 use crate::filter::lanes::Lanes;
@@ -35,7 +35,11 @@ pub(super) struct Tables<const W: usize> {
     /// Rows at the temperatures of `kept`.
     rows: Vec<[f64; W]>,
     kept: [f64; KEPT],
-    oldest: usize,
+    /// The block of cells that needed each of them last.
+    needed_by: [u64; KEPT],
+    block: u64,
+    /// Which makes room next, if the present block does not need it.
+    next: usize,
     has_error: bool,
 }
 
@@ -59,7 +63,9 @@ impl<const W: usize> Tables<W> {
             nodes: nodes.collect(),
             rows: vec![[0.0; W]; KEPT * (model.soc.len() - 1)],
             kept: [f64::NAN; KEPT],
-            oldest: 0,
+            needed_by: [0; KEPT],
+            block: 0,
+            next: 0,
             has_error: model.voltage_error_v.is_some(),
             model: model.clone(),
         }
@@ -69,10 +75,18 @@ impl<const W: usize> Tables<W> {
         self.has_error
     }
 
-    /// Number of the first row of a temperature; `hint` is where it was the last time.
+    /// The isotherms asked for from here on stay until this is called again; fewer than [`KEPT`] of them.
+    #[inline(always)]
+    pub(super) fn begin_block(&mut self) {
+        self.block += 1;
+    }
+
+    /// Number of the rows of a temperature; `hint` is what it was the last time.
     #[inline(always)]
     pub(super) fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
-        if self.kept[hint % KEPT] == temperature_c { hint } else { self.find(temperature_c) }
+        let slot = if self.kept[hint % KEPT] == temperature_c { hint % KEPT } else { self.find(temperature_c) };
+        self.needed_by[slot] = self.block;
+        slot
     }
 
     /// The rows of a temperature are found among the kept ones, or made.
@@ -82,8 +96,11 @@ impl<const W: usize> Tables<W> {
         if let Some(found) = self.kept.iter().position(|&kept| kept == temperature_c) {
             return found;
         }
-        let slot = self.oldest;
-        self.oldest = (slot + 1) % KEPT;
+        while self.needed_by[self.next] == self.block {
+            self.next = (self.next + 1) % KEPT;
+        }
+        let slot = self.next;
+        self.next = (slot + 1) % KEPT;
         self.kept[slot] = temperature_c;
         let place = self.model.row(temperature_c);
         let mut along = [place.along_t; W];
