@@ -9,7 +9,8 @@ use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::machine::{Change, Machine, Refusal, State};
+use super::judge::Verdict;
+use super::machine::{Change, Machine, Refusal, Standing, State};
 use super::{Observation, Outcome, Rule, RuleConfig, Scope, Selector, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -112,6 +113,8 @@ struct RuleSlots {
     cell_slots: usize,
     /// Alarms of it whose value is not known.
     unknown: usize,
+    /// Alarms of it that are not at rest.
+    restless: usize,
 }
 
 impl RuleSlots {
@@ -121,7 +124,8 @@ impl RuleSlots {
             Scope::Cell => (0, cells),
             Scope::Both => (1, cells),
         };
-        Self { config, first, pack_slots, cell_slots, unknown: pack_slots + cell_slots }
+        let all = pack_slots + cell_slots;
+        Self { config, first, pack_slots, cell_slots, unknown: all, restless: all }
     }
 
     fn slots(&self) -> Range<usize> {
@@ -208,16 +212,26 @@ impl AlarmEngine {
         }
     }
 
+    /// Whether values of `rule`, whatever cell they are of, change nothing as long as none is worse than `worst`: every
+    /// alarm is at rest, and that is not beyond a threshold. Also when nothing watches the rule.
+    pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
+        self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
+            let is_beyond = || Verdict::of(&slots.config, &Observation::new(Some(worst))).0 != Verdict::Healthy;
+            slots.restless == 0 && !is_beyond()
+        })
+    }
+
     /// Lets time pass for the values that hold until the next one ([`Row::is_learned`](super::rule::Row::is_learned)).
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
             let config = &self.rules[index].config;
+            let before = self.machines[slot].standing();
             let change = if config.rule.row().is_learned { self.machines[slot].poll(now, config) } else { None };
             if let Some(change) = change {
                 // The slot leaves `counting`, so the next one moves into its place.
-                self.file(index, slot, self.machines[slot].is_known);
+                self.file(index, slot, before);
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             } else {
                 next += 1;
@@ -230,8 +244,9 @@ impl AlarmEngine {
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
+            let before = self.machines[slot].standing();
             self.machines[slot].handle_gap();
-            set_member(&mut self.counting, slot, false);
+            self.file(self.rule_of(slot), slot, before);
         }
     }
 
@@ -255,7 +270,7 @@ impl AlarmEngine {
             }
             for slot in self.rules[index].slots() {
                 let old = std::mem::take(&mut self.machines[slot]);
-                self.file(index, slot, old.is_known);
+                self.file(index, slot, old.standing());
                 if old.state.is_raised() {
                     changes.push(AlarmChange { change: Change::Forgotten, alarm: self.alarm(index, slot) });
                 }
@@ -355,7 +370,7 @@ impl AlarmEngine {
             };
             // Its value comes with the next look.
             self.machines[slot] = alarm.machine.without_value();
-            self.file(index, slot, false);
+            self.file(index, slot, Machine::default().standing());
         }
         orphans
     }
@@ -376,7 +391,7 @@ impl AlarmEngine {
                 let rule = &old.rules[before];
                 if let Some((index, place)) = self.place(rule.config.rule, rule.config.severity, rule.cell(slot)) {
                     self.machines[place] = old.machines[slot];
-                    self.file(index, place, false);
+                    self.file(index, place, Machine::default().standing());
                 } else if std::mem::take(&mut old.machines[slot]).is_worth_storing() {
                     ended += 1;
                     changes.push(AlarmChange { change: Change::Forgotten, alarm: old.alarm(before, slot) });
@@ -393,9 +408,9 @@ impl AlarmEngine {
 
     fn retarget(&mut self, now: Timestamp, index: usize, changes: &mut Vec<AlarmChange>) {
         for slot in self.rules[index].slots() {
-            let was_known = self.machines[slot].is_known;
+            let before = self.machines[slot].standing();
             let change = self.machines[slot].retarget(now, &self.rules[index].config);
-            self.file(index, slot, was_known);
+            self.file(index, slot, before);
             if let Some(change) = change {
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             }
@@ -423,9 +438,9 @@ impl AlarmEngine {
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
             let Some(slot) = self.rules[index].slot(cell) else { continue };
-            let was_known = self.machines[slot].is_known;
+            let before = self.machines[slot].standing();
             let change = act(&mut self.machines[slot], &self.rules[index].config);
-            self.file(index, slot, was_known);
+            self.file(index, slot, before);
             if let Some(change) = change {
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             }
@@ -445,9 +460,9 @@ impl AlarmEngine {
                 if !which.matches(rule, severity, self.rules[index].cell(slot)) {
                     continue;
                 }
-                let was_known = self.machines[slot].is_known;
+                let before = self.machines[slot].standing();
                 let result = act(&mut self.machines[slot]);
-                self.file(index, slot, was_known);
+                self.file(index, slot, before);
                 match result {
                     Ok(change) => {
                         outcome.changed += 1;
@@ -489,17 +504,16 @@ impl AlarmEngine {
     }
 
     /// Keeps the lists and counts in step with a machine.
-    fn file(&mut self, index: usize, slot: usize, was_known: bool) {
-        let machine = &self.machines[slot];
-        let (is_known, is_raised, is_counting) = (machine.is_known, machine.state.is_raised(), machine.is_counting());
-        let unknown = &mut self.rules[index].unknown;
-        match (was_known, is_known) {
-            (true, false) => *unknown += 1,
-            (false, true) => *unknown -= 1,
-            (true, true) | (false, false) => {}
+    fn file(&mut self, index: usize, slot: usize, before: Standing) {
+        let now = self.machines[slot].standing();
+        if now == before {
+            return;
         }
-        set_member(&mut self.raised, slot, is_raised);
-        set_member(&mut self.counting, slot, is_counting);
+        let rule = &mut self.rules[index];
+        rule.unknown = rule.unknown + usize::from(!now.is_known) - usize::from(!before.is_known);
+        rule.restless = rule.restless + usize::from(!now.is_at_rest) - usize::from(!before.is_at_rest);
+        set_member(&mut self.raised, slot, now.is_raised);
+        set_member(&mut self.counting, slot, now.is_counting);
     }
 }
 

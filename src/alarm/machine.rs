@@ -188,7 +188,29 @@ pub(super) struct Machine {
     is_suspended: bool,
 }
 
+/// What is counted and listed of an alarm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Standing {
+    pub(super) is_known: bool,
+    pub(super) is_raised: bool,
+    /// Whether time is being counted.
+    pub(super) is_counting: bool,
+    /// Whether only a value beyond its threshold, or one that is not known, changes anything.
+    pub(super) is_at_rest: bool,
+}
+
 impl Machine {
+    pub(super) fn standing(&self) -> Standing {
+        let is_counting = self.counted_to.is_some();
+        let is_rest = matches!(self.state, State::Inactive | State::Cleared);
+        Standing {
+            is_known: self.is_known,
+            is_raised: self.state.is_raised(),
+            is_counting,
+            is_at_rest: is_rest && self.is_known && !is_counting && !self.is_suspended,
+        }
+    }
+
     /// Takes a value. One that is learned while its inputs are lost (their loss ends the half-cycle before) may raise the
     /// alarm; to one that is raised already it says nothing before they are back: it would clear, or look fresh.
     pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, seen: &Observation) -> Option<Change> {
@@ -286,11 +308,6 @@ impl Machine {
     /// The latest value, unless it is not known (any more).
     pub(super) fn value(&self) -> Option<f64> {
         self.seen.value.filter(|value| self.is_known && value.is_finite())
-    }
-
-    /// Whether time is being counted.
-    pub(super) fn is_counting(&self) -> bool {
-        self.counted_to.is_some()
     }
 
     /// Whether a restart must not forget it.

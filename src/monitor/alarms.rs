@@ -13,6 +13,8 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
+/// Values that change nothing are told to the rules this often, s.
+const RESTATE_S: f64 = 1.0;
 /// Command frames that are not obeyed are told at most this often, s.
 const BAD_COMMAND_S: f64 = 1.0;
 
@@ -60,6 +62,10 @@ impl MonitorConfig {
 impl Monitor {
     /// Everything the rules compare that is not learned at a transition.
     pub(super) fn watch(&mut self, out: &mut Outputs) {
+        self.is_restating = self.now.since(self.restated_at).abs() >= RESTATE_S;
+        if self.is_restating {
+            self.restated_at = self.now;
+        }
         self.watch_inputs(out);
         self.watch_learned(out);
         self.watch_pack(out);
@@ -77,6 +83,12 @@ impl Monitor {
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
     /// what belongs to no cell under the pack.
     fn watch_inputs(&mut self, out: &mut Outputs) {
+        let quiet = |(silence_s, share): (f64, f64)| {
+            self.alarms.is_quiet(Rule::InputMissing, silence_s) && self.alarms.is_quiet(Rule::InputImplausible, share)
+        };
+        if !self.restates(out) && self.sampler.worst_input(self.now).is_some_and(quiet) {
+            return;
+        }
         let mut pack: Option<InputState> = None;
         for index in 0..self.sampler.channels().len() {
             let channel = self.sampler.channels()[index];
@@ -116,14 +128,19 @@ impl Monitor {
 
     /// What was learned of a cell stands only while its inputs can renew it.
     fn watch_learned(&mut self, out: &mut Outputs) {
-        let mut all_valid = true;
+        if self.all_valid_told && !self.restates(out) && !self.sampler.any_lost() {
+            return;
+        }
+        let (mut all_valid, mut all_started) = (true, true);
         for (index, cell) in (0..self.config.sample.cells).map(CellIndex).enumerate() {
             let valid = self.inputs_valid(cell);
             all_valid &= valid;
             for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
                 self.tell_alarms(AlarmInput::InputsValid { rule, cell: Some(cell), valid }, out);
             }
-            if !valid || self.estimators.soc(index).is_none() {
+            let is_started = self.estimators.soc(index).is_some();
+            all_started &= is_started;
+            if !valid || !is_started {
                 self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::default(), out);
             }
         }
@@ -131,6 +148,13 @@ impl Monitor {
             self.tell_alarms(AlarmInput::InputsValid { rule, cell: None, valid: all_valid }, out);
         }
         self.report_alarms(out);
+        self.all_valid_told = all_valid && all_started;
+    }
+
+    /// Whether also values that change nothing are told to the rules now: once a second, so that what is shown of an
+    /// alarm at rest is not older, and always when somebody else wants to know them.
+    pub(super) fn restates(&self, out: &Outputs) -> bool {
+        self.is_restating || out.want_alarm_inputs
     }
 
     /// Whether what an estimate of a cell is made of comes in.
@@ -194,7 +218,8 @@ impl Monitor {
         let config = &self.config.sample;
         let soc = self.pack.map(|pack| Belief::from_std(pack.soc, pack.soc_std));
         let rated_ah = self.config.model.rated_capacity_ah;
-        let soh = self.weakest_capacity().map(|c| Belief::from_std(c.mean / rated_ah, c.std() / rated_ah));
+        let weakest = if config.reported_soh.is_some() { self.weakest_capacity() } else { None };
+        let soh = weakest.map(|c| Belief::from_std(c.mean / rated_ah, c.std() / rated_ah));
         let pairs = [
             (config.reported_soc.is_some(), Channel::ReportedSoc, soc),
             (config.reported_soh.is_some(), Channel::ReportedSoh, soh),

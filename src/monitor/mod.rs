@@ -157,6 +157,11 @@ pub struct Monitor {
     /// Cells with a new estimate since the pack's values were last combined.
     updated_cells: usize,
     alarms: AlarmEngine,
+    /// When values at rest were last told to the rules, and whether they are now.
+    restated_at: Timestamp,
+    is_restating: bool,
+    /// The rules have been told that every learned value stands on valid inputs.
+    all_valid_told: bool,
     buses: Buses,
     store: StoreState,
     /// When a command frame that was not obeyed was last told.
@@ -223,6 +228,9 @@ impl Monitor {
             normalised_recharge: None,
             pack: None,
             updated_cells: 0,
+            restated_at: Timestamp::from_nanos(i64::MIN),
+            is_restating: true,
+            all_valid_told: false,
             buses: Buses::default(),
             store: StoreState::default(),
             bad_command_told: None,
@@ -381,7 +389,7 @@ impl Monitor {
         self.learner =
             Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
         self.cells.fill(CellSlot::new(config));
-        self.learned_at = None;
+        (self.learned_at, self.all_valid_told) = (None, false);
         self.detector = TransitionDetector::default();
         self.recharge = RechargeTimer::default();
         (self.recharge_period_s, self.normalised_recharge) = (None, None);
@@ -476,6 +484,9 @@ impl Monitor {
     }
 
     fn report_signals(&mut self, out: &mut Outputs) {
+        if self.scratch.signal_changes.is_empty() {
+            return;
+        }
         for change in self.scratch.signal_changes.drain(..) {
             let channel = change.channel;
             let kind = match change.state {
@@ -597,8 +608,9 @@ impl Monitor {
             slot.trusted = trusted;
             out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
         }
+        let is_quiet = !self.restates(out) && self.alarms.is_quiet(Rule::EstimateUntrusted, mean_nis);
         // Without a current the filter goes on, but its innovations say nothing about its model.
-        if self.inputs_valid(cell) {
+        if !is_quiet && self.inputs_valid(cell) {
             self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
         }
     }

@@ -61,6 +61,7 @@ impl Monitor {
         }
         self.forget_measures(&old.health, out);
         let (rules, cells) = (self.config.rules.clone(), self.config.sample.cells);
+        self.all_valid_told = false;
         let alarms_ended = self.alarms.reconfigure(self.now, rules, cells, &mut self.scratch.alarm_changes);
         self.report_alarms(out);
         if old.health.recharge != self.config.health.recharge {

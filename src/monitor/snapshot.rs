@@ -235,6 +235,7 @@ impl Monitor {
 impl Monitor {
     /// Takes the stored alarms up. Those that nothing watches any more end, here and for whoever saw them on the bus.
     fn restore_alarms(&mut self, time: Timestamp, state: &AlarmState, out: &mut Outputs) {
+        self.all_valid_told = false;
         for orphan in self.alarms.restore(state) {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());

@@ -55,6 +55,7 @@ impl ChargeCounter {
     }
 
     /// Totals at `time`, with the latest reading held as long as it may be.
+    #[inline]
     pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> Totals {
         let dt_s = self.passed_s(time);
         let mut totals = self.totals;

@@ -162,9 +162,9 @@ impl Sampler {
             return None;
         };
         let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
-        let limits = self.limits(channel);
+        let limits = limits(&self.config, channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
-        let judged = self.state.signals[slot].handle(time, value, &limits, should_move_s(channel, &totals));
+        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &totals));
         self.state.counts.note(judged.value.err());
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
@@ -174,7 +174,8 @@ impl Sampler {
         let value = judged.value.ok()?;
         match channel {
             Channel::Current => {
-                self.state.charge.handle_current(time, value, limits.max_age_s, self.flow_a);
+                let max_age_s = self.config.current.max_age_s;
+                self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
                 None
             }
             Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
@@ -193,14 +194,14 @@ impl Sampler {
         let mut next = Timestamp::from_nanos(i64::MAX);
         for slot in 0..self.state.signals.len() {
             let channel = self.channels[slot];
-            let limits = self.limits(channel);
+            let limits = limits(&self.config, channel);
             let signal = &mut self.state.signals[slot];
-            if let Some(state) = signal.poll(now, began, &limits) {
+            if let Some(state) = signal.poll(now, began, limits) {
                 self.state.counts.note(Some(Fault::Stale));
                 changes.push(SignalChange { channel, state });
             }
             if !signal.is_bad() {
-                next = next.min(signal.stale_from(began, &limits));
+                next = next.min(signal.stale_from(began, limits));
             }
         }
         self.next_stale = Some(next);
@@ -224,6 +225,7 @@ impl Sampler {
     }
 
     /// Pack current, A, positive = discharge, when its last good reading is fresh.
+    #[inline]
     pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
         self.state.signals[0].fresh(now, &self.config.current)
     }
@@ -240,6 +242,7 @@ impl Sampler {
     }
 
     /// Temperature of a cell, degrees C, when its sensor's last good reading is fresh.
+    #[inline]
     pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
         let sensor = (*self.config.sensor_of_cell.get(cell.index())?)?;
         self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
@@ -277,8 +280,7 @@ impl Sampler {
 
     /// The last good value of a channel, when it is young enough.
     pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        let limits = self.limits(channel);
-        self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, &limits))
+        self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, limits(&self.config, channel)))
     }
 
     /// Whether a channel is lost: its latest reading is bad or too old, and so is its last good one. A single bad reading
@@ -295,7 +297,24 @@ impl Sampler {
 
     /// Whether nothing, good or bad, came for longer than a value may be old.
     pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
-        self.silence_s(channel, now).is_none_or(|silence_s| silence_s > self.limits(channel).max_age_s)
+        self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
+    }
+
+    /// The longest silence of a channel, s, and the largest share of bad readings, while something has come on every
+    /// channel and none is silent; `None` otherwise.
+    pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
+        let began = self.state.began?;
+        let (mut oldest, mut share) = (now, 0.0_f64);
+        for signal in &self.state.signals {
+            let heard = signal.heard_at().filter(|&heard| heard >= began)?;
+            oldest = oldest.min(heard);
+            share = share.max(signal.bad_share().unwrap_or(0.0));
+        }
+        let config = &self.config;
+        let reported = [config.reported_soc, config.reported_soh].into_iter().flatten();
+        let limits = [config.current, config.voltage, config.temperature].into_iter().chain(reported);
+        let silence_s = now.since(oldest);
+        limits.into_iter().all(|limits| silence_s <= limits.max_age_s).then_some((silence_s, share))
     }
 
     /// Whether anything has come on the channel since the start or the last waking.
@@ -313,6 +332,11 @@ impl Sampler {
     /// Whether any signal the estimates are made of is bad or stale.
     pub fn any_bad(&self) -> bool {
         self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
+    }
+
+    /// Whether any signal at all is bad or stale.
+    pub fn any_lost(&self) -> bool {
+        self.state.signals.iter().any(Signal::is_bad)
     }
 
     /// Whether a stored state is of this many signals.
@@ -349,6 +373,7 @@ impl Sampler {
         Ok(())
     }
 
+    #[inline]
     fn sample(&self, time: Timestamp, cell: CellIndex, voltage_v: f64, totals: Totals) -> CellSample {
         CellSample {
             time,
@@ -362,6 +387,7 @@ impl Sampler {
     }
 
     /// Notes that time has come to `time`; the latest time, should it have gone back.
+    #[inline]
     fn pass(&mut self, time: Timestamp) -> Timestamp {
         if self.state.began.is_none() {
             self.state.began = Some(time);
@@ -382,6 +408,7 @@ impl Sampler {
     }
 
     /// What a reading is divided by to become a cell's: a total voltage is shared by the cells in series.
+    #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
         match (channel, self.config.voltage_source) {
             (Channel::PackVoltage, VoltageSource::PackTotal { series }) => f64::from(series.max(1)),
@@ -398,16 +425,7 @@ impl Sampler {
         }
     }
 
-    fn limits(&self, channel: Channel) -> Limits {
-        match channel {
-            Channel::Current => self.config.current,
-            Channel::Temperature(_) => self.config.temperature,
-            Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => self.config.voltage,
-            Channel::ReportedSoc => self.config.reported_soc.unwrap_or(self.config.voltage),
-            Channel::ReportedSoh => self.config.reported_soh.unwrap_or(self.config.voltage),
-        }
-    }
-
+    #[inline]
     fn slot(&self, channel: Channel) -> Option<usize> {
         let voltage = 1 + self.sensors;
         match (channel, self.config.voltage_source) {
@@ -427,6 +445,16 @@ impl Sampler {
                 Some(first + found)
             }
         }
+    }
+}
+
+fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
+    match channel {
+        Channel::Current => &config.current,
+        Channel::Temperature(_) => &config.temperature,
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => &config.voltage,
+        Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
+        Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
     }
 }
 

@@ -64,6 +64,7 @@ pub(super) struct Judged {
 
 impl Signal {
     /// Takes a reading. `should_move_s` is the clock for the stuck check.
+    #[inline]
     pub(super) fn handle(
         &mut self,
         time: Timestamp,
@@ -99,6 +100,7 @@ impl Signal {
     }
 
     /// The last good value when it is young enough.
+    #[inline]
     pub(super) fn fresh(&self, now: Timestamp, limits: &Limits) -> Option<f64> {
         self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
     }
@@ -143,6 +145,7 @@ impl Signal {
         self.heard = self.heard.map(|stamp| stamp.plus_nanos(by_nanos));
     }
 
+    #[inline]
     fn judge(
         &mut self,
         time: Timestamp,
@@ -166,6 +169,7 @@ impl Signal {
         Ok(value)
     }
 
+    #[inline]
     fn is_stuck(&mut self, value: f64, limits: &Limits, should_move_s: f64) -> bool {
         if self.rests_at != Some(value) {
             self.rests_at = Some(value);
@@ -174,6 +178,7 @@ impl Signal {
         limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s)
     }
 
+    #[inline]
     fn is_too_fast(&mut self, reading: Stamped, limits: &Limits) -> bool {
         let (Some(rate), Some(good)) = (limits.max_rate_per_s, self.good) else { return false };
         if agree(good, reading, rate) {
@@ -185,12 +190,14 @@ impl Signal {
         self.refused_count < ACCEPT_AFTER
     }
 
+    #[inline]
     fn count(&mut self, bad: bool) {
         self.readings = (self.readings + 1).min(BAD_SHARE_READINGS);
         let now = if bad { 1.0 } else { 0.0 };
         self.bad_share += (now - self.bad_share) / f64::from(self.readings);
     }
 
+    #[inline]
     fn turn(&mut self, fault: Option<Fault>, readings: u64) -> Option<Result<u64, Fault>> {
         match (self.fault, fault) {
             (None, None) => None,
