@@ -139,6 +139,11 @@ impl FloodGate {
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
+    /// Whether anything began or ended since.
+    pub fn has_changes(&self) -> bool {
+        !self.changes.is_empty()
+    }
+
     /// What began or ended since the last call.
     pub fn take_changes(&mut self) -> impl Iterator<Item = FloodChange> + '_ {
         self.changes.drain(..)

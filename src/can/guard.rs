@@ -130,6 +130,11 @@ impl Guards {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
+    /// Whether anything turned since.
+    pub fn has_changes(&self) -> bool {
+        !self.changes.is_empty()
+    }
+
     /// What turned since the last call, in the order in which it did.
     pub fn take_changes(&mut self) -> impl Iterator<Item = GuardChange> + '_ {
         self.changes.drain(..)

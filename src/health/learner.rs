@@ -158,6 +158,7 @@ impl Learner {
     }
 
     /// Takes a cell's new estimate into its totals; `end` tells where the cell is.
+    #[inline]
     pub fn observe(&mut self, cell: usize, seen: &Observed, end: impl FnOnce() -> CellEnd) {
         let totals = &mut self.totals[cell];
         if let Some(temperature_c) = seen.temperature_c {
@@ -291,6 +292,7 @@ impl Learner {
     }
 
     /// Offset of the current as a cell's half-cycles tell it, per cell, A: measured less true.
+    #[inline]
     pub fn current_offset_a(&self, cell: usize) -> f64 {
         self.drift[cell].offset_a()
     }

@@ -138,7 +138,7 @@ impl Monitor {
             for rule in [Rule::CapacityLow, Rule::UsableCapacityLow, Rule::ResistanceHigh] {
                 self.tell_alarms(AlarmInput::InputsValid { rule, cell: Some(cell), valid }, out);
             }
-            let is_started = self.estimators.soc(index).is_some();
+            let is_started = self.estimators.is_started(index);
             all_started &= is_started;
             if !valid || !is_started {
                 self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::default(), out);
@@ -348,6 +348,7 @@ impl Monitor {
         };
         out.events.push(Event { time: self.now, kind: EventKind::Command { source, command, changed, refused } });
         self.report_alarms(out);
+        self.due = self.find_due();
     }
 
     /// What was learned of the old pack is told once more and does not hold for the new one.

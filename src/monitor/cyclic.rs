@@ -72,7 +72,12 @@ fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
 
 impl Monitor {
     /// When a tick will next do something: a driver may leave out earlier ticks, the result is the same.
+    #[inline]
     pub fn next_due(&self) -> Option<Timestamp> {
+        self.due
+    }
+
+    pub(super) fn find_due(&self) -> Option<Timestamp> {
         if !self.started {
             return None;
         }
@@ -124,7 +129,7 @@ impl Monitor {
     pub(super) fn validity(&self) -> Validity {
         if self.pack.is_none() {
             Validity::Unavailable
-        } else if self.cells.iter().any(|cell| !cell.trusted) {
+        } else if !self.all_trusted {
             Validity::Untrusted
         } else if self.sampler.any_bad() {
             Validity::Degraded

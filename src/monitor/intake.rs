@@ -89,6 +89,9 @@ impl Intake {
     }
 
     fn report(&mut self, time: Timestamp, out: &mut Outputs) {
+        if !self.guards.has_changes() && !self.gate.has_changes() {
+            return;
+        }
         let turned = self.guards.take_changes().map(|c| EventKind::Protection {
             bus: c.bus,
             id: c.id,

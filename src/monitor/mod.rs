@@ -160,6 +160,10 @@ pub struct Monitor {
     /// When values at rest were last told to the rules, and whether they are now.
     restated_at: Timestamp,
     is_restating: bool,
+    /// Whether every cell's innovations agree with their covariance.
+    all_trusted: bool,
+    /// When a tick will next do something; `None` = not started.
+    due: Option<Timestamp>,
     /// The rules have been told that every learned value stands on valid inputs.
     all_valid_told: bool,
     buses: Buses,
@@ -230,6 +234,8 @@ impl Monitor {
             updated_cells: 0,
             restated_at: Timestamp::from_nanos(i64::MIN),
             is_restating: true,
+            all_trusted: true,
+            due: None,
             all_valid_told: false,
             buses: Buses::default(),
             store: StoreState::default(),
@@ -257,25 +263,25 @@ impl Monitor {
         if !self.started {
             self.start(time, out);
         }
-        match input {
-            Input::Tick { .. } if self.next_due().is_some_and(|due| time < due) => return,
-            Input::Frame { .. } => {}
-            Input::Tick { .. }
-            | Input::Bus { .. }
-            | Input::UnknownGap { .. }
-            | Input::Command { .. }
-            | Input::Store { .. } => self.make_steps(out),
+        if let Input::Frame { bus, frame, .. } = input {
+            self.advance(time, out);
+            self.handle_frame(bus, frame, out);
+            if self.j1939.is_some() {
+                self.handle_j1939_frame(bus, frame, out);
+                self.due = self.find_due();
+            }
+            return;
         }
+        if matches!(input, Input::Tick { .. }) && self.due.is_some_and(|due| time < due) {
+            return;
+        }
+        self.make_steps(out);
         match input {
+            Input::Frame { .. } => {}
             Input::UnknownGap { .. } => self.handle_unknown_gap(time, out),
             Input::Tick { .. } => {
                 self.advance(time, out);
                 self.handle_tick(out);
-            }
-            Input::Frame { bus, frame, .. } => {
-                self.advance(time, out);
-                self.handle_frame(bus, frame, out);
-                self.handle_j1939_frame(bus, frame, out);
             }
             Input::Command { command, .. } => {
                 self.advance(time, out);
@@ -296,6 +302,7 @@ impl Monitor {
                 }
             }
         }
+        self.due = self.find_due();
     }
 
     /// The latest estimate of every cell, for live tables; `None` before its first. What came since the last
@@ -380,6 +387,7 @@ impl Monitor {
         if was_away_briefly {
             self.start_j1939(time, out);
         }
+        self.due = self.find_due();
     }
 
     /// Nothing is known of the cells any more; what comes in is judged as before.
@@ -389,7 +397,7 @@ impl Monitor {
         self.learner =
             Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
         self.cells.fill(CellSlot::new(config));
-        (self.learned_at, self.all_valid_told) = (None, false);
+        (self.learned_at, self.all_valid_told, self.all_trusted) = (None, false, true);
         self.detector = TransitionDetector::default();
         self.recharge = RechargeTimer::default();
         (self.recharge_period_s, self.normalised_recharge) = (None, None);
@@ -404,6 +412,7 @@ impl Monitor {
             if time < self.now.plus_nanos(-MERGE_TOLERANCE_NS) {
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds: -elapsed_s } });
                 self.handle_unknown_gap(time, out);
+                self.due = self.find_due();
             }
             return;
         }
@@ -413,6 +422,7 @@ impl Monitor {
             self.sampler.wake(time);
             self.schedule.restart(time);
             self.start_j1939(time, out);
+            self.due = self.find_due();
         }
         self.now = time;
     }
@@ -540,8 +550,15 @@ impl Monitor {
             gaps_s.push(gap_s);
         }
         self.estimators.step(&steps);
+        let is_quiet = self.all_trusted && !self.restates(out) && {
+            let worst = steps.iter().fold(0.0_f64, |worst, (cell, _)| worst.max(self.estimators.mean_nis(*cell)));
+            worst <= self.config.estimator.consistency_limit && self.alarms.is_quiet(Rule::EstimateUntrusted, worst)
+        };
         for ((sample, (_, step)), gap_s) in waiting.iter().zip(&steps).zip(&gaps_s) {
             self.take_estimate(sample, step.measured_s, *gap_s, out);
+            if !is_quiet && self.estimators.is_started(sample.cell.index()) {
+                self.judge_trust(sample.cell, out);
+            }
         }
         (waiting.clear(), steps.clear(), gaps_s.clear());
         (self.waiting, self.scratch.steps, self.scratch.gaps_s) = (waiting, steps, gaps_s);
@@ -578,13 +595,14 @@ impl Monitor {
     /// What follows from a cell's step.
     fn take_estimate(&mut self, sample: &CellSample, measured_s: f64, gap_s: f64, out: &mut Outputs) {
         let index = sample.cell.index();
-        let result = *self.estimators.result(index);
-        self.statistics.note_voltage(&result);
-        if self.estimators.soc(index).is_none() {
+        let result = self.estimators.result(index);
+        let is_reset = result.reset;
+        self.statistics.note_voltage(result);
+        if !self.estimators.is_started(index) {
             return;
         }
         self.cells[index].sample = Some(*sample);
-        if result.reset {
+        if is_reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
             self.recharge.discard();
@@ -593,7 +611,6 @@ impl Monitor {
         let estimators = &self.estimators;
         self.learner.observe(index, &seen, || end_state(estimators, index));
         self.note_taper(sample);
-        self.judge_trust(sample.cell, out);
         if out.want_estimates {
             out.estimates.extend(self.estimate(index));
         }
@@ -606,11 +623,11 @@ impl Monitor {
         let trusted = mean_nis <= self.config.estimator.consistency_limit;
         if trusted != slot.trusted {
             slot.trusted = trusted;
+            self.all_trusted = self.cells.iter().all(|cell| cell.trusted);
             out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
         }
-        let is_quiet = !self.restates(out) && self.alarms.is_quiet(Rule::EstimateUntrusted, mean_nis);
         // Without a current the filter goes on, but its innovations say nothing about its model.
-        if !is_quiet && self.inputs_valid(cell) {
+        if self.inputs_valid(cell) {
             self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
         }
     }

@@ -75,6 +75,7 @@ impl Monitor {
         let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);
         out.events.push(Event { time: now.max(self.now), kind: EventKind::Reconfigured { alarms_ended: alarms } });
         self.statistics.note_events(&out.events[told..]);
+        self.due = self.find_due();
         Ok(Reconfigured { changed, alarms_ended })
     }
 

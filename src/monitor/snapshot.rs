@@ -208,6 +208,7 @@ impl Monitor {
             }
         }
         self.waiting = snapshot.waiting;
+        self.all_trusted = self.cells.iter().all(|cell| cell.trusted);
         // Checked in `restore`.
         let _ = self.sampler.restore(&snapshot.sampler);
         self.detector = snapshot.detector;

@@ -116,6 +116,17 @@ pub struct Sampler {
     state: SamplerState,
     /// Before this no signal can become stale; `None` = not known.
     next_stale: Option<Timestamp>,
+    /// What the latest readings had in common; `None` = not known (any more).
+    moment: Option<Moment>,
+}
+
+/// What is the same for every reading of one time, as long as no current comes.
+#[derive(Debug, Clone, Copy)]
+struct Moment {
+    time: Timestamp,
+    totals: Totals,
+    cell_current_a: Option<f64>,
+    cell_charge_as: f64,
 }
 
 impl Sampler {
@@ -136,7 +147,7 @@ impl Sampler {
             counts: ReadingCounts::default(),
         };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
-        Self { config, channels, sensors, voltages, flow_a, state, next_stale: None }
+        Self { config, channels, sensors, voltages, flow_a, state, next_stale: None, moment: None }
     }
 
     /// Other limits for the same signals.
@@ -161,10 +172,10 @@ impl Sampler {
             self.state.unused_readings += 1;
             return None;
         };
-        let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
+        let moment = self.moment(time);
         let limits = limits(&self.config, channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
-        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &totals));
+        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &moment.totals));
         self.state.counts.note(judged.value.err());
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
@@ -176,11 +187,12 @@ impl Sampler {
             Channel::Current => {
                 let max_age_s = self.config.current.max_age_s;
                 self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
+                self.moment = None;
                 None
             }
             Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
-            Channel::PackVoltage => Some(self.sample(time, CellIndex(0), value, totals)),
-            Channel::CellVoltage(cell) => Some(self.sample(time, cell, value, totals)),
+            Channel::PackVoltage => Some(self.sample(&moment, CellIndex(0), value)),
+            Channel::CellVoltage(cell) => Some(self.sample(&moment, cell, value)),
         }
     }
 
@@ -214,7 +226,7 @@ impl Sampler {
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
         self.state.began = Some(time);
         self.state.latest = time;
-        self.next_stale = None;
+        (self.next_stale, self.moment) = (None, None);
     }
 
     /// The computer was asleep until `time`: values are as old as they are, but nothing is called silent or stale
@@ -369,20 +381,32 @@ impl Sampler {
             return Err(SamplerShape { found, allowed });
         }
         self.state.clone_from(state);
-        self.next_stale = None;
+        (self.next_stale, self.moment) = (None, None);
         Ok(())
     }
 
     #[inline]
-    fn sample(&self, time: Timestamp, cell: CellIndex, voltage_v: f64, totals: Totals) -> CellSample {
+    fn moment(&mut self, time: Timestamp) -> Moment {
+        if let Some(moment) = self.moment.filter(|moment| moment.time == time) {
+            return moment;
+        }
+        let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
+        let cell_charge_as = totals.charge_as / self.strings();
+        let moment = Moment { time, totals, cell_current_a: self.cell_current_a(time), cell_charge_as };
+        self.moment = Some(moment);
+        moment
+    }
+
+    #[inline]
+    fn sample(&self, moment: &Moment, cell: CellIndex, voltage_v: f64) -> CellSample {
         CellSample {
-            time,
+            time: moment.time,
             cell,
             voltage_v,
-            current_a: self.cell_current_a(time),
-            charge_as: totals.charge_as / self.strings(),
-            unmeasured_s: totals.unmeasured_s,
-            temperature_c: self.temperature_c(cell, time),
+            current_a: moment.cell_current_a,
+            charge_as: moment.cell_charge_as,
+            unmeasured_s: moment.totals.unmeasured_s,
+            temperature_c: self.temperature_c(cell, moment.time),
         }
     }
 

@@ -208,6 +208,12 @@ impl EstimatorBank {
         thermal_c(&self.model, self.cells[cell].memory.temperature_c, soc, self.log_resistance(cell).mean, step)
     }
 
+    /// Whether a cell has a state of charge.
+    #[inline]
+    pub fn is_started(&self, cell: usize) -> bool {
+        self.cells[cell].has_filter
+    }
+
     /// State of charge; `None` before the first voltage.
     pub fn soc(&self, cell: usize) -> Option<Belief> {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
