@@ -51,7 +51,10 @@ def machine():
     info = Path("/proc/cpuinfo").read_text()
     name = re.search(r"model name\s*: (.*)", info)
     rustc = output("rustc", "--version", cwd=REPOSITORY).split()[1]
-    commit = output("git", "describe", "--always", "--dirty", cwd=REPOSITORY).strip()
+    commit = output("git", "rev-parse", "--short", "HEAD", cwd=REPOSITORY).strip()
+    measured = ["Cargo.toml", "Cargo.lock", "src", "benches", "config"]
+    if output("git", "status", "--porcelain", "--", *measured, cwd=REPOSITORY):
+        commit += " and changes"
     return (f"{os.cpu_count()} x {name[1] if name else 'processor of unknown name'}, rustc {rustc}, commit {commit}, "
             f"load {os.getloadavg()[0]:.1f}")
 
