@@ -18,7 +18,7 @@ use packwatch::io::candump::{Line, parse_line};
 use packwatch::quantity::{BusIndex, CellIndex, Channel};
 
 /// Name, what one unit of it is, and what makes it.
-const WORKS: [(&str, &str, fn() -> Work); 7] = [
+const WORKS: [Named; 7] = [
     ("parse", "candump line of 8 bytes", parse),
     ("parse_and_decode", "such a line and its 3 signals", parse_and_decode),
     ("decode_page", "frame of 3 cells, one of 32 pages", decode_page),
@@ -32,6 +32,8 @@ const WORKS: [(&str, &str, fn() -> Work); 7] = [
 const UNITS: u32 = 960;
 /// Passes timed under `cargo bench`.
 const TIMED_PASSES: u32 = 200;
+
+type Named = (&'static str, &'static str, fn() -> Work);
 
 /// A pass over the work's inputs; what it gives keeps the optimiser from leaving it out.
 type Work = Box<dyn FnMut() -> f64>;
@@ -64,7 +66,7 @@ fn features() -> String {
     found.iter().filter(|(_, has)| *has).fold(std::env::consts::ARCH.to_owned(), |all, (name, _)| all + " " + name)
 }
 
-fn time((name, unit, work): &(&str, &str, fn() -> Work)) {
+fn time((name, unit, work): &Named) {
     let mut work = work();
     let mut took_ns: Vec<f64> = (0..TIMED_PASSES)
         .map(|_| {
