@@ -1,0 +1,195 @@
+//! Work whose instructions `tests/instructions` counts: parser, decoder, estimator.
+//!
+//! `instructions WORK PASSES` does one of [`WORKS`] that many times over the same inputs and prints how many units a pass has
+//! and which wide instructions the processor offered (they decide what the estimator runs). Counted for some passes and for
+//! twice as many, the difference is the work alone. Without arguments, as under `cargo bench`, it prints the time of each.
+#![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use packwatch::can::Frame;
+use packwatch::can::dbc::Database;
+use packwatch::can::decode::{Binding, InputMap};
+use packwatch::can::encode::InputEncoder;
+use packwatch::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
+use packwatch::config;
+use packwatch::io::candump::{Line, parse_line};
+use packwatch::quantity::{BusIndex, CellIndex, Channel};
+
+/// Name, what one unit of it is, and what makes it.
+const WORKS: [Named; 7] = [
+    ("parse", "candump line of 8 bytes", parse),
+    ("parse_and_decode", "such a line and its 3 signals", parse_and_decode),
+    ("decode_page", "frame of 3 cells, one of 32 pages", decode_page),
+    ("step_one_branch", "step of one cell, 1 branch", || one_cell(1)),
+    ("step_two_branches", "step of one cell, 2 branches", || one_cell(2)),
+    ("step_three_branches", "step of one cell, 3 branches", || one_cell(3)),
+    ("step_of_96", "cell and step of a pack of 96, 1 branch", pack),
+];
+
+/// Lines, frames or steps in a pass.
+const UNITS: u32 = 960;
+/// Passes timed under `cargo bench`.
+const TIMED_PASSES: u32 = 200;
+
+type Named = (&'static str, &'static str, fn() -> Work);
+
+/// A pass over the work's inputs; what it gives keeps the optimiser from leaving it out.
+type Work = Box<dyn FnMut() -> f64>;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    match arguments.as_slice() {
+        [name, passes] => {
+            let (_, _, work) = WORKS.iter().find(|(known, _, _)| known == name).expect("a work that is known");
+            let (mut work, passes) = (work(), passes.parse::<u32>().expect("a number of passes"));
+            for _ in 0..passes {
+                black_box(work());
+            }
+            println!("{UNITS} {}", features());
+        }
+        _ => WORKS.iter().for_each(time),
+    }
+}
+
+/// What decides at run time which code runs.
+fn features() -> String {
+    #[cfg(target_arch = "x86_64")]
+    let found = [
+        ("avx2", std::is_x86_feature_detected!("avx2")),
+        ("fma", std::is_x86_feature_detected!("fma")),
+        ("avx512f", std::is_x86_feature_detected!("avx512f")),
+    ];
+    #[cfg(not(target_arch = "x86_64"))]
+    let found: [(&str, bool); 0] = [];
+    found.iter().filter(|(_, has)| *has).fold(std::env::consts::ARCH.to_owned(), |all, (name, _)| all + " " + name)
+}
+
+fn time((name, unit, work): &Named) {
+    let mut work = work();
+    let mut took_ns: Vec<f64> = (0..TIMED_PASSES)
+        .map(|_| {
+            let start = Instant::now();
+            black_box(work());
+            start.elapsed().as_secs_f64() * 1e9 / f64::from(UNITS)
+        })
+        .collect();
+    took_ns.sort_by(f64::total_cmp);
+    println!("{name:20} {:8.1} ns median per {unit}", took_ns[took_ns.len() / 2]);
+}
+
+/// Lines as a pack at work sends them, of one message with three signals.
+fn lines() -> Vec<u8> {
+    let line = |n: u64| {
+        let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        format!("(17000{:05}.{:06}) can0 100#{data:016X}\n", n / 1000, n % 1000 * 1000)
+    };
+    (0..u64::from(UNITS)).flat_map(|n| line(n).into_bytes()).collect()
+}
+
+fn parse() -> Work {
+    let text = lines();
+    Box::new(move || {
+        let mut sum = 0.0;
+        each_frame(&text, |frame| sum += f64::from(frame.data()[0]));
+        sum
+    })
+}
+
+fn parse_and_decode() -> Work {
+    let (text, map) = (lines(), bind(include_str!("../config/measured.dbc"), |_| true));
+    Box::new(move || {
+        let mut sum = 0.0;
+        each_frame(&text, |frame| {
+            map.decode(BusIndex(0), frame, |reading| sum += reading.value.unwrap_or(0.0));
+        });
+        sum
+    })
+}
+
+fn each_frame(text: &[u8], mut take: impl FnMut(&Frame)) {
+    let mut start = 0;
+    for end in memchr::memchr_iter(b'\n', text) {
+        if let Ok(Line::Frame { frame, .. }) = parse_line(&text[start..end]) {
+            take(&frame);
+        }
+        start = end + 1;
+    }
+}
+
+/// Every signal of a DBC whose name is wanted, each as a channel of its own.
+fn bind(dbc: &str, wanted: fn(&str) -> bool) -> InputMap {
+    let database = Database::parse(dbc).expect("the shipped DBC parses");
+    let signals =
+        database.messages.iter().flat_map(|message| message.signals.iter().map(move |signal| (message, signal)));
+    let wanted = (0..).zip(signals.filter(|(_, signal)| wanted(&signal.name)));
+    let binding =
+        |(n, (message, signal))| Binding::new(BusIndex(0), message, signal, Channel::CellVoltage(CellIndex(n)));
+    InputMap::new(wanted.map(|of| binding(of).expect("its layout is readable")).collect())
+}
+
+fn decode_page() -> Work {
+    let map = bind(include_str!("../config/pack96.dbc"), |name| name.starts_with("CellVoltage"));
+    let values: Vec<_> = (0..96).map(|n| (Channel::CellVoltage(CellIndex(n)), Some(3.7))).collect();
+    let mut pages = Vec::new();
+    InputEncoder::new(&map).encode(&values, &mut pages);
+    let rounds = UNITS as usize / pages.len();
+    Box::new(move || {
+        let mut sum = 0.0;
+        for (bus, frame) in pages.iter().cycle().take(rounds * pages.len()) {
+            map.decode(*bus, black_box(frame), |reading| sum += reading.value.unwrap_or(0.0));
+        }
+        sum
+    })
+}
+
+/// The example's cell with 1 to 3 RC branches.
+fn cell(branches: usize) -> (CellModel, EstimatorConfig) {
+    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
+    let monitor = config::load(path).unwrap_or_else(|faults| panic!("{faults:?}")).monitor;
+    let mut model = monitor.model;
+    model.branches = vec![model.branches[0].clone(); branches];
+    (model, monitor.estimator)
+}
+
+/// Ten readings a second under a load that turns round every 3 s; a little different from cell to cell, and at a
+/// temperature between two rows of the tables, as real ones are.
+fn reading(k: u32, cell: u32) -> CellStep {
+    let current_a = if k % 60 < 30 { 1.3 } else { -1.3 };
+    CellStep {
+        measured_s: 0.1,
+        charge_as: 0.1 * current_a,
+        unmeasured_s: 0.0,
+        current_a: Some(current_a),
+        temperature_c: Some(25.0),
+        ambient_c: 25.0,
+        voltage_v: 3.7 - 0.05 * current_a + 0.0001 * f64::from(cell),
+    }
+}
+
+fn one_cell(branches: usize) -> Work {
+    let (model, config) = cell(branches);
+    let mut estimator = CellEstimator::new(&config);
+    Box::new(move || {
+        for k in 0..UNITS {
+            black_box(estimator.step(&model, &config, black_box(&reading(k, 0))));
+        }
+        estimator.soc().map_or(0.0, |soc| soc.mean)
+    })
+}
+
+fn pack() -> Work {
+    let (model, config) = cell(1);
+    let mut pack = vec![CellEstimator::new(&config); 96];
+    let mut k = 0;
+    Box::new(move || {
+        for _ in 0..UNITS / 96 {
+            k += 1;
+            for (n, estimator) in (0..).zip(&mut pack) {
+                black_box(estimator.step(&model, &config, black_box(&reading(k, n))));
+            }
+        }
+        pack[0].soc().map_or(0.0, |soc| soc.mean)
+    })
+}
