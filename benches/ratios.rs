@@ -85,20 +85,18 @@ impl Plain {
 
 struct Bank {
     bank: EstimatorBank,
-    steps: Vec<(usize, CellStep)>,
     cells: usize,
 }
 
 impl Bank {
     fn new(cells: usize) -> Self {
         let config = example().monitor;
-        Self { bank: EstimatorBank::new(&config.model, &config.estimator, cells), steps: Vec::new(), cells }
+        Self { bank: EstimatorBank::new(&config.model, &config.estimator, cells), cells }
     }
 
     fn step(&mut self, k: u32) {
-        self.steps.clear();
-        self.steps.extend((0..self.cells).map(|cell| (cell, step(k, cell))));
-        self.bank.step(black_box(&self.steps));
+        (0..self.cells).for_each(|cell| self.bank.add(cell, black_box(&step(k, cell))));
+        self.bank.step();
         black_box(self.bank.result(0));
     }
 }

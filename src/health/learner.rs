@@ -60,19 +60,6 @@ pub struct CellEnd {
     pub load_v: f64,
 }
 
-/// A cell has a new estimate.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Observed {
-    /// When.
-    pub time: Timestamp,
-    /// Temperature, degrees C; `None` = no valid sensor.
-    pub temperature_c: Option<f64>,
-    /// Time since the last estimate in which the current was measured, s.
-    pub measured_s: f64,
-    /// Time since then in which it was not, s; infinite before the first estimate and after an unknown gap.
-    pub gap_s: f64,
-}
-
 /// What the capacity filter made of a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
@@ -157,19 +144,30 @@ impl Learner {
         }
     }
 
-    /// Takes a cell's new estimate into its totals; `end` tells where the cell is.
+    /// Takes a cell's sample into its totals: when, its temperature (degrees C), the time since the sample before in which
+    /// the current was measured, and that in which it was not (infinite before the first and after an unknown gap), s.
+    /// Whether what may begin next was marked in that gap: then it begins where the cell is after it ([`Self::move_mark`]).
     #[inline]
-    pub fn observe(&mut self, cell: usize, seen: &Observed, end: impl FnOnce() -> CellEnd) {
-        let totals = &mut self.totals[cell];
-        if let Some(temperature_c) = seen.temperature_c {
-            totals.temperature_integral += temperature_c * seen.measured_s;
-            totals.temperature_s += seen.measured_s;
+    pub fn observe(
+        &mut self,
+        cell: usize,
+        time: Timestamp,
+        temperature_c: Option<f64>,
+        measured_s: f64,
+        gap_s: f64,
+    ) -> bool {
+        if let Some(temperature_c) = temperature_c {
+            let totals = &mut self.totals[cell];
+            totals.temperature_integral += temperature_c * measured_s;
+            totals.temperature_s += measured_s;
         }
-        if let Some(mark) = self.candidate.as_mut().filter(|_| seen.gap_s > 0.0)
-            && seen.time.since(mark.time) < seen.gap_s
-        {
-            // Marked since the gap: what begins right behind it begins at this SOC, not at the one before.
-            mark.cells[cell].put(end());
+        gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
+    }
+
+    /// What begins next begins for a cell where it is now, not where it was when that was marked.
+    pub fn move_mark(&mut self, cell: usize, end: CellEnd) {
+        if let Some(mark) = &mut self.candidate {
+            mark.cells[cell].put(end);
         }
     }
 
@@ -413,20 +411,15 @@ mod tests {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
         let mut learner = Learner::new(&config(), 1, Belief::from_std(2.0, 0.1));
-        let seen = |time_s: f64, gap_s: f64| Observed {
-            time: Timestamp::from_secs(time_s),
-            temperature_c: None,
-            measured_s: 10.0,
-            gap_s,
-        };
         let at = |soc: f64| CellEnd { soc: Some(Belief::from_std(soc, 0.01)), load_v: 0.0 };
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
-        learner.observe(0, &seen(1000.0, 0.0), || at(0.1));
+        assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
         learner.mark_candidate(start, 0.0, |_| at(0.1));
-        learner.observe(0, &seen(5000.1, 4000.0), || at(0.9));
+        assert!(learner.observe(0, Timestamp::from_secs(5000.1), None, 10.0, 4000.0));
+        learner.move_mark(0, at(0.9));
         let mut found = Vec::new();
         learner.complete(&transition, 2.0, Mode::Unknown, &mut found);
-        learner.observe(0, &seen(8600.0, 0.0), || at(0.4));
+        assert!(!learner.observe(0, end, None, 10.0, 0.0));
         learner.mark_candidate(end, 3600.0, |_| at(0.4));
         learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
         assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");

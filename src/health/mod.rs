@@ -13,7 +13,7 @@ pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
 pub use forecast::{Axis, Forecast, Passed, Reading, Remaining, RemainingLife, TooThin};
-pub use learner::{CapacityUpdate, CellEnd, HalfCycle, Learner, Observed};
+pub use learner::{CapacityUpdate, CellEnd, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
 pub use recharge::{Charged, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

@@ -128,7 +128,7 @@ impl Monitor {
 
     /// What was learned of a cell stands only while its inputs can renew it.
     fn watch_learned(&mut self, out: &mut Outputs) {
-        if self.all_valid_told && !self.restates(out) && !self.sampler.any_lost() {
+        if self.all_valid_told && !out.want_alarm_inputs && !self.sampler.any_lost() {
             return;
         }
         let (mut all_valid, mut all_started) = (true, true);
@@ -194,6 +194,11 @@ impl Monitor {
 
     /// SOC of the emptiest and the fullest of the cells whose estimate is fresh; `None` = of no cell.
     fn spread(&self) -> Option<Spread> {
+        if self.sampler.all_good(self.now)
+            && let Some((lowest, highest)) = self.estimators.extremes()
+        {
+            return Some(Spread { lowest, highest, is_whole: true });
+        }
         let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
         for cell in (0..self.config.sample.cells).map(CellIndex) {
             let is_fresh = self.sampler.is_fresh(self.voltage_channel(cell), self.now);

@@ -45,7 +45,7 @@ use crate::can::j1939::Node;
 use crate::can::{CanId, Frame};
 use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorBank, EstimatorConfig};
 use crate::filter::Belief;
-use crate::health::{CellEnd, HalfCycle, HealthConfig, Learner, Observed, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{CellEnd, HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
@@ -186,8 +186,8 @@ struct Scratch {
     signal_changes: Vec<SignalChange>,
     alarm_changes: Vec<AlarmChange>,
     half_cycles: Vec<HalfCycle>,
-    steps: Vec<(usize, CellStep)>,
-    gaps_s: Vec<f64>,
+    /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
+    after_gap: Vec<usize>,
 }
 
 impl MonitorConfig {
@@ -542,30 +542,28 @@ impl Monitor {
             return;
         }
         let mut waiting = std::mem::take(&mut self.waiting);
-        let mut steps = std::mem::take(&mut self.scratch.steps);
-        let mut gaps_s = std::mem::take(&mut self.scratch.gaps_s);
         for sample in &waiting {
-            let (step, gap_s) = self.next_step(sample.cell.index(), sample);
-            steps.push((sample.cell.index(), step));
-            gaps_s.push(gap_s);
+            let step = self.next_step(sample);
+            self.estimators.add(sample.cell.index(), &step);
         }
-        self.estimators.step(&steps);
+        self.estimators.step();
         let is_quiet = self.all_trusted && !self.restates(out) && {
-            let worst = steps.iter().fold(0.0_f64, |worst, (cell, _)| worst.max(self.estimators.mean_nis(*cell)));
+            let nis = |sample: &CellSample| self.estimators.mean_nis(sample.cell.index());
+            let worst = waiting.iter().fold(0.0_f64, |worst, sample| worst.max(nis(sample)));
             worst <= self.config.estimator.consistency_limit && self.alarms.is_quiet(Rule::EstimateUntrusted, worst)
         };
-        for ((sample, (_, step)), gap_s) in waiting.iter().zip(&steps).zip(&gaps_s) {
-            self.take_estimate(sample, step.measured_s, *gap_s, out);
-            if !is_quiet && self.estimators.is_started(sample.cell.index()) {
-                self.judge_trust(sample.cell, out);
-            }
+        for sample in &waiting {
+            self.take_estimate(sample, is_quiet, out);
         }
-        (waiting.clear(), steps.clear(), gaps_s.clear());
-        (self.waiting, self.scratch.steps, self.scratch.gaps_s) = (waiting, steps, gaps_s);
+        waiting.clear();
+        self.waiting = waiting;
+        let estimators = &self.estimators;
+        self.scratch.after_gap.drain(..).for_each(|cell| self.learner.move_mark(cell, end_state(estimators, cell)));
     }
 
-    /// What happened to a cell between the sample before and the latest one, and for how long nobody measured, s.
-    fn next_step(&mut self, index: usize, sample: &CellSample) -> (CellStep, f64) {
+    /// What happened to a cell between the sample before and this one.
+    fn next_step(&mut self, sample: &CellSample) -> CellStep {
+        let index = sample.cell.index();
         let slot = &mut self.cells[index];
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
@@ -578,9 +576,12 @@ impl Monitor {
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
             gap_s = unmeasured_s;
         }
+        if self.learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
+            self.scratch.after_gap.push(index);
+        }
         // What charges and discharges have shown to be the sensor's, not the cell's.
         let offset_a = self.learner.current_offset_a(index);
-        let step = CellStep {
+        CellStep {
             measured_s,
             charge_as: charge_as - offset_a * measured_s,
             unmeasured_s,
@@ -588,29 +589,25 @@ impl Monitor {
             temperature_c: sample.temperature_c,
             ambient_c: self.config.sample.ambient_c,
             voltage_v: sample.voltage_v,
-        };
-        (step, gap_s)
+        }
     }
 
     /// What follows from a cell's step.
-    fn take_estimate(&mut self, sample: &CellSample, measured_s: f64, gap_s: f64, out: &mut Outputs) {
+    fn take_estimate(&mut self, sample: &CellSample, is_quiet: bool, out: &mut Outputs) {
         let index = sample.cell.index();
         let result = self.estimators.result(index);
         let is_reset = result.reset;
         self.statistics.note_voltage(result);
-        if !self.estimators.is_started(index) {
-            return;
-        }
         self.cells[index].sample = Some(*sample);
         if is_reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
             self.recharge.discard();
         }
-        let seen = Observed { time: sample.time, temperature_c: sample.temperature_c, measured_s, gap_s };
-        let estimators = &self.estimators;
-        self.learner.observe(index, &seen, || end_state(estimators, index));
         self.note_taper(sample);
+        if !is_quiet {
+            self.judge_trust(sample.cell, out);
+        }
         if out.want_estimates {
             out.estimates.extend(self.estimate(index));
         }

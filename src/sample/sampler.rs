@@ -346,6 +346,12 @@ impl Sampler {
         self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
     }
 
+    /// Whether something has come on every channel since the start or the last waking, and the latest of each is good
+    /// and young enough.
+    pub fn all_good(&self, now: Timestamp) -> bool {
+        !self.any_lost() && self.worst_input(now).is_some()
+    }
+
     /// Whether any signal at all is bad or stale.
     pub fn any_lost(&self) -> bool {
         self.state.signals.iter().any(Signal::is_bad)

@@ -73,6 +73,11 @@ impl Signal {
         should_move_s: f64,
     ) -> Judged {
         self.heard = Some(time);
+        if let Ok(value) = value
+            && self.take_ordinary(Stamped { value, time }, limits, should_move_s)
+        {
+            return Judged { value: Ok(value), change: None, is_new_level: false };
+        }
         let value = self.judge(time, value, limits, should_move_s);
         self.count(value.is_err());
         let is_new_level = value.is_ok() && self.refused_count >= ACCEPT_AFTER;
@@ -81,6 +86,28 @@ impl Signal {
             self.refused_count = 0;
         }
         Judged { value, change: self.turn(value.err(), 1), is_new_level }
+    }
+
+    /// Takes a good reading of a signal that has been good for long, as [`judge`](Self::judge) and [`count`](Self::count)
+    /// would, with less to look at; `false` and nothing changed when it may be anything else.
+    #[inline]
+    fn take_ordinary(&mut self, reading: Stamped, limits: &Limits, should_move_s: f64) -> bool {
+        let Stamped { value, time } = reading;
+        let is_settled = self.fault.is_none() && self.refused_count == 0;
+        let is_faultless = self.readings == BAD_SHARE_READINGS && self.bad_share == 0.0;
+        let (Some(good), true) = (self.good, is_settled && is_faultless) else { return false };
+        // Also false for NaN.
+        let is_plausible = value >= limits.min && value <= limits.max;
+        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, reading, rate)) {
+            return false;
+        }
+        if self.rests_at != Some(value) {
+            (self.rests_at, self.rests_since_s) = (Some(value), should_move_s);
+        } else if limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s) {
+            return false;
+        }
+        self.good = Some(Stamped { value, time });
+        true
     }
 
     /// Judges the age; the change to tell when the signal has just become stale.
@@ -218,6 +245,7 @@ impl Signal {
     }
 }
 
+#[inline]
 fn agree(earlier: Stamped, later: Stamped, max_rate_per_s: f64) -> bool {
     let dt_s = later.time.since(earlier.time).max(MIN_RATE_INTERVAL_S);
     (later.value - earlier.value).abs() <= max_rate_per_s * dt_s

@@ -31,10 +31,10 @@ pub struct EstimatorBank {
     constants: Constants,
     filters: Filters,
     cells: Vec<Cell>,
-    /// The steps of a batch, by cell; what is left of an earlier one is not looked at.
+    /// The steps of the batch; what is left of an earlier one is not looked at.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
-    /// Cells of a batch that have no ordinary step.
+    /// Cells of the batch that have no ordinary step.
     others: Vec<(usize, CellStep)>,
     machine: pulp::Arch,
 }
@@ -151,48 +151,21 @@ impl EstimatorBank {
         &self.config
     }
 
-    /// Takes a voltage reading of each of some cells, each at most once; what became of it: [`Self::result`].
+    /// Adds a cell's voltage reading to the batch: each cell's at most once.
     ///
     /// # Panics
     /// When there is no such cell.
-    pub fn step(&mut self, steps: &[(usize, CellStep)]) {
-        self.others.clear();
-        for (cell, step) in steps {
-            self.place(*cell, step);
-        }
-        let Self { machine, constants, filters, inputs, cells, results, .. } = self;
-        each_lane!(filters, lanes => machine.dispatch(StepAll { lanes, constants, inputs, cells, results }));
-        for (cell, step) in steps {
-            // Ordinary by its input, but not by what came of it.
-            let (block, lane) = (cell / WIDTH, cell % WIDTH);
-            if std::mem::take(&mut self.inputs[block].is_present[lane]) {
-                self.others.push((*cell, *step));
-            }
-        }
-        for at in 0..self.others.len() {
-            let (cell, step) = self.others[at];
-            let mut estimator = self.cell(cell);
-            self.results[cell] = estimator.step(&self.model, &self.config, &step);
-            self.put(cell, &estimator);
-        }
-    }
-
-    /// What became of a cell's last step.
-    pub fn result(&self, cell: usize) -> &StepResult {
-        &self.results[cell]
-    }
-
-    /// Puts a step into its lane, or among the others.
-    fn place(&mut self, index: usize, step: &CellStep) {
-        let cell = &mut self.cells[index];
-        let (Some(current_a), true) = (step.current_a, step.unmeasured_s == 0.0 && cell.is_ordinary()) else {
-            return self.others.push((index, *step));
+    #[inline]
+    pub fn add(&mut self, cell: usize, step: &CellStep) {
+        let (Some(current_a), true) = (step.current_a, step.unmeasured_s == 0.0 && self.cells[cell].is_ordinary())
+        else {
+            return self.others.push((cell, *step));
         };
         let temperature_c = match step.temperature_c {
             Some(measured_c) => measured_c,
-            None => self.modelled_c(index, step),
+            None => self.modelled_c(cell, step),
         };
-        let (block, lane) = (&mut self.inputs[index / WIDTH], index % WIDTH);
+        let (block, lane) = (&mut self.inputs[cell / WIDTH], cell % WIDTH);
         block.is_present[lane] = true;
         block.temperature_c[lane] = temperature_c;
         let input = &mut block.input;
@@ -200,6 +173,24 @@ impl EstimatorBank {
         input.charge_as.0[lane] = step.charge_as;
         input.current_a.0[lane] = current_a;
         input.voltage_v.0[lane] = step.voltage_v;
+    }
+
+    /// Makes the steps of the batch; what became of each: [`Self::result`].
+    pub fn step(&mut self) {
+        let Self { machine, constants, filters, inputs, cells, results, others, .. } = self;
+        each_lane!(filters, lanes => machine.dispatch(StepAll { lanes, constants, inputs, cells, results, others }));
+        for at in 0..self.others.len() {
+            let (cell, step) = self.others[at];
+            let mut estimator = self.cell(cell);
+            self.results[cell] = estimator.step(&self.model, &self.config, &step);
+            self.put(cell, &estimator);
+        }
+        self.others.clear();
+    }
+
+    /// What became of a cell's last step.
+    pub fn result(&self, cell: usize) -> &StepResult {
+        &self.results[cell]
     }
 
     /// Temperature of a cell without a sensor's, degrees C.
@@ -222,6 +213,21 @@ impl EstimatorBank {
             let away = memory.away_std_if_any();
             Belief { variance: away.map_or(soc.variance, |std| widened(soc.variance, std * std)), ..soc }
         })
+    }
+
+    /// State of charge of the emptiest and the fullest cell; `None` when one's is not known, or of before time away.
+    pub fn extremes(&self) -> Option<(Belief, Belief)> {
+        let (mut lowest, mut highest) = (self.soc(0)?, self.soc(0)?);
+        for cell in 0..self.cells.len() {
+            let Cell { memory, has_filter, .. } = &self.cells[cell];
+            if !has_filter || memory.is_unseen || memory.away_std_if_any().is_some() {
+                return None;
+            }
+            let soc = self.belief(cell, 0);
+            lowest = if soc.mean < lowest.mean { soc } else { lowest };
+            highest = if soc.mean > highest.mean { soc } else { highest };
+        }
+        Some((lowest, highest))
     }
 
     /// ln of the resistance relative to new.
@@ -338,6 +344,7 @@ struct StepAll<'a, const N: usize, const T: usize, const W: usize> {
     inputs: &'a mut [BlockInput],
     cells: &'a mut [Cell],
     results: &'a mut [StepResult],
+    others: &'a mut Vec<(usize, CellStep)>,
 }
 
 impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for StepAll<'_, N, T, W> {
@@ -346,6 +353,14 @@ impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for StepAll<
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(self, _: S) {
         self.lanes.step(self.constants, self.inputs, self.cells, self.results);
+        for (block, input) in self.inputs.iter_mut().enumerate() {
+            // Ordinary by its input, but not by what came of it.
+            for lane in 0..WIDTH {
+                if std::mem::take(&mut input.is_present[lane]) {
+                    self.others.push((block * WIDTH + lane, input.step(lane)));
+                }
+            }
+        }
     }
 }
 
@@ -434,6 +449,21 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
 }
 
 impl BlockInput {
+    /// The step that was put into a lane.
+    fn step(&self, lane: usize) -> CellStep {
+        let Self { temperature_c, input, .. } = self;
+        CellStep {
+            measured_s: input.measured_s.0[lane],
+            charge_as: input.charge_as.0[lane],
+            unmeasured_s: 0.0,
+            current_a: Some(input.current_a.0[lane]),
+            temperature_c: Some(temperature_c[lane]),
+            // Not asked for where the temperature is known.
+            ambient_c: temperature_c[lane],
+            voltage_v: input.voltage_v.0[lane],
+        }
+    }
+
     /// Notes that the step of a lane is made.
     #[inline(always)]
     fn note<const L: usize>(

@@ -96,6 +96,12 @@ impl Pack {
     }
 }
 
+/// One batch.
+fn step(bank: &mut EstimatorBank, steps: &[(usize, CellStep)]) {
+    steps.iter().for_each(|(cell, step)| bank.add(*cell, step));
+    bank.step();
+}
+
 /// The small model with so many branches.
 fn model(branches: usize) -> CellModel {
     let mut model = small_model();
@@ -117,7 +123,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
     let (mut soc, mut learned, mut accepted, mut resets) = (0.0_f64, 0.0_f64, 0, 0);
     for time in 0..rounds {
         let steps = pack.round(time);
-        bank.step(&steps);
+        step(&mut bank, &steps);
         for (cell, step) in &steps {
             let estimator = &mut readable[*cell];
             let result = estimator.step(model, config, step);
@@ -180,10 +186,10 @@ fn a_cell_does_not_know_its_company() {
         let steps = pack.round(time);
         // In two parts, the second backwards.
         let (first, second) = steps.split_at(steps.len() / 3);
-        together.step(first);
-        together.step(&second.iter().rev().copied().collect::<Vec<_>>());
-        for (cell, step) in steps {
-            alone[cell].step(&[(0, step)]);
+        step(&mut together, first);
+        step(&mut together, &second.iter().rev().copied().collect::<Vec<_>>());
+        for (cell, own) in steps {
+            step(&mut alone[cell], &[(0, own)]);
             assert_eq!(together.cell(cell).snapshot(), alone[cell].cell(0).snapshot(), "{time} {cell}");
             assert_eq!(together.result(cell), alone[cell].result(0));
         }
@@ -195,7 +201,7 @@ fn what_is_put_in_is_what_comes_out() {
     let (model, config) = (model(3), config());
     let mut bank = EstimatorBank::new(&model, &config, 9);
     let mut pack = Pack::new(&model, 9);
-    (0..50).for_each(|time| bank.step(&pack.round(time)));
+    (0..50).for_each(|time| step(&mut bank, &pack.round(time)));
     let before = bank.cell(4).snapshot();
     let other = bank.cell(7);
     bank.put(4, &other);
