@@ -19,7 +19,7 @@ use super::event_log;
 use super::store::Recorder;
 use crate::alarm::Change;
 use crate::can::Frame;
-use crate::io::log::{LogCounts, LogError, LogSource, Record};
+use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
 use crate::monitor::{Away, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
@@ -30,7 +30,7 @@ pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
 
 /// Records between two looks at the clock for the progress report.
-const REPORT_EVERY: u64 = 4096;
+const REPORT_EVERY: usize = 4096;
 /// Raised alarms listed one by one in the summary; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
@@ -187,18 +187,28 @@ pub fn run(
     report: &mut dyn FnMut(Progress),
 ) -> Result<(Summary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    let mut records: u64 = 0;
-    while let Some(record) = source.next_record()? {
-        if !replay.take(&record, source.carries_ticks())? {
-            break;
+    // Where the log is not read to its end, or may be waited for, nothing is read beyond the record in hand.
+    let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
+    let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
+    let mut unreported: usize = 0;
+    'records: while source.next_batch(&mut batch)? {
+        for record in batch.records() {
+            if !replay.take(record, batch.carries_ticks())? {
+                break 'records;
+            }
         }
-        records += 1;
-        if records.is_multiple_of(REPORT_EVERY) || replay.pace.speed.is_some() {
-            let bytes = source.read_bytes().load(Ordering::Relaxed);
-            report(Progress { bytes, frames: source.counts().frames, times_real_time: replay.span.times_real_time() });
+        unreported += batch.records().len();
+        if unreported >= REPORT_EVERY || replay.pace.speed.is_some() {
+            unreported = 0;
+            report(progress(source, source.counts().frames, &replay.span));
         }
     }
     replay.finish(source.counts())
+}
+
+fn progress(source: &LogSource, frames: u64, span: &Span) -> Progress {
+    let bytes = source.read_bytes().load(Ordering::Relaxed);
+    Progress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
 /// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
@@ -227,8 +237,7 @@ pub fn play(
             pace.wait(*time);
             send(*bus, frame)?;
             sent += 1;
-            let bytes = source.read_bytes().load(Ordering::Relaxed);
-            report(Progress { bytes, frames: sent, times_real_time: span.times_real_time() });
+            report(progress(source, sent, &span));
         }
     }
     Ok(sent)
