@@ -161,17 +161,8 @@ impl InputMap {
         if frame.kind() == FrameKind::Remote {
             return;
         }
-        let payload = frame.data();
         for run in runs.unwrap_or_default() {
-            let bindings = &self.bindings[run.clone()];
-            let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
-            if present == Ok(false) {
-                continue;
-            }
-            for binding in bindings {
-                let value = present.and_then(|_| binding.value(payload));
-                each(Reading { channel: binding.channel, value });
-            }
+            plan::decode_plainly(&self.bindings[run.clone()], frame.data(), &mut each);
         }
     }
 

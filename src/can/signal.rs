@@ -263,7 +263,6 @@ impl SignalPlan {
         let is_integer = matches!(self.value_type, ValueType::Unsigned | ValueType::Signed);
         (is_integer && !self.wide && self.down > 0).then_some(Shifts {
             window: self.window,
-            bytes_needed: self.bytes_needed,
             is_big_endian: self.byte_order == ByteOrder::BigEndian,
             is_signed: self.value_type == ValueType::Signed,
             up: self.up,
@@ -454,8 +453,6 @@ impl SignalPlan {
 pub(crate) struct Shifts {
     /// First of the eight bytes.
     pub(crate) window: u8,
-    /// Bytes a payload must have to carry the signal.
-    pub(crate) bytes_needed: u8,
     pub(crate) is_big_endian: bool,
     pub(crate) is_signed: bool,
     /// Brings the signal's top bit to the word's top.

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 mod cells;
+mod in_order;
 mod intake;
 mod rows;
 
@@ -26,6 +27,7 @@ use crate::monitor::{Away, Event, EventKind, Input, Monitor, Outputs, RestoreErr
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
+pub use in_order::in_order;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
 
@@ -169,6 +171,10 @@ pub struct Summary {
     pub wall_s: f64,
     /// Awake time over wall time.
     pub times_real_time: f64,
+    /// Frames read, over wall time.
+    pub frames_per_s: f64,
+    /// Voltage readings that came to an estimator, over wall time.
+    pub cell_steps_per_s: f64,
     /// Peak resident memory, KiB, where the system tells.
     pub peak_memory_kib: Option<u64>,
     /// What the user should know.
@@ -260,6 +266,8 @@ struct Replay {
     /// A reload of the recorded run was noted.
     reloaded: bool,
     usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    /// Cell-steps of a stored state that was taken up; `None` until the first input has taken it up.
+    steps_before: Option<u64>,
 }
 
 impl Replay {
@@ -283,6 +291,7 @@ impl Replay {
             summary: Summary::default(),
             reloaded: false,
             usable: BTreeMap::new(),
+            steps_before: Some(0),
         })
     }
 
@@ -339,6 +348,7 @@ impl Replay {
         };
         match (self.settings.restore.take(), recorded) {
             (Some(snapshot), recorded) => {
+                self.steps_before = None;
                 self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
             }
             (None, Some(_)) => self
@@ -365,6 +375,7 @@ impl Replay {
         self.pace.wait(input.time());
         self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
         self.monitor.handle(input, &mut self.out);
+        self.steps_before.get_or_insert_with(|| cell_steps(&self.monitor));
         if let Some(store) = &mut self.settings.store {
             store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
         }
@@ -425,6 +436,9 @@ impl Replay {
         summary.last_s = span.latest.map(Timestamp::secs);
         summary.awake_s = span.awake_s();
         summary.wall_s = span.started.elapsed().as_secs_f64();
+        summary.frames_per_s = counts.frames as f64 / summary.wall_s.max(1e-9);
+        let steps = cell_steps(&self.monitor).saturating_sub(self.steps_before.unwrap_or(0));
+        summary.cell_steps_per_s = steps as f64 / summary.wall_s.max(1e-9);
         summary.times_real_time = span.times_real_time();
         summary.peak_memory_kib = peak_memory_kib();
         if counts.frames == 0 && !counts.foreign.is_empty() {
@@ -434,6 +448,12 @@ impl Replay {
         }
         Ok((summary, self.snapshot))
     }
+}
+
+/// Voltage readings that came to an estimator, since the monitor's first start.
+fn cell_steps(monitor: &Monitor) -> u64 {
+    let counts = monitor.statistics();
+    counts.voltages_used + counts.voltages_gated + counts.voltages_without_current
 }
 
 impl Sinks {

@@ -33,7 +33,8 @@ pub enum RawLine<'a> {
 /// # Errors
 /// When the file cannot be opened or its first bytes cannot be read.
 pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
-    let raw: Box<dyn Read + Send> = if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
+    let raw: Box<dyn Read + Send> =
+        if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
     let mut counted = Counted { inner: raw, bytes: Arc::clone(read_bytes) };
     let mut magic = Vec::with_capacity(4);
     (&mut counted).take(4).read_to_end(&mut magic)?;

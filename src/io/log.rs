@@ -250,6 +250,7 @@ struct State {
     interfaces: Vec<String>,
     /// Of the interfaces with names of usual length: the name as a usual line has it, and the number.
     keys: Vec<(u64, BusIndex)>,
+    usual: usual::UsualLines,
     /// Interfaces that are not configured get a number too.
     adopt: bool,
     shift_ns: i64,
@@ -275,6 +276,7 @@ impl LogSource {
                 strict: options.strict,
                 keys: keys(&options.interfaces),
                 interfaces: options.interfaces,
+                usual: usual::UsualLines::default(),
                 adopt: false,
                 shift_ns: 0,
                 latest: None,
@@ -422,7 +424,7 @@ impl State {
     #[inline(always)]
     fn usual_record(&mut self, lines: &mut Lines) -> Option<Record> {
         let latest = self.latest.filter(|_| !self.fresh)?;
-        let line = usual::parse(lines.unread())?;
+        let line = self.usual.parse(lines.unread())?;
         let bus = self.keys.iter().find(|(key, _)| *key == line.name_key)?.1;
         lines.take_line(line.line_len);
         self.counts.lines += 1;

@@ -7,8 +7,8 @@
 use std::ops::Range;
 
 use super::{Binding, Channel, MuxTest, Reading};
-use crate::can::id_table::IdTable;
 use crate::can::Frame;
+use crate::can::id_table::IdTable;
 use crate::can::signal::{Shifts, SignalPlan, float_of_signed};
 use crate::quantity::BusIndex;
 
@@ -38,6 +38,8 @@ struct MessagePlan {
 #[derive(Debug, Clone, PartialEq)]
 struct Visit {
     bindings: Range<usize>,
+    /// Payloads of this length carry them all.
+    bytes_needed: usize,
     /// Whether they are there is still to be found out.
     check: bool,
 }
@@ -59,8 +61,6 @@ struct Plan {
     channel: Channel,
     /// Eight bytes of the payload from here on hold the signal.
     window: u8,
-    /// Bytes a payload must have; more than there are for a signal that the binding alone can read.
-    bytes_needed: u8,
     /// Which of [`Wire::words`].
     word: u8,
     up: u8,
@@ -124,14 +124,15 @@ impl Plans {
         let Some(number) = self.numbers.get(bus, frame.id()) else { return };
         let wire = Wire::new(frame);
         for visit in self.messages[number].visits(wire.payload) {
-            let present = if visit.check { bindings[visit.bindings.start].holds(wire.payload) } else { Ok(true) };
-            if present == Ok(false) {
+            let range = visit.bindings.clone();
+            if visit.check || wire.payload.len() < visit.bytes_needed {
+                decode_plainly(&bindings[range], wire.payload, &mut each);
                 continue;
             }
-            for (plan, index) in self.signals[visit.bindings.clone()].iter().zip(visit.bindings.start..) {
-                let value = match (plan.good(&wire), present) {
-                    (Some(value), Ok(_)) => Ok(value),
-                    (_, present) => present.and_then(|_| bindings[index].value(wire.payload)),
+            for (plan, index) in self.signals[range.clone()].iter().zip(range.start..) {
+                let value = match plan.good(&wire) {
+                    Some(value) => Ok(value),
+                    None => bindings[index].value(wire.payload),
                 };
                 each(Reading { channel: plan.channel, value });
             }
@@ -139,9 +140,28 @@ impl Plans {
     }
 }
 
+/// Bindings that are there or not there together, as they say.
+pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
+    let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
+    if present == Ok(false) {
+        return;
+    }
+    for binding in bindings {
+        let value = present.and_then(|_| binding.value(payload));
+        each(Reading { channel: binding.channel, value });
+    }
+}
+
+impl Visit {
+    fn new(bindings: &[Binding], run: &Range<usize>, check: bool) -> Self {
+        let needed = bindings[run.clone()].iter().map(|binding| binding.plan.bytes_needed());
+        Self { bindings: run.clone(), bytes_needed: needed.max().unwrap_or(0), check }
+    }
+}
+
 impl MessagePlan {
     fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
-        let visit = |run: &Range<usize>| Visit { bindings: run.clone(), check: !bindings[run.start].mux.is_empty() };
+        let visit = |run: &Range<usize>| Visit::new(bindings, run, !bindings[run.start].mux.is_empty());
         Self { all: runs.iter().map(visit).collect(), pages: Pages::new(bindings, runs) }
     }
 
@@ -178,7 +198,7 @@ impl Pages {
                     continue;
                 }
                 let check = tests(run).iter().any(|test| test.plan != selector);
-                pages.visits.push(Visit { bindings: run.clone(), check });
+                pages.visits.push(Visit::new(bindings, run, check));
             }
             pages.starts.push(pages.visits.len());
             if pages.visits.len() > MAX_VISITS {
@@ -197,7 +217,8 @@ impl Pages {
     fn of(&self, payload: &[u8]) -> &[Visit] {
         let above = self.starts.len() - 2;
         // A payload long enough always has a code.
-        let code = self.selector.raw(payload).map_or(above, |code| usize::try_from(code).map_or(above, |c| c.min(above)));
+        let code =
+            self.selector.raw(payload).map_or(above, |code| usize::try_from(code).map_or(above, |c| c.min(above)));
         &self.visits[self.starts[code]..self.starts[code + 1]]
     }
 }
@@ -208,13 +229,13 @@ impl Plan {
         let nothing = Self {
             channel,
             window: 0,
-            bytes_needed: u8::MAX,
             word: 0,
             up: 0,
-            down: 0,
+            down: 63,
             sign: 0,
+            // Of 64 bits one is left: no code is good.
             not_available: u64::MAX,
-            first_good: 0,
+            first_good: i64::MAX,
             more_good: 0,
             factor: 0.0,
             offset: 0.0,
@@ -226,7 +247,6 @@ impl Plan {
         let Some((first, last)) = good_codes(binding, &shifts) else { return nothing };
         Self {
             window: shifts.window,
-            bytes_needed: shifts.bytes_needed,
             word: u8::from(shifts.is_big_endian),
             up: shifts.up,
             down: shifts.down,
@@ -241,14 +261,13 @@ impl Plan {
         }
     }
 
-    /// The value in the program's unit and sign, if the payload carries the signal and it is good.
+    /// The value in the program's unit and sign, if it is good; the payload carries the signal.
     #[inline]
     fn good(&self, wire: &Wire<'_>) -> Option<f64> {
         let raw = wire.word(self) << (self.up & 63) >> (self.down & 63);
         let code = (raw ^ self.sign).wrapping_sub(self.sign).cast_signed();
-        let is_good = (usize::from(self.bytes_needed) <= wire.payload.len())
-            & (raw != self.not_available)
-            & (code.wrapping_sub(self.first_good).cast_unsigned() <= self.more_good);
+        let is_good =
+            (raw != self.not_available) & (code.wrapping_sub(self.first_good).cast_unsigned() <= self.more_good);
         is_good.then(|| (float_of_signed(code) * self.factor + self.offset) * self.scale + self.shift)
     }
 }
