@@ -361,8 +361,10 @@ impl Replay {
     }
 
     fn make_ticks(&mut self) -> Result<(), ReplayError> {
-        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-            self.feed(Input::Tick { time })?;
+        while self.ticks.is_pending() {
+            if let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+                self.feed(Input::Tick { time })?;
+            }
         }
         Ok(())
     }
@@ -385,6 +387,10 @@ impl Replay {
 
     fn write_out(&mut self) -> io::Result<()> {
         let out = &mut self.out;
+        let is_silent = out.events.is_empty() && out.frames.is_empty() && out.estimates.is_empty();
+        if is_silent && self.sinks.watch.is_none() && self.pace.speed.is_none() {
+            return Ok(());
+        }
         if let Some(Watch(watch)) = &mut self.sinks.watch {
             watch(out);
         }
@@ -611,8 +617,14 @@ impl Pace {
         self.anchor = None;
     }
 
+    #[inline]
     fn wait(&mut self, time: Timestamp) {
-        let Some(speed) = self.speed else { return };
+        if let Some(speed) = self.speed {
+            self.wait_at(speed, time);
+        }
+    }
+
+    fn wait_at(&mut self, speed: f64, time: Timestamp) {
         let (began, origin) = *self.anchor.get_or_insert_with(|| (Instant::now(), time));
         let due = Duration::try_from_secs_f64(time.since(origin) / speed).unwrap_or_default();
         let ahead = due.saturating_sub(began.elapsed());
