@@ -34,7 +34,7 @@ pub const MAX_ADOPTED: usize = 64;
 pub struct LogError(pub String);
 
 /// Turns one CSV row's values into the frames that would have carried them; gives how many values no frame could carry.
-pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize + Send>;
+pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
 /// How logs are to be read.
 pub struct LogOptions {

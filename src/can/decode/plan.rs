@@ -130,14 +130,20 @@ impl Plans {
                 continue;
             }
             for (plan, index) in self.signals[range.clone()].iter().zip(range.start..) {
-                let value = match plan.good(&wire) {
-                    Some(value) => Ok(value),
-                    None => bindings[index].value(wire.payload),
-                };
-                each(Reading { channel: plan.channel, value });
+                // Two places rather than one value made of both: the good one then stays in a register.
+                match plan.good(&wire) {
+                    Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
+                    None => decode_one(&bindings[index], wire.payload, &mut each),
+                }
             }
         }
     }
+}
+
+/// One binding that is there, as it says.
+#[cold]
+fn decode_one(binding: &Binding, payload: &[u8], each: &mut impl FnMut(Reading)) {
+    each(Reading { channel: binding.channel, value: binding.value(payload) });
 }
 
 /// Bindings that are there or not there together, as they say.
