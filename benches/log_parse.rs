@@ -1,40 +1,123 @@
-//! How fast candump lines are parsed, beside the newline scan that any reader must do.
+//! How fast candump logs become frames and readings: as `replay` does it, and in the plain form that says the same, beside
+//! the newline scan that any reader must do.
+#![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
 
+use divan::Bencher;
+use divan::counter::ItemsCount;
+use packwatch::can::dbc::Database;
+use packwatch::can::decode::{Binding, InputMap};
 use packwatch::io::candump::{Line, parse_line};
+use packwatch::io::csv_log::CsvOptions;
+use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch::quantity::{BusIndex, CellIndex, Channel, Reading, SensorIndex};
 
 fn main() {
     divan::main();
 }
 
-/// Lines of one log, about 1 MB.
-const LINES: u64 = 25_000;
+/// Lines of one log, about 10 MB.
+const LINES: u64 = 200_000;
 
-/// Classic frames of 8 bytes on two interfaces, as a pack at work sends them.
+/// Classic frames of 8 bytes with three signals each, at a bus's pace.
 fn log() -> Vec<u8> {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
-        format!("(17000{:05}.{:06}) can{} {:03X}#{data:016X}\n", n / 1000, n % 1000 * 1000, n % 2, n % 0x7FF)
+        let (second, micros) = (n * 225 / 1_000_000, n * 225 % 1_000_000);
+        format!("({}.{micros:06}) can0 100#{data:016X}\n", 1_700_000_000 + second)
     };
     (0..LINES).flat_map(|n| line(n).into_bytes()).collect()
 }
 
-#[divan::bench]
-fn newline_scan(bencher: divan::Bencher) {
+fn three_signals() -> InputMap {
+    let db = Database::parse(include_str!("../config/measured.dbc")).unwrap();
+    let bind = |name: &str, channel| {
+        let (message, signal) = db.signal(name).unwrap();
+        Binding::new(BusIndex(0), message, signal, channel).unwrap()
+    };
+    InputMap::new(vec![
+        bind("MeasuredCell.Voltage", Channel::CellVoltage(CellIndex(0))),
+        bind("MeasuredCell.Current", Channel::Current),
+        bind("MeasuredCell.Temperature", Channel::Temperature(SensorIndex(0))),
+    ])
+}
+
+fn value(reading: Reading) -> f64 {
+    reading.value.unwrap_or(0.0)
+}
+
+fn lines(bencher: Bencher, mut each: impl FnMut(&[u8])) {
     let text = log();
-    bencher.counter(divan::counter::ItemsCount::new(LINES)).bench_local(|| memchr::memchr_iter(b'\n', &text).count());
+    bencher.counter(ItemsCount::new(LINES)).bench_local(|| {
+        let mut start = 0;
+        for end in memchr::memchr_iter(b'\n', &text) {
+            each(&text[start..end]);
+            start = end + 1;
+        }
+    });
 }
 
 #[divan::bench]
-fn scan_and_parse(bencher: divan::Bencher) {
-    let text = log();
-    bencher.counter(divan::counter::ItemsCount::new(LINES)).bench_local(|| {
-        let (mut start, mut frames) = (0, 0u64);
-        for end in memchr::memchr_iter(b'\n', &text) {
-            if let Ok(Line::Frame { frame, .. }) = parse_line(&text[start..end]) {
-                frames += u64::from(divan::black_box(&frame).data().len() == 8);
-            }
-            start = end + 1;
+fn newline_scan(bencher: Bencher) {
+    lines(bencher, |line| {
+        divan::black_box(line);
+    });
+}
+
+#[divan::bench]
+fn parse_plainly(bencher: Bencher) {
+    lines(bencher, |line| {
+        divan::black_box(parse_line(line).unwrap());
+    });
+}
+
+#[divan::bench]
+fn parse_and_decode_plainly(bencher: Bencher) {
+    let map = three_signals();
+    lines(bencher, |line| {
+        let Ok(Line::Frame { frame, .. }) = parse_line(line) else { panic!("a frame") };
+        let mut sum = 0.0;
+        map.decode_plainly(BusIndex(0), &frame, |reading| sum += value(reading));
+        divan::black_box(sum);
+    });
+}
+
+/// Reads a file as `replay` does and gives every batch to `each`.
+fn batches(bencher: Bencher, mut each: impl FnMut(&[Record])) {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), log()).unwrap();
+    bencher.counter(ItemsCount::new(LINES)).bench_local(|| {
+        let options = LogOptions {
+            interfaces: vec!["can0".to_owned()],
+            strict: true,
+            csv: CsvOptions::default(),
+            encode_row: Box::new(|_, _| 0),
+        };
+        let mut source = LogSource::new([file.path().to_owned()], options);
+        let mut batch = Batch::new(Batch::MAX);
+        while source.next_batch(&mut batch).unwrap() {
+            each(batch.records());
         }
-        assert_eq!(frames, LINES);
+        assert_eq!(source.counts().frames, LINES);
+    });
+}
+
+#[divan::bench]
+fn parse(bencher: Bencher) {
+    batches(bencher, |records| {
+        divan::black_box(records);
+    });
+}
+
+#[divan::bench]
+fn parse_and_decode(bencher: Bencher) {
+    let map = three_signals();
+    batches(bencher, |records| {
+        for record in records {
+            if let Record::Frame { bus, frame, .. } = record {
+                let mut sum = 0.0;
+                map.decode(*bus, frame, |reading| sum += value(reading));
+                divan::black_box(sum);
+            }
+        }
     });
 }

@@ -8,7 +8,7 @@ use packwatch::can::{CanId, Frame};
 use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
-use packwatch::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
+use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource, Record};
 use packwatch::monitor::{Away, BusEvent, Input};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
@@ -186,6 +186,73 @@ fn read(
         records.push(record);
     }
     Ok((records, source.counts().clone()))
+}
+
+/// The same in batches of up to `max`.
+fn read_batches(paths: &[PathBuf], strict: bool, max: usize) -> Result<(Vec<Record>, LogCounts), LogError> {
+    let mut source = LogSource::new(paths.to_vec(), options(strict));
+    let (mut batch, mut records) = (Batch::new(max), Vec::new());
+    while source.next_batch(&mut batch)? {
+        assert!((1..=max).contains(&batch.records().len()));
+        assert_eq!(batch.carries_ticks(), source.carries_ticks());
+        records.extend_from_slice(batch.records());
+    }
+    Ok((records, source.counts().clone()))
+}
+
+/// Files whose lines are of every kind: usual ones, unusual ones, bad ones, other interfaces, ends of files.
+fn any_log() -> impl Strategy<Value = Vec<u8>> {
+    let usual = "\\(000000000[0-9]\\.[0-9]{6}\\) can[012] [0-7][0-9A-F]{2}#([0-9A-F]{2}){0,8}\r?\n";
+    let unusual = "\\([0-9]{1,3}\\.[0-9]{6}\\)  ?can[01] [0-7][0-9A-F]{2}#[R#]?([0-9A-F]{2}){0,9}( [RTX])?\n";
+    let other = prop_oneof![
+        "TICK \\(000000000[0-9]\\.[0-9]{9}\\)\n",
+        "[ -~]{0,40}\n",
+        "\\([0-9. a-z#]{0,40}",
+        Just("\n".to_owned())
+    ];
+    let line = prop_oneof![8 => usual, 3 => unusual, 2 => other];
+    let head = prop_oneof![4 => Just(String::new()), 1 => Just("PACKWATCH-JOURNAL 1\n".to_owned())];
+    (head, prop::collection::vec(line, 0..40)).prop_map(|(head, lines)| (head + &lines.concat()).into_bytes())
+}
+
+proptest! {
+    #[test]
+    fn batches_give_the_records_one_by_one_gives(
+        logs in prop::collection::vec(any_log(), 1..4),
+        strict in any::<bool>(),
+        max in prop::sample::select(vec![1, 3, Batch::MAX]),
+    ) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let paths: Vec<_> = logs.iter().zip(0..).map(|(log, n)| file(folder.path(), &format!("{n}.log"), log)).collect();
+        let one_by_one = read(&paths, strict, |_| {});
+        prop_assert_eq!(read_batches(&paths, strict, max), one_by_one);
+        // Spread by blanks nothing is usual any more, and nothing else changes.
+        let spread: Vec<_> = logs.iter().zip(0..).map(|(log, n)| {
+            let text = String::from_utf8_lossy(log).replace(") can", ")  can");
+            file(folder.path(), &format!("{n}.log"), text.as_bytes())
+        }).collect();
+        if !strict {
+            let (wide, mut counts) = read(&spread, strict, |_| {}).expect("not strict");
+            let (records, mut plain) = read_batches(&paths, strict, max).expect("not strict");
+            (counts.first_bad_line, plain.first_bad_line) = (None, None);
+            prop_assert_eq!((records, plain), (wide, counts));
+        }
+    }
+}
+
+#[test]
+fn a_batch_ends_with_its_file_and_says_whose_ticks_are_told() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let lines: String = (1..100).map(|n| format!("({n:010}.000000) can0 123#11\n")).collect();
+    let plain = file(folder.path(), "a.log", lines.as_bytes());
+    let journal =
+        file(folder.path(), "b.log", format!("PACKWATCH-JOURNAL 1\n{}", lines.replace("(00", "(01")).as_bytes());
+    let mut source = LogSource::new(vec![plain, journal], options(true));
+    let (mut batch, mut told) = (Batch::new(Batch::MAX), [0, 0]);
+    while source.next_batch(&mut batch).expect("read") {
+        told[usize::from(batch.carries_ticks())] += batch.records().len();
+    }
+    assert_eq!(told, [99, 99]);
 }
 
 fn file(folder: &Path, name: &str, text: &[u8]) -> PathBuf {

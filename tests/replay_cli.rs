@@ -82,3 +82,99 @@ fn a_snapshot_beyond_the_log_is_an_error_and_leaves_no_file() {
     replay(&[&log(folder.path()), "--snapshot", snapshot, "--snapshot-at", "+1e6"]).code(1);
     assert!(!Path::new(snapshot).exists());
 }
+
+/// Logs in candump form: a cell's voltage every second, `seconds` long, the second one broken on request.
+fn trips(folder: &Path, seconds: [u32; 3]) -> [String; 3] {
+    [0, 1, 2].map(|n| {
+        let path = folder.join(format!("trip{n}.csv"));
+        let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
+        for second in 0..seconds[n] {
+            text.push_str(&format!("{second},{},{:.4},24.5\n", n + 1, 4.1 - 0.0002 * f64::from(second)));
+        }
+        fs::write(&path, text).expect("written");
+        path.display().to_string()
+    })
+}
+
+fn stdout_of(assert: &assert_cmd::assert::Assert) -> String {
+    String::from_utf8_lossy(&assert.get_output().stdout).into_owned()
+}
+
+#[test]
+fn each_log_is_replayed_as_if_alone_and_told_in_the_order_given() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let logs = trips(folder.path(), [3000, 5, 200]);
+    let out = folder.path().join("out").display().to_string();
+    let each = ["--each", "--json", "-j", "3", "--estimates", &out, "--events", &out, "--frames", &out];
+    let told = stdout_of(&replay(&[&logs.each_ref().map(String::as_str)[..], &each[..]].concat()).success());
+    let told: Vec<serde_json::Value> = told.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    assert_eq!(told.iter().map(|one| one["name"].as_str().expect("a name")).collect::<Vec<_>>(), logs);
+    assert_eq!(told.iter().map(|one| one["frames"].as_u64()).collect::<Vec<_>>(), [3000, 5, 200].map(Some));
+    for (n, log) in logs.iter().enumerate() {
+        let alone = ["csv", "jsonl", "log"].map(|kind| folder.path().join(format!("alone.{kind}")));
+        let [estimates, events, frames] = alone.each_ref().map(|path| path.to_str().expect("UTF-8"));
+        replay(&[log, "--estimates", estimates, "--events", events, "--frames", frames]).success();
+        for path in alone {
+            let kind = path.extension().expect("one").to_str().expect("UTF-8");
+            let each = fs::read(folder.path().join(format!("out/trip{n}.{kind}"))).expect("written");
+            assert!(each == fs::read(&path).expect("written"), "trip{n}.{kind}");
+        }
+    }
+}
+
+#[test]
+fn a_log_that_fails_is_told_by_name_and_the_others_go_on() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let logs = trips(folder.path(), [50, 50, 50]);
+    fs::remove_file(&logs[1]).expect("removed");
+    let args = [&logs.each_ref().map(String::as_str)[..], &["--each"][..]].concat();
+    let result = replay(&args).code(1);
+    let error = String::from_utf8_lossy(&result.get_output().stderr).into_owned();
+    assert!(error.starts_with(&logs[1]) && error.lines().count() == 1, "{error}");
+    let told = stdout_of(&result);
+    let places = logs.each_ref().map(|log| told.find(log.as_str()).expect("every log is told"));
+    assert!(places.is_sorted(), "{told}");
+    assert_eq!(told.matches("wall time").count(), 2, "{told}");
+    let json = stdout_of(&replay(&[&args[..], &["--json"][..]].concat()).code(1));
+    let second: serde_json::Value = serde_json::from_str(json.lines().nth(1).expect("a line")).expect("JSON");
+    assert_eq!((&second["name"], second["error"].is_string()), (&logs[1].as_str().into(), true));
+}
+
+#[test]
+fn what_makes_no_sense_for_each_log_is_refused_by_name() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let [log, other, _] = trips(folder.path(), [5, 5, 5]);
+    let refused = |args: &[&str], code: i32| {
+        let result = replay(&[&[log.as_str(), "--each"], args].concat()).code(code);
+        String::from_utf8_lossy(&result.get_output().stderr).into_owned()
+    };
+    for (option, value) in
+        [("--to", "vcan0"), ("--speed", "2"), ("--snapshot", "x"), ("--restore", "x"), ("--state", "x")]
+    {
+        assert!(refused(&[option, value], 2).contains(option), "{option}");
+    }
+    assert!(refused(&["-"], 1).contains("standard input"));
+    assert!(refused(&["--events", "-"], 1).contains("must be a folder"));
+    assert!(refused(&[&log], 1).contains("named twice"));
+    let inner = folder.path().join("inner");
+    fs::create_dir(&inner).expect("made");
+    let same_name = inner.join("trip0.log").display().to_string();
+    fs::write(&same_name, "").expect("written");
+    let out = folder.path().join("out").display().to_string();
+    assert!(refused(&[&same_name, "--events", &out], 1).contains("would take the place of those of"));
+    let onto_itself = refused(&["--estimates", &folder.path().display().to_string()], 1);
+    assert!(onto_itself.contains("is read, cannot be written too"), "{onto_itself}");
+    assert!(stdout_of(&replay(&[&log, &other, "-j", "2"]).code(2)).is_empty(), "--jobs needs --each");
+}
+
+#[test]
+fn until_reads_no_further_than_it_says() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("a.log");
+    let line = |n: u32| format!("({:010}.000000) vcan0 100#{n:016X}\n", 1_700_000_000 + n);
+    fs::write(&path, (0..500).map(line).collect::<String>()).expect("written");
+    let path = path.display().to_string();
+    let output = stdout_of(&replay(&[&path, "--json", "--until", "+99"]).success());
+    let summary: serde_json::Value = serde_json::from_str(&output).expect("JSON");
+    assert_eq!((&summary["lines"], &summary["last_s"]), (&101.into(), &1_700_000_099.0.into()));
+}

@@ -1,11 +1,15 @@
 //! The plan that turns input frames into readings.
 //!
-//! Built once from the configured signals; per frame it is a look-up by interface and identifier, a look at the
-//! multiplexors, and a shift and a multiply-add per signal. A signal whose multiplexor says that it is not in this
+//! Built once from the configured signals; per frame it is a look-up by interface and identifier, one by the selector's
+//! code, and a shift and a multiply-add per signal. A signal whose multiplexor says that it is not in this
 //! payload gives nothing; one that is there but unusable gives a reading with its fault. The same identifier on
 //! another interface is another message, and so is the extended identifier of the same number.
 
+mod plan;
+
 use std::ops::Range;
+
+use plan::Plans;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::signal::{LayoutFault, SignalPlan};
@@ -21,6 +25,12 @@ pub struct MuxTest {
     pub plan: SignalPlan,
     /// Codes for which the signal is there.
     pub ranges: Vec<(u64, u64)>,
+}
+
+impl MuxTest {
+    fn allows(&self, code: u64) -> bool {
+        self.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code))
+    }
 }
 
 /// One configured signal: where it comes from and what it means.
@@ -78,7 +88,7 @@ impl Binding {
     pub(crate) fn holds(&self, payload: &[u8]) -> Result<bool, Fault> {
         for test in &self.mux {
             let code = test.plan.raw(payload)?;
-            if !test.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code)) {
+            if !test.allows(code) {
                 return Ok(false);
             }
         }
@@ -104,6 +114,7 @@ pub struct InputMap {
     runs: Vec<Range<usize>>,
     /// Per interface, sorted by identifier: where in `runs` the message's are.
     messages: Vec<Vec<(CanId, Range<usize>)>>,
+    plans: Plans,
 }
 
 impl InputMap {
@@ -127,30 +138,31 @@ impl InputMap {
                 _ => messages[bus.index()].push((id, index..index + 1)),
             }
         }
-        Self { bindings, runs, messages }
+        Self { plans: Plans::new(&bindings, &runs), bindings, runs, messages }
     }
 
     /// Hands the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those
     /// that are there. When a selector cannot be read, every signal that depends on it is a short frame. Frames
     /// that are not configured, and remote frames, give nothing.
     #[inline]
-    pub fn decode(&self, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
-        let Some(ids) = self.messages.get(bus.index()) else { return };
-        let Ok(found) = ids.binary_search_by_key(&frame.id(), |(id, _)| *id) else { return };
+    pub fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
+        if frame.kind() != FrameKind::Remote {
+            self.plans.decode(&self.bindings, bus, frame, each);
+        }
+    }
+
+    /// What [`decode`](Self::decode) gives, found and computed signal by signal as the bindings say: slow and plain, what
+    /// the compiled plan is held against.
+    pub fn decode_plainly(&self, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
+        let runs = self.messages.get(bus.index()).and_then(|ids| {
+            let found = ids.binary_search_by_key(&frame.id(), |(id, _)| *id).ok()?;
+            Some(&self.runs[ids[found].1.clone()])
+        });
         if frame.kind() == FrameKind::Remote {
             return;
         }
-        let payload = frame.data();
-        for run in &self.runs[ids[found].1.clone()] {
-            let bindings = &self.bindings[run.clone()];
-            let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
-            if present == Ok(false) {
-                continue;
-            }
-            for binding in bindings {
-                let value = present.and_then(|_| binding.value(payload));
-                each(Reading { channel: binding.channel, value });
-            }
+        for run in runs.unwrap_or_default() {
+            plan::decode_plainly(&self.bindings[run.clone()], frame.data(), &mut each);
         }
     }
 

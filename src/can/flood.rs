@@ -11,6 +11,7 @@ use std::num::NonZeroU32;
 use serde::{Deserialize, Serialize};
 
 use crate::can::CanId;
+use crate::can::id_table::IdTable;
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Length of the burst that passes at once, ns: a tenth of a second's frames.
@@ -78,6 +79,8 @@ pub struct FloodGate {
     frame_ns: i64,
     /// Sorted by interface and identifier.
     buckets: Vec<Bucket>,
+    /// Which bucket is a message's.
+    numbers: IdTable,
     changes: Vec<FloodChange>,
 }
 
@@ -94,7 +97,8 @@ impl FloodGate {
         let mut buckets: Vec<_> = messages.into_iter().map(bucket).collect();
         buckets.sort_by_key(|bucket| (bucket.bus, bucket.id));
         buckets.dedup_by_key(|bucket| (bucket.bus, bucket.id));
-        Self { frame_ns, changes: Vec::with_capacity(buckets.len() + 1), buckets }
+        let numbers = IdTable::new(buckets.iter().map(|bucket| (bucket.bus, bucket.id)));
+        Self { frame_ns, numbers, changes: Vec::with_capacity(buckets.len() + 1), buckets }
     }
 
     /// With the counts, the spent budget and the floods of another gate for the messages that are in both.
@@ -109,10 +113,9 @@ impl FloodGate {
     }
 
     /// Whether a frame is taken in; time never runs backwards except after [`Self::restart`].
+    #[inline]
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
-        let Ok(found) = self.buckets.binary_search_by_key(&(bus, id), |bucket| (bucket.bus, bucket.id)) else {
-            return true;
-        };
+        let Some(found) = self.numbers.get(bus, id) else { return true };
         let bucket = &mut self.buckets[found];
         let spent = bucket.spent_until.map_or(now, |spent| spent.max(now)).plus_nanos(self.frame_ns);
         if spent <= now.plus_nanos(bucket.burst_ns) {

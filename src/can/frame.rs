@@ -62,13 +62,19 @@ pub enum FrameKind {
     },
 }
 
+/// Payload bytes, zeros after the payload. Aligned, so that a word of it that is loaded soon after the frame was copied lies
+/// within one of the copy's own stores: the processor would wait for both otherwise, longer than decoding takes.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(align(8))]
+struct Data([u8; MAX_DATA]);
+
 /// One frame: identifier, kind and payload.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Frame {
     id: CanId,
     kind: FrameKind,
     len: u8,
-    data: [u8; MAX_DATA],
+    data: Data,
 }
 
 impl Frame {
@@ -85,13 +91,22 @@ impl Frame {
 
     /// A remote request for `len` bytes, or `None` for more than 8.
     pub fn remote(id: CanId, len: u8) -> Option<Self> {
-        (len <= 8).then_some(Self { id, kind: FrameKind::Remote, len, data: [0; MAX_DATA] })
+        (len <= 8).then_some(Self { id, kind: FrameKind::Remote, len, data: Data([0; MAX_DATA]) })
+    }
+
+    /// A classic data frame whose payload is the lowest `len` (at most 8) bytes of a word that has zeros above them.
+    #[inline]
+    pub(crate) fn of_word(id: CanId, word: u64, len: u8) -> Self {
+        debug_assert!(len <= 8 && (len == 8 || word >> (8 * len) == 0), "bytes beyond the payload are zeros");
+        let mut data = [0; MAX_DATA];
+        data[..8].copy_from_slice(&word.to_le_bytes());
+        Self { id, kind: FrameKind::Classic, len, data: Data(data) }
     }
 
     fn build(id: CanId, kind: FrameKind, bytes: &[u8]) -> Self {
         let mut data = [0; MAX_DATA];
         data[..bytes.len()].copy_from_slice(bytes);
-        Self { id, kind, len: bytes.len() as u8, data }
+        Self { id, kind, len: bytes.len() as u8, data: Data(data) }
     }
 
     /// The identifier.
@@ -105,18 +120,24 @@ impl Frame {
     }
 
     /// The payload; empty for a remote request.
+    #[inline]
     pub fn data(&self) -> &[u8] {
         match self.kind {
             FrameKind::Remote => &[],
-            FrameKind::Classic | FrameKind::Fd { .. } => &self.data[..usize::from(self.len)],
+            FrameKind::Classic | FrameKind::Fd { .. } => &self.data.0[..usize::from(self.len)],
         }
+    }
+
+    /// The payload with zeros after it; all zeros for a remote request.
+    pub(crate) const fn padded_data(&self) -> &[u8; MAX_DATA] {
+        &self.data.0
     }
 
     /// The payload, to be changed in place.
     pub(crate) fn data_mut(&mut self) -> &mut [u8] {
         match self.kind {
             FrameKind::Remote => &mut [],
-            FrameKind::Classic | FrameKind::Fd { .. } => &mut self.data[..usize::from(self.len)],
+            FrameKind::Classic | FrameKind::Fd { .. } => &mut self.data.0[..usize::from(self.len)],
         }
     }
 

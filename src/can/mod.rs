@@ -8,6 +8,7 @@ pub mod encode;
 pub mod flood;
 pub mod frame;
 pub mod guard;
+mod id_table;
 pub mod j1939;
 pub mod signal;
 

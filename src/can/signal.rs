@@ -258,6 +258,22 @@ impl SignalPlan {
         usize::from(self.bytes_needed)
     }
 
+    /// For reading only, where the signal is one of the usual ones.
+    pub(crate) fn shifts(&self) -> Option<Shifts> {
+        let is_integer = matches!(self.value_type, ValueType::Unsigned | ValueType::Signed);
+        (is_integer && !self.wide && self.down > 0).then_some(Shifts {
+            window: self.window,
+            is_big_endian: self.byte_order == ByteOrder::BigEndian,
+            is_signed: self.value_type == ValueType::Signed,
+            up: self.up,
+            down: self.down,
+            factor: self.factor,
+            offset: self.offset,
+            low: self.low,
+            high: self.high,
+        })
+    }
+
     /// Length of the signal in bits, 1 to 64.
     pub fn length_bits(&self) -> u32 {
         64 - u32::from(self.down)
@@ -429,6 +445,32 @@ impl SignalPlan {
             *byte = (*byte & !mask) | bits;
         }
         Ok(())
+    }
+}
+
+/// An integer signal of at most 63 bits within eight bytes: where it is and what it means, for a plan that reads many.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Shifts {
+    /// First of the eight bytes.
+    pub(crate) window: u8,
+    pub(crate) is_big_endian: bool,
+    pub(crate) is_signed: bool,
+    /// Brings the signal's top bit to the word's top.
+    pub(crate) up: u8,
+    /// Then brings its lowest bit to the word's bottom.
+    pub(crate) down: u8,
+    pub(crate) factor: f64,
+    pub(crate) offset: f64,
+    /// Smallest and largest physical value in the DBC's unit.
+    pub(crate) low: f64,
+    pub(crate) high: f64,
+}
+
+impl Shifts {
+    /// Smallest and largest code the bits can hold.
+    pub(crate) fn codes(&self) -> (i64, i64) {
+        let highest = (u64::MAX >> self.down).cast_signed();
+        if self.is_signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 }
 

@@ -1,6 +1,7 @@
 //! `packwatch replay`: records through the same core as live, or onto an interface.
 
 mod args;
+mod each;
 mod report;
 
 use std::io;
@@ -26,6 +27,9 @@ use crate::sample::VoltageSource;
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = config::load(&args.config)?;
+    if args.each {
+        return each::run(args, &config);
+    }
     let mut source = LogSource::new(args.logs.clone(), log_options(&args.input, &config));
     let settings = settings(args, &config)?;
     let result = match &args.to {
@@ -96,9 +100,6 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let speed = args.speed.or(args.to.is_some().then_some(1.0));
     Ok(Settings {
         speed: speed.filter(|speed| speed.is_finite()),
-        from: args.from,
-        until: args.until,
-        sleep_gap_s: args.input.sleep_gap,
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
@@ -109,8 +110,24 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
             .map(|path| Recorder::create(path, &config.store))
             .transpose()
             .map_err(Failure::new)?,
-        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+        ..plain_settings(args, config)
     })
+}
+
+/// From the start to the end, as fast as possible, with nothing kept.
+fn plain_settings(args: &Args, config: &Config) -> Settings {
+    Settings {
+        speed: None,
+        from: args.from,
+        until: args.until,
+        sleep_gap_s: args.input.sleep_gap,
+        snapshot: false,
+        snapshot_at: None,
+        restore: None,
+        away: None,
+        store: None,
+        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+    }
 }
 
 fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {

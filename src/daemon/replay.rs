@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 mod cells;
+mod in_order;
 mod intake;
 mod rows;
 
@@ -19,18 +20,19 @@ use super::event_log;
 use super::store::Recorder;
 use crate::alarm::Change;
 use crate::can::Frame;
-use crate::io::log::{LogCounts, LogError, LogSource, Record};
+use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
 use crate::monitor::{Away, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
+pub use in_order::in_order;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
 
 /// Records between two looks at the clock for the progress report.
-const REPORT_EVERY: u64 = 4096;
+const REPORT_EVERY: usize = 4096;
 /// Raised alarms listed one by one in the summary; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
@@ -169,6 +171,10 @@ pub struct Summary {
     pub wall_s: f64,
     /// Awake time over wall time.
     pub times_real_time: f64,
+    /// Frames read, over wall time.
+    pub frames_per_s: f64,
+    /// Voltage readings that came to an estimator, over wall time.
+    pub cell_steps_per_s: f64,
     /// Peak resident memory, KiB, where the system tells.
     pub peak_memory_kib: Option<u64>,
     /// What the user should know.
@@ -187,18 +193,28 @@ pub fn run(
     report: &mut dyn FnMut(Progress),
 ) -> Result<(Summary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    let mut records: u64 = 0;
-    while let Some(record) = source.next_record()? {
-        if !replay.take(&record, source.carries_ticks())? {
-            break;
+    // Where the log is not read to its end, or may be waited for, nothing is read beyond the record in hand.
+    let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
+    let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
+    let mut unreported: usize = 0;
+    'records: while source.next_batch(&mut batch)? {
+        for record in batch.records() {
+            if !replay.take(record, batch.carries_ticks())? {
+                break 'records;
+            }
         }
-        records += 1;
-        if records.is_multiple_of(REPORT_EVERY) || replay.pace.speed.is_some() {
-            let bytes = source.read_bytes().load(Ordering::Relaxed);
-            report(Progress { bytes, frames: source.counts().frames, times_real_time: replay.span.times_real_time() });
+        unreported += batch.records().len();
+        if unreported >= REPORT_EVERY || replay.pace.speed.is_some() {
+            unreported = 0;
+            report(progress(source, source.counts().frames, &replay.span));
         }
     }
     replay.finish(source.counts())
+}
+
+fn progress(source: &LogSource, frames: u64, span: &Span) -> Progress {
+    let bytes = source.read_bytes().load(Ordering::Relaxed);
+    Progress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
 /// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
@@ -227,8 +243,7 @@ pub fn play(
             pace.wait(*time);
             send(*bus, frame)?;
             sent += 1;
-            let bytes = source.read_bytes().load(Ordering::Relaxed);
-            report(Progress { bytes, frames: sent, times_real_time: span.times_real_time() });
+            report(progress(source, sent, &span));
         }
     }
     Ok(sent)
@@ -251,6 +266,8 @@ struct Replay {
     /// A reload of the recorded run was noted.
     reloaded: bool,
     usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    /// Cell-steps of a stored state that was taken up; `None` until the first input has taken it up.
+    steps_before: Option<u64>,
 }
 
 impl Replay {
@@ -274,6 +291,7 @@ impl Replay {
             summary: Summary::default(),
             reloaded: false,
             usable: BTreeMap::new(),
+            steps_before: Some(0),
         })
     }
 
@@ -330,6 +348,7 @@ impl Replay {
         };
         match (self.settings.restore.take(), recorded) {
             (Some(snapshot), recorded) => {
+                self.steps_before = None;
                 self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
             }
             (None, Some(_)) => self
@@ -342,8 +361,10 @@ impl Replay {
     }
 
     fn make_ticks(&mut self) -> Result<(), ReplayError> {
-        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
-            self.feed(Input::Tick { time })?;
+        while self.ticks.is_pending() {
+            if let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+                self.feed(Input::Tick { time })?;
+            }
         }
         Ok(())
     }
@@ -356,6 +377,7 @@ impl Replay {
         self.pace.wait(input.time());
         self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
         self.monitor.handle(input, &mut self.out);
+        self.steps_before.get_or_insert_with(|| cell_steps(&self.monitor));
         if let Some(store) = &mut self.settings.store {
             store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
         }
@@ -365,6 +387,10 @@ impl Replay {
 
     fn write_out(&mut self) -> io::Result<()> {
         let out = &mut self.out;
+        let is_silent = out.events.is_empty() && out.frames.is_empty() && out.estimates.is_empty();
+        if is_silent && self.sinks.watch.is_none() && self.pace.speed.is_none() {
+            return Ok(());
+        }
         if let Some(Watch(watch)) = &mut self.sinks.watch {
             watch(out);
         }
@@ -418,6 +444,9 @@ impl Replay {
         summary.last_s = span.latest.map(Timestamp::secs);
         summary.awake_s = span.awake_s();
         summary.wall_s = span.started.elapsed().as_secs_f64();
+        summary.frames_per_s = counts.frames as f64 / summary.wall_s.max(1e-9);
+        let steps = cell_steps(&self.monitor).saturating_sub(self.steps_before.unwrap_or(0));
+        summary.cell_steps_per_s = steps as f64 / summary.wall_s.max(1e-9);
         summary.times_real_time = span.times_real_time();
         summary.peak_memory_kib = peak_memory_kib();
         if counts.frames == 0 && !counts.foreign.is_empty() {
@@ -427,6 +456,12 @@ impl Replay {
         }
         Ok((summary, self.snapshot))
     }
+}
+
+/// Voltage readings that came to an estimator, since the monitor's first start.
+fn cell_steps(monitor: &Monitor) -> u64 {
+    let counts = monitor.statistics();
+    counts.voltages_used + counts.voltages_gated + counts.voltages_without_current
 }
 
 impl Sinks {
@@ -584,8 +619,14 @@ impl Pace {
         self.anchor = None;
     }
 
+    #[inline]
     fn wait(&mut self, time: Timestamp) {
-        let Some(speed) = self.speed else { return };
+        if let Some(speed) = self.speed {
+            self.wait_at(speed, time);
+        }
+    }
+
+    fn wait_at(&mut self, speed: f64, time: Timestamp) {
         let (began, origin) = *self.anchor.get_or_insert_with(|| (Instant::now(), time));
         let due = Duration::try_from_secs_f64(time.since(origin) / speed).unwrap_or_default();
         let ahead = due.saturating_sub(began.elapsed());

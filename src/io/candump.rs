@@ -9,6 +9,8 @@
 //!
 //! FD payloads of a length the bus cannot carry are padded with zeros to the next one, as canplayer does.
 
+pub(super) mod usual;
+
 use std::io::{self, Write};
 
 use crate::can::{CanId, Frame, FrameKind, MAX_DATA};

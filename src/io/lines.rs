@@ -1,13 +1,18 @@
 //! Lines of a file, plain, gzip or zstd, read in large blocks and lent without copying.
 //!
 //! The compression is told by the content, never by the name. A line longer than the block is handed on as
-//! [`RawLine::TooLong`] and skipped to its end. Bytes taken from the file are counted for the progress bar.
+//! [`RawLine::TooLong`] and skipped to its end. Bytes taken from the file are counted for the progress bar. What is
+//! compressed is unpacked on a thread of its own; plain files need none.
+
+mod ahead;
 
 use std::fs::File;
 use std::io::{self, Cursor, Read};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+
+use ahead::Ahead;
 
 /// Bytes asked of the file or decompressor at once; also the longest line taken. A CAN XL line has 4,200.
 const BLOCK: usize = 256 * 1024;
@@ -28,23 +33,25 @@ pub enum RawLine<'a> {
 /// # Errors
 /// When the file cannot be opened or its first bytes cannot be read.
 pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
-    let raw: Box<dyn Read> = if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
+    let raw: Box<dyn Read + Send> =
+        if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
     let mut counted = Counted { inner: raw, bytes: Arc::clone(read_bytes) };
     let mut magic = Vec::with_capacity(4);
     (&mut counted).take(4).read_to_end(&mut magic)?;
     let (gzip, zstd) = (magic.starts_with(&[0x1F, 0x8B]), magic == [0x28, 0xB5, 0x2F, 0xFD]);
     let whole = Cursor::new(magic).chain(counted);
     if gzip {
-        Ok(Box::new(flate2::bufread::MultiGzDecoder::new(io::BufReader::with_capacity(BLOCK, whole))))
+        let packed = io::BufReader::with_capacity(BLOCK, whole);
+        Ok(Box::new(Ahead::new(flate2::bufread::MultiGzDecoder::new(packed), BLOCK)?))
     } else if zstd {
-        Ok(Box::new(zstd::stream::read::Decoder::new(whole)?))
+        Ok(Box::new(Ahead::new(zstd::stream::read::Decoder::new(whole)?, BLOCK)?))
     } else {
         Ok(Box::new(whole))
     }
 }
 
 struct Counted {
-    inner: Box<dyn Read>,
+    inner: Box<dyn Read + Send>,
     bytes: Arc<AtomicU64>,
 }
 
@@ -82,6 +89,20 @@ impl Lines {
     /// Number of the line last handed out, from 1.
     pub fn number(&self) -> u64 {
         self.number
+    }
+
+    /// What was read and not handed out yet; may end within a line, or be empty before the end of the source.
+    #[inline]
+    pub(super) fn unread(&self) -> &[u8] {
+        &self.buffer[self.start..self.end]
+    }
+
+    /// Takes the first `len` bytes of [`unread`](Self::unread), which are one line with its line feed.
+    #[inline]
+    pub(super) fn take_line(&mut self, len: usize) {
+        debug_assert_eq!(memchr::memchr(b'\n', self.unread()), Some(len - 1), "one line");
+        self.start += len;
+        self.number += 1;
     }
 
     /// The next line, or `None` at the end.

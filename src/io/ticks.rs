@@ -43,6 +43,7 @@ impl Ticks {
     /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then hand the record on. Whether the
     /// recorder was asleep before it (the first record, or one after a hole). A time a little before the latest (interfaces
     /// merged out of order) makes no tick.
+    #[inline]
     pub fn advance(&mut self, time: Timestamp) -> bool {
         let time_ns = time.nanos();
         let Some(latest_ns) = self.latest_ns else {
@@ -73,6 +74,12 @@ impl Ticks {
         if let Some(latest_ns) = self.latest_ns.take() {
             self.limit_ns = latest_ns.saturating_add(1);
         }
+    }
+
+    /// Whether [`pop`](Self::pop) has something to do, whatever the core cares for: no, for most records.
+    #[inline]
+    pub fn is_pending(&self) -> bool {
+        self.next_ns < self.limit_ns || self.wake_ns.is_some()
     }
 
     /// The next tick that is due and that the core cares for: none before `due` (`None` = it cares for none).
@@ -112,8 +119,8 @@ mod tests {
         let mut ticks = Ticks::new(10, 0.05);
         let mut made = Vec::new();
         let mut drain = |ticks: &mut Ticks| {
-            while let Some(tick) = ticks.pop(due) {
-                made.push(tick.nanos() / 1_000_000);
+            while ticks.is_pending() {
+                made.extend(ticks.pop(due).map(|tick| tick.nanos() / 1_000_000));
             }
         };
         for &record in records {

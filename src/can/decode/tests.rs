@@ -1,7 +1,10 @@
 //! What an input map hands on, and what it passes over.
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::can::dbc::Database;
+use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::quantity::CellIndex;
 
 /// A plain message whose voltage comes first and current last, a paged one with a signal on every page, and one whose
@@ -213,4 +216,74 @@ fn identifiers_and_channels_are_listed_once_and_in_order() {
     assert_eq!(map().ids(BusIndex(9)), []);
     let all = [Channel::Current, sensor(0), sensor(1), Channel::PackVoltage, cell(0), cell(1), cell(2)];
     assert_eq!(map().channels(), all);
+}
+
+/// Signals of every kind and place, several to a message, some of them on pages.
+fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
+    let order = prop::sample::select(vec![ByteOrder::LittleEndian, ByteOrder::BigEndian]);
+    let kind = prop_oneof![
+        8 => Just((ValueType::Unsigned, None)),
+        8 => Just((ValueType::Signed, None)),
+        1 => Just((ValueType::Float32, Some(32))),
+        1 => Just((ValueType::Float64, Some(64))),
+    ];
+    let number = prop_oneof![Just(1.0), Just(0.0), Just(-0.1), Just(0.001), Just(1e300), -1e3..1e3f64];
+    let layout =
+        (0..128u16, 1..=64u16, order, kind, [number.clone(), number.clone()], [number.clone(), number.clone()]);
+    let layout =
+        layout.prop_map(|(start_bit, length_bits, byte_order, (value_type, length), [factor, offset], [a, b])| {
+            let (minimum, maximum) = (a.min(b), a.max(b));
+            let length_bits = length.unwrap_or(length_bits);
+            SignalLayout { start_bit, length_bits, byte_order, value_type, factor, offset, minimum, maximum }
+        });
+    let plan = layout.prop_filter_map("a layout that can be read", |layout| layout.plan().ok());
+    let range = prop_oneof![Just((f64::NEG_INFINITY, f64::INFINITY)), (-1e3..0.0, 0.0..1e3)];
+    let codes = prop::collection::vec(prop_oneof![0..4u64, any::<u64>()], 0..3);
+    let page = prop::collection::vec((prop::sample::select(vec![0u16, 4, 60]), 0..5u64, 0..3u64), 0..3);
+    let binding = (0..2u8, 0..3u32, plan, [number.clone(), number], codes, range, page);
+    let binding = binding.prop_map(|(bus, id, plan, [scale, offset], not_available, range, page)| {
+        let selector = |start_bit| SignalLayout { start_bit, length_bits: 4, ..SELECTOR }.plan().unwrap();
+        let test = |(start, low, more)| MuxTest { plan: selector(start), ranges: vec![(low, low + more), (9, 9)] };
+        let id = if id == 2 { CanId::Extended(1) } else { CanId::Standard(id as u16) };
+        let mux = page.into_iter().map(test).collect();
+        let channel = cell(0);
+        Binding { bus: BusIndex(bus), id, len_bytes: 8, plan, mux, channel, scale, offset, not_available, range }
+    });
+    prop::collection::vec(binding, 0..12).prop_map(|mut bindings| {
+        bindings.iter_mut().zip(0..).for_each(|(binding, n)| binding.channel = cell(n));
+        bindings
+    })
+}
+
+const SELECTOR: SignalLayout = SignalLayout {
+    start_bit: 0,
+    length_bits: 4,
+    byte_order: ByteOrder::LittleEndian,
+    value_type: ValueType::Unsigned,
+    factor: 1.0,
+    offset: 0.0,
+    minimum: 0.0,
+    maximum: 0.0,
+};
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2000))]
+
+    #[test]
+    fn the_plan_gives_bit_for_bit_what_the_bindings_say(
+        bindings in any_bindings(),
+        frames in prop::collection::vec((0..2u8, 0..3u32, prop::collection::vec(prop_oneof![0..16u8, any::<u8>()], 0..17)), 1..20),
+    ) {
+        let map = InputMap::new(bindings);
+        for (bus, id, data) in frames {
+            let id = if id == 2 { CanId::Extended(1) } else { CanId::Standard(id as u16) };
+            let len = data.len() - data.len() % if data.len() > 8 { 4 } else { 1 };
+            let frame = Frame::fd(id, false, false, &data[..len]).unwrap();
+            let (mut quick, mut plain) = (Vec::new(), Vec::new());
+            let bits = |reading: Reading| (reading.channel, reading.value.map(f64::to_bits));
+            map.decode(BusIndex(bus), &frame, |reading| quick.push(bits(reading)));
+            map.decode_plainly(BusIndex(bus), &frame, |reading| plain.push(bits(reading)));
+            prop_assert_eq!(quick, plain);
+        }
+    }
 }

@@ -23,24 +23,31 @@ pub(crate) struct Args {
     /// Configuration
     #[arg(short, long, value_name = "FILE")]
     pub(crate) config: PathBuf,
-    /// Journals, candump logs or CSV files, also .gz or .zst, read one after another; - is standard input
+    /// Journals, candump logs or CSV files, also .gz or .zst, read one after another as one record; - is standard input
     #[arg(required = true, value_name = "LOG")]
     pub(crate) logs: Vec<PathBuf>,
     #[command(flatten)]
     pub(crate) input: InputArgs,
+    /// Replay every log by itself and from the start, several at a time; summaries come in the logs' order, as JSON one per line. A
+    /// log that fails is told, and the others go on
+    #[arg(long, conflicts_with_all = ["to", "speed", "snapshot", "snapshot_at", "restore", "away", "state"])]
+    pub(crate) each: bool,
+    /// Logs at a time (default: one per core)
+    #[arg(short, long, value_name = "N", requires = "each", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    pub(crate) jobs: Option<u16>,
     /// Times real time (1 = real time); as fast as possible when not given, real time with --to
     #[arg(long, value_name = "X", value_parser = positive)]
     pub(crate) speed: Option<f64>,
     /// Play the frames onto this CAN interface instead of through the core
     #[arg(long, value_name = "IFACE", conflicts_with_all = ["estimates", "events", "frames", "snapshot", "restore", "state"])]
     pub(crate) to: Option<String>,
-    /// Write every estimate, as CSV
+    /// Write every estimate, as CSV; with --each a folder, which gets a NAME.csv per log
     #[arg(long, value_name = "FILE.csv")]
     pub(crate) estimates: Option<PathBuf>,
-    /// Write every event, one JSON document per line
+    /// Write every event, one JSON document per line; with --each a folder, which gets a NAME.jsonl per log
     #[arg(long, value_name = "FILE.jsonl")]
     pub(crate) events: Option<PathBuf>,
-    /// Write the frames that would be sent, as candump lines
+    /// Write the frames that would be sent, as candump lines; with --each a folder, which gets a NAME.log per log
     #[arg(long, value_name = "FILE.log")]
     pub(crate) frames: Option<PathBuf>,
     /// Print the summary as JSON
@@ -103,6 +110,10 @@ impl Args {
 
     /// What one argument alone cannot tell.
     pub(crate) fn check(&self) -> Result<(), Failure> {
+        if self.each {
+            // Results are folders, which have rules of their own.
+            return Ok(());
+        }
         let on_stdout = self.results().filter(|&path| path == Path::new("-")).count() + usize::from(self.json);
         if on_stdout > 1 {
             return Err(Failure::new("only one of the results and --json can go to standard output"));

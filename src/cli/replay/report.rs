@@ -1,7 +1,7 @@
 //! What `replay` tells on the terminal: a progress bar, a summary.
 
 use std::io::{self, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -22,15 +22,7 @@ pub(crate) struct Bar(ProgressBar);
 impl Bar {
     /// For logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
     pub(crate) fn new(logs: &[PathBuf]) -> Self {
-        let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
-        let total: Option<u64> = logs.iter().map(size).sum();
-        let bar = ProgressBar::with_draw_target(total, ProgressDrawTarget::stderr_with_hz(5));
-        let template = match total {
-            Some(_) => "{bar:32} {bytes}/{total_bytes} {msg} eta {eta}",
-            None => "{spinner} {bytes} {msg}",
-        };
-        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Self(bar)
+        Self(bar(logs, ProgressDrawTarget::stderr_with_hz(5)))
     }
 
     /// The present state.
@@ -53,6 +45,30 @@ impl Bar {
     pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }
+}
+
+/// A bar over the sizes of logs; without an end where one has no size.
+pub(super) fn bar(logs: &[PathBuf], target: ProgressDrawTarget) -> ProgressBar {
+    let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
+    let total: Option<u64> = logs.iter().map(size).sum();
+    let template = match total {
+        Some(_) => "{bar:32} {percent:>3} % {bytes}/{total_bytes} {bytes_per_sec} {msg} eta {eta}",
+        None => "{spinner} {bytes} {bytes_per_sec} {msg}",
+    };
+    let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::with_draw_target(total, target).with_style(style)
+}
+
+/// The summary as one line of JSON that begins with the log's name.
+pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &Summary) -> io::Result<()> {
+    #[derive(serde::Serialize)]
+    struct Named<'a> {
+        name: String,
+        #[serde(flatten)]
+        summary: &'a Summary,
+    }
+    serde_json::to_writer(&mut *out, &Named { name: log.display().to_string(), summary })?;
+    writeln!(out)
 }
 
 /// The summary as one JSON document on standard output.
@@ -102,11 +118,12 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
     rows
 }
 
-fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
+pub(super) fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
     let s = summary;
     let mut rows = log_rows(&s.log);
     rows.push(("record", format!("{:.1} s awake", s.awake_s)));
     rows.push(("wall time", format!("{:.2} s ({:.0} x real time)", s.wall_s, s.times_real_time)));
+    rows.push(("rate", format!("{:.0} frames/s, {:.0} cell-steps/s", s.frames_per_s, s.cell_steps_per_s)));
     rows.extend(s.peak_memory_kib.map(|kib| ("peak memory", format!("{:.1} MiB", kib as f64 / 1024.0))));
     rows.push(("ticks", s.ticks.to_string()));
     rows.push(("frames to send", s.frames_out.to_string()));

@@ -1,0 +1,316 @@
+//! The bindings compiled for reading: which message, which page of it, and per signal shifts, factors and limits.
+//!
+//! Everything here only finds sooner, and computes with fewer branches, what [`Binding`] says; results are the same bit
+//! for bit. What is rare (floats, signals over nine bytes, several codes for "not available", a selector with too many
+//! codes for a table) goes the binding's own way.
+
+use std::ops::Range;
+
+use super::{Binding, Channel, MuxTest, Reading};
+use crate::can::Frame;
+use crate::can::id_table::IdTable;
+use crate::can::signal::{Shifts, SignalPlan, float_of_signed};
+use crate::quantity::BusIndex;
+
+/// Codes a selector may have to be looked up in a table: ten bits. Selectors have 4 to 8.
+const MAX_CODES: u64 = 1024;
+/// Entries of all tables of one message, so that wide ranges on many signals take no memory to speak of.
+const MAX_VISITS: usize = 1 << 16;
+
+/// All messages, ready to be read.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Plans {
+    numbers: IdTable,
+    messages: Vec<MessagePlan>,
+    /// One for each binding.
+    signals: Vec<Plan>,
+}
+
+/// One message.
+#[derive(Debug, Clone, PartialEq)]
+struct MessagePlan {
+    /// Every group of signals, in order.
+    all: Vec<Visit>,
+    pages: Option<Pages>,
+}
+
+/// Neighbours among the bindings that are there or not there together.
+#[derive(Debug, Clone, PartialEq)]
+struct Visit {
+    bindings: Range<usize>,
+    /// Payloads of this length carry them all.
+    bytes_needed: usize,
+    /// Whether they are there is still to be found out.
+    check: bool,
+}
+
+/// What a selector's codes bring.
+#[derive(Debug, Clone, PartialEq)]
+struct Pages {
+    selector: SignalPlan,
+    /// A payload of this length carries every selector of the message; of shorter ones, each signal is judged for itself.
+    bytes_needed: usize,
+    /// Per code, and last for every code above: where its visits begin. One more at the end.
+    starts: Vec<usize>,
+    visits: Vec<Visit>,
+}
+
+/// One signal: what a good code becomes. Whatever is not certainly good is left to the binding.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Plan {
+    channel: Channel,
+    /// Eight bytes of the payload from here on hold the signal.
+    window: u8,
+    /// Which of [`Wire::words`].
+    word: u8,
+    up: u8,
+    down: u8,
+    /// The highest bit of a signed signal, 0 for an unsigned one: flipped and subtracted it extends the sign.
+    sign: u64,
+    /// A code that means "not available"; one that the signal cannot have where there is none.
+    not_available: u64,
+    /// Codes whose values are within the DBC's and the configured range: the first, and how many follow it.
+    first_good: i64,
+    more_good: u64,
+    factor: f64,
+    offset: f64,
+    scale: f64,
+    shift: f64,
+}
+
+/// A payload as signals are taken from it.
+struct Wire<'a> {
+    payload: &'a [u8],
+    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
+    words: [u64; 2],
+    frame: &'a Frame,
+}
+
+impl<'a> Wire<'a> {
+    #[inline]
+    fn new(frame: &'a Frame) -> Self {
+        let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
+        Self { payload: frame.data(), words: [word, word.swap_bytes()], frame }
+    }
+
+    #[inline]
+    fn word(&self, plan: &Plan) -> u64 {
+        if plan.window == 0 {
+            return self.words[usize::from(plan.word & 1)];
+        }
+        let from = usize::from(plan.window);
+        // The window of a signal lies within the longest payload.
+        let bytes = self.frame.padded_data().get(from..).and_then(|rest| rest.first_chunk());
+        let word = bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes));
+        if plan.word == 0 { word } else { word.swap_bytes() }
+    }
+}
+
+impl Plans {
+    /// Bindings sorted by message and channel, and their runs.
+    pub(super) fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
+        let message = |run: &Range<usize>| (bindings[run.start].bus, bindings[run.start].id);
+        let messages: Vec<_> = runs.chunk_by(|a, b| message(a) == message(b)).collect();
+        Self {
+            numbers: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
+            messages: messages.iter().map(|runs| MessagePlan::new(bindings, runs)).collect(),
+            signals: bindings.iter().map(Plan::new).collect(),
+        }
+    }
+
+    /// See [`super::InputMap::decode`].
+    #[inline]
+    pub(super) fn decode(&self, bindings: &[Binding], bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
+        let Some(number) = self.numbers.get(bus, frame.id()) else { return };
+        let wire = Wire::new(frame);
+        for visit in self.messages[number].visits(wire.payload) {
+            let range = visit.bindings.clone();
+            if visit.check || wire.payload.len() < visit.bytes_needed {
+                decode_plainly(&bindings[range], wire.payload, &mut each);
+                continue;
+            }
+            for (plan, index) in self.signals[range.clone()].iter().zip(range.start..) {
+                // Two places rather than one value made of both: the good one then stays in a register.
+                match plan.good(&wire) {
+                    Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
+                    None => decode_one(&bindings[index], wire.payload, &mut each),
+                }
+            }
+        }
+    }
+}
+
+/// One binding that is there, as it says.
+#[cold]
+fn decode_one(binding: &Binding, payload: &[u8], each: &mut impl FnMut(Reading)) {
+    each(Reading { channel: binding.channel, value: binding.value(payload) });
+}
+
+/// Bindings that are there or not there together, as they say.
+pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
+    let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
+    if present == Ok(false) {
+        return;
+    }
+    for binding in bindings {
+        let value = present.and_then(|_| binding.value(payload));
+        each(Reading { channel: binding.channel, value });
+    }
+}
+
+impl Visit {
+    fn new(bindings: &[Binding], run: &Range<usize>, check: bool) -> Self {
+        let needed = bindings[run.clone()].iter().map(|binding| binding.plan.bytes_needed());
+        Self { bindings: run.clone(), bytes_needed: needed.max().unwrap_or(0), check }
+    }
+}
+
+impl MessagePlan {
+    fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
+        let visit = |run: &Range<usize>| Visit::new(bindings, run, !bindings[run.start].mux.is_empty());
+        Self { all: runs.iter().map(visit).collect(), pages: Pages::new(bindings, runs) }
+    }
+
+    #[inline]
+    fn visits(&self, payload: &[u8]) -> &[Visit] {
+        match &self.pages {
+            Some(pages) if payload.len() >= pages.bytes_needed => pages.of(payload),
+            _ => &self.all,
+        }
+    }
+}
+
+impl Pages {
+    /// By the selector most runs depend on; `None` without one, or when a table would be too large.
+    fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Option<Self> {
+        let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
+        let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
+        let selector = runs.iter().flat_map(tests).map(|test| test.plan).max_by_key(|plan| dependents(*plan))?;
+        let highest = runs.iter().flat_map(tests).filter(|test| test.plan == selector).flat_map(|test| &test.ranges);
+        let codes = highest.map(|(_, high)| high.saturating_add(1)).max()?;
+        if codes > MAX_CODES {
+            return None;
+        }
+        let mut pages = Self {
+            selector,
+            bytes_needed: runs.iter().flat_map(tests).map(|test| test.plan.bytes_needed()).max()?,
+            starts: vec![0],
+            visits: Vec::new(),
+        };
+        // The last code stands for every one above: no range reaches it.
+        for code in 0..=codes {
+            for run in runs {
+                if !pages.may_hold(tests(run), code) {
+                    continue;
+                }
+                let check = tests(run).iter().any(|test| test.plan != selector);
+                pages.visits.push(Visit::new(bindings, run, check));
+            }
+            pages.starts.push(pages.visits.len());
+            if pages.visits.len() > MAX_VISITS {
+                return None;
+            }
+        }
+        Some(pages)
+    }
+
+    /// Whether the selector's code leaves room for the run to be there.
+    fn may_hold(&self, tests: &[MuxTest], code: u64) -> bool {
+        tests.iter().filter(|test| test.plan == self.selector).all(|test| test.allows(code))
+    }
+
+    #[inline]
+    fn of(&self, payload: &[u8]) -> &[Visit] {
+        let above = self.starts.len() - 2;
+        // A payload long enough always has a code.
+        let code =
+            self.selector.raw(payload).map_or(above, |code| usize::try_from(code).map_or(above, |c| c.min(above)));
+        &self.visits[self.starts[code]..self.starts[code + 1]]
+    }
+}
+
+impl Plan {
+    fn new(binding: &Binding) -> Self {
+        let Binding { channel, scale, offset: shift, .. } = *binding;
+        let nothing = Self {
+            channel,
+            window: 0,
+            word: 0,
+            up: 0,
+            down: 63,
+            sign: 0,
+            // Of 64 bits one is left: no code is good.
+            not_available: u64::MAX,
+            first_good: i64::MAX,
+            more_good: 0,
+            factor: 0.0,
+            offset: 0.0,
+            scale,
+            shift,
+        };
+        let is_usual = binding.not_available.len() <= 1 && scale.is_finite() && scale != 0.0 && shift.is_finite();
+        let Some(shifts) = binding.plan.shifts().filter(|_| is_usual) else { return nothing };
+        let Some((first, last)) = good_codes(binding, &shifts) else { return nothing };
+        Self {
+            window: shifts.window,
+            word: u8::from(shifts.is_big_endian),
+            up: shifts.up,
+            down: shifts.down,
+            sign: if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 },
+            // At most 63 bits: no code has all 64.
+            not_available: binding.not_available.first().copied().unwrap_or(u64::MAX),
+            first_good: first,
+            more_good: first.abs_diff(last),
+            factor: shifts.factor,
+            offset: shifts.offset,
+            ..nothing
+        }
+    }
+
+    /// The value in the program's unit and sign, if it is good; the payload carries the signal.
+    #[inline]
+    fn good(&self, wire: &Wire<'_>) -> Option<f64> {
+        let raw = wire.word(self) << (self.up & 63) >> (self.down & 63);
+        let code = (raw ^ self.sign).wrapping_sub(self.sign).cast_signed();
+        let is_good =
+            (raw != self.not_available) & (code.wrapping_sub(self.first_good).cast_unsigned() <= self.more_good);
+        is_good.then(|| (float_of_signed(code) * self.factor + self.offset) * self.scale + self.shift)
+    }
+}
+
+/// The first and the last code whose value is within both ranges. Every step from the code to the value keeps the order
+/// (or turns it round), rounding included, so that the good codes are neighbours and halving finds their ends exactly.
+fn good_codes(binding: &Binding, shifts: &Shifts) -> Option<(i64, i64)> {
+    let physical = |code: i64| float_of_signed(code) * shifts.factor + shifts.offset;
+    let value = |code: i64| physical(code) * binding.scale + binding.offset;
+    let (lowest, highest) = shifts.codes();
+    let is_rising = |of: &dyn Fn(i64) -> f64| of(lowest) <= of(highest);
+    let mut good = (lowest, highest);
+    let both: [(&dyn Fn(i64) -> f64, f64, f64); 2] =
+        [(&physical, shifts.low, shifts.high), (&value, binding.range.0, binding.range.1)];
+    for (of, low, high) in both {
+        // Along rising values: not below the lower limit any more, and above the upper one.
+        let (first, end) = if is_rising(of) {
+            (first_where(good, |code| of(code) >= low), first_where(good, |code| of(code) > high))
+        } else {
+            (first_where(good, |code| of(code) <= high), first_where(good, |code| of(code) < low))
+        };
+        good = (first?, end.map_or(good.1, |end| end - 1));
+        if good.0 > good.1 {
+            return None;
+        }
+    }
+    Some(good)
+}
+
+/// The first of neighbouring codes for which something holds that holds for all after it.
+fn first_where((mut low, mut high): (i64, i64), holds: impl Fn(i64) -> bool) -> Option<i64> {
+    if !holds(high) {
+        return None;
+    }
+    while low < high {
+        let middle = low + (high - low) / 2;
+        if holds(middle) { high = middle } else { low = middle + 1 }
+    }
+    Some(low)
+}

@@ -1,0 +1,99 @@
+//! Finds a message's number by interface and identifier: one load for a standard identifier, a binary search among the few
+//! extended ones.
+
+use crate::can::CanId;
+use crate::quantity::BusIndex;
+
+/// How many standard identifiers there are.
+const STANDARD_IDS: usize = 0x800;
+/// No message.
+const NONE: u32 = u32::MAX;
+
+/// Numbers of messages, in the order in which they were given.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct IdTable {
+    buses: Vec<Ids>,
+}
+
+/// The messages of one interface.
+#[derive(Debug, Clone, PartialEq)]
+struct Ids {
+    /// By identifier: 8 KiB, of which the lines of configured messages are in use.
+    standard: Box<[u32; STANDARD_IDS]>,
+    /// Every other message, sorted by identifier.
+    others: Vec<(CanId, u32)>,
+}
+
+impl Ids {
+    fn new() -> Self {
+        Self { standard: Box::new([NONE; STANDARD_IDS]), others: Vec::new() }
+    }
+}
+
+impl IdTable {
+    /// The first message given is number 0; of two with the same interface and identifier the first counts.
+    pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
+        let mut table = Self::default();
+        for ((bus, id), number) in messages.into_iter().zip(0..NONE) {
+            if table.buses.len() <= bus.index() {
+                table.buses.resize_with(bus.index() + 1, Ids::new);
+            }
+            table.buses[bus.index()].put(id, number);
+        }
+        table
+    }
+
+    /// The message's number.
+    #[inline]
+    pub(crate) fn get(&self, bus: BusIndex, id: CanId) -> Option<usize> {
+        let ids = self.buses.get(bus.index())?;
+        let number = match id {
+            CanId::Standard(raw) if usize::from(raw) < STANDARD_IDS => ids.standard[usize::from(raw)],
+            _ => ids.others.binary_search_by_key(&id, |(id, _)| *id).map_or(NONE, |at| ids.others[at].1),
+        };
+        // Lossless: at least 32 bits on every machine this runs on.
+        (number != NONE).then_some(number as usize)
+    }
+}
+
+impl Ids {
+    fn put(&mut self, id: CanId, number: u32) {
+        match id {
+            CanId::Standard(raw) if usize::from(raw) < STANDARD_IDS => {
+                let place = &mut self.standard[usize::from(raw)];
+                *place = (*place).min(number);
+            }
+            _ => {
+                if let Err(at) = self.others.binary_search_by_key(&id, |(id, _)| *id) {
+                    self.others.insert(at, (id, number));
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_is_found_by_interface_kind_and_number() {
+        let given = [
+            (BusIndex(1), CanId::Extended(0x100)),
+            (BusIndex(1), CanId::Standard(0x100)),
+            (BusIndex(3), CanId::Standard(0x7FF)),
+            (BusIndex(1), CanId::Extended(0x1FFF_FFFF)),
+            (BusIndex(1), CanId::Standard(0x100)),
+        ];
+        let table = IdTable::new(given);
+        let found = |bus, id| table.get(BusIndex(bus), id);
+        assert_eq!(found(1, CanId::Extended(0x100)), Some(0));
+        assert_eq!(found(1, CanId::Standard(0x100)), Some(1), "the first of two");
+        assert_eq!(found(3, CanId::Standard(0x7FF)), Some(2));
+        assert_eq!(found(1, CanId::Extended(0x1FFF_FFFF)), Some(3));
+        for (bus, id) in [(0, 0x100), (2, 0x100), (3, 0x100), (9, 0x100), (1, 0)] {
+            assert_eq!(found(bus, CanId::Standard(id)), None, "{bus} {id:X}");
+        }
+        assert_eq!(found(1, CanId::Standard(u16::MAX)), None, "no identifier at all");
+    }
+}

@@ -1,0 +1,178 @@
+//! A reader that works ahead on a thread of its own: unpacking costs several times what reading the text does.
+//!
+//! Bytes and errors come out in their order and place. At most [`BLOCKS`] blocks are in flight and they are used again, so
+//! memory is bounded and nothing is allocated on the way. When the reader is dropped the thread ends with its next block;
+//! nobody waits for it, since its source may be a pipe that says nothing for long.
+
+use std::io::{self, Read};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
+use std::thread;
+
+/// Blocks in flight: one being filled, one being read, two to even out what comes between.
+const BLOCKS: usize = 4;
+
+/// What the thread hands over.
+enum Piece {
+    Block(Vec<u8>),
+    End(io::Result<()>),
+}
+
+/// The reading end.
+pub(super) struct Ahead {
+    pieces: Receiver<Piece>,
+    used: Sender<Vec<u8>>,
+    block: Vec<u8>,
+    /// Bytes of the block already given.
+    given: usize,
+    ended: bool,
+}
+
+impl Ahead {
+    /// Begins to read `source` in blocks of `block_len` bytes.
+    pub(super) fn new(source: impl Read + Send + 'static, block_len: usize) -> io::Result<Self> {
+        let (full, pieces) = sync_channel(BLOCKS);
+        let (used, empty) = channel();
+        for _ in 0..BLOCKS {
+            let _ = used.send(vec![0; block_len]);
+        }
+        thread::Builder::new().name("unpack".to_owned()).spawn(move || work(source, &empty, &full))?;
+        Ok(Self { pieces, used, block: Vec::new(), given: 0, ended: false })
+    }
+
+    /// Waits for the next block; `false` at the end.
+    fn next_block(&mut self) -> io::Result<bool> {
+        if self.ended {
+            return Ok(false);
+        }
+        match self.pieces.recv() {
+            Ok(Piece::Block(block)) => {
+                let used = std::mem::replace(&mut self.block, block);
+                self.given = 0;
+                if !used.is_empty() {
+                    // Nobody takes it once the thread has ended.
+                    let _ = self.used.send(used);
+                }
+                Ok(true)
+            }
+            Ok(Piece::End(result)) => {
+                self.ended = true;
+                result.map(|()| false)
+            }
+            Err(_) => {
+                self.ended = true;
+                Err(io::Error::other("unpacking stopped for no known reason"))
+            }
+        }
+    }
+}
+
+impl Read for Ahead {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        while self.given == self.block.len() {
+            if !self.next_block()? {
+                return Ok(0);
+            }
+        }
+        let count = buffer.len().min(self.block.len() - self.given);
+        buffer[..count].copy_from_slice(&self.block[self.given..self.given + count]);
+        self.given += count;
+        Ok(count)
+    }
+}
+
+/// Fills blocks until the source ends, fails, or nobody wants more.
+fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<Piece>) {
+    while let Ok(mut block) = empty.recv() {
+        let room = block.capacity();
+        block.resize(room, 0);
+        let (count, end) = fill(&mut source, &mut block);
+        block.truncate(count);
+        if count > 0 && full.send(Piece::Block(block)).is_err() {
+            return;
+        }
+        if let Some(end) = end {
+            let _ = full.send(Piece::End(end));
+            return;
+        }
+    }
+}
+
+/// How many bytes of the block were filled, and how the source ended, if it did.
+fn fill(source: &mut impl Read, block: &mut [u8]) -> (usize, Option<io::Result<()>>) {
+    let mut count = 0;
+    while count < block.len() {
+        match source.read(&mut block[count..]) {
+            Ok(0) => return (count, Some(Ok(()))),
+            Ok(more) => count += more,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return (count, Some(Err(error))),
+        }
+    }
+    (count, None)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Gives `bytes` in pieces of 1 to 7, then `end`.
+    struct Drip {
+        bytes: Vec<u8>,
+        at: usize,
+        end: Option<io::ErrorKind>,
+    }
+
+    impl Read for Drip {
+        fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+            let count = (1 + self.at % 7).min(self.bytes.len() - self.at).min(buffer.len());
+            buffer[..count].copy_from_slice(&self.bytes[self.at..self.at + count]);
+            self.at += count;
+            match self.end {
+                Some(kind) if count == 0 => Err(kind.into()),
+                _ => Ok(count),
+            }
+        }
+    }
+
+    fn drip(len: usize, end: Option<io::ErrorKind>) -> Drip {
+        Drip { bytes: (0..len).map(|n| (n * 31 % 251) as u8).collect(), at: 0, end }
+    }
+
+    #[test]
+    fn all_bytes_come_through_in_their_order() {
+        for len in [0, 1, 99, 100, 101, 12_345] {
+            let mut out = Vec::new();
+            Ahead::new(drip(len, None), 100).expect("a thread").read_to_end(&mut out).expect("no error");
+            assert_eq!(out, drip(len, None).bytes, "{len}");
+        }
+    }
+
+    #[test]
+    fn an_error_comes_after_every_byte_before_it_and_then_the_end() {
+        let mut ahead = Ahead::new(drip(1234, Some(io::ErrorKind::InvalidData)), 100).expect("a thread");
+        let mut out = Vec::new();
+        let error = ahead.read_to_end(&mut out).expect_err("the source's error");
+        assert_eq!((error.kind(), out.len()), (io::ErrorKind::InvalidData, 1234));
+        assert_eq!(ahead.read(&mut [0; 8]).expect("the end"), 0);
+    }
+
+    #[test]
+    fn a_source_that_panics_is_an_error_and_no_end() {
+        struct Panics;
+        impl Read for Panics {
+            fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {
+                panic!("as a decoder with a fault would");
+            }
+        }
+        let mut ahead = Ahead::new(Panics, 100).expect("a thread");
+        assert!(ahead.read(&mut [0; 8]).is_err());
+    }
+
+    #[test]
+    fn a_reader_that_stops_early_does_not_wait_for_the_rest() {
+        let endless = io::repeat(b'x');
+        let mut ahead = Ahead::new(endless, 100).expect("a thread");
+        assert_eq!(ahead.read(&mut [0; 8]).expect("bytes"), 8);
+        drop(ahead);
+    }
+}
