@@ -154,6 +154,7 @@ impl Loop {
     /// Interfaces merge by time; what one interface delivered keeps its order.
     fn handle_batch(&mut self) {
         self.batch.sort_by_key(|received| received.time);
+        let mut has_frame = false;
         for received in &self.batch {
             let Received { time, bus, what } = *received;
             let input = match &what {
@@ -161,9 +162,11 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
-            if matches!(what, What::Frame(_)) {
-                self.seeing.note_frame(time, self.clock.now());
-            }
+            has_frame |= matches!(what, What::Frame(_));
+        }
+        // What comes of any of them leaves after the last: that is when all have their estimates.
+        if has_frame {
+            self.seeing.note_frames(&self.batch, self.clock.now());
         }
         self.batch.clear();
     }
