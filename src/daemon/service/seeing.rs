@@ -50,13 +50,13 @@ impl Seeing {
         }
     }
 
-    /// Hands a document over when it is time for one.
-    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], now: Timestamp) {
+    /// With a tick that was due then: hands a document over when it is time for one.
+    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
-        if self.told.is_some_and(|told| told.elapsed() < PERIOD) {
+        if self.told.is_some_and(|told| tick.duration_since(told) < PERIOD) {
             return;
         }
-        self.told = Some(Instant::now());
+        self.told = Some(tick);
         let sources = Sources {
             identity: &self.identity,
             monitor: &engine.monitor,
