@@ -76,6 +76,15 @@ fn is_warm(record: &Record, first: &Record) -> bool {
 }
 
 #[test]
+fn an_allocation_is_counted() {
+    let _alone = alone();
+    let profiler = dhat::Profiler::builder().testing().build();
+    let kept = std::thread::spawn(|| vec![0_u8; 1000]).join();
+    assert!(dhat::HeapStats::get().total_bytes >= 1000, "else the zeros of the other tests say nothing");
+    drop((profiler, kept));
+}
+
+#[test]
 fn a_line_of_a_log_allocates_nothing() {
     let _alone = alone();
     let folder = tempfile::tempdir().expect("a folder");
