@@ -50,7 +50,16 @@ fn example() -> PathBuf {
 fn pack_log(folder: &Path) -> PathBuf {
     let log = folder.join("pack.log");
     let mut simulate = Command::new(env!("CARGO_BIN_EXE_packwatch"));
-    simulate.args(["simulate", "reference", "--period", "10", "--cell-period", "100", "--duration", &LOG_S.to_string()]);
+    simulate.args([
+        "simulate",
+        "reference",
+        "--period",
+        "10",
+        "--cell-period",
+        "100",
+        "--duration",
+        &LOG_S.to_string(),
+    ]);
     simulate.arg("-c").arg(example()).arg("-o").arg(&log).stdout(Stdio::null()).stderr(Stdio::null());
     assert!(simulate.status().expect("packwatch runs").success());
     log

@@ -265,6 +265,8 @@ fn nanos(time: TimeSpec) -> Option<i64> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::UdpSocket;
+
     use super::*;
 
     #[test]
@@ -285,5 +287,29 @@ mod tests {
     fn a_zero_stamp_is_none() {
         assert_eq!(nanos(TimeSpec::new(0, 0)), None);
         assert_eq!(nanos(TimeSpec::new(1, 5)), Some(1_000_000_005));
+    }
+
+    #[test]
+    fn one_call_takes_what_waits_in_order_and_frames_without_stamps_spoil_no_later_ones() {
+        // Any datagrams do: the kernel's headers are the same.
+        let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        tx.connect(rx.local_addr().unwrap()).unwrap();
+        let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());
+        let mut slots = Slots::new();
+        for stamped in [true, false, true, true] {
+            setsockopt(&rx, sockopt::ReceiveTimestampns, &stamped).unwrap();
+            for frame in &frames {
+                tx.send(wire::encode(frame, &mut [0; FD_BYTES])).unwrap();
+            }
+            let mut received = Vec::new();
+            while received.len() < frames.len() {
+                if let Err(error) = slots.receive(rx.as_raw_fd(), &mut received) {
+                    assert_eq!(error, Errno::EAGAIN);
+                }
+            }
+            assert!(received.iter().map(|received| received.what).eq(frames.map(Wire::Frame)));
+            assert!(received.iter().all(|received| received.stamps.software_ns.is_some() == stamped), "{received:?}");
+        }
+        assert_eq!(slots.receive(rx.as_raw_fd(), &mut Vec::new()), Err(Errno::EAGAIN));
     }
 }
