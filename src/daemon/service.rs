@@ -111,7 +111,9 @@ impl Service {
     pub fn run(self) -> Result<(), ServiceError> {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
-        runtime.block_on(self.serve())
+        // A task like those of the interfaces: waking the one future that is no task goes through the kernel, for every frame.
+        let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
+        served.unwrap_or_else(|stopped| std::panic::resume_unwind(stopped.into_panic()))
     }
 
     async fn serve(mut self) -> Result<(), ServiceError> {

@@ -36,13 +36,16 @@ pub(crate) struct Reading {
 impl Reading {
     /// Reads both clocks. A kernel without CLOCK_BOOTTIME does not exist since 2.6.39; zero stands for it.
     pub(crate) fn now() -> Self {
-        let nanos = |id| clock_gettime(id).map_or(0, |t| t.tv_sec().saturating_mul(1_000_000_000) + t.tv_nsec());
-        Self { realtime_ns: nanos(ClockId::CLOCK_REALTIME), boottime_ns: nanos(ClockId::CLOCK_BOOTTIME) }
+        Self { realtime_ns: nanos_of(ClockId::CLOCK_REALTIME), boottime_ns: nanos_of(ClockId::CLOCK_BOOTTIME) }
     }
 
     fn offset_ns(self) -> i64 {
         self.realtime_ns - self.boottime_ns
     }
+}
+
+fn nanos_of(clock: ClockId) -> i64 {
+    clock_gettime(clock).map_or(0, |t| t.tv_sec().saturating_mul(1_000_000_000) + t.tv_nsec())
 }
 
 /// Stamps the kernel gave a frame, ns on their own clocks.
@@ -74,7 +77,7 @@ impl MappedClock {
 
     /// The time now.
     pub(crate) fn now(&self) -> Timestamp {
-        self.at(Reading::now())
+        Timestamp::from_nanos(self.origin_ns + nanos_of(ClockId::CLOCK_BOOTTIME))
     }
 }
 
@@ -105,6 +108,13 @@ impl StampMapper {
     /// The socket was found empty at `reading`: what comes from now on is younger.
     pub(crate) fn socket_empty(&mut self, reading: Reading) {
         self.emptied_ns = reading.boottime_ns;
+        self.emptied_offset_ns = reading.offset_ns();
+    }
+
+    /// The socket was found empty by the very call that gave the frame answered last, read at `reading`: what comes from now
+    /// on is younger than that frame.
+    pub(crate) fn socket_emptied(&mut self, reading: Reading) {
+        self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);
         self.emptied_offset_ns = reading.offset_ns();
     }
 
@@ -197,7 +207,7 @@ mod tests {
     }
 
     /// A frame arrives every 100 ms and is read 2 ms later; the wall clock steps by `step_ns` at `step_at_ns`.
-    fn arrivals(step_ns: i64, step_at_ns: i64) -> Vec<i64> {
+    fn arrivals(step_ns: i64, step_at_ns: i64, by_the_same_call: bool) -> Vec<i64> {
         let mut mapper = mapper();
         let wall_step = |t: i64| if t >= step_at_ns { step_ns } else { 0 };
         (1..40)
@@ -206,7 +216,12 @@ mod tests {
                 let stamps =
                     KernelStamps { software_ns: Some(OFFSET + arrived + wall_step(arrived)), hardware_ns: None };
                 let time = mapper.arrival(stamps, at(read, wall_step(read)));
-                mapper.socket_empty(at(read, wall_step(read)));
+                // Found empty by the same call, or by another after it.
+                if by_the_same_call {
+                    mapper.socket_emptied(at(read, wall_step(read)));
+                } else {
+                    mapper.socket_empty(at(read, wall_step(read)));
+                }
                 time.nanos() - OFFSET
             })
             .collect()
@@ -214,7 +229,7 @@ mod tests {
 
     #[test]
     fn a_software_stamp_is_the_arrival_not_the_reading() {
-        assert_eq!(arrivals(0, 0)[0], 100 * MS);
+        assert_eq!(arrivals(0, 0, true)[0], 100 * MS);
     }
 
     #[test]
@@ -222,9 +237,10 @@ mod tests {
         // Between two frames, and between stamp and reading of one frame.
         for step_at in [1950 * MS, 2001 * MS] {
             for step in [3600 * S, -3600 * S, S / 2, -S / 2, 50 * MS, -50 * MS] {
-                let times = arrivals(step, step_at);
-                for pair in times.windows(2) {
-                    assert_eq!(pair[1] - pair[0], 100 * MS, "step {step} ns at {step_at} ns");
+                for times in [true, false].map(|by_the_same_call| arrivals(step, step_at, by_the_same_call)) {
+                    for pair in times.windows(2) {
+                        assert_eq!(pair[1] - pair[0], 100 * MS, "step {step} ns at {step_at} ns");
+                    }
                 }
             }
         }

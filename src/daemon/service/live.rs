@@ -20,6 +20,7 @@ use crate::daemon::{logging, snapshot_file};
 use crate::io::clock::MappedClock;
 use crate::io::socket::{LinkOutput, Received, What};
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
+use crate::quantity::Timestamp;
 
 /// Of these, handed over between two looks at the timer: under one tick's time of a full bus.
 const BATCH: usize = 256;
@@ -58,9 +59,9 @@ impl Loop {
                 () = stop.wait() => return,
                 now = ticks.tick() => {
                     self.seeing.note_tick(now);
-                    self.tick().await;
+                    let time = self.tick().await;
                     self.tell_manager(now);
-                    self.seeing.tell(&self.engine, &self.outputs, self.clock.now());
+                    self.seeing.tell(&self.engine, &self.outputs, now, time);
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -104,11 +105,13 @@ impl Loop {
         }
     }
 
-    /// What came before the tick is handed over before it.
-    async fn tick(&mut self) {
+    /// What came before the tick is handed over before it; its time.
+    async fn tick(&mut self) -> Timestamp {
         self.drain().await;
-        self.engine.look_after_store(self.clock.now(), &self.outputs);
-        self.engine.handle(&Input::Tick { time: self.clock.now() }, &self.outputs);
+        let time = self.clock.now();
+        self.engine.look_after_store(time, &self.outputs);
+        self.engine.handle(&Input::Tick { time }, &self.outputs);
+        time
     }
 
     /// Somebody on this computer asks.
@@ -154,6 +157,7 @@ impl Loop {
     /// Interfaces merge by time; what one interface delivered keeps its order.
     fn handle_batch(&mut self) {
         self.batch.sort_by_key(|received| received.time);
+        let mut has_frame = false;
         for received in &self.batch {
             let Received { time, bus, what } = *received;
             let input = match &what {
@@ -161,9 +165,11 @@ impl Loop {
                 What::Event(event) => Input::Bus { time, bus, event: *event },
             };
             self.engine.handle(&input, &self.outputs);
-            if matches!(what, What::Frame(_)) {
-                self.seeing.note_frame(time, self.clock.now());
-            }
+            has_frame |= matches!(what, What::Frame(_));
+        }
+        // What comes of any of them leaves after the last: that is when all have their estimates.
+        if has_frame {
+            self.seeing.note_frames(&self.batch, self.clock.now());
         }
         self.batch.clear();
     }

@@ -59,6 +59,8 @@ pub(super) struct Readiness {
     restored: Option<String>,
     told: String,
     told_at: Option<Instant>,
+    /// Something the line speaks of has changed since it was last made: most ticks make none.
+    is_changed: bool,
 }
 
 impl Readiness {
@@ -77,6 +79,7 @@ impl Readiness {
             restored,
             told: String::new(),
             told_at: None,
+            is_changed: true,
         }
     }
 
@@ -95,13 +98,15 @@ impl Readiness {
                 }
             }
             EventKind::Store { works } => self.store_works = works,
-            _ => {}
+            _ => return,
         }
+        self.is_changed = true;
     }
 
     /// Takes how a reload went: `None` = well, else why not.
     pub(super) fn note_reload(&mut self, refused: Option<String>) {
         self.refused = refused;
+        self.is_changed = true;
     }
 
     /// Looks at the core; gives what is to be told.
@@ -109,6 +114,7 @@ impl Readiness {
         let waited = now.duration_since(self.began);
         if self.first_after.is_none() && monitor.has_heard() {
             self.first_after = Some(waited);
+            self.is_changed = true;
         }
         let is_due = self.told_at.is_none_or(|told_at| now.duration_since(told_at) >= STATUS_PERIOD);
         let ready = !self.is_ready && (self.first_after.is_some() || waited >= self.timeout);
@@ -116,6 +122,7 @@ impl Readiness {
             return Told::default();
         }
         self.is_ready |= ready;
+        self.is_changed |= ready;
         self.look(monitor);
         Told { ready, status: self.new_line(now) }
     }
@@ -132,13 +139,20 @@ impl Readiness {
     }
 
     fn look(&mut self, monitor: &Monitor) {
+        if self.inputs == monitor.inputs() && monitor.lost_inputs().eq(self.lost.iter().copied()) {
+            return;
+        }
         self.lost.clear();
         self.lost.extend(monitor.lost_inputs());
         self.inputs = monitor.inputs();
+        self.is_changed = true;
     }
 
     /// The line, when it is another than was told.
     fn new_line(&mut self, now: Instant) -> Option<String> {
+        if !std::mem::take(&mut self.is_changed) {
+            return None;
+        }
         let line = self.line();
         if line == self.told {
             return None;

@@ -8,7 +8,7 @@ use crate::daemon::status::StatusServer;
 use crate::daemon::status::collect::{Before, Identity, Sources};
 use crate::daemon::status::counters::LoopCounters;
 use crate::daemon::status::document::ConfigFile;
-use crate::io::socket::LinkOutput;
+use crate::io::socket::{LinkOutput, Received, What};
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
 
@@ -33,10 +33,10 @@ impl Seeing {
         self.counters.note_tick(due.elapsed().as_secs_f64(), f64::from(TICK_PERIOD_MS) / 1e3);
     }
 
-    /// A frame of that time has its estimate.
-    #[inline]
-    pub(super) fn note_frame(&mut self, received: Timestamp, now: Timestamp) {
-        self.counters.latency.record(now.since(received));
+    /// The frames among these have their estimates now.
+    pub(super) fn note_frames(&mut self, batch: &[Received], now: Timestamp) {
+        let frames = batch.iter().filter(|received| matches!(received.what, What::Frame(_)));
+        frames.for_each(|received| self.counters.latency.record(now.since(received.time)));
     }
 
     /// The configuration was read again, and taken over (`Ok`) or not.
@@ -50,13 +50,13 @@ impl Seeing {
         }
     }
 
-    /// Hands a document over when it is time for one.
-    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], now: Timestamp) {
+    /// With a tick that was due then: hands a document over when it is time for one.
+    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
-        if self.told.is_some_and(|told| told.elapsed() < PERIOD) {
+        if self.told.is_some_and(|told| tick.duration_since(told) < PERIOD) {
             return;
         }
-        self.told = Some(Instant::now());
+        self.told = Some(tick);
         let sources = Sources {
             identity: &self.identity,
             monitor: &engine.monitor,

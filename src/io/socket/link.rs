@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
 use super::counters::{LinkCounters, LinkState};
-use super::raw::{RawConfig, RawReceived, RawSocket, index_of};
+use super::raw::{CALL_BATCH, RawConfig, RawReceived, RawSocket, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -143,6 +143,8 @@ pub(crate) struct Link {
 struct Open {
     socket: AsyncFd<RawSocket>,
     mapper: StampMapper,
+    /// What one call brought; kept for its room.
+    received: Vec<RawReceived>,
     dropped_total: u32,
     /// The next frame to send, waiting for room.
     pending: Option<Outgoing>,
@@ -222,11 +224,18 @@ impl Link {
         let state = if error.is_none() { State::Up } else { State::Down };
         let mapper = StampMapper::new(self.clock, Reading::now());
         self.enter(state).await;
-        Some(Open { socket, mapper, dropped_total: 0, pending: None })
+        let received = Vec::with_capacity(CALL_BATCH);
+        Some(Open { socket, mapper, received, dropped_total: 0, pending: None })
     }
 
     /// Receives and sends until the socket is dead or the daemon stops.
     async fn serve(&mut self, mut open: Open) -> End {
+        let end = self.serve_open(&mut open).await;
+        self.note_dropped(&mut open);
+        end
+    }
+
+    async fn serve_open(&mut self, open: &mut Open) -> End {
         let mut look_at = Instant::now() + self.pause;
         loop {
             let interest = match open.pending {
@@ -246,22 +255,26 @@ impl Link {
                     Err(error) => { self.problem(&error); return End::Dead; }
                 },
                 next = self.outgoing.recv(), if open.pending.is_none() => Err(next),
-                _ = self.report.tick() => { self.report_losses(open.mapper.event(Reading::now())).await; continue; }
+                _ = self.report.tick() => {
+                    self.note_dropped(open);
+                    self.report_losses(open.mapper.event(Reading::now())).await;
+                    continue;
+                }
                 () = sleep_until(look_at), if self.state != Some(State::Up) => {
                     look_at = Instant::now() + self.lengthen_pause();
-                    if self.look(&open).await { continue } else { return End::Dead }
+                    if self.look(open).await { continue } else { return End::Dead }
                 }
             };
             match step {
                 Err(None) => return End::Stopped,
                 Err(Some(outgoing)) => open.pending = Some(outgoing),
                 Ok(()) => {
-                    if self.receive_all(&mut open).await == Some(End::Dead) {
+                    if self.receive_all(open).await == Some(End::Dead) {
                         return End::Dead;
                     }
                 }
             }
-            if self.send_pending(&mut open).await == Some(End::Dead) {
+            if self.send_pending(open).await == Some(End::Dead) {
                 return End::Dead;
             }
         }
@@ -269,15 +282,22 @@ impl Link {
 
     /// Reads until the socket is empty, with pauses for the other tasks.
     async fn receive_all(&mut self, open: &mut Open) -> Option<End> {
-        let mut before = Reading::now();
         loop {
-            for _ in 0..READ_BATCH {
-                match open.socket.get_mut().receive() {
-                    Ok(received) => before = self.take(open, received).await,
-                    Err(Errno::EAGAIN) => {
-                        open.mapper.socket_empty(before);
-                        return None;
+            for _ in 0..READ_BATCH / CALL_BATCH {
+                open.received.clear();
+                match open.socket.get_ref().receive(&mut open.received) {
+                    Ok(()) => {
+                        // Once for all of them: what came with one call was read at one moment.
+                        let reading = Reading::now();
+                        for received in &open.received {
+                            self.take(&mut open.mapper, received, reading).await;
+                        }
+                        if open.received.len() < CALL_BATCH {
+                            open.mapper.socket_emptied(reading);
+                            return None;
+                        }
                     }
+                    Err(Errno::EAGAIN) => return None,
                     Err(Errno::EINTR) => {}
                     Err(error) => {
                         if let Some(end) = self.failed(error).await {
@@ -295,35 +315,35 @@ impl Link {
         self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
     }
 
-    /// Hands on one thing read; the clocks at its reading.
-    async fn take(&mut self, open: &mut Open, received: RawReceived) -> Reading {
-        let reading = Reading::now();
-        let time = open.mapper.arrival(received.stamps, reading);
+    /// Hands on one thing read.
+    async fn take(&mut self, mapper: &mut StampMapper, received: &RawReceived, reading: Reading) {
+        let time = mapper.arrival(received.stamps, reading);
         // Frames that were still in the socket when the interface went down do not say that it is up again.
         if self.state != Some(State::Up) && time > self.state_since {
             self.enter_at(State::Up, time).await;
         }
-        if let Some(total) = received.dropped_total {
-            let dropped = u64::from(total.wrapping_sub(open.dropped_total));
-            self.lost += dropped;
-            LinkCounters::add(&self.counters.kernel_dropped, dropped);
-            open.dropped_total = total;
-        }
         let what = match received.what {
-            Wire::Frame(frame) if !self.is_wanted(frame.id()) => return reading,
+            Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
             Wire::Frame(frame) => What::Frame(frame),
             Wire::Error(class) => What::Event(BusEvent::ErrorFrame { class }),
             Wire::Malformed => {
                 self.lost += 1;
                 LinkCounters::add(&self.counters.malformed, 1);
-                return reading;
+                return;
             }
         };
         if self.inbox.try_send(Received { time, bus: self.config.bus, what }).is_err() {
             self.lost += 1;
             LinkCounters::add(&self.counters.inbox_full, 1);
         }
-        reading
+    }
+
+    /// Takes over what the kernel had no room for since this was asked last.
+    fn note_dropped(&mut self, open: &mut Open) {
+        let total = open.socket.get_ref().dropped_total();
+        let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
+        self.lost += dropped;
+        LinkCounters::add(&self.counters.kernel_dropped, dropped);
     }
 
     /// Sends what waits, if there is room.

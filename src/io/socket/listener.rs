@@ -4,7 +4,7 @@ use std::io;
 
 use nix::errno::Errno;
 
-use super::raw::{DEFAULT_RECEIVE_BUFFER_BYTES, RawConfig, RawSocket};
+use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawConfig, RawReceived, RawSocket};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -15,7 +15,10 @@ use crate::quantity::Timestamp;
 pub(crate) struct CanListener {
     socket: RawSocket,
     mapper: StampMapper,
-    dropped_total: u32,
+    /// What the last call brought, and how much of it was handed on; the clocks at its reading.
+    received: Vec<RawReceived>,
+    taken: usize,
+    reading: Reading,
 }
 
 impl CanListener {
@@ -32,7 +35,8 @@ impl CanListener {
             return Err(named(error));
         }
         let now = Reading::now();
-        Ok(Self { socket, mapper: StampMapper::new(MappedClock::new(now), now), dropped_total: 0 })
+        let mapper = StampMapper::new(MappedClock::new(now), now);
+        Ok(Self { socket, mapper, received: Vec::with_capacity(CALL_BATCH), taken: 0, reading: now })
     }
 
     /// The next frame that has come, and when; `None` = there is none now.
@@ -41,14 +45,17 @@ impl CanListener {
     /// When the interface went down or away.
     pub(crate) fn next(&mut self) -> io::Result<Option<(Timestamp, Frame)>> {
         loop {
-            match self.socket.receive() {
-                Ok(received) => {
-                    let time = self.mapper.arrival(received.stamps, Reading::now());
-                    self.dropped_total = received.dropped_total.unwrap_or(self.dropped_total);
-                    if let Wire::Frame(frame) = received.what {
-                        return Ok(Some((time, frame)));
-                    }
+            while let Some(received) = self.received.get(self.taken) {
+                self.taken += 1;
+                let time = self.mapper.arrival(received.stamps, self.reading);
+                if let Wire::Frame(frame) = received.what {
+                    return Ok(Some((time, frame)));
                 }
+            }
+            self.received.clear();
+            self.taken = 0;
+            match self.socket.receive(&mut self.received) {
+                Ok(()) => self.reading = Reading::now(),
                 Err(Errno::EAGAIN) => return Ok(None),
                 Err(Errno::EINTR) => {}
                 Err(error) => return Err(error.into()),
@@ -58,6 +65,6 @@ impl CanListener {
 
     /// Frames the kernel had no room to keep for us.
     pub(crate) fn dropped(&self) -> u32 {
-        self.dropped_total
+        self.socket.dropped_total()
     }
 }

@@ -1,14 +1,19 @@
-//! One SocketCAN raw socket: opened so that nothing but the wanted identifiers ever reaches it, read with its
-//! control messages (stamps, drop counter), written without blocking.
+//! One SocketCAN raw socket: opened so that nothing but the wanted identifiers ever reaches it, read several frames in
+//! one system call with their stamps, written without blocking.
+//!
+//! The kernel's drop counter is asked for by itself, not taken with each frame: a frame's control message tells it only once a
+//! frame has got in again, and changes its size when the first is dropped (see [`Slots`]).
 
+use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd};
 
 use nix::cmsg_space;
 use nix::errno::Errno;
+use nix::libc;
 use nix::sys::socket::{
-    AddressFamily, ControlMessageOwned, MsgFlags, SockFlag, SockProtocol, SockType, TimestampingFlag, Timestamps,
-    recvmsg, send, setsockopt, socket, sockopt,
+    AddressFamily, ControlMessageOwned, MsgFlags, MultiHeaders, SockFlag, SockProtocol, SockType, TimestampingFlag,
+    Timestamps, recvmmsg, send, setsockopt, socket, sockopt,
 };
 use nix::sys::time::TimeSpec;
 use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
@@ -20,6 +25,14 @@ use crate::io::clock::KernelStamps;
 /// Receive buffer asked for, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its
 /// bookkeeping), a third of a second of a full 1 Mbit/s bus. The kernel caps it at net.core.rmem_max.
 pub(crate) const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
+
+/// Most frames taken in one system call: with 16 the call itself is no longer what a frame costs, and laying out room for
+/// them costs little when only one comes.
+pub(super) const CALL_BATCH: usize = 16;
+
+/// Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
+const MEMINFO_NUMBERS: usize = 9;
+const MEMINFO_DROPS: usize = 8;
 
 /// Most filters the kernel takes (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
@@ -39,13 +52,56 @@ pub(super) struct RawConfig<'a> {
     pub(super) receive_buffer_bytes: usize,
 }
 
-/// One read: what came, its stamps, and the kernel's drop counter where it has moved from zero.
+/// One thing read, and its stamps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RawReceived {
     pub(super) what: Wire,
     pub(super) stamps: KernelStamps,
-    /// Frames this socket has lost since it was opened, modulo 2^32.
-    pub(super) dropped_total: Option<u32>,
+}
+
+/// Where the kernel puts what one call takes. It is used again and again, and the kernel writes into each header how much of the
+/// room for control messages it has used, which is all the room the next frame there has: enough as long as each carries its stamp.
+/// After one that did not, the headers are made anew.
+struct Slots {
+    headers: MultiHeaders<()>,
+    bytes: [[u8; FD_BYTES]; CALL_BATCH],
+}
+
+impl Slots {
+    fn new() -> Self {
+        Self { headers: Self::headers(), bytes: [[0; FD_BYTES]; CALL_BATCH] }
+    }
+
+    fn headers() -> MultiHeaders<()> {
+        MultiHeaders::preallocate(CALL_BATCH, Some(cmsg_space!(Timestamps, TimeSpec)))
+    }
+
+    fn receive(&mut self, fd: RawFd, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+        let mut lengths = [0; CALL_BATCH];
+        let begin = into.len();
+        {
+            let mut slices = self.bytes.each_mut().map(|bytes| [IoSliceMut::new(bytes)]);
+            let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
+            for (message, length) in messages.zip(&mut lengths) {
+                *length = message.bytes.min(FD_BYTES);
+                // An error says that a control message was cut off: as good as none.
+                let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
+                into.push(RawReceived { what: Wire::Malformed, stamps });
+            }
+        }
+        for ((received, length), bytes) in into[begin..].iter_mut().zip(lengths).zip(&self.bytes) {
+            received.what = wire::decode(&bytes[..length]);
+        }
+        if into[begin..].iter().any(|received| received.stamps.software_ns.is_none()) {
+            self.headers = Self::headers();
+        }
+        Ok(())
+    }
+}
+
+thread_local! {
+    /// Of all sockets of a thread: headers hold pointers, so they cannot go from thread to thread as a socket may.
+    static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
 }
 
 /// A bound, nonblocking raw socket.
@@ -54,7 +110,6 @@ pub(super) struct RawSocket {
     socket: CanFdSocket,
     /// The kernel's number of the interface it is bound to.
     pub(super) index: u32,
-    control: Vec<u8>,
 }
 
 impl RawSocket {
@@ -80,7 +135,6 @@ impl RawSocket {
     fn open_filtered(config: &RawConfig<'_>, filters: &[CanFilter]) -> io::Result<Self> {
         let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
         let fd = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
-        setsockopt(&fd, sockopt::RxqOvfl, &1)?;
         set_stamping(&fd)?;
         let socket = CanFdSocket::from(fd);
         socket.set_recv_own_msgs(false)?;
@@ -94,7 +148,7 @@ impl RawSocket {
         socket.as_raw_socket().set_recv_buffer_size(config.receive_buffer_bytes)?;
         let index = index_of(config.interface)?;
         socket.as_raw_socket().bind(&CanAddr::new(index).into_sock_addr())?;
-        Ok(Self { socket, index, control: cmsg_space!(Timestamps, TimeSpec, u32) })
+        Ok(Self { socket, index })
     }
 
     /// The pending error of the socket: `ENETDOWN` right after opening on an interface that is down.
@@ -107,20 +161,22 @@ impl RawSocket {
         self.socket.as_raw_socket().recv_buffer_size()
     }
 
-    /// Takes one frame from the socket.
+    /// Takes up to [`CALL_BATCH`] frames from the socket and appends them; fewer say that it was empty then.
     ///
     /// # Errors
     /// `EAGAIN` when there is none; `ENETDOWN`, `ENODEV` once when the interface went down or away.
-    pub(super) fn receive(&mut self) -> Result<RawReceived, Errno> {
-        let mut bytes = [0; FD_BYTES];
-        let fd = self.socket.as_raw_fd();
-        let (length, stamps, dropped_total) = {
-            let mut slices = [IoSliceMut::new(&mut bytes)];
-            let message = recvmsg::<()>(fd, &mut slices, Some(&mut self.control), MsgFlags::MSG_DONTWAIT)?;
-            let (stamps, dropped) = read_control(message.cmsgs()?);
-            (message.bytes, stamps, dropped)
-        };
-        Ok(RawReceived { what: wire::decode(&bytes[..length.min(FD_BYTES)]), stamps, dropped_total })
+    pub(super) fn receive(&self, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+        SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
+    }
+
+    /// Frames this socket has lost since it was opened because its receive buffer was full, modulo 2^32; 0 where the kernel cannot
+    /// say.
+    pub(super) fn dropped_total(&self) -> u32 {
+        let mut bytes = [0; MEMINFO_NUMBERS * size_of::<u32>()];
+        let told = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
+        let (numbers, _) = bytes.as_chunks();
+        // A shorter answer leaves it zero.
+        told.map_or(0, |_| u32::from_ne_bytes(numbers[MEMINFO_DROPS]))
     }
 
     /// Hands one frame to the kernel.
@@ -186,9 +242,8 @@ fn filter_mask(id: CanId) -> u32 {
     bits | wire::EXTENDED_FLAG | wire::REMOTE_FLAG
 }
 
-fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> (KernelStamps, Option<u32>) {
+fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> KernelStamps {
     let mut stamps = KernelStamps::default();
-    let mut dropped = None;
     for message in messages {
         match message {
             ControlMessageOwned::ScmTimestampsns(all) => {
@@ -196,11 +251,10 @@ fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> (KernelS
                 stamps.hardware_ns = nanos(all.hw_raw);
             }
             ControlMessageOwned::ScmTimestampns(stamp) => stamps.software_ns = nanos(stamp),
-            ControlMessageOwned::RxqOvfl(total) => dropped = Some(total),
             _ => {}
         }
     }
-    (stamps, dropped)
+    stamps
 }
 
 /// Zero means "no such stamp".
@@ -211,6 +265,8 @@ fn nanos(time: TimeSpec) -> Option<i64> {
 
 #[cfg(test)]
 mod tests {
+    use std::net::UdpSocket;
+
     use super::*;
 
     #[test]
@@ -231,5 +287,29 @@ mod tests {
     fn a_zero_stamp_is_none() {
         assert_eq!(nanos(TimeSpec::new(0, 0)), None);
         assert_eq!(nanos(TimeSpec::new(1, 5)), Some(1_000_000_005));
+    }
+
+    #[test]
+    fn one_call_takes_what_waits_in_order_and_frames_without_stamps_spoil_no_later_ones() {
+        // Any datagrams do: the kernel's headers are the same.
+        let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        tx.connect(rx.local_addr().unwrap()).unwrap();
+        let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());
+        let mut slots = Slots::new();
+        for stamped in [true, false, true, true] {
+            setsockopt(&rx, sockopt::ReceiveTimestampns, &stamped).unwrap();
+            for frame in &frames {
+                tx.send(wire::encode(frame, &mut [0; FD_BYTES])).unwrap();
+            }
+            let mut received = Vec::new();
+            while received.len() < frames.len() {
+                if let Err(error) = slots.receive(rx.as_raw_fd(), &mut received) {
+                    assert_eq!(error, Errno::EAGAIN);
+                }
+            }
+            assert!(received.iter().map(|received| received.what).eq(frames.map(Wire::Frame)));
+            assert!(received.iter().all(|received| received.stamps.software_ns.is_some() == stamped), "{received:?}");
+        }
+        assert_eq!(slots.receive(rx.as_raw_fd(), &mut Vec::new()), Err(Errno::EAGAIN));
     }
 }

@@ -4,7 +4,7 @@ use std::io;
 
 use nix::errno::Errno;
 
-use super::raw::RawSocket;
+use super::raw::{CALL_BATCH, RawReceived, RawSocket};
 use super::wire::Wire;
 use crate::can::Frame;
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -26,6 +26,8 @@ pub(crate) enum Tapped {
 pub(crate) struct Tap {
     socket: RawSocket,
     mapper: StampMapper,
+    /// What one call brought; kept for its room.
+    received: Vec<RawReceived>,
     dropped_total: u32,
     /// The clocks as last read: before what is read next.
     before: Reading,
@@ -40,36 +42,44 @@ impl Tap {
         let socket = RawSocket::open_all(interface)?;
         let is_up = socket.take_error()?.is_none();
         let before = Reading::now();
-        Ok((Self { socket, mapper: StampMapper::new(clock, before), dropped_total: 0, before }, is_up))
+        let (mapper, received) = (StampMapper::new(clock, before), Vec::with_capacity(CALL_BATCH));
+        Ok((Self { socket, mapper, received, dropped_total: 0, before }, is_up))
     }
 
-    /// The next thing that has come, and when; `None` = there is nothing now.
+    /// Appends what has come, and when; `false` = that was all there is now.
     ///
     /// # Errors
     /// When the interface went down (`ENETDOWN`: the tap stays good) or away.
     pub(crate) fn next(&mut self, into: &mut Vec<(Timestamp, Tapped)>) -> io::Result<bool> {
-        match self.socket.receive() {
-            Ok(received) => {
-                self.before = Reading::now();
-                let time = self.mapper.arrival(received.stamps, self.before);
-                if let Some(total) = received.dropped_total {
-                    let lost = total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total));
-                    into.extend((lost > 0).then_some((time, Tapped::Dropped(u64::from(lost)))));
-                }
-                match received.what {
-                    Wire::Frame(frame) => into.push((time, Tapped::Frame(frame))),
-                    Wire::Error(class) => into.push((time, Tapped::Error(class))),
-                    Wire::Malformed => into.push((time, Tapped::Dropped(1))),
-                }
-                Ok(true)
-            }
+        self.received.clear();
+        match self.socket.receive(&mut self.received) {
+            Ok(()) => self.before = Reading::now(),
             Err(Errno::EAGAIN) => {
                 self.mapper.socket_empty(self.before);
                 self.before = Reading::now();
-                Ok(false)
+                self.note_dropped(into);
+                return Ok(false);
             }
-            Err(Errno::EINTR) => Ok(true),
-            Err(error) => Err(error.into()),
+            Err(Errno::EINTR) => return Ok(true),
+            Err(error) => return Err(error.into()),
+        }
+        for received in &self.received {
+            let time = self.mapper.arrival(received.stamps, self.before);
+            let what = match received.what {
+                Wire::Frame(frame) => Tapped::Frame(frame),
+                Wire::Error(class) => Tapped::Error(class),
+                Wire::Malformed => Tapped::Dropped(1),
+            };
+            into.push((time, what));
+        }
+        Ok(true)
+    }
+
+    fn note_dropped(&mut self, into: &mut Vec<(Timestamp, Tapped)>) {
+        let total = self.socket.dropped_total();
+        let lost = total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total));
+        if lost > 0 {
+            into.push((self.mapper.event(self.before), Tapped::Dropped(u64::from(lost))));
         }
     }
 }

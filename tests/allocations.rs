@@ -1,0 +1,177 @@
+//! In steady state nothing on the way of a frame allocates: reading a log, the core with the example's 96 cells, its ticks
+//! and the frames it sends. What comes first (growing buffers), what is learned at a transition, and what is told as an event may.
+//!
+//! Every thread of the process counts. When a test fails, `dhat-heap.json` says where it allocated.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use packwatch::config;
+use packwatch::io::candump::{Line, parse_line};
+use packwatch::io::csv_log::CsvOptions;
+use packwatch::io::log::{LogOptions, LogSource, Record};
+use packwatch::io::ticks::Ticks;
+use packwatch::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
+
+#[global_allocator]
+static ALLOCATOR: dhat::Alloc = dhat::Alloc;
+
+/// A hole in the record longer than this means that its recorder was asleep, s; there is none here.
+const SLEEP_GAP_S: f64 = 30.0;
+/// Length of the log, s.
+const LOG_S: f64 = 160.0;
+/// Its first part warms up, s: the health frames go through the 96 cells once.
+const WARM_S: f64 = 110.0;
+/// Fewer frames than this after it would prove nothing: 50 s of 10 currents and 32 other frames each 100 ms.
+const MIN_FRAMES: u64 = 20_000;
+
+/// One test at a time: all of them count the whole process.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Runs `work`, in which no thread may allocate.
+fn without_allocating(what: &str, work: impl FnOnce()) {
+    let profiler = dhat::Profiler::builder().testing().build();
+    work();
+    let blocks = dhat::HeapStats::get().total_blocks;
+    // Its own assertion saves where.
+    dhat::assert_eq!(blocks, 0, "{what}: blocks allocated");
+    drop(profiler);
+}
+
+fn example() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/example.toml")
+}
+
+/// The example's pack on its bus: current every 10 ms, the cells every 100 ms.
+fn pack_log(folder: &Path) -> PathBuf {
+    let log = folder.join("pack.log");
+    let mut simulate = Command::new(env!("CARGO_BIN_EXE_packwatch"));
+    simulate.args([
+        "simulate",
+        "reference",
+        "--period",
+        "10",
+        "--cell-period",
+        "100",
+        "--duration",
+        &LOG_S.to_string(),
+    ]);
+    simulate.arg("-c").arg(example()).arg("-o").arg(&log).stdout(Stdio::null()).stderr(Stdio::null());
+    assert!(simulate.status().expect("packwatch runs").success());
+    log
+}
+
+fn source(log: &Path) -> LogSource {
+    let options = LogOptions {
+        interfaces: vec!["can0".to_owned()],
+        strict: true,
+        csv: CsvOptions::default(),
+        encode_row: Box::new(|_, _| 0),
+    };
+    LogSource::new([log.to_owned()], options)
+}
+
+fn next(source: &mut LogSource) -> Option<Record> {
+    source.next_record().expect("a good log")
+}
+
+/// Has the log reached its steady part?
+fn is_warm(record: &Record, first: &Record) -> bool {
+    record.time().since(first.time()) >= WARM_S
+}
+
+#[test]
+fn an_allocation_is_counted() {
+    let _alone = alone();
+    let profiler = dhat::Profiler::builder().testing().build();
+    let kept = std::thread::spawn(|| vec![0_u8; 1000]).join();
+    assert!(dhat::HeapStats::get().total_bytes >= 1000, "else the zeros of the other tests say nothing");
+    drop((profiler, kept));
+}
+
+#[test]
+fn a_line_of_a_log_allocates_nothing() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a folder");
+    let text = std::fs::read(pack_log(folder.path())).expect("a log");
+    let mut frames = 0;
+    without_allocating("parsing", || {
+        for line in text.split(|&byte| byte == b'\n').filter(|line| !line.is_empty()) {
+            frames += u64::from(matches!(parse_line(line), Ok(Line::Frame { .. })));
+        }
+    });
+    assert!(frames > MIN_FRAMES, "{frames} frames");
+}
+
+#[test]
+fn a_frame_read_from_a_log_allocates_nothing() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut source = source(&pack_log(folder.path()));
+    let first = next(&mut source).expect("a frame");
+    while !is_warm(&next(&mut source).expect("a long log"), &first) {}
+    let mut frames = 0;
+    without_allocating("reading a log", || {
+        // The last frames are left: what is done at the end of a file is done once.
+        while frames < MIN_FRAMES {
+            frames += u64::from(matches!(next(&mut source), Some(Record::Frame { .. })));
+        }
+    });
+}
+
+/// The core as a replay drives it.
+struct Core {
+    monitor: Monitor,
+    ticks: Ticks,
+    out: Outputs,
+    sent: usize,
+    events: usize,
+}
+
+impl Core {
+    fn new() -> Self {
+        let config = config::load(&example()).expect("the example is good");
+        let ticks = Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S);
+        Self { monitor: Monitor::new(config.monitor), ticks, out: Outputs::default(), sent: 0, events: 0 }
+    }
+
+    fn feed(&mut self, record: &Record) {
+        self.ticks.advance(record.time());
+        while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+            self.handle(Input::Tick { time });
+        }
+        self.handle(record.input().expect("a frame"));
+    }
+
+    fn handle(&mut self, input: Input<'_>) {
+        self.monitor.handle(input, &mut self.out);
+        self.sent += self.out.frames.len();
+        self.events += self.out.events.len();
+        self.out.clear();
+    }
+}
+
+#[test]
+fn a_frame_through_the_core_with_96_cells_allocates_nothing() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut source = source(&pack_log(folder.path()));
+    let mut core = Core::new();
+    let mut records = Vec::new();
+    while let Some(record) = next(&mut source) {
+        records.push(record);
+    }
+    let warm = records.iter().position(|record| is_warm(record, &records[0])).expect("a long log");
+    let (before, steady) = records.split_at(warm);
+    assert!(steady.len() as u64 > MIN_FRAMES, "{} frames", steady.len());
+    before.iter().for_each(|record| core.feed(record));
+    (core.sent, core.events) = (0, 0);
+    without_allocating("the core", || steady.iter().for_each(|record| core.feed(record)));
+    assert!(core.sent > 500, "{} frames sent: status ten times a second, health, alarms", core.sent);
+    assert!(core.monitor.latest().flatten().count() == 96, "every cell has its estimate");
+    assert_eq!(core.events, 0, "a steady part");
+}
