@@ -6,30 +6,34 @@
 #![expect(clippy::print_stdout, reason = "a program whose output is read by tests/instructions")]
 
 use std::hint::black_box;
+use std::io::Write;
 use std::time::Instant;
 
 use packwatch::can::Frame;
 use packwatch::can::dbc::Database;
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::encode::InputEncoder;
-use packwatch::cell::{CellEstimator, CellModel, CellStep, EstimatorConfig};
+use packwatch::cell::{CellEstimator, CellModel, CellStep, EstimatorBank, EstimatorConfig};
 use packwatch::config;
-use packwatch::io::candump::{Line, parse_line};
+use packwatch::io::csv_log::CsvOptions;
+use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel};
+use tempfile::NamedTempFile;
 
 /// Name, what one unit of it is, and what makes it.
-const WORKS: [Named; 7] = [
-    ("parse", "candump line of 8 bytes", parse),
+const WORKS: [Named; 8] = [
+    ("parse", "candump line of 8 bytes, read and placed in time", parse),
     ("parse_and_decode", "such a line and its 3 signals", parse_and_decode),
     ("decode_page", "frame of 3 cells, one of 32 pages", decode_page),
     ("step_one_branch", "step of one cell, 1 branch", || one_cell(1)),
     ("step_two_branches", "step of one cell, 2 branches", || one_cell(2)),
     ("step_three_branches", "step of one cell, 3 branches", || one_cell(3)),
     ("step_of_96", "cell and step of a pack of 96, 1 branch", pack),
+    ("plain_step", "step of one cell by the readable filter, 1 branch", plain),
 ];
 
 /// Lines, frames or steps in a pass.
-const UNITS: u32 = 960;
+const UNITS: u32 = 9600;
 /// Passes timed under `cargo bench`.
 const TIMED_PASSES: u32 = 200;
 
@@ -80,41 +84,49 @@ fn time((name, unit, work): &Named) {
 }
 
 /// Lines as a pack at work sends them, of one message with three signals.
-fn lines() -> Vec<u8> {
+fn log() -> NamedTempFile {
     let line = |n: u64| {
         let data = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
         format!("(17000{:05}.{:06}) can0 100#{data:016X}\n", n / 1000, n % 1000 * 1000)
     };
-    (0..u64::from(UNITS)).flat_map(|n| line(n).into_bytes()).collect()
+    let mut log = NamedTempFile::new().expect("a temporary file");
+    (0..u64::from(UNITS)).for_each(|n| log.write_all(line(n).as_bytes()).expect("room for it"));
+    log
 }
 
 fn parse() -> Work {
-    let text = lines();
+    let log = log();
     Box::new(move || {
         let mut sum = 0.0;
-        each_frame(&text, |frame| sum += f64::from(frame.data()[0]));
+        each_frame(&log, |_, frame| sum += f64::from(frame.data()[0]));
         sum
     })
 }
 
 fn parse_and_decode() -> Work {
-    let (text, map) = (lines(), bind(include_str!("../config/measured.dbc"), |_| true));
+    let (log, map) = (log(), bind(include_str!("../config/measured.dbc"), |_| true));
     Box::new(move || {
         let mut sum = 0.0;
-        each_frame(&text, |frame| {
-            map.decode(BusIndex(0), frame, |reading| sum += reading.value.unwrap_or(0.0));
-        });
+        each_frame(&log, |bus, frame| map.decode(bus, frame, |reading| sum += reading.value.unwrap_or(0.0)));
         sum
     })
 }
 
-fn each_frame(text: &[u8], mut take: impl FnMut(&Frame)) {
-    let mut start = 0;
-    for end in memchr::memchr_iter(b'\n', text) {
-        if let Ok(Line::Frame { frame, .. }) = parse_line(&text[start..end]) {
-            take(&frame);
+/// The frames of a log, as replay has them: reading, lines and their places in time are in it.
+fn each_frame(log: &NamedTempFile, mut take: impl FnMut(BusIndex, &Frame)) {
+    let options = LogOptions {
+        interfaces: vec!["can0".to_owned()],
+        strict: true,
+        csv: CsvOptions::default(),
+        encode_row: Box::new(|_, _| 0),
+    };
+    let mut source = LogSource::new([log.path().to_owned()], options);
+    let mut batch = Batch::new(Batch::MAX);
+    while source.next_batch(&mut batch).expect("a log without faults") {
+        for record in batch.records() {
+            let Record::Frame { bus, frame, .. } = record else { panic!("frames alone") };
+            take(*bus, frame);
         }
-        start = end + 1;
     }
 }
 
@@ -169,27 +181,34 @@ fn reading(k: u32, cell: u32) -> CellStep {
 }
 
 fn one_cell(branches: usize) -> Work {
+    steps(branches, 1)
+}
+
+fn pack() -> Work {
+    steps(1, 96)
+}
+
+fn steps(branches: usize, cells: u32) -> Work {
     let (model, config) = cell(branches);
+    let mut pack = EstimatorBank::new(&model, &config, cells as usize);
+    let mut k = 0;
+    Box::new(move || {
+        for _ in 0..UNITS / cells {
+            k += 1;
+            (0..cells).for_each(|cell| pack.add(cell as usize, black_box(&reading(k, cell))));
+            pack.step();
+        }
+        pack.soc(0).map_or(0.0, |soc| soc.mean)
+    })
+}
+
+fn plain() -> Work {
+    let (model, config) = cell(1);
     let mut estimator = CellEstimator::new(&config);
     Box::new(move || {
         for k in 0..UNITS {
             black_box(estimator.step(&model, &config, black_box(&reading(k, 0))));
         }
         estimator.soc().map_or(0.0, |soc| soc.mean)
-    })
-}
-
-fn pack() -> Work {
-    let (model, config) = cell(1);
-    let mut pack = vec![CellEstimator::new(&config); 96];
-    let mut k = 0;
-    Box::new(move || {
-        for _ in 0..UNITS / 96 {
-            k += 1;
-            for (n, estimator) in (0..).zip(&mut pack) {
-                black_box(estimator.step(&model, &config, black_box(&reading(k, n))));
-            }
-        }
-        pack[0].soc().map_or(0.0, |soc| soc.mean)
     })
 }

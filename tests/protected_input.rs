@@ -99,7 +99,9 @@ impl Bench {
         self.estimates.clear();
     }
 
+    /// What came of the inputs so far, without waiting for the rest of a round of voltages.
     fn take(&mut self) {
+        self.monitor.settle(&mut self.out);
         self.events.append(&mut self.out.events);
         self.estimates.append(&mut self.out.estimates);
         self.out.clear();

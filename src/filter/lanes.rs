@@ -109,7 +109,7 @@ impl<const L: usize> Lanes<L> {
     /// Square root of each lane; NaN below 0.
     #[inline(always)]
     pub fn sqrt(self) -> Self {
-        Self(self.0.map(f64::sqrt))
+        Self(from_fn(|i| self.0[i].sqrt()))
     }
 
     /// 1 / x.
@@ -121,19 +121,25 @@ impl<const L: usize> Lanes<L> {
     /// Magnitude of each lane.
     #[inline(always)]
     pub fn abs(self) -> Self {
-        Self(self.0.map(f64::abs))
+        Self(from_fn(|i| self.0[i].abs()))
+    }
+
+    /// The smaller of each lane and the other's; the other's where the lane is NaN.
+    #[inline(always)]
+    pub fn smaller(self, other: Self) -> Self {
+        Self(from_fn(|i| if self.0[i] < other.0[i] { self.0[i] } else { other.0[i] }))
     }
 
     /// The smaller of each lane and `limit`; `limit` where the lane is NaN.
     #[inline(always)]
     pub fn at_most(self, limit: f64) -> Self {
-        Self(self.0.map(|x| if x < limit { x } else { limit }))
+        Self(from_fn(|i| if self.0[i] < limit { self.0[i] } else { limit }))
     }
 
     /// The larger of each lane and `limit`; `limit` where the lane is NaN.
     #[inline(always)]
     pub fn at_least(self, limit: f64) -> Self {
-        Self(self.0.map(|x| if x > limit { x } else { limit }))
+        Self(from_fn(|i| if self.0[i] > limit { self.0[i] } else { limit }))
     }
 
     /// Whether each lane is above the other's; no where one is NaN.
@@ -145,13 +151,13 @@ impl<const L: usize> Lanes<L> {
     /// The same for one limit.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
-        Mask(self.0.map(|x| x > limit))
+        Mask(from_fn(|i| self.0[i] > limit))
     }
 
     /// Whether each lane is neither NaN nor infinite.
     #[inline(always)]
     pub fn is_finite(self) -> Mask<L> {
-        Mask(self.0.map(|x| x.abs() < f64::INFINITY))
+        Mask(from_fn(|i| self.0[i].abs() < f64::INFINITY))
     }
 
     /// Each lane of `self` where the mask says yes, else of `other`.
@@ -160,48 +166,52 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x to within three units in the last place; 0 below -708, finite above 709 too (e^709).
-    ///
-    /// x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n is
-    /// added to the exponent's bits.
+    /// e^x to within three units in the last place; 0 below -708, e^709 above 709.
     #[inline(always)]
     pub fn exp(self) -> Self {
-        Self(self.0.map(|x| {
-            let x = if x < 709.0 { x } else { 709.0 };
-            let clamped = if x > LEAST { x } else { LEAST };
-            let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
-            let n = shifted - ROUNDER;
-            let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
-            // Even and odd powers apart: two short chains instead of a long one.
-            let r2 = r * r;
-            let even = EXP_EVEN.iter().fold(1.0 / 479_001_600.0, |sum, factor| sum * r2 + factor);
-            let odd = EXP_ODD.iter().fold(1.0 / 39_916_800.0, |sum, factor| sum * r2 + factor);
-            let series = even + odd * r;
-            // The lowest bits of `shifted` are n; those above fall off.
-            let scaled = f64::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 52));
-            if x > LEAST { scaled } else { 0.0 }
-        }))
+        Self(from_fn(|i| exp(self.0[i])))
     }
 
     /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
-    ///
-    /// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).
     #[inline(always)]
     pub fn ln(self) -> Self {
-        Self(self.0.map(|x| {
-            // Subtracting the bits of sqrt(1/2) leaves e in the exponent's place.
-            let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
-            let exponent = above & 0xFFF0_0000_0000_0000;
-            let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
-            // e as a number without a conversion of integers: its low bits into the mantissa of a large one.
-            let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
-            let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
-            let s = (m - 1.0) / (m + 1.0);
-            let s2 = s * s;
-            let series = LN_SERIES.iter().fold(1.0 / 21.0, |sum, factor| sum * s2 + factor);
-            2.0 * s * series + e * std::f64::consts::LN_2
-        }))
+        Self(from_fn(|i| ln(self.0[i])))
     }
+}
+
+/// x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n is
+/// added to the exponent's bits.
+#[inline(always)]
+fn exp(x: f64) -> f64 {
+    let x = if x < 709.0 { x } else { 709.0 };
+    let clamped = if x > LEAST { x } else { LEAST };
+    let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
+    let n = shifted - ROUNDER;
+    let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
+    // Even and odd powers apart: two short chains instead of a long one.
+    let r2 = r * r;
+    let even = EXP_EVEN.iter().fold(1.0 / 479_001_600.0, |sum, factor| sum * r2 + factor);
+    let odd = EXP_ODD.iter().fold(1.0 / 39_916_800.0, |sum, factor| sum * r2 + factor);
+    let series = even + odd * r;
+    // The lowest bits of `shifted` are n; those above fall off.
+    let scaled = f64::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 52));
+    if x > LEAST { scaled } else { 0.0 }
+}
+
+/// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).
+#[inline(always)]
+fn ln(x: f64) -> f64 {
+    // Subtracting the bits of sqrt(1/2) leaves e in the exponent's place.
+    let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
+    let exponent = above & 0xFFF0_0000_0000_0000;
+    let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
+    // e as a number without a conversion of integers: its low bits into the mantissa of a large one.
+    let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
+    let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
+    let s = (m - 1.0) / (m + 1.0);
+    let s2 = s * s;
+    let series = LN_SERIES.iter().fold(1.0 / 21.0, |sum, factor| sum * s2 + factor);
+    2.0 * s * series + e * std::f64::consts::LN_2
 }
 
 /// Below this e^x is taken for 0: the bits of smaller results would not be a normal number's.

@@ -66,9 +66,11 @@ impl Monitor {
         if self.is_restating {
             self.restated_at = self.now;
         }
-        self.watch_inputs(out);
-        self.watch_learned(out);
-        self.watch_pack(out);
+        let any_lost = self.sampler.any_lost();
+        let worst = self.sampler.worst_input(self.now);
+        self.watch_inputs(worst, out);
+        self.watch_learned(any_lost, out);
+        self.watch_pack(worst.is_some() && !any_lost, out);
         let (fault_s, is_whole) = self.buses.worst_s(self.now, self.config.interfaces);
         let bus = Observation { is_bound: !is_whole, ..Observation::new(fault_s) };
         self.observe_alarm(Rule::BusFault, None, bus, out);
@@ -82,11 +84,11 @@ impl Monitor {
 
     /// Silence and plausibility of every input, for the rules about them: a cell's own voltage under its number,
     /// what belongs to no cell under the pack.
-    fn watch_inputs(&mut self, out: &mut Outputs) {
+    fn watch_inputs(&mut self, worst: Option<(f64, f64)>, out: &mut Outputs) {
         let quiet = |(silence_s, share): (f64, f64)| {
             self.alarms.is_quiet(Rule::InputMissing, silence_s) && self.alarms.is_quiet(Rule::InputImplausible, share)
         };
-        if !self.restates(out) && self.sampler.worst_input(self.now).is_some_and(quiet) {
+        if !self.restates(out) && worst.is_some_and(quiet) {
             return;
         }
         let mut pack: Option<InputState> = None;
@@ -127,8 +129,8 @@ impl Monitor {
     }
 
     /// What was learned of a cell stands only while its inputs can renew it.
-    fn watch_learned(&mut self, out: &mut Outputs) {
-        if self.all_valid_told && !out.want_alarm_inputs && !self.sampler.any_lost() {
+    fn watch_learned(&mut self, any_lost: bool, out: &mut Outputs) {
+        if self.all_valid_told && !out.want_alarm_inputs && !any_lost {
             return;
         }
         let (mut all_valid, mut all_started) = (true, true);
@@ -171,8 +173,8 @@ impl Monitor {
         }
     }
 
-    fn watch_pack(&mut self, out: &mut Outputs) {
-        let spread = self.spread();
+    fn watch_pack(&mut self, all_fresh: bool, out: &mut Outputs) {
+        let spread = self.spread(all_fresh);
         let soc_low = spread.map_or(Observation::default(), |spread| Observation {
             is_bound: !spread.is_whole,
             ..Observation::new(Some(spread.lowest.mean)).with_std(spread.lowest.std())
@@ -193,8 +195,8 @@ impl Monitor {
     }
 
     /// SOC of the emptiest and the fullest of the cells whose estimate is fresh; `None` = of no cell.
-    fn spread(&self) -> Option<Spread> {
-        if self.sampler.all_good(self.now)
+    fn spread(&self, all_fresh: bool) -> Option<Spread> {
+        if all_fresh
             && let Some((lowest, highest)) = self.estimators.extremes()
         {
             return Some(Spread { lowest, highest, is_whole: true });

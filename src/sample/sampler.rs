@@ -168,6 +168,11 @@ impl Sampler {
     ) -> Option<CellSample> {
         let time = self.pass(time);
         let channel = reading.channel;
+        if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (channel, reading.value)
+            && let Some(sample) = self.ordinary_voltage(time, cell, voltage_v)
+        {
+            return Some(sample);
+        }
         let Some(slot) = self.slot(channel) else {
             self.state.unused_readings += 1;
             return None;
@@ -194,6 +199,23 @@ impl Sampler {
             Channel::PackVoltage => Some(self.sample(&moment, CellIndex(0), value)),
             Channel::CellVoltage(cell) => Some(self.sample(&moment, cell, value)),
         }
+    }
+
+    /// Takes the most frequent reading by the shortest way: a cell's good voltage after many others. `None` and nothing
+    /// changed when it may be anything else.
+    #[inline]
+    fn ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
+        if cell.index() >= self.voltages || self.config.voltage_source != VoltageSource::Cells {
+            return None;
+        }
+        let moment = self.moment(time);
+        let signal = &mut self.state.signals[1 + self.sensors + cell.index()];
+        let clock_s = should_move_s(Channel::CellVoltage(cell), &moment.totals);
+        if !signal.take_ordinary(time, voltage_v, &self.config.voltage, clock_s) {
+            return None;
+        }
+        self.state.counts.note(None);
+        Some(self.sample(&moment, cell, voltage_v))
     }
 
     /// Judges the ages at `now`; signals that have become stale go to `changes`.
@@ -344,12 +366,6 @@ impl Sampler {
     /// Whether any signal the estimates are made of is bad or stale.
     pub fn any_bad(&self) -> bool {
         self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
-    }
-
-    /// Whether something has come on every channel since the start or the last waking, and the latest of each is good
-    /// and young enough.
-    pub fn all_good(&self, now: Timestamp) -> bool {
-        !self.any_lost() && self.worst_input(now).is_some()
     }
 
     /// Whether any signal at all is bad or stale.

@@ -73,11 +73,6 @@ impl Signal {
         should_move_s: f64,
     ) -> Judged {
         self.heard = Some(time);
-        if let Ok(value) = value
-            && self.take_ordinary(Stamped { value, time }, limits, should_move_s)
-        {
-            return Judged { value: Ok(value), change: None, is_new_level: false };
-        }
         let value = self.judge(time, value, limits, should_move_s);
         self.count(value.is_err());
         let is_new_level = value.is_ok() && self.refused_count >= ACCEPT_AFTER;
@@ -88,17 +83,16 @@ impl Signal {
         Judged { value, change: self.turn(value.err(), 1), is_new_level }
     }
 
-    /// Takes a good reading of a signal that has been good for long, as [`judge`](Self::judge) and [`count`](Self::count)
-    /// would, with less to look at; `false` and nothing changed when it may be anything else.
+    /// Takes a good reading of a signal that has been good for long, as [`handle`](Self::handle) would, with less to look
+    /// at; `false` and nothing changed when it may be anything else.
     #[inline]
-    fn take_ordinary(&mut self, reading: Stamped, limits: &Limits, should_move_s: f64) -> bool {
-        let Stamped { value, time } = reading;
+    pub(super) fn take_ordinary(&mut self, time: Timestamp, value: f64, limits: &Limits, should_move_s: f64) -> bool {
         let is_settled = self.fault.is_none() && self.refused_count == 0;
         let is_faultless = self.readings == BAD_SHARE_READINGS && self.bad_share == 0.0;
         let (Some(good), true) = (self.good, is_settled && is_faultless) else { return false };
         // Also false for NaN.
         let is_plausible = value >= limits.min && value <= limits.max;
-        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, reading, rate)) {
+        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, Stamped { value, time }, rate)) {
             return false;
         }
         if self.rests_at != Some(value) {
@@ -107,6 +101,7 @@ impl Signal {
             return false;
         }
         self.good = Some(Stamped { value, time });
+        self.heard = Some(time);
         true
     }
 

@@ -6,13 +6,12 @@
 #![expect(clippy::unwrap_used, reason = "a bench that cannot set itself up has nothing to measure")]
 
 use std::path::Path;
-use std::sync::Arc;
 use std::time::Instant;
 
 use packwatch::can::dbc::Database;
 use packwatch::can::decode::{Binding, InputMap};
-use packwatch::io::candump::{Line, parse_line};
-use packwatch::io::lines::{self, Lines, RawLine};
+use packwatch::io::csv_log::CsvOptions;
+use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel};
 
 fn main() {
@@ -35,13 +34,23 @@ fn every_signal(dbc: &str) -> InputMap {
 }
 
 fn parse_and_decode(log: &Path, map: &InputMap, most: u64) -> (u64, f64) {
-    let mut lines = Lines::new(lines::open(log, &Arc::default()).unwrap());
+    let options = LogOptions {
+        interfaces: vec!["can0".to_owned()],
+        strict: false,
+        csv: CsvOptions::default(),
+        encode_row: Box::new(|_, _| 0),
+    };
+    let mut source = LogSource::new([log.to_owned()], options);
+    let mut batch = Batch::new(Batch::MAX);
     let (mut frames, mut sum) = (0, 0.0);
-    while frames < most {
-        let Some(RawLine::Whole(line) | RawLine::Last(line)) = lines.next_line().unwrap() else { break };
-        let Ok(Line::Frame { frame, .. }) = parse_line(line) else { continue };
-        map.decode(BusIndex(0), &frame, |reading| sum += reading.value.unwrap_or(0.0));
-        frames += 1;
+    while frames < most && source.next_batch(&mut batch).unwrap() {
+        for record in batch.records() {
+            let Record::Frame { bus, frame, .. } = record else { continue };
+            if frames < most {
+                map.decode(*bus, frame, |reading| sum += reading.value.unwrap_or(0.0));
+                frames += 1;
+            }
+        }
     }
     (frames, sum)
 }

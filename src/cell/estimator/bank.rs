@@ -217,17 +217,14 @@ impl EstimatorBank {
 
     /// State of charge of the emptiest and the fullest cell; `None` when one's is not known, or of before time away.
     pub fn extremes(&self) -> Option<(Belief, Belief)> {
-        let (mut lowest, mut highest) = (self.soc(0)?, self.soc(0)?);
-        for cell in 0..self.cells.len() {
-            let Cell { memory, has_filter, .. } = &self.cells[cell];
-            if !has_filter || memory.is_unseen || memory.away_std_if_any().is_some() {
-                return None;
-            }
-            let soc = self.belief(cell, 0);
-            lowest = if soc.mean < lowest.mean { soc } else { lowest };
-            highest = if soc.mean > highest.mean { soc } else { highest };
+        let is_present = |cell: &Cell| {
+            cell.has_filter && !cell.memory.is_unseen && cell.memory.away_std_if_any().is_none()
+        };
+        if !self.cells.iter().all(is_present) {
+            return None;
         }
-        Some((lowest, highest))
+        let (lowest, highest) = each_lane!(&self.filters, x => x.extremes(self.cells.len()))?;
+        Some((self.belief(lowest, 0), self.belief(highest, 0)))
     }
 
     /// ln of the resistance relative to new.
@@ -398,12 +395,7 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             if count == 1
                 && let Some(lane) = block.is_present.iter().position(|&present| present)
             {
-                let one = State::of_lane(state, lane);
-                let (new, outcome) = kernel::step(&self.tables, c, &one, &block.input.lane(lane));
-                if outcome.is_usable.0[0] {
-                    state.set_lane(lane, &new);
-                    block.note(lane, 0, &outcome, &mut cells[lane], &mut results[lane]);
-                }
+                step_alone(&self.tables, c, state, block, lane, &mut cells[lane], &mut results[lane]);
                 continue;
             }
             let (new, outcome) = kernel::step(&self.tables, c, state, &block.input);
@@ -419,6 +411,16 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 }
             }
         }
+    }
+
+    /// The first of the cells with the lowest and of those with the highest SOC.
+    fn extremes(&self, cells: usize) -> Option<(usize, usize)> {
+        let all = self.blocks.iter().flat_map(|state| state.mean[0].0).take(cells).enumerate();
+        let first = all.clone().next()?;
+        let ends = all.fold((first, first), |(lowest, highest), cell| {
+            (if cell.1 < lowest.1 { cell } else { lowest }, if cell.1 > highest.1 { cell } else { highest })
+        });
+        Some((ends.0.0, ends.1.0))
     }
 
     fn filter(&self, block: usize, lane: usize, make: fn(Gaussian<N>) -> Filter) -> (Filter, [f64; kernel::MEMORY]) {
@@ -445,6 +447,25 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         hot[MEAN_NIS].0[lane] = memory.mean_nis;
         hot[INFORMATION_S].0[lane] = memory.information_s;
         hot[REST_S].0[lane] = memory.rest_s;
+    }
+}
+
+/// The step of one cell of a block. Not a part of the vector code: it is needed once, not once per width.
+#[inline(never)]
+fn step_alone<const N: usize, const T: usize, const W: usize>(
+    tables: &Tables<W>,
+    c: &Constants,
+    state: &mut State<WIDTH, N, T>,
+    block: &mut BlockInput,
+    lane: usize,
+    cell: &mut Cell,
+    result: &mut StepResult,
+) {
+    let one = State::of_lane(state, lane);
+    let (new, outcome) = kernel::step(tables, c, &one, &block.input.lane(lane));
+    if outcome.is_usable.0[0] {
+        state.set_lane(lane, &new);
+        block.note(lane, 0, &outcome, cell, result);
     }
 }
 

@@ -293,9 +293,10 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     input: &Input<L>,
 ) -> (State<L, N, T>, Outcome<L>) {
     let ratio = before.mean[LOG_RESISTANCE].exp();
-    let (mut x, predicted) = predict(tables, c, before, input, ratio);
+    let (mean, covariance, has_factor) = predict(tables, c, before, input, ratio);
+    let mut x = State { mean, covariance, memory: before.memory };
     let information_s = remember(c, &mut x, input);
-    let (mut x, mut outcome) = update(tables, c, &x, input, ratio, information_s);
+    let mut outcome = update(tables, c, &mut x, input, ratio, information_s);
     x.memory[INFORMATION_S] = Lanes::splat(0.0);
     let forget = Lanes::splat(1.0) - input.kept.consistency;
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
@@ -304,11 +305,11 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     for number in x.mean[1..].iter().chain(&x.covariance) {
         sum = sum + *number;
     }
-    let mut is_usable = outcome.is_usable & predicted & sum.is_finite();
-    for i in 0..N {
-        is_usable = is_usable & x.covariance[at(i, i)].above_number(0.0);
+    let mut least = x.covariance[at(0, 0)];
+    for i in 1..N {
+        least = least.smaller(x.covariance[at(i, i)]);
     }
-    outcome.is_usable = is_usable;
+    outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
     (x, outcome)
 }
 
@@ -358,7 +359,7 @@ fn shift<const L: usize>(c: &Constants, even: [Lanes<L>; COLUMNS]) -> Lanes<L> {
     (even[0] + even[1] + even[2]) * (1.0 / c.scale)
 }
 
-/// The circuit's equations over the measured time; where the covariance had a factor.
+/// The circuit's equations over the measured time: mean, covariance, and where the covariance before had a factor.
 #[inline(always)]
 fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &Tables<W>,
@@ -366,7 +367,7 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     x: &State<L, N, T>,
     input: &Input<L>,
     ratio: Lanes<L>,
-) -> (State<L, N, T>, Mask<L>) {
+) -> ([Lanes<L>; N], [Lanes<L>; T], Mask<L>) {
     let one = Lanes::splat(1.0);
     let Factor { columns: l, is_positive, .. } = Factor::<L, N>::new(&x.covariance);
     let dt = input.measured_s;
@@ -420,10 +421,10 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     }
 
     let soc_shift = shift(c, soc_even);
-    let mut next = *x;
-    next.mean[0] = x.mean[0] - moved + soc_shift;
+    let mut mean = x.mean;
+    mean[0] = x.mean[0] - moved + soc_shift;
     let capacity_column = [l[0][CAPACITY], l[1][CAPACITY], l[2][CAPACITY]];
-    let p = &mut next.covariance;
+    let mut p = x.covariance;
     let soc_noise = dt * c.soc_variance_per_s + moved.abs() * c.charge_variance_per_soc;
     p[at(0, 0)] = sum(soc_odd, soc_odd) + sum(soc_even, soc_even) + soc_shift.square() * c.excess + soc_noise;
     p[at(LOG_RESISTANCE, 0)] = soc_odd[0] * l[0][LOG_RESISTANCE] + soc_odd[1] * l[1][LOG_RESISTANCE];
@@ -434,7 +435,7 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
         let odd = [u_odd[0][i], u_odd[1][i], u_odd[2][i]];
         let even = [u_even[0][i], u_even[1][i], u_even[2][i]];
         let u_shift = shift(c, even);
-        next.mean[i] = u[i] + u_shift;
+        mean[i] = u[i] + u_shift;
         p[at(i, 0)] = sum(soc_odd, odd) + sum(soc_even, even) + soc_shift * u_shift * c.excess;
         p[at(i, LOG_RESISTANCE)] = l[0][LOG_RESISTANCE] * odd[0] + l[1][LOG_RESISTANCE] * odd[1];
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
@@ -450,7 +451,7 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
         }
         p[at(i, i)] = p[at(i, i)] + noise[i];
     }
-    (next, is_positive)
+    (mean, p, is_positive)
 }
 
 /// Follows the load, and the time the reading speaks for, which is given, s.
@@ -479,16 +480,16 @@ fn remember<const L: usize, const N: usize, const T: usize>(
     (x.memory[INFORMATION_S] + new_s).at_least(1e-3).at_most(c.max_information_s)
 }
 
-/// The measurement update.
+/// The measurement update: moves `x`, whether that may be used or not.
 #[inline(always)]
 fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &Tables<W>,
     c: &Constants,
-    x: &State<L, N, T>,
+    x: &mut State<L, N, T>,
     input: &Input<L>,
     ratio: Lanes<L>,
     information_s: Lanes<L>,
-) -> (State<L, N, T>, Outcome<L>) {
+) -> Outcome<L> {
     let Factor { columns: l, rest, is_positive } = Factor::<L, N>::new(&x.covariance);
     let per_scale = 1.0 / c.scale;
     let reach = l[0][0] * c.scale;
@@ -575,18 +576,17 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     let gate = variance + (slope_v.square() * c.gate_soc_variance + c.gate_variance);
     let test_ratio = innovation_v.square() / gate;
 
-    let mut next = *x;
     let inverse = total.reciprocal();
     for i in 0..N {
         let gain = cross[i] * inverse;
-        next.mean[i] = x.mean[i] + gain * innovation_v;
+        x.mean[i] = x.mean[i] + gain * innovation_v;
         for j in 0..=i {
-            next.covariance[at(i, j)] = x.covariance[at(i, j)] - gain * cross[j];
+            x.covariance[at(i, j)] = x.covariance[at(i, j)] - gain * cross[j];
         }
     }
     let is_within = !test_ratio.above_number(c.gate_limit) & total.above_number(0.0) & total.is_finite();
     let is_usable = is_positive & is_within & test_ratio.is_finite();
-    (next, Outcome { is_usable, innovation_v, innovation_variance: total, test_ratio })
+    Outcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
 }
 
 /// Open-circuit voltage of a cell that has aged to a capacity, V: that of a new one at [`CellModel::ocv_soc`].
