@@ -1,5 +1,6 @@
 //! How much faster the estimator of a pack is than the plain form of the same filter, as ratios: both are timed in turns
 //! in one run, so that what else the machine does is felt by both. The medians of the rounds are what is printed.
+#![expect(clippy::print_stdout, reason = "what it measures is what it prints")]
 
 use std::hint::black_box;
 use std::time::Instant;

@@ -352,9 +352,7 @@ impl CellEstimator {
 
     /// Covariance of capacity (Ah) and ln(resistance).
     pub fn capacity_resistance_covariance(&self) -> f64 {
-        self.filter
-            .as_ref()
-            .map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
+        self.filter.as_ref().map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
     }
 
     /// Voltage the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
@@ -448,7 +446,8 @@ fn fresh<const N: usize>(soc: Belief, branch_variance: f64, kept: &Kept) -> Gaus
     (mean[LOG_RESISTANCE], variance[LOG_RESISTANCE]) = (kept.log_resistance.mean, kept.log_resistance.variance);
     (mean[CAPACITY], variance[CAPACITY]) = (kept.capacity.mean, kept.capacity.variance);
     let mut covariance = SMatrix::from_diagonal(&variance);
-    (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) = (kept.covariance, kept.covariance);
+    (covariance[(LOG_RESISTANCE, CAPACITY)], covariance[(CAPACITY, LOG_RESISTANCE)]) =
+        (kept.covariance, kept.covariance);
     Gaussian { mean, covariance }
 }
 

@@ -196,9 +196,7 @@ impl Monitor {
 
     /// SOC of the emptiest and the fullest of the cells whose estimate is fresh; `None` = of no cell.
     fn spread(&self, all_fresh: bool) -> Option<Spread> {
-        if all_fresh
-            && let Some((lowest, highest)) = self.estimators.extremes()
-        {
+        if all_fresh && let Some((lowest, highest)) = self.estimators.extremes() {
             return Some(Spread { lowest, highest, is_whole: true });
         }
         let (mut spread, mut known): (Option<Spread>, usize) = (None, 0);
@@ -265,8 +263,7 @@ impl Monitor {
             }
             // A measured value is as old as the state; after a moment only it may still be taken for the present one.
             if was_away_briefly && self.estimators.soc(index).is_some() {
-                let mean_nis =
-                    Observation { value: Some(self.estimators.mean_nis(index)), ..Observation::default() };
+                let mean_nis = Observation { value: Some(self.estimators.mean_nis(index)), ..Observation::default() };
                 self.observe_alarm(Rule::EstimateUntrusted, cell, mean_nis, out);
             }
             if let Some(resistance) = self.cells[index].discharge_resistance {

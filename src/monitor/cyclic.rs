@@ -167,7 +167,8 @@ impl Monitor {
         }
         let capacity = self.weakest_capacity();
         let usable = self.cells.iter().filter_map(|slot| slot.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
-        let log_resistance = (0..self.cells.len()).map(|cell| self.estimators.log_resistance(cell).mean).max_by(f64::total_cmp);
+        let log_resistance =
+            (0..self.cells.len()).map(|cell| self.estimators.log_resistance(cell).mean).max_by(f64::total_cmp);
         let life = self.pack_remaining_life().map(|(_, life)| life);
         let cycles = life.and_then(|life| life.cycles);
         HealthFields {

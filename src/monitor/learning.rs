@@ -187,12 +187,7 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
     }
 }
 
-fn capacity_event(
-    cell: CellIndex,
-    usable: Option<Belief>,
-    resistance: Belief,
-    update: &CapacityUpdate,
-) -> EventKind {
+fn capacity_event(cell: CellIndex, usable: Option<Belief>, resistance: Belief, update: &CapacityUpdate) -> EventKind {
     EventKind::Capacity {
         cell,
         measured_ah: update.measurement.map(|z| z.value),

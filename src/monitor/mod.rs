@@ -394,8 +394,7 @@ impl Monitor {
     fn forget_learned(&mut self) {
         let (config, cells) = (&self.config, self.cells.len());
         self.estimators = EstimatorBank::new(&config.model, &config.estimator, cells);
-        self.learner =
-            Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
+        self.learner = Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
         self.cells.fill(CellSlot::new(config));
         (self.learned_at, self.all_valid_told, self.all_trusted) = (None, false, true);
         self.detector = TransitionDetector::default();

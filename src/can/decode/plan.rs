@@ -286,7 +286,8 @@ fn good_codes(binding: &Binding, shifts: &Shifts) -> Option<(i64, i64)> {
     let (lowest, highest) = shifts.codes();
     let is_rising = |of: &dyn Fn(i64) -> f64| of(lowest) <= of(highest);
     let mut good = (lowest, highest);
-    let both: [(&dyn Fn(i64) -> f64, f64, f64); 2] =
+    type Map<'a> = &'a dyn Fn(i64) -> f64;
+    let both: [(Map<'_>, f64, f64); 2] =
         [(&physical, shifts.low, shifts.high), (&value, binding.range.0, binding.range.1)];
     for (of, low, high) in both {
         // Along rising values: not below the lower limit any more, and above the upper one.

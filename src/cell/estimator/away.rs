@@ -65,7 +65,8 @@ pub(super) fn update_after_away<const N: usize>(
     let mut used = used(x, config, away_std);
     // The voltage as it is foreseen by a belief that wide, without moving anything.
     let foreseen = update(&mut used.clone(), model, config, reading)?.innovation_variance;
-    let drop_v = reading.current_a * model.r0_ohm(&model.place_in(&reading.row, before_soc)) * libm::exp(x.mean[LOG_RESISTANCE]);
+    let drop_v =
+        reading.current_a * model.r0_ohm(&model.place_in(&reading.row, before_soc)) * libm::exp(x.mean[LOG_RESISTANCE]);
     let reach = 3.0_f64.sqrt() * away_std;
     let soc = model.soc_of_ocv_in(&reading.row, reading.voltage_v + drop_v);
     // Everything within reach is as likely: the belief is taken to where the voltage is, so that the curve is straight there.

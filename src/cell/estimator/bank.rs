@@ -217,9 +217,8 @@ impl EstimatorBank {
 
     /// State of charge of the emptiest and the fullest cell; `None` when one's is not known, or of before time away.
     pub fn extremes(&self) -> Option<(Belief, Belief)> {
-        let is_present = |cell: &Cell| {
-            cell.has_filter && !cell.memory.is_unseen && cell.memory.away_std_if_any().is_none()
-        };
+        let is_present =
+            |cell: &Cell| cell.has_filter && !cell.memory.is_unseen && cell.memory.away_std_if_any().is_none();
         if !self.cells.iter().all(is_present) {
             return None;
         }
@@ -370,7 +369,11 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         let mut mean = [zero; N];
         mean[CAPACITY] = Lanes::splat(1e3);
         let state = State { mean, covariance, memory: [zero; kernel::MEMORY] };
-        Self { tables: Tables::new(model), blocks: vec![state; blocks], rhythm: Rhythm { time_s: f64::NAN, kept: Kept::NONE } }
+        Self {
+            tables: Tables::new(model),
+            blocks: vec![state; blocks],
+            rhythm: Rhythm { time_s: f64::NAN, kept: Kept::NONE },
+        }
     }
 
     fn constants(&self, model: &CellModel, config: &EstimatorConfig) -> Constants {
@@ -387,9 +390,9 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 continue;
             }
             self.tables.begin_block();
-            for lane in 0..cells.len() {
-                let isotherm = self.tables.isotherm(block.temperature_c[lane], cells[lane].isotherm);
-                (cells[lane].isotherm, block.input.isotherms[lane]) = (isotherm, isotherm);
+            for (lane, cell) in cells.iter_mut().enumerate() {
+                cell.isotherm = self.tables.isotherm(block.temperature_c[lane], cell.isotherm);
+                block.input.isotherms[lane] = cell.isotherm;
             }
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             if count == 1

@@ -31,10 +31,8 @@ const fn place_of(i: usize, n: usize) -> usize {
 impl CellEstimator {
     /// The state, to be stored.
     pub fn snapshot(&self) -> CellState {
-        let (mean, covariance) = self.filter.as_ref().map_or_else(
-            Default::default,
-            |filter| each!(filter, x => document(x)),
-        );
+        let (mean, covariance) =
+            self.filter.as_ref().map_or_else(Default::default, |filter| each!(filter, x => document(x)));
         CellState { mean, covariance, memory: self.memory }
     }
 

@@ -224,7 +224,7 @@ fn hex_word(word: u64) -> HexWord {
     // Lanes hold at most 0x7F before each addition, so that none carries into the next.
     let low = word & !HIGHS;
     let no_digit = (low ^ ZEROS).wrapping_add(0x76 * ONES);
-    let letter = (low | 0x20 * ONES) ^ (0x60 * ONES);
+    let letter = (low | (0x20 * ONES)) ^ (0x60 * ONES);
     let letters = letter.wrapping_add(0x7F * ONES) & !letter.wrapping_add(0x79 * ONES) & HIGHS;
     let bad = ((no_digit & !letters) | word) & HIGHS;
     let nibbles = (word & (0x0F * ONES)) + (letters >> 7) * 9;

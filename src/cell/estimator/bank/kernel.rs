@@ -3,9 +3,9 @@
 //! The same filter as [`Gaussian`](crate::filter::Gaussian) with the circuit of [`crate::cell::circuit`], to rounding. What
 //! is saved, all of it exact:
 //! * With the points in pairs x +- s L_k (s = sqrt(N + lambda)) and f's odd and even parts over each pair, o_k = (f+ - f-) / 2s
-//!   and e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + sum e_k / s for the mean and sum (o_k o_k' + e_k e_k')
-//!   + (beta - alpha^2) m m' for the covariance, m = sum e_k / s. A pair that is moved by a linear map has o_k = its
-//!   image and e_k = 0.
+//!   and e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
+//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. A pair that is moved by a linear map has
+//!   its image for o_k, and e_k = 0.
 //! * The state is ordered so that only the first three columns of the Cholesky factor L move what the circuit is not
 //!   linear in. Those of the branches add up to P less the first three columns: they are never computed.
 //! * SOC differs in one pair only, so a phase looks its tables up at three places and not at 2 N + 1.
@@ -13,6 +13,7 @@
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and where they may be
 //! used: all numbers finite, the covariance with a factor, the reading within the gate.
+#![expect(clippy::needless_range_loop, reason = "indices of states say more than iterators over parts of a matrix")]
 
 use std::array::from_fn;
 
@@ -276,10 +277,7 @@ impl<const L: usize> Ratios<L> {
         let per_scale = 1.0 / c.scale;
         Self {
             first: [up, up.reciprocal()],
-            second: [
-                (grown - shrunk) * (0.5 * per_scale),
-                ((grown + shrunk) * 0.5 - Lanes::splat(1.0)) * per_scale,
-            ],
+            second: [(grown - shrunk) * (0.5 * per_scale), ((grown + shrunk) * 0.5 - Lanes::splat(1.0)) * per_scale],
         }
     }
 }
@@ -326,13 +324,7 @@ struct BranchAt<const L: usize> {
 
 impl<const L: usize> BranchAt<L> {
     #[inline(always)]
-    fn new<const W: usize>(
-        tables: &Tables<W>,
-        c: &Constants,
-        input: &Input<L>,
-        spot: &Spot<L>,
-        i: usize,
-    ) -> Self {
+    fn new<const W: usize>(tables: &Tables<W>, c: &Constants, input: &Input<L>, spot: &Spot<L>, i: usize) -> Self {
         let (r_ohm, tau_s) = tables.branch(spot, i - BRANCHES);
         let ratio = input.measured_s / tau_s;
         let exact = (-ratio).exp();

@@ -55,9 +55,8 @@ pub(super) struct Spot<const L: usize> {
 impl<const W: usize> Tables<W> {
     pub(super) fn new(model: &CellModel) -> Self {
         let temperatures = model.temperature_c.len();
-        let nodes = (0..=temperatures).flat_map(|t| {
-            (0..model.soc.len() - 1).map(move |s| row(model, t.min(temperatures - 1), s))
-        });
+        let nodes = (0..=temperatures)
+            .flat_map(|t| (0..model.soc.len() - 1).map(move |s| row(model, t.min(temperatures - 1), s)));
         Self {
             borders: model.soc[1..model.soc.len() - 1].to_vec(),
             nodes: nodes.collect(),
@@ -125,8 +124,8 @@ impl<const W: usize> Tables<W> {
     pub(super) fn spot<const L: usize>(&self, isotherms: &[usize; L], soc: Lanes<L>) -> Spot<L> {
         let mut interval = [0_u64; L];
         for &border in &self.borders {
-            for lane in 0..L {
-                interval[lane] += u64::from(soc.0[lane] >= border);
+            for (interval, soc) in interval.iter_mut().zip(soc.0) {
+                *interval += u64::from(soc >= border);
             }
         }
         let mut row = [0; L];
@@ -138,12 +137,7 @@ impl<const W: usize> Tables<W> {
 
     /// The places of L states of charge, and of those `reach` above and below.
     #[inline(always)]
-    pub(super) fn spots<const L: usize>(
-        &self,
-        isotherms: &[usize; L],
-        soc: Lanes<L>,
-        reach: Lanes<L>,
-    ) -> [Spot<L>; 3] {
+    pub(super) fn spots<const L: usize>(&self, isotherms: &[usize; L], soc: Lanes<L>, reach: Lanes<L>) -> [Spot<L>; 3] {
         [self.spot(isotherms, soc), self.spot(isotherms, soc + reach), self.spot(isotherms, soc - reach)]
     }
 

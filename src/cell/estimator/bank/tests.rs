@@ -1,11 +1,11 @@
 //! The kernel against the readable filter, and a cell in company against the same cell alone.
 
 use super::*;
+use crate::cell::Table;
+use crate::cell::circuit::{self, BranchAt};
 use crate::cell::config::{CapacityState, Discretisation};
 use crate::cell::estimator::tests::config;
 use crate::cell::model::tests::small_model;
-use crate::cell::circuit::{self, BranchAt};
-use crate::cell::Table;
 
 /// A generator of numbers in [0, 1) that needs no seed from outside.
 struct Dice(u64);
@@ -162,14 +162,21 @@ fn every_setting_that_changes_the_filter_changes_the_kernel() {
         let mut model = model(1);
         let one = |table: &mut Table| table.values.truncate(1);
         model.temperature_c.truncate(1);
-        (one(&mut model.ocv_v), one(&mut model.r0_ohm));
-        model.branches.iter_mut().for_each(|b| (one(&mut b.r_ohm), one(&mut b.c_farad)).0);
+        [&mut model.ocv_v, &mut model.r0_ohm].into_iter().for_each(one);
+        model.branches.iter_mut().flat_map(|b| [&mut b.r_ohm, &mut b.c_farad]).for_each(one);
         model
     };
     let held = EstimatorConfig { capacity_state: CapacityState::Held, ..config() };
     let euler = EstimatorConfig { discretisation: Discretisation::Euler, ..config() };
     let spread = EstimatorConfig { alpha: 0.3, beta: 1.0, kappa: 2.0, ..config() };
-    let cases = [(&aged, config()), (&own_error, config()), (&one_temperature, config()), (&plain, held), (&plain, euler), (&plain, spread)];
+    let cases = [
+        (&aged, config()),
+        (&own_error, config()),
+        (&one_temperature, config()),
+        (&plain, held),
+        (&plain, euler),
+        (&plain, spread),
+    ];
     for (case, (model, config)) in cases.into_iter().enumerate() {
         let (soc, learned) = differences(model, &config, 6000);
         assert!(soc < 1e-9 && learned < 1e-8, "case {case}: {soc} {learned}");
