@@ -6,11 +6,11 @@
 //! | layer | module | what lives there |
 //! | --- | --- | --- |
 //! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
-//! | 1 | [`filter`] | unscented and linear Kalman filters: pure numbers |
+//! | 1 | [`filter`] | unscented and linear Kalman filters, arithmetic of several lanes: pure numbers |
 //! | 1 | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
 //! | 1 | [`can`] | frame, signal layout, decode, encode, end-to-end protection, bound on frames, J1939 |
 //! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
-//! | 2 | [`cell`] | equivalent circuit, thermal model, estimator |
+//! | 2 | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
 //! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity, remaining life |
 //! | 2 | [`alarm`] | rules over named values, the life of an alarm |
 //! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |

@@ -494,7 +494,8 @@ fn propagate<const N: usize>(
 ) -> Result<(), FilterError> {
     let mean_current_a = if dt_s > 0.0 { charge_as / dt_s } else { 0.0 };
     let row = model.row(temperature_c);
-    // The branches' parameters are those at the middle of the step's SOC, as the mean capacity makes it.
+    // The branches' parameters are those at the middle of the step's SOC. The mean capacity makes it: that of each sigma
+    // point would move it by the charge of a step times the capacity's relative deviation, 1e-6 of SOC at most.
     let half_soc = 0.5 * charge_as / (3600.0 * x.mean[CAPACITY]);
     let place = |soc: f64| model.place_in(&row, soc - half_soc);
     let f = |x: &SVector<f64, N>| {

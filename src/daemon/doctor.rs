@@ -103,9 +103,22 @@ impl Session {
         }
         if let Some(monitor) = &mut self.monitor {
             monitor.handle(*input, &mut self.out);
-            self.out.estimates.iter().for_each(|estimate| self.doctor.handle_estimate(estimate));
-            self.out.clear();
+            self.hand_on_estimates();
         }
+    }
+
+    fn hand_on_estimates(&mut self) {
+        self.out.estimates.iter().for_each(|estimate| self.doctor.handle_estimate(estimate));
+        self.out.clear();
+    }
+
+    /// Nothing more comes.
+    fn finish(mut self) -> Report {
+        if let Some(monitor) = &mut self.monitor {
+            monitor.settle(&mut self.out);
+            self.hand_on_estimates();
+        }
+        self.doctor.finish()
     }
 }
 
@@ -159,7 +172,7 @@ pub fn replay(
             each(Progress { bytes, frames: session.doctor.frames(), seconds: session.doctor.seconds() });
         }
     }
-    Ok((session.doctor.finish(), source.counts().clone()))
+    Ok((session.finish(), source.counts().clone()))
 }
 
 /// One interface listened to.
@@ -211,7 +224,7 @@ pub fn listen(
         std::thread::sleep(READ_PERIOD);
     }
     session.doctor.handle_listened(began.elapsed().as_secs_f64());
-    Ok(session.doctor.finish())
+    Ok(session.finish())
 }
 
 impl Ear {

@@ -420,6 +420,9 @@ impl Replay {
         self.ticks.sleep();
         self.make_ticks()?;
         self.monitor.settle(&mut self.out);
+        if let (Some(store), Some(end)) = (&mut self.settings.store, self.span.latest) {
+            store.record(&self.out.events, &self.monitor, end).map_err(ReplayError::Store)?;
+        }
         self.write_out()?;
         if let (Some(store), Some(end)) = (self.settings.store.take(), self.span.latest) {
             store.finish(&self.monitor, end).map_err(ReplayError::Store)?;

@@ -166,7 +166,8 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x to within three units in the last place; 0 below -708, e^709 above 709.
+    /// e^x to within three units in the last place; 0 below -708, e^709 above 709
+    /// and for NaN: who must know of a NaN looks at what it was made of.
     #[inline(always)]
     pub fn exp(self) -> Self {
         Self(from_fn(|i| exp(self.0[i])))

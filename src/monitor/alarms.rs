@@ -14,7 +14,7 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
 /// Values that change nothing are told to the rules this often, s.
-const RESTATE_S: f64 = 1.0;
+pub(super) const RESTATE_S: f64 = 1.0;
 /// Command frames that are not obeyed are told at most this often, s.
 const BAD_COMMAND_S: f64 = 1.0;
 

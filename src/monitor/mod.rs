@@ -18,6 +18,7 @@ mod output;
 mod reconfigure;
 mod snapshot;
 mod statistics;
+mod steps;
 mod types;
 mod view;
 
@@ -30,22 +31,23 @@ pub use statistics::{AlarmCounts, BusStatistics, Statistics};
 pub use types::*;
 pub use view::{CellView, PackView};
 
-use alarms::StoreState;
+use alarms::{HOUSEKEEPING_S, StoreState};
 use buses::Buses;
 use cyclic::{Schedule, Test};
 use intake::Intake;
 use life::CellLife;
 use snapshot::{PendingRestore, Taken};
+use steps::end_state;
 
-use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Observation, Rule, RuleConfig};
+use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, RuleConfig};
 use crate::can::decode::InputMap;
 use crate::can::flood::{FloodConfig, FloodCount};
 use crate::can::guard::{GuardConfig, GuardCounts};
 use crate::can::j1939::Node;
 use crate::can::{CanId, Frame};
-use crate::cell::{CellEstimator, CellModel, CellStep, EstimatorBank, EstimatorConfig};
+use crate::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
 use crate::filter::Belief;
-use crate::health::{CellEnd, HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{HalfCycle, HealthConfig, Learner, PackState, RechargeTimer, TransitionDetector};
 use crate::quantity::{BusIndex, CellIndex, Channel, Mode, Reading, Timestamp};
 use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
@@ -160,6 +162,8 @@ pub struct Monitor {
     /// When values at rest were last told to the rules, and whether they are now.
     restated_at: Timestamp,
     is_restating: bool,
+    /// When innovations at rest were.
+    nis_told_at: Timestamp,
     /// Whether every cell's innovations agree with their covariance.
     all_trusted: bool,
     /// When a tick will next do something; `None` = not started.
@@ -234,6 +238,7 @@ impl Monitor {
             updated_cells: 0,
             restated_at: Timestamp::from_nanos(i64::MIN),
             is_restating: true,
+            nis_told_at: Timestamp::from_nanos(i64::MIN),
             all_trusted: true,
             due: None,
             all_valid_told: false,
@@ -368,11 +373,11 @@ impl Monitor {
         let taken = self.apply_pending(time, out);
         let was_away_briefly = taken != Taken::Ageless && time.since(self.now) <= ASLEEP_S;
         if taken == Taken::Aged {
-            if !was_away_briefly {
-                // What was measured before the time away belongs before it.
-                self.make_steps(out);
-            }
             let away_s = time.since(self.now);
+            if away_s > HOUSEKEEPING_S {
+                // What was measured before the time away belongs before it, and says nothing of the present.
+                self.step_waiting(was_away_briefly, out);
+            }
             let config = self.config.estimator;
             self.estimators.change_all(|estimator| estimator.note_away(&config, away_s));
         }
@@ -409,6 +414,7 @@ impl Monitor {
         if elapsed_s < 0.0 {
             self.time_backwards += 1;
             if time < self.now.plus_nanos(-MERGE_TOLERANCE_NS) {
+                self.make_steps(out);
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds: -elapsed_s } });
                 self.handle_unknown_gap(time, out);
                 self.due = self.find_due();
@@ -506,128 +512,6 @@ impl Monitor {
         }
     }
 
-    /// Cells mostly report in rounds: their steps are made together once all have reported, or one does for the second time.
-    fn note_sample(&mut self, sample: CellSample, out: &mut Outputs) {
-        let index = sample.cell.index();
-        if self.cells[index].updated_in_round {
-            self.close_round(out);
-        }
-        self.cells[index].updated_in_round = true;
-        self.waiting.push(sample);
-        self.updated_cells += 1;
-        if self.updated_cells == self.cells.len() {
-            self.close_round(out);
-        }
-    }
-
-    /// The round is over: the pack's values.
-    fn close_round(&mut self, out: &mut Outputs) {
-        self.make_steps(out);
-        self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
-        self.updated_cells = 0;
-        self.combine_pack(out);
-    }
-
-    /// Makes the steps of the cells whose voltages have come since the last time, without waiting for the others. The
-    /// core does so by itself before anything that asks for estimates; a driver does after its last input.
-    pub fn settle(&mut self, out: &mut Outputs) {
-        let told = out.events.len();
-        self.make_steps(out);
-        self.statistics.note_events(&out.events[told..]);
-    }
-
-    fn make_steps(&mut self, out: &mut Outputs) {
-        if self.waiting.is_empty() {
-            return;
-        }
-        let mut waiting = std::mem::take(&mut self.waiting);
-        for sample in &waiting {
-            let step = self.next_step(sample);
-            self.estimators.add(sample.cell.index(), &step);
-        }
-        self.estimators.step();
-        let is_quiet = self.all_trusted && !self.restates(out) && {
-            let nis = |sample: &CellSample| self.estimators.mean_nis(sample.cell.index());
-            let worst = waiting.iter().fold(0.0_f64, |worst, sample| worst.max(nis(sample)));
-            worst <= self.config.estimator.consistency_limit && self.alarms.is_quiet(Rule::EstimateUntrusted, worst)
-        };
-        for sample in &waiting {
-            self.take_estimate(sample, is_quiet, out);
-        }
-        waiting.clear();
-        self.waiting = waiting;
-        let estimators = &self.estimators;
-        self.scratch.after_gap.drain(..).for_each(|cell| self.learner.move_mark(cell, end_state(estimators, cell)));
-    }
-
-    /// What happened to a cell between the sample before and this one.
-    fn next_step(&mut self, sample: &CellSample) -> CellStep {
-        let index = sample.cell.index();
-        let slot = &mut self.cells[index];
-        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
-        let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
-        let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
-        // Before the first reading, and where a record goes on after it is unknown how long, nobody measured for ever.
-        let mut gap_s = f64::INFINITY;
-        if let Some(before) = slot.consumed.replace(now) {
-            charge_as = charge - before.charge_as;
-            unmeasured_s = unmeasured - before.unmeasured_s;
-            measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
-            gap_s = unmeasured_s;
-        }
-        if self.learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
-            self.scratch.after_gap.push(index);
-        }
-        // What charges and discharges have shown to be the sensor's, not the cell's.
-        let offset_a = self.learner.current_offset_a(index);
-        CellStep {
-            measured_s,
-            charge_as: charge_as - offset_a * measured_s,
-            unmeasured_s,
-            current_a: sample.current_a.map(|current_a| current_a - offset_a),
-            temperature_c: sample.temperature_c,
-            ambient_c: self.config.sample.ambient_c,
-            voltage_v: sample.voltage_v,
-        }
-    }
-
-    /// What follows from a cell's step.
-    fn take_estimate(&mut self, sample: &CellSample, is_quiet: bool, out: &mut Outputs) {
-        let index = sample.cell.index();
-        let result = self.estimators.result(index);
-        let is_reset = result.reset;
-        self.statistics.note_voltage(result);
-        self.cells[index].sample = Some(*sample);
-        if is_reset {
-            out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
-            // The SOC jumped: what it crosses on the way is no charging.
-            self.recharge.discard();
-        }
-        self.note_taper(sample);
-        if !is_quiet {
-            self.judge_trust(sample.cell, out);
-        }
-        if out.want_estimates {
-            out.estimates.extend(self.estimate(index));
-        }
-    }
-
-    /// Whether the filter's innovations agree with its covariance; told on change.
-    fn judge_trust(&mut self, cell: CellIndex, out: &mut Outputs) {
-        let slot = &mut self.cells[cell.index()];
-        let mean_nis = self.estimators.mean_nis(cell.index());
-        let trusted = mean_nis <= self.config.estimator.consistency_limit;
-        if trusted != slot.trusted {
-            slot.trusted = trusted;
-            self.all_trusted = self.cells.iter().all(|cell| cell.trusted);
-            out.events.push(Event { time: self.now, kind: EventKind::Trust { cell, trusted, mean_nis } });
-        }
-        // Without a current the filter goes on, but its innovations say nothing about its model.
-        if self.inputs_valid(cell) {
-            self.observe_alarm(Rule::EstimateUntrusted, Some(cell), Observation::new(Some(mean_nis)), out);
-        }
-    }
-
     /// A cell's estimate after its latest step; `None` before the first.
     fn estimate(&self, index: usize) -> Option<Estimate> {
         let sample = self.cells[index].sample.as_ref()?;
@@ -659,9 +543,4 @@ impl Monitor {
         let ratio = libm::exp(log_resistance.mean);
         Belief::from_std(ratio, ratio * log_resistance.std())
     }
-}
-
-/// Where a half-cycle that begins or ends now would begin or end for a cell.
-fn end_state(estimators: &EstimatorBank, index: usize) -> CellEnd {
-    CellEnd { soc: estimators.soc(index), load_v: estimators.load_v(index) }
 }

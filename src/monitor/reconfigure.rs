@@ -50,6 +50,10 @@ impl Monitor {
     ) -> Result<Reconfigured, ReconfigureError> {
         self.config.check_fits(&config)?;
         let told = out.events.len();
+        if !self.config.steps_as(&config) {
+            // What was measured before is judged as it was then.
+            self.make_steps(out);
+        }
         let changed = self.config.changed_tables(&config);
         let old = std::mem::replace(&mut self.config, config);
         self.estimators.reconfigure(&self.config.model, &self.config.estimator);
@@ -184,6 +188,14 @@ impl MonitorConfig {
                 allowed: "those it was started with".to_owned(),
             }),
         }
+    }
+
+    /// Whether `new` makes the same of a sample.
+    fn steps_as(&self, new: &Self) -> bool {
+        self.model == new.model
+            && self.estimator == new.estimator
+            && self.health.usable == new.health.usable
+            && self.sample.ambient_c == new.sample.ambient_c
     }
 
     /// The tables whose settings are others in `new`.

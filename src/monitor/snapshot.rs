@@ -179,7 +179,7 @@ impl Monitor {
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
             return Err(RestoreError::Shape {
-                found: format!("{} cells, or another number of branches", snapshot.cells.len()),
+                found: format!("{} cells, another number of branches, or samples of no cell", snapshot.cells.len()),
                 allowed: format!("{} cells of {branches} branches", self.cells.len()),
             });
         }
@@ -248,10 +248,10 @@ impl Monitor {
 }
 
 impl Snapshot {
-    /// Whether the samples that wait are of its cells, and each of another.
+    /// Whether the samples that wait are of its cells, each of another, and known to have come.
     fn waiting_fits(&self) -> bool {
-        let mut waits = vec![false; self.cells.len()];
-        let mut is_first = |cell: usize| waits.get_mut(cell).is_some_and(|waits| !std::mem::replace(waits, true));
+        let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
+        let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
         self.waiting.iter().all(|sample| is_first(sample.cell.index()))
     }
 

@@ -338,17 +338,30 @@ impl Sampler {
     /// channel and none is silent; `None` otherwise.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;
-        let (mut oldest, mut share) = (now, 0.0_f64);
-        for signal in &self.state.signals {
-            let heard = signal.heard_at().filter(|&heard| heard >= began)?;
-            oldest = oldest.min(heard);
-            share = share.max(signal.bad_share().unwrap_or(0.0));
-        }
+        let (mut longest_s, mut share) = (0.0_f64, 0.0_f64);
         let config = &self.config;
-        let reported = [config.reported_soc, config.reported_soh].into_iter().flatten();
-        let limits = [config.current, config.voltage, config.temperature].into_iter().chain(reported);
-        let silence_s = now.since(oldest);
-        limits.into_iter().all(|limits| silence_s <= limits.max_age_s).then_some((silence_s, share))
+        let voltages = 1 + self.sensors;
+        let reported = voltages + self.voltages;
+        let parts =
+            [(0..1, &config.current), (1..voltages, &config.temperature), (voltages..reported, &config.voltage)];
+        for (slots, limits) in parts {
+            let mut oldest = now;
+            for signal in &self.state.signals[slots] {
+                oldest = oldest.min(signal.heard_at().filter(|&heard| heard >= began)?);
+                share = share.max(signal.bad_share().unwrap_or(0.0));
+            }
+            let silence_s = now.since(oldest);
+            if silence_s > limits.max_age_s {
+                return None;
+            }
+            longest_s = longest_s.max(silence_s);
+        }
+        for &channel in &self.channels[reported..] {
+            let heard = self.heard_since_waking(channel) && !self.is_silent(channel, now);
+            longest_s = longest_s.max(self.silence_s(channel, now).filter(|_| heard)?);
+            share = share.max(self.bad_share(channel).unwrap_or(0.0));
+        }
+        Some((longest_s, share))
     }
 
     /// Whether anything has come on the channel since the start or the last waking.

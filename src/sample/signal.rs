@@ -87,9 +87,7 @@ impl Signal {
     /// at; `false` and nothing changed when it may be anything else.
     #[inline]
     pub(super) fn take_ordinary(&mut self, time: Timestamp, value: f64, limits: &Limits, should_move_s: f64) -> bool {
-        let is_settled = self.fault.is_none() && self.refused_count == 0;
-        let is_faultless = self.readings == BAD_SHARE_READINGS && self.bad_share == 0.0;
-        let (Some(good), true) = (self.good, is_settled && is_faultless) else { return false };
+        let (Some(good), None, 0) = (self.good, self.fault, self.refused_count) else { return false };
         // Also false for NaN.
         let is_plausible = value >= limits.min && value <= limits.max;
         if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, Stamped { value, time }, rate)) {
@@ -102,6 +100,7 @@ impl Signal {
         }
         self.good = Some(Stamped { value, time });
         self.heard = Some(time);
+        self.count(false);
         true
     }
 
@@ -215,6 +214,9 @@ impl Signal {
     #[inline]
     fn count(&mut self, bad: bool) {
         self.readings = (self.readings + 1).min(BAD_SHARE_READINGS);
+        if !bad && self.bad_share == 0.0 {
+            return;
+        }
         let now = if bad { 1.0 } else { 0.0 };
         self.bad_share += (now - self.bad_share) / f64::from(self.readings);
     }

@@ -141,8 +141,12 @@ impl EstimatorBank {
 
     /// Other settings and tables for the same cells; the model has as many branches.
     pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig) {
+        if (&self.model, &self.config) == (model, config) {
+            return;
+        }
         let mut new = Self::new(model, config, self.cells.len());
         (0..self.cells.len()).for_each(|cell| new.put(cell, &self.cell(cell)));
+        new.results = std::mem::take(&mut self.results);
         *self = new;
     }
 
@@ -203,6 +207,11 @@ impl EstimatorBank {
     #[inline]
     pub fn is_started(&self, cell: usize) -> bool {
         self.cells[cell].has_filter
+    }
+
+    /// State of charge as the filter has it: what may have happened while the program did not run is not in it.
+    pub fn filtered_soc(&self, cell: usize) -> Option<Belief> {
+        self.is_started(cell).then(|| self.belief(cell, 0))
     }
 
     /// State of charge; `None` before the first voltage.
@@ -288,15 +297,14 @@ impl EstimatorBank {
     pub fn put(&mut self, cell: usize, estimator: &CellEstimator) {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         let CellEstimator { filter, memory } = estimator;
-        let kept = &mut self.cells[cell];
-        (kept.memory, kept.has_filter) = (*memory, filter.is_some());
-        match (&mut self.filters, filter) {
+        self.cells[cell].memory = *memory;
+        self.cells[cell].has_filter = match (&mut self.filters, filter) {
             (Filters::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory),
             (Filters::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory),
             (Filters::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory),
             // A filter of another number of branches cannot be: states are checked when they are taken up.
             (filters, _) => each_lane!(filters, x => x.clear(block, lane, memory)),
-        }
+        };
     }
 
     /// Changes a cell's estimator.
@@ -394,6 +402,7 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 cell.isotherm = self.tables.isotherm(block.temperature_c[lane], cell.isotherm);
                 block.input.isotherms[lane] = cell.isotherm;
             }
+            block.fill_absent();
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             if count == 1
                 && let Some(lane) = block.is_present.iter().position(|&present| present)
@@ -433,7 +442,8 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         (make(Gaussian { mean, covariance }), state.memory.map(|number| number.0[0]))
     }
 
-    fn set(&mut self, block: usize, lane: usize, filter: &Gaussian<N>, memory: &Memory) {
+    /// Puts a filter into a lane; that there is one.
+    fn set(&mut self, block: usize, lane: usize, filter: &Gaussian<N>, memory: &Memory) -> bool {
         self.clear(block, lane, memory);
         let state = &mut self.blocks[block];
         for i in 0..N {
@@ -442,14 +452,17 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 state.covariance[at(i, j)].0[lane] = filter.covariance[(i, j)];
             }
         }
+        true
     }
 
-    fn clear(&mut self, block: usize, lane: usize, memory: &Memory) {
+    /// Puts the memory of a cell without a filter into its lane; that there is none.
+    fn clear(&mut self, block: usize, lane: usize, memory: &Memory) -> bool {
         let hot = &mut self.blocks[block].memory;
         hot[LOAD_A].0[lane] = memory.load_a;
         hot[MEAN_NIS].0[lane] = memory.mean_nis;
         hot[INFORMATION_S].0[lane] = memory.information_s;
         hot[REST_S].0[lane] = memory.rest_s;
+        false
     }
 }
 
@@ -473,6 +486,16 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
 }
 
 impl BlockInput {
+    /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
+    #[inline(always)]
+    fn fill_absent(&mut self) {
+        let present = self.is_present.iter().position(|&present| present).unwrap_or(0);
+        let time_s = self.input.measured_s.0[present];
+        for (time, is_present) in self.input.measured_s.0.iter_mut().zip(self.is_present) {
+            *time = if is_present { *time } else { time_s };
+        }
+    }
+
     /// The step that was put into a lane.
     fn step(&self, lane: usize) -> CellStep {
         let Self { temperature_c, input, .. } = self;
