@@ -345,10 +345,86 @@ fn sum<const L: usize>(a: [Lanes<L>; COLUMNS], b: [Lanes<L>; COLUMNS]) -> Lanes<
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Mean of what the pairs are moved by beside the centre.
+/// Odd and even parts of something over the pairs of the first columns.
+#[derive(Clone, Copy)]
+struct Parts<const L: usize> {
+    odd: [Lanes<L>; COLUMNS],
+    even: [Lanes<L>; COLUMNS],
+}
+
+impl<const L: usize> Parts<L> {
+    const NONE: Self = Self { odd: [Lanes([0.0; L]); COLUMNS], even: [Lanes([0.0; L]); COLUMNS] };
+
+    /// Of the first pair, from what its plus and minus point and the centre became.
+    #[inline(always)]
+    fn put(&mut self, c: &Constants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
+        self.odd[k] = (plus - minus) * (0.5 / c.scale);
+        self.even[k] = ((plus + minus) * 0.5 - centre) * (1.0 / c.scale);
+    }
+
+    /// Mean of what the pairs are moved by beside the centre.
+    #[inline(always)]
+    fn shift(&self, c: &Constants) -> Lanes<L> {
+        (self.even[0] + self.even[1] + self.even[2]) * (1.0 / c.scale)
+    }
+}
+
+/// SOC after the charge `charge_ah` was taken out, `moved` at the centre: linear but for the charge over the capacity.
 #[inline(always)]
-fn shift<const L: usize>(c: &Constants, even: [Lanes<L>; COLUMNS]) -> Lanes<L> {
-    (even[0] + even[1] + even[2]) * (1.0 / c.scale)
+fn soc_parts<const L: usize, const N: usize>(
+    c: &Constants,
+    l: &[[Lanes<L>; N]; COLUMNS],
+    capacity_ah: Lanes<L>,
+    charge_ah: Lanes<L>,
+) -> Parts<L> {
+    let per_capacity = capacity_ah.reciprocal();
+    let mut parts = Parts::NONE;
+    for k in 0..COLUMNS {
+        let spread = l[k][CAPACITY] * c.scale;
+        let pair = charge_ah / (capacity_ah.square() - spread.square());
+        parts.odd[k] = l[k][CAPACITY] * pair;
+        parts.even[k] = -(parts.odd[k] * spread * per_capacity);
+    }
+    parts.odd[0] = parts.odd[0] + l[0][0];
+    parts
+}
+
+/// What a branch becomes.
+struct BranchParts<const L: usize> {
+    /// Its voltage at the centre.
+    centre_v: Lanes<L>,
+    /// What is left of what it was, at the centre.
+    kept: Lanes<L>,
+    noise: Lanes<L>,
+    parts: Parts<L>,
+}
+
+/// Branch `i` of the state under a current that would take a new cell's to its resistance times `drive`: the pair of the
+/// first column has other tables, that of the second another resistance.
+#[inline(always)]
+fn branch_parts<const L: usize, const N: usize, const W: usize>(
+    tables: &Tables<W>,
+    c: &Constants,
+    input: &Input<L>,
+    spots: &[Spot<L>; 3],
+    l: &[[Lanes<L>; N]; COLUMNS],
+    (i, before_v, drive, ratios): (usize, Lanes<L>, Lanes<L>, &Ratios<L>),
+) -> BranchParts<L> {
+    let one = Lanes::splat(1.0);
+    let here = BranchAt::new(tables, c, input, &spots[0], i);
+    let kept = here.kept;
+    let gain = here.r_ohm * drive * (one - kept);
+    let centre_v = gain + before_v * kept;
+    let reach = l[0][i] * c.scale;
+    let plus = BranchAt::new(tables, c, input, &spots[1], i).voltage_v(drive * ratios.first[0], before_v + reach);
+    let minus = BranchAt::new(tables, c, input, &spots[2], i).voltage_v(drive * ratios.first[1], before_v - reach);
+    let mut parts = Parts::NONE;
+    parts.put(c, 0, plus, minus, centre_v);
+    parts.odd[1] = gain * ratios.second[0] + kept * l[1][i];
+    parts.even[1] = gain * ratios.second[1];
+    parts.odd[2] = kept * l[2][i];
+    let noise = here.tau_s * (0.5 * c.branch_variance_per_s) * (one - here.exact.square());
+    BranchParts { centre_v, kept, noise, parts }
 }
 
 /// The circuit's equations over the measured time: mean, covariance, and where the covariance before had a factor.
@@ -360,88 +436,48 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     input: &Input<L>,
     ratio: Lanes<L>,
 ) -> ([Lanes<L>; N], [Lanes<L>; T], Mask<L>) {
-    let one = Lanes::splat(1.0);
     let Factor { columns: l, is_positive, .. } = Factor::<L, N>::new(&x.covariance);
     let dt = input.measured_s;
     let charge_ah = input.charge_as * (1.0 / 3600.0);
-    let per_capacity = x.mean[CAPACITY].reciprocal();
-    let moved = charge_ah * per_capacity;
-
-    // SOC: linear but for the charge over the capacity.
-    let mut soc_odd = [Lanes::splat(0.0); COLUMNS];
-    let mut soc_even = [Lanes::splat(0.0); COLUMNS];
-    for k in 0..COLUMNS {
-        let spread = l[k][CAPACITY] * c.scale;
-        let pair = charge_ah / (x.mean[CAPACITY].square() - spread.square());
-        soc_odd[k] = l[k][CAPACITY] * pair;
-        soc_even[k] = -(soc_odd[k] * spread * per_capacity);
-    }
-    soc_odd[0] = soc_odd[0] + l[0][0];
-
-    // Branches: the pair of the first column has other tables, that of the second another resistance.
-    let middle = x.mean[0] - moved * 0.5;
-    let reach = l[0][0] * c.scale;
-    let spots = tables.spots(&input.isotherms, middle, reach);
+    let moved = charge_ah / x.mean[CAPACITY];
+    let soc = soc_parts(c, &l, x.mean[CAPACITY], charge_ah);
+    let spots = tables.spots(&input.isotherms, x.mean[0] - moved * 0.5, l[0][0] * c.scale);
     let ratios = Ratios::new(c, &l);
-    let is_moving = dt.above_number(0.0);
-    let mean_current_a = (input.charge_as / dt).or_else(is_moving, Lanes::splat(0.0));
-    let per_scale = 1.0 / c.scale;
-    let mut u = [Lanes::splat(0.0); N];
-    let mut keeps = [Lanes::splat(0.0); N];
-    let mut u_odd = [[Lanes::splat(0.0); N]; COLUMNS];
-    let mut u_even = [[Lanes::splat(0.0); N]; COLUMNS];
-    let mut noise = [Lanes::splat(0.0); N];
-    for i in BRANCHES..N {
-        let here = BranchAt::new(tables, c, input, &spots[0], i);
-        let kept = here.kept;
-        let settled_v = ratio * mean_current_a;
-        let gain = here.r_ohm * settled_v * (one - kept);
-        u[i] = gain + x.mean[i] * kept;
-        keeps[i] = kept;
-        noise[i] = here.tau_s * (0.5 * c.branch_variance_per_s) * (one - here.exact.square());
+    let mean_current_a = (input.charge_as / dt).or_else(dt.above_number(0.0), Lanes::splat(0.0));
+    let drive = ratio * mean_current_a;
 
-        let reach = l[0][i] * c.scale;
-        let plus = BranchAt::new(tables, c, input, &spots[1], i);
-        let plus = plus.voltage_v(settled_v * ratios.first[0], x.mean[i] + reach);
-        let minus = BranchAt::new(tables, c, input, &spots[2], i);
-        let minus = minus.voltage_v(settled_v * ratios.first[1], x.mean[i] - reach);
-        u_odd[0][i] = (plus - minus) * (0.5 * per_scale);
-        u_even[0][i] = ((plus + minus) * 0.5 - u[i]) * per_scale;
-        u_odd[1][i] = gain * ratios.second[0] + kept * l[1][i];
-        u_even[1][i] = gain * ratios.second[1];
-        u_odd[2][i] = kept * l[2][i];
-    }
-
-    let soc_shift = shift(c, soc_even);
-    let mut mean = x.mean;
+    let soc_shift = soc.shift(c);
+    let (mut mean, mut p) = (x.mean, x.covariance);
     mean[0] = x.mean[0] - moved + soc_shift;
     let capacity_column = [l[0][CAPACITY], l[1][CAPACITY], l[2][CAPACITY]];
-    let mut p = x.covariance;
     let soc_noise = dt * c.soc_variance_per_s + moved.abs() * c.charge_variance_per_soc;
-    p[at(0, 0)] = sum(soc_odd, soc_odd) + sum(soc_even, soc_even) + soc_shift.square() * c.excess + soc_noise;
-    p[at(LOG_RESISTANCE, 0)] = soc_odd[0] * l[0][LOG_RESISTANCE] + soc_odd[1] * l[1][LOG_RESISTANCE];
-    p[at(CAPACITY, 0)] = sum(soc_odd, capacity_column);
+    p[at(0, 0)] = sum(soc.odd, soc.odd) + sum(soc.even, soc.even) + soc_shift.square() * c.excess + soc_noise;
+    p[at(LOG_RESISTANCE, 0)] = soc.odd[0] * l[0][LOG_RESISTANCE] + soc.odd[1] * l[1][LOG_RESISTANCE];
+    p[at(CAPACITY, 0)] = sum(soc.odd, capacity_column);
     let log_resistance = at(LOG_RESISTANCE, LOG_RESISTANCE);
     p[log_resistance] = p[log_resistance] + dt.at_most(MAX_WALK_S) * c.log_resistance_variance_per_s;
+    let mut done = [(Parts::NONE, Lanes::splat(0.0)); N];
     for i in BRANCHES..N {
-        let odd = [u_odd[0][i], u_odd[1][i], u_odd[2][i]];
-        let even = [u_even[0][i], u_even[1][i], u_even[2][i]];
-        let u_shift = shift(c, even);
-        mean[i] = u[i] + u_shift;
-        p[at(i, 0)] = sum(soc_odd, odd) + sum(soc_even, even) + soc_shift * u_shift * c.excess;
+        let branch = branch_parts(tables, c, input, &spots, &l, (i, x.mean[i], drive, &ratios));
+        let Parts { odd, even } = branch.parts;
+        let u_shift = branch.parts.shift(c);
+        done[i] = (branch.parts, branch.kept);
+        mean[i] = branch.centre_v + u_shift;
+        p[at(i, 0)] = sum(soc.odd, odd) + sum(soc.even, even) + soc_shift * u_shift * c.excess;
         p[at(i, LOG_RESISTANCE)] = l[0][LOG_RESISTANCE] * odd[0] + l[1][LOG_RESISTANCE] * odd[1];
         p[at(i, CAPACITY)] = sum(capacity_column, odd);
         for j in BRANCHES..=i {
-            let other = [u_even[0][j], u_even[1][j], u_even[2][j]];
-            let moved_alike = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
-            p[at(i, j)] = odd[0] * u_odd[0][j]
-                + odd[1] * u_odd[1][j]
-                + keeps[i] * keeps[j] * moved_alike
-                + even[0] * other[0]
-                + even[1] * other[1]
-                + u_shift * shift(c, other) * c.excess;
+            let (other, other_kept) = &done[j];
+            // All columns beyond the second are moved alike.
+            let others = x.covariance[at(i, j)] - l[0][i] * l[0][j] - l[1][i] * l[1][j];
+            p[at(i, j)] = odd[0] * other.odd[0]
+                + odd[1] * other.odd[1]
+                + branch.kept * *other_kept * others
+                + even[0] * other.even[0]
+                + even[1] * other.even[1]
+                + u_shift * other.shift(c) * c.excess;
         }
-        p[at(i, i)] = p[at(i, i)] + noise[i];
+        p[at(i, i)] = p[at(i, i)] + branch.noise;
     }
     (mean, p, is_positive)
 }
@@ -472,6 +508,96 @@ fn remember<const L: usize, const N: usize, const T: usize>(
     (x.memory[INFORMATION_S] + new_s).at_least(1e-3).at_most(c.max_information_s)
 }
 
+/// The voltage that is foreseen.
+struct Foreseen<const L: usize> {
+    /// At the centre, V.
+    centre_v: Lanes<L>,
+    /// Over the pairs of the first columns.
+    parts: Parts<L>,
+    /// Slope of the open-circuit voltage, V per unit of SOC.
+    slope_v: Lanes<L>,
+    /// Voltage lost in the cell now, V.
+    lost_v: Lanes<L>,
+    /// Standard deviation of the model's error over one second, squared.
+    base_variance: Lanes<L>,
+    /// Resistance of new cells once every branch has settled, ohm.
+    settled_ohm: Lanes<L>,
+}
+
+impl<const L: usize> Foreseen<L> {
+    #[inline(always)]
+    fn new<const N: usize, const T: usize, const W: usize>(
+        tables: &Tables<W>,
+        c: &Constants,
+        x: &State<L, N, T>,
+        input: &Input<L>,
+        l: &[[Lanes<L>; N]; COLUMNS],
+        ratio: Lanes<L>,
+    ) -> Self {
+        let reach = l[0][0] * c.scale;
+        let spots = tables.spots(&input.isotherms, x.mean[0], reach);
+        let ratios = Ratios::new(c, l);
+        let (mut ocv_v, slope_v, r0_ohm) = tables.ocv_and_r0(&spots[0]);
+        let (plus_v, _, plus_ohm) = tables.ocv_and_r0(&spots[1]);
+        let (minus_v, _, minus_ohm) = tables.ocv_and_r0(&spots[2]);
+        let mut side_v = [plus_v, minus_v];
+        let mut parts = Parts::NONE;
+        if c.ocv_ageing_shift != 0.0 {
+            (ocv_v, side_v) = aged_voltages(tables, c, x, input, l, &mut parts);
+        }
+        let mut settled_ohm = r0_ohm;
+        let mut branches_v = Lanes::splat(0.0);
+        let mut branches = [Lanes::splat(0.0); COLUMNS];
+        for i in BRANCHES..N {
+            settled_ohm = settled_ohm + tables.one(&spots[0], branch(i - BRANCHES));
+            branches_v = branches_v + x.mean[i];
+            for k in 0..COLUMNS {
+                branches[k] = branches[k] + l[k][i];
+            }
+        }
+        let drop_v = r0_ohm * ratio * input.current_a;
+        let centre_v = ocv_v - branches_v - drop_v;
+        let plus = side_v[0] - plus_ohm * ratio * ratios.first[0] * input.current_a;
+        let minus = side_v[1] - minus_ohm * ratio * ratios.first[1] * input.current_a;
+        parts.put(c, 0, plus, minus, centre_v + branches_v);
+        parts.odd[0] = parts.odd[0] - branches[0];
+        parts.odd[1] = parts.odd[1] - branches[1] - drop_v * ratios.second[0];
+        parts.even[1] = parts.even[1] - drop_v * ratios.second[1];
+        parts.odd[2] = parts.odd[2] - branches[2];
+        let base_variance = if tables.has_error() {
+            tables.one(&spots[0], ERROR_V).square() * ERROR_WINDOW_S
+        } else {
+            Lanes::splat(c.model_variance)
+        };
+        Self { centre_v, parts, slope_v, lost_v: drop_v + branches_v, base_variance, settled_ohm }
+    }
+}
+
+/// Open-circuit voltages of aged cells at the centre and the first pair, V; the parts of the other pairs, whose capacity is
+/// another.
+#[inline(always)]
+fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>(
+    tables: &Tables<W>,
+    c: &Constants,
+    x: &State<L, N, T>,
+    input: &Input<L>,
+    l: &[[Lanes<L>; N]; COLUMNS],
+    parts: &mut Parts<L>,
+) -> (Lanes<L>, [Lanes<L>; 2]) {
+    let (soc, capacity, isotherms) = (x.mean[0], x.mean[CAPACITY], &input.isotherms);
+    let (reach, reach_ah) = (l[0][0] * c.scale, l[0][CAPACITY] * c.scale);
+    let centre_v = aged_ocv_v(tables, c, isotherms, soc, capacity);
+    for k in 1..COLUMNS {
+        let reach_ah = l[k][CAPACITY] * c.scale;
+        let plus = aged_ocv_v(tables, c, isotherms, soc, capacity + reach_ah);
+        let minus = aged_ocv_v(tables, c, isotherms, soc, capacity - reach_ah);
+        parts.put(c, k, plus, minus, centre_v);
+    }
+    let plus = aged_ocv_v(tables, c, isotherms, soc + reach, capacity + reach_ah);
+    let minus = aged_ocv_v(tables, c, isotherms, soc - reach, capacity - reach_ah);
+    (centre_v, [plus, minus])
+}
+
 /// The measurement update: moves `x`, whether that may be used or not.
 #[inline(always)]
 fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
@@ -483,57 +609,13 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     information_s: Lanes<L>,
 ) -> Outcome<L> {
     let Factor { columns: l, rest, is_positive } = Factor::<L, N>::new(&x.covariance);
-    let per_scale = 1.0 / c.scale;
-    let reach = l[0][0] * c.scale;
-    let soc = x.mean[0];
-    let spots = tables.spots(&input.isotherms, soc, reach);
-    let ratios = Ratios::new(c, &l);
-    let (mut ocv_v, slope_v, r0_ohm) = tables.ocv_and_r0(&spots[0]);
-    let (plus_v, _, plus_ohm) = tables.ocv_and_r0(&spots[1]);
-    let (minus_v, _, minus_ohm) = tables.ocv_and_r0(&spots[2]);
-    // Odd and even parts of the voltage over the pairs of the first three columns.
-    let mut odd = [Lanes::splat(0.0); COLUMNS];
-    let mut even = [Lanes::splat(0.0); COLUMNS];
-    let mut side_v = [plus_v, minus_v];
-    if c.ocv_ageing_shift != 0.0 {
-        let capacity = x.mean[CAPACITY];
-        let reach_ah = l[0][CAPACITY] * c.scale;
-        ocv_v = aged_ocv_v(tables, c, &input.isotherms, soc, capacity);
-        side_v = [
-            aged_ocv_v(tables, c, &input.isotherms, soc + reach, capacity + reach_ah),
-            aged_ocv_v(tables, c, &input.isotherms, soc - reach, capacity - reach_ah),
-        ];
-        for k in 1..COLUMNS {
-            let reach_ah = l[k][CAPACITY] * c.scale;
-            let plus = aged_ocv_v(tables, c, &input.isotherms, soc, capacity + reach_ah);
-            let minus = aged_ocv_v(tables, c, &input.isotherms, soc, capacity - reach_ah);
-            odd[k] = (plus - minus) * (0.5 * per_scale);
-            even[k] = ((plus + minus) * 0.5 - ocv_v) * per_scale;
-        }
-    }
-    // Sums over the branches: the voltage, and the columns.
-    let mut branches_v = Lanes::splat(0.0);
-    let mut branches = [Lanes::splat(0.0); COLUMNS];
-    for i in BRANCHES..N {
-        branches_v = branches_v + x.mean[i];
-        for k in 0..COLUMNS {
-            branches[k] = branches[k] + l[k][i];
-        }
-    }
-    let drop_v = r0_ohm * ratio * input.current_a;
-    let centre = ocv_v - branches_v - drop_v;
-    let plus = side_v[0] - plus_ohm * ratio * ratios.first[0] * input.current_a;
-    let minus = side_v[1] - minus_ohm * ratio * ratios.first[1] * input.current_a;
-    odd[0] = (plus - minus) * (0.5 * per_scale) - branches[0];
-    even[0] = ((plus + minus) * 0.5 - branches_v - centre) * per_scale;
-    odd[1] = odd[1] - branches[1] - drop_v * ratios.second[0];
-    even[1] = even[1] - drop_v * ratios.second[1];
-    odd[2] = odd[2] - branches[2];
-    let shift = shift(c, even);
+    let foreseen = Foreseen::new(tables, c, x, input, &l, ratio);
+    let Parts { odd, even } = foreseen.parts;
+    let shift_v = foreseen.parts.shift(c);
 
     // Covariance of state and voltage, and the voltage's variance.
     let mut cross = [Lanes::splat(0.0); N];
-    let mut variance = shift.square() * c.excess;
+    let mut variance = shift_v.square() * c.excess;
     for k in 0..COLUMNS {
         variance = variance + odd[k].square() + even[k].square();
         for i in k..N {
@@ -552,20 +634,11 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     }
 
     // What noise the reading carries: see `noise::Reading`.
-    let mut settled_ohm = r0_ohm;
-    for i in BRANCHES..N {
-        settled_ohm = settled_ohm + tables.one(&spots[0], branch(i - BRANCHES));
-    }
-    let load_v = settled_ohm * ratio * x.memory[LOAD_A];
-    let base = if tables.has_error() {
-        tables.one(&spots[0], ERROR_V).square() * ERROR_WINDOW_S
-    } else {
-        Lanes::splat(c.model_variance)
-    };
-    let model = base + (drop_v + branches_v).square() * c.drop_variance + load_v.square() * c.load_variance;
+    let load_v = foreseen.settled_ohm * ratio * x.memory[LOAD_A];
+    let model = foreseen.base_variance + foreseen.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
     let total = variance + (model / information_s + c.sensor_variance);
-    let innovation_v = input.voltage_v - (centre + shift);
-    let gate = variance + (slope_v.square() * c.gate_soc_variance + c.gate_variance);
+    let innovation_v = input.voltage_v - (foreseen.centre_v + shift_v);
+    let gate = variance + (foreseen.slope_v.square() * c.gate_soc_variance + c.gate_variance);
     let test_ratio = innovation_v.square() / gate;
 
     let inverse = total.reciprocal();
