@@ -36,6 +36,7 @@ pub struct EstimatorBank {
     results: Vec<StepResult>,
     /// Cells of the batch that have no ordinary step.
     others: Vec<(usize, CellStep)>,
+    #[cfg(feature = "lab")]
     machine: pulp::Arch,
 }
 
@@ -133,6 +134,7 @@ impl EstimatorBank {
             inputs: vec![BlockInput::NONE; blocks],
             results: vec![idle; cells],
             others: Vec::with_capacity(cells),
+            #[cfg(feature = "lab")]
             machine: pulp::Arch::new(),
         };
         (0..cells).for_each(|cell| bank.put(cell, &CellEstimator::new(config)));
@@ -181,8 +183,16 @@ impl EstimatorBank {
 
     /// Makes the steps of the batch; what became of each: [`Self::result`].
     pub fn step(&mut self) {
-        let Self { machine, constants, filters, inputs, cells, results, others, .. } = self;
-        each_lane!(filters, lanes => machine.dispatch(StepAll { lanes, constants, inputs, cells, results, others }));
+        #[cfg(feature = "lab")]
+        let machine = self.machine;
+        let Self { constants, filters, inputs, cells, results, others, .. } = self;
+        each_lane!(filters, lanes => {
+            let all = StepAll { lanes, constants, inputs, cells, results, others };
+            #[cfg(feature = "lab")]
+            machine.dispatch(all);
+            #[cfg(not(feature = "lab"))]
+            all.run::<false>();
+        });
         for at in 0..self.others.len() {
             let (cell, step) = self.others[at];
             let mut estimator = self.cell(cell);
@@ -351,12 +361,21 @@ struct StepAll<'a, const N: usize, const T: usize, const W: usize> {
     others: &'a mut Vec<(usize, CellStep)>,
 }
 
+#[cfg(feature = "lab")]
 impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for StepAll<'_, N, T, W> {
     type Output = ();
 
     #[inline(always)]
     fn with_simd<S: pulp::Simd>(self, _: S) {
-        self.lanes.step(self.constants, self.inputs, self.cells, self.results);
+        if S::F64_LANES > 1 { self.run::<true>() } else { self.run::<false>() }
+    }
+}
+
+impl<const N: usize, const T: usize, const W: usize> StepAll<'_, N, T, W> {
+    /// Without wide instructions the lanes are stepped one by one: the same bits, and no second kernel.
+    #[inline(always)]
+    fn run<const WIDE: bool>(self) {
+        self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate() {
             // Ordinary by its input, but not by what came of it.
             for lane in 0..WIDTH {
@@ -390,7 +409,13 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
 
     /// Steps every block that has inputs. Those whose steps are made are no longer present afterwards.
     #[inline(always)]
-    fn step(&mut self, c: &Constants, inputs: &mut [BlockInput], cells: &mut [Cell], results: &mut [StepResult]) {
+    fn step<const WIDE: bool>(
+        &mut self,
+        c: &Constants,
+        inputs: &mut [BlockInput],
+        cells: &mut [Cell],
+        results: &mut [StepResult],
+    ) {
         let blocks = self.blocks.iter_mut().zip(inputs).zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH)));
         for ((state, block), (cells, results)) in blocks {
             let count = block.is_present.iter().filter(|&&present| present).count();
@@ -404,10 +429,12 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             }
             block.fill_absent();
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
-            if count == 1
-                && let Some(lane) = block.is_present.iter().position(|&present| present)
-            {
-                step_alone(&self.tables, c, state, block, lane, &mut cells[lane], &mut results[lane]);
+            if !WIDE || count == 1 {
+                for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
+                    if block.is_present[lane] {
+                        step_alone(&self.tables, c, state, block, lane, cell, result);
+                    }
+                }
                 continue;
             }
             let (new, outcome) = kernel::step(&self.tables, c, state, &block.input);

@@ -584,17 +584,26 @@ fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>
     l: &[[Lanes<L>; N]; COLUMNS],
     parts: &mut Parts<L>,
 ) -> (Lanes<L>, [Lanes<L>; 2]) {
-    let (soc, capacity, isotherms) = (x.mean[0], x.mean[CAPACITY], &input.isotherms);
-    let (reach, reach_ah) = (l[0][0] * c.scale, l[0][CAPACITY] * c.scale);
-    let centre_v = aged_ocv_v(tables, c, isotherms, soc, capacity);
-    for k in 1..COLUMNS {
-        let reach_ah = l[k][CAPACITY] * c.scale;
-        let plus = aged_ocv_v(tables, c, isotherms, soc, capacity + reach_ah);
-        let minus = aged_ocv_v(tables, c, isotherms, soc, capacity - reach_ah);
-        parts.put(c, k, plus, minus, centre_v);
+    let (soc, capacity) = (x.mean[0], x.mean[CAPACITY]);
+    let reach = l[0][0] * c.scale;
+    let reach_ah = [l[0][CAPACITY] * c.scale, l[1][CAPACITY] * c.scale, l[2][CAPACITY] * c.scale];
+    let places = [
+        (soc, capacity),
+        (soc + reach, capacity + reach_ah[0]),
+        (soc - reach, capacity - reach_ah[0]),
+        (soc, capacity + reach_ah[1]),
+        (soc, capacity - reach_ah[1]),
+        (soc, capacity + reach_ah[2]),
+        (soc, capacity - reach_ah[2]),
+    ];
+    // A loop, not seven copies of the look-up: few cells are modelled so.
+    let mut voltages = [Lanes::splat(0.0); 7];
+    for (voltage, (soc, capacity_ah)) in voltages.iter_mut().zip(places) {
+        *voltage = aged_ocv_v(tables, c, &input.isotherms, soc, capacity_ah);
     }
-    let plus = aged_ocv_v(tables, c, isotherms, soc + reach, capacity + reach_ah);
-    let minus = aged_ocv_v(tables, c, isotherms, soc - reach, capacity - reach_ah);
+    let [centre_v, plus, minus, plus_1, minus_1, plus_2, minus_2] = voltages;
+    parts.put(c, 1, plus_1, minus_1, centre_v);
+    parts.put(c, 2, plus_2, minus_2, centre_v);
     (centre_v, [plus, minus])
 }
 
