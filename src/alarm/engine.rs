@@ -191,7 +191,13 @@ impl AlarmEngine {
         seen: &Observation,
         changes: &mut Vec<AlarmChange>,
     ) {
-        self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, seen));
+        for index in self.by_rule[usize::from(rule as u8)].clone() {
+            let Some(slot) = self.rules[index].slot(cell) else { continue };
+            // Most values are healthy ones of alarms at rest.
+            if !self.machines[slot].rest_on(&self.rules[index].config, seen) {
+                self.act(index, slot, changes, |machine, config| machine.observe(now, config, seen));
+            }
+        }
     }
 
     /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
@@ -437,13 +443,25 @@ impl AlarmEngine {
         mut act: impl FnMut(&mut Machine, &RuleConfig) -> Option<Change>,
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
-            let Some(slot) = self.rules[index].slot(cell) else { continue };
-            let before = self.machines[slot].standing();
-            let change = act(&mut self.machines[slot], &self.rules[index].config);
-            self.file(index, slot, before);
-            if let Some(change) = change {
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+            if let Some(slot) = self.rules[index].slot(cell) {
+                self.act(index, slot, changes, &mut act);
             }
+        }
+    }
+
+    /// Lets an alarm take something, and tells what became of it.
+    fn act(
+        &mut self,
+        index: usize,
+        slot: usize,
+        changes: &mut Vec<AlarmChange>,
+        act: impl FnOnce(&mut Machine, &RuleConfig) -> Option<Change>,
+    ) {
+        let before = self.machines[slot].standing();
+        let change = act(&mut self.machines[slot], &self.rules[index].config);
+        self.file(index, slot, before);
+        if let Some(change) = change {
+            changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
         }
     }
 

@@ -90,6 +90,7 @@ pub(super) enum Verdict {
 
 impl Verdict {
     /// Judges; also gives the probability that the truth is beyond the set threshold, where it can be said.
+    #[inline]
     pub(super) fn of(rule: &RuleConfig, seen: &Observation) -> (Self, Option<f64>) {
         let Some(value) = seen.value.filter(|value| value.is_finite()) else { return (Self::Unknown, None) };
         let std = seen.std.filter(|std| *std >= 0.0 && std.is_finite());

@@ -200,6 +200,7 @@ pub(super) struct Standing {
 }
 
 impl Machine {
+    #[inline]
     pub(super) fn standing(&self) -> Standing {
         let is_counting = self.counted_to.is_some();
         let is_rest = matches!(self.state, State::Inactive | State::Cleared);
@@ -209,6 +210,20 @@ impl Machine {
             is_counting,
             is_at_rest: is_rest && self.is_known && !is_counting && !self.is_suspended,
         }
+    }
+
+    /// Takes a value that changes nothing but what is shown of an alarm at rest; `false` and nothing done when it is none.
+    #[inline]
+    pub(super) fn rest_on(&mut self, rule: &RuleConfig, seen: &Observation) -> bool {
+        if !self.standing().is_at_rest {
+            return false;
+        }
+        let (verdict, probability) = Verdict::of(rule, seen);
+        let rests = matches!(verdict, Verdict::Healthy | Verdict::Between);
+        if rests {
+            (self.seen, self.probability) = (Observation { is_new: false, ..*seen }, probability);
+        }
+        rests
     }
 
     /// Takes a value. One that is learned while its inputs are lost (their loss ends the half-cycle before) may raise the

@@ -7,52 +7,34 @@
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
-
-use serde::Serialize;
 
 mod cells;
+mod clock;
 mod in_order;
 mod intake;
 mod rows;
+mod summary;
 
 use super::event_log;
 use super::store::Recorder;
-use crate::alarm::Change;
 use crate::can::Frame;
 use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
-use crate::monitor::{Away, Event, EventKind, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::monitor::{Away, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
+pub use clock::When;
+use clock::{Pace, Place, Span, Window};
 pub use in_order::in_order;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
+pub use summary::Summary;
+use summary::{note_event, peak_memory_kib};
 
 /// Records between two looks at the clock for the progress report.
 const REPORT_EVERY: usize = 4096;
-/// Raised alarms listed one by one in the summary; all are counted.
-const MAX_LISTED_ALARMS: usize = 1000;
-
-/// A moment of the log as the user gives it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum When {
-    /// A stamp on the log's own clock.
-    At(Timestamp),
-    /// Nanoseconds after the log's first record.
-    After(i64),
-}
-
-impl When {
-    fn resolve(self, first: Timestamp) -> Timestamp {
-        match self {
-            Self::At(time) => time,
-            Self::After(nanos) => first.plus_nanos(nanos),
-        }
-    }
-}
 
 /// How to replay.
 #[derive(Debug)]
@@ -77,6 +59,14 @@ pub struct Settings {
     pub store: Option<Recorder>,
     /// Names of the interfaces, for the frames that would be sent.
     pub interfaces: Vec<String>,
+}
+
+impl Settings {
+    /// Every record is taken, as fast as possible, and neither it nor the state after it is kept.
+    fn is_simple(&self) -> bool {
+        let Self { speed, from, until, snapshot_at, store, .. } = self;
+        speed.is_none() && from.is_none() && until.is_none() && snapshot_at.is_none() && store.is_none()
+    }
 }
 
 /// Files that results go to.
@@ -135,52 +125,6 @@ pub struct Progress {
     pub times_real_time: f64,
 }
 
-/// What a replay came to.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Summary {
-    /// What was read.
-    #[serde(flatten)]
-    pub log: LogCounts,
-    /// Records outside `from` and `until`.
-    pub skipped_records: u64,
-    /// Ticks handed to the core.
-    pub ticks: u64,
-    /// Estimates made (counted only when written).
-    pub estimates: u64,
-    /// Frames that would be sent.
-    pub frames_out: u64,
-    /// Bad readings of signals that came back to good.
-    pub bad_readings: u64,
-    /// Protected input messages.
-    pub protected: Vec<ProtectedSummary>,
-    /// Messages that came too often.
-    pub dropped: Vec<DroppedSummary>,
-    /// Events by kind.
-    pub events: BTreeMap<&'static str, u64>,
-    /// The first 1,000 alarms raised.
-    pub alarms_raised: Vec<Event>,
-    /// The cells at the end.
-    pub cells: Vec<CellSummary>,
-    /// First stamp, s.
-    pub first_s: Option<f64>,
-    /// Last stamp, s.
-    pub last_s: Option<f64>,
-    /// Time awake within the record, s: holes longer than the sleep gap do not count.
-    pub awake_s: f64,
-    /// Wall time, s.
-    pub wall_s: f64,
-    /// Awake time over wall time.
-    pub times_real_time: f64,
-    /// Frames read, over wall time.
-    pub frames_per_s: f64,
-    /// Voltage readings that came to an estimator, over wall time.
-    pub cell_steps_per_s: f64,
-    /// Peak resident memory, KiB, where the system tells.
-    pub peak_memory_kib: Option<u64>,
-    /// What the user should know.
-    pub notes: Vec<String>,
-}
-
 /// Replays `source` through a monitor that has had no input; gives the summary and the snapshot, if one was wanted.
 ///
 /// # Errors
@@ -197,11 +141,9 @@ pub fn run(
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
-    'records: while source.next_batch(&mut batch)? {
-        for record in batch.records() {
-            if !replay.take(record, batch.carries_ticks())? {
-                break 'records;
-            }
+    while source.next_batch(&mut batch)? {
+        if !replay.take_batch(&batch)? {
+            break;
         }
         unreported += batch.records().len();
         if unreported >= REPORT_EVERY || replay.pace.speed.is_some() {
@@ -259,6 +201,8 @@ struct Replay {
     window: Window,
     sinks: Sinks,
     settings: Settings,
+    /// Every record is wanted, at once, and nobody looks at more than what comes of it.
+    is_simple: bool,
     /// When the snapshot is due, once the first stamp is known.
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
@@ -284,6 +228,7 @@ impl Replay {
             pace: Pace::new(settings.speed),
             span: Span::new(settings.sleep_gap_s),
             window: Window::new(&settings),
+            is_simple: settings.is_simple() && sinks.watch.is_none(),
             sinks,
             settings,
             snapshot_at: None,
@@ -293,6 +238,26 @@ impl Replay {
             usable: BTreeMap::new(),
             steps_before: Some(0),
         })
+    }
+
+    /// Records in a row; `false` when the rest of the log is not wanted.
+    fn take_batch(&mut self, batch: &Batch) -> Result<bool, ReplayError> {
+        for record in batch.records() {
+            if let Record::Frame { time, bus, frame } = record
+                && self.is_simple
+                && !batch.carries_ticks()
+                && self.ticks.advance_within(*time, self.monitor.next_due())
+            {
+                self.span.advance(*time);
+                self.monitor.handle(Input::Frame { time: *time, bus: *bus, frame }, &mut self.out);
+                if !self.out.is_empty() {
+                    self.write_out()?;
+                }
+            } else if !self.take(record, batch.carries_ticks())? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 
     /// One record; `false` when the rest of the log is not wanted.
@@ -387,8 +352,7 @@ impl Replay {
 
     fn write_out(&mut self) -> io::Result<()> {
         let out = &mut self.out;
-        let is_silent = out.events.is_empty() && out.frames.is_empty() && out.estimates.is_empty();
-        if is_silent && self.sinks.watch.is_none() && self.pace.speed.is_none() {
+        if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
             return Ok(());
         }
         if let Some(Watch(watch)) = &mut self.sinks.watch {
@@ -472,175 +436,4 @@ impl Sinks {
     fn flush(&mut self) -> io::Result<()> {
         [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
     }
-}
-
-fn note_event(summary: &mut Summary, usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>, event: &Event) {
-    let name = match event.kind {
-        EventKind::Mode { .. } => "mode",
-        EventKind::HalfCycle { .. } => "half_cycle",
-        EventKind::Capacity { cell, usable_capacity_ah, usable_capacity_std_ah, .. } => {
-            usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
-            "capacity"
-        }
-        EventKind::RemainingLife { .. } => "remaining_life",
-        EventKind::RechargePeriod { .. } => "recharge_period",
-        EventKind::Alarm { change, .. } => {
-            if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
-                summary.alarms_raised.push(*event);
-            }
-            alarm_change_name(change)
-        }
-        EventKind::SignalBad { .. } => "signal_bad",
-        EventKind::SignalGood { bad_readings, .. } => {
-            summary.bad_readings += bad_readings;
-            "signal_good"
-        }
-        EventKind::Protection { usable, .. } => {
-            if usable {
-                "protection_usable"
-            } else {
-                "protection_failed"
-            }
-        }
-        EventKind::Flood { active, .. } => {
-            if active {
-                "flood_begun"
-            } else {
-                "flood_over"
-            }
-        }
-        EventKind::Bus { .. } => "bus",
-        EventKind::J1939 { .. } => "j1939",
-        EventKind::Gap { .. } => "gap",
-        EventKind::TimeBackwards { .. } => "time_backwards",
-        EventKind::FilterReset { .. } => "filter_reset",
-        EventKind::Trust { .. } => "trust",
-        EventKind::Command { .. } => "command",
-        EventKind::BadCommand { .. } => "bad_command",
-        EventKind::Test { .. } => "test",
-        EventKind::PackReplaced { .. } => "pack_replaced",
-        EventKind::PackIdentity { .. } => "pack_identity",
-        EventKind::Reconfigured { .. } => "reconfigured",
-        EventKind::AlarmDropped { .. } => "alarm_dropped",
-        EventKind::Store { .. } => "store",
-    };
-    *summary.events.entry(name).or_default() += 1;
-}
-
-fn alarm_change_name(change: Change) -> &'static str {
-    match change {
-        Change::Raised => "alarm_raised",
-        Change::Suppressed => "alarm_suppressed",
-        Change::Resumed => "alarm_resumed",
-        Change::Latched => "alarm_latched",
-        Change::Cleared => "alarm_cleared",
-        Change::Acknowledged => "alarm_acknowledged",
-        Change::Forgotten => "alarm_forgotten",
-    }
-}
-
-/// Which records are wanted.
-struct Window {
-    from: Option<When>,
-    until: Option<When>,
-    /// The log's first stamp, wanted or not.
-    first: Option<Timestamp>,
-}
-
-enum Place {
-    Before,
-    Inside,
-    After,
-}
-
-impl Window {
-    fn new(settings: &Settings) -> Self {
-        Self { from: settings.from, until: settings.until, first: None }
-    }
-
-    fn judge(&mut self, time: Timestamp) -> Place {
-        let first = *self.first.get_or_insert(time);
-        if self.from.is_some_and(|from| time < from.resolve(first)) {
-            Place::Before
-        } else if self.until.is_some_and(|until| time > until.resolve(first)) {
-            Place::After
-        } else {
-            Place::Inside
-        }
-    }
-}
-
-/// How much time the record covers, and how long that took here.
-struct Span {
-    sleep_gap_s: f64,
-    first: Option<Timestamp>,
-    latest: Option<Timestamp>,
-    /// Nanoseconds, so that the sum of millions of steps is exact.
-    awake_ns: i64,
-    started: Instant,
-}
-
-impl Span {
-    fn new(sleep_gap_s: f64) -> Self {
-        Self { sleep_gap_s, first: None, latest: None, awake_ns: 0, started: Instant::now() }
-    }
-
-    /// Notes a record; whether it follows a hole.
-    fn advance(&mut self, time: Timestamp) -> bool {
-        self.first.get_or_insert(time);
-        let latest = *self.latest.get_or_insert(time);
-        let asleep = time.since(latest) > self.sleep_gap_s;
-        if time > latest {
-            self.latest = Some(time);
-            self.awake_ns += if asleep { 0 } else { time.nanos().saturating_sub(latest.nanos()) };
-        }
-        asleep
-    }
-
-    fn awake_s(&self) -> f64 {
-        self.awake_ns as f64 * 1e-9
-    }
-
-    fn times_real_time(&self) -> f64 {
-        self.awake_s() / self.started.elapsed().as_secs_f64().max(1e-9)
-    }
-}
-
-/// Holds the replay to a multiple of real time by deadlines, so that lateness does not add up.
-struct Pace {
-    speed: Option<f64>,
-    anchor: Option<(Instant, Timestamp)>,
-}
-
-impl Pace {
-    fn new(speed: Option<f64>) -> Self {
-        Self { speed, anchor: None }
-    }
-
-    /// Time starts anew with the next record: holes and unknown gaps are not waited out.
-    fn rebase(&mut self) {
-        self.anchor = None;
-    }
-
-    #[inline]
-    fn wait(&mut self, time: Timestamp) {
-        if let Some(speed) = self.speed {
-            self.wait_at(speed, time);
-        }
-    }
-
-    fn wait_at(&mut self, speed: f64, time: Timestamp) {
-        let (began, origin) = *self.anchor.get_or_insert_with(|| (Instant::now(), time));
-        let due = Duration::try_from_secs_f64(time.since(origin) / speed).unwrap_or_default();
-        let ahead = due.saturating_sub(began.elapsed());
-        if !ahead.is_zero() {
-            std::thread::sleep(ahead);
-        }
-    }
-}
-
-/// VmHWM of /proc/self/status.
-fn peak_memory_kib() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()
 }

@@ -6,6 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::filter::Belief;
 use crate::quantity::{CellIndex, Unsound};
 
 /// One cell's part in the pack.
@@ -14,13 +15,9 @@ pub struct CellShare {
     /// Which cell.
     pub cell: CellIndex,
     /// State of charge, fraction.
-    pub soc: f64,
-    /// Its standard deviation.
-    pub soc_std: f64,
+    pub soc: Belief,
     /// Capacity, Ah.
-    pub capacity_ah: f64,
-    /// Its standard deviation, Ah.
-    pub capacity_std_ah: f64,
+    pub capacity: Belief,
 }
 
 /// The pack as its limiting cells make it.
@@ -43,8 +40,8 @@ pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let mut weakest: Option<(f64, CellShare)> = None;
     let mut chargeable_ah = f64::INFINITY;
     for share in cells {
-        let dischargeable_ah = share.soc * share.capacity_ah;
-        chargeable_ah = chargeable_ah.min((1.0 - share.soc) * share.capacity_ah);
+        let dischargeable_ah = share.soc.mean * share.capacity.mean;
+        chargeable_ah = chargeable_ah.min((1.0 - share.soc.mean) * share.capacity.mean);
         if weakest.is_none_or(|(least, _)| dischargeable_ah < least) {
             weakest = Some((dischargeable_ah, share));
         }
@@ -53,9 +50,9 @@ pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
     let capacity_ah = dischargeable_ah + chargeable_ah;
     (capacity_ah > 0.0).then_some(PackState {
         soc: dischargeable_ah / capacity_ah,
-        soc_std: limiting.soc_std,
+        soc_std: limiting.soc.std(),
         capacity_ah,
-        capacity_std_ah: limiting.capacity_std_ah,
+        capacity_std_ah: limiting.capacity.std(),
         limiting_cell: limiting.cell,
     })
 }
@@ -77,7 +74,8 @@ mod tests {
     use super::*;
 
     fn share(cell: u16, soc: f64, capacity_ah: f64) -> CellShare {
-        CellShare { cell: CellIndex(cell), soc, soc_std: 0.01, capacity_ah, capacity_std_ah: 0.05 }
+        let (soc, capacity) = (Belief::from_std(soc, 0.01), Belief::from_std(capacity_ah, 0.05));
+        CellShare { cell: CellIndex(cell), soc, capacity }
     }
 
     #[test]

@@ -68,6 +68,24 @@ impl Ticks {
         asleep
     }
 
+    /// The most frequent record: [`advance`](Self::advance), and as many [`pop`](Self::pop)s as there are, where none of them
+    /// gives a tick and the recorder was awake; `false` and nothing done otherwise.
+    #[inline]
+    pub fn advance_within(&mut self, time: Timestamp, due: Option<Timestamp>) -> bool {
+        let (Some(latest_ns), None) = (self.latest_ns, self.wake_ns) else { return false };
+        let time_ns = time.nanos();
+        let limit_ns = self.limit_ns.max(time_ns);
+        let is_within = (0..=self.sleep_gap_ns).contains(&time_ns.saturating_sub(latest_ns));
+        if !is_within || due.is_some_and(|due| due.nanos() < limit_ns) {
+            return false;
+        }
+        (self.limit_ns, self.latest_ns) = (limit_ns, Some(time_ns));
+        if self.next_ns < limit_ns {
+            self.next_ns = self.at_or_after(limit_ns);
+        }
+        true
+    }
+
     /// The record ends here, or goes on after an unknown gap: what is left up to the latest record may be popped,
     /// and the next record wakes the recorder whatever its stamp.
     pub fn sleep(&mut self) {

@@ -136,13 +136,7 @@ impl Monitor {
         let shares = (0..self.config.sample.cells).filter_map(|index| {
             let soc = self.estimators.soc(usize::from(index))?;
             let capacity = self.learner.capacity(&config.capacity, usize::from(index));
-            Some(CellShare {
-                cell: CellIndex(index),
-                soc: soc.mean,
-                soc_std: soc.std(),
-                capacity_ah: capacity.mean,
-                capacity_std_ah: capacity.std(),
-            })
+            Some(CellShare { cell: CellIndex(index), soc, capacity })
         });
         pack::combine(shares)
     }

@@ -53,6 +53,7 @@ use crate::sample::{CellSample, SampleConfig, Sampler, SignalChange};
 
 /// Without any input, not even a tick, for this long, the computer was asleep, s: 500 ticks.
 const ASLEEP_S: f64 = 5.0;
+const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
 /// Everything the core must know, already checked.
 #[derive(Debug, Clone)]
@@ -85,13 +86,20 @@ pub struct MonitorConfig {
     pub j1939: Option<J1939Config>,
 }
 
-/// What is known of a cell beside its estimator, and what that has consumed of the pack's totals.
-#[derive(Debug, Clone)]
-struct CellSlot {
+/// How far a cell's samples have been taken in. Every sample touches this, so it lies apart from all else that is known of
+/// a cell.
+#[derive(Debug, Clone, Copy, Default)]
+struct Progress {
     /// Sampler totals at the last step; `None` before the first.
     consumed: Option<Consumed>,
     /// The sample of the latest estimate.
     sample: Option<CellSample>,
+    updated_in_round: bool,
+}
+
+/// What is known of a cell beside its estimator and its samples.
+#[derive(Debug, Clone)]
+struct CellSlot {
     trusted: bool,
     /// SOC the last full charge left; 1 until one was seen.
     full_soc: f64,
@@ -101,22 +109,18 @@ struct CellSlot {
     /// Resistance relative to new as the last discharge left it.
     discharge_resistance: Option<Belief>,
     life: CellLife,
-    updated_in_round: bool,
 }
 
 impl CellSlot {
     /// A cell of which nothing is known.
     fn new(config: &MonitorConfig) -> Self {
         Self {
-            consumed: None,
-            sample: None,
             trusted: true,
             full_soc: 1.0,
             tapered: false,
             usable: None,
             discharge_resistance: None,
             life: CellLife::new(config),
-            updated_in_round: false,
         }
     }
 }
@@ -146,6 +150,8 @@ pub struct Monitor {
     sampler: Sampler,
     estimators: EstimatorBank,
     cells: Vec<CellSlot>,
+    /// One for each cell.
+    progress: Vec<Progress>,
     /// Samples that wait for their step, in the order in which they came, at most one of a cell.
     waiting: Vec<CellSample>,
     detector: TransitionDetector,
@@ -224,6 +230,7 @@ impl Monitor {
             alarms: AlarmEngine::new(config.rules.clone(), config.sample.cells),
             estimators,
             cells: vec![slot; cells],
+            progress: vec![Progress::default(); cells],
             waiting: Vec::with_capacity(cells),
             started: false,
             heard: false,
@@ -401,6 +408,7 @@ impl Monitor {
         self.estimators = EstimatorBank::new(&config.model, &config.estimator, cells);
         self.learner = Learner::new(&config.health.capacity, cells, CellEstimator::new(&config.estimator).capacity());
         self.cells.fill(CellSlot::new(config));
+        self.progress.fill(Progress::default());
         (self.learned_at, self.all_valid_told, self.all_trusted) = (None, false, true);
         self.detector = TransitionDetector::default();
         self.recharge = RechargeTimer::default();
@@ -409,7 +417,17 @@ impl Monitor {
     }
 
     /// Moves the clock to an input's time: never back, and with an eye on time asleep (or away, after a restart).
+    #[inline]
     fn advance(&mut self, time: Timestamp, out: &mut Outputs) {
+        if (0..=ASLEEP_NS).contains(&time.nanos().saturating_sub(self.now.nanos())) {
+            self.now = time;
+        } else {
+            self.advance_far(time, out);
+        }
+    }
+
+    #[cold]
+    fn advance_far(&mut self, time: Timestamp, out: &mut Outputs) {
         let elapsed_s = time.since(self.now);
         if elapsed_s < 0.0 {
             self.time_backwards += 1;
@@ -448,7 +466,7 @@ impl Monitor {
     fn forget_pack(&mut self) {
         self.pack = None;
         self.updated_cells = 0;
-        self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
+        self.progress.iter_mut().for_each(|cell| cell.updated_in_round = false);
     }
 
     /// The record goes on at `time`, but how far that is from before nobody knows.
@@ -466,7 +484,7 @@ impl Monitor {
         self.schedule.restart(time);
         self.start_j1939(self.now, out);
         self.estimators.change_all(CellEstimator::handle_unknown_gap);
-        self.cells.iter_mut().for_each(|cell| cell.consumed = None);
+        self.progress.iter_mut().for_each(|cell| cell.consumed = None);
     }
 
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
@@ -483,6 +501,13 @@ impl Monitor {
         for reading in readings.drain(..) {
             if reading.channel == Channel::PackIdentity {
                 self.observe_identity(bus, reading.value, out);
+                continue;
+            }
+            if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
+                && let Some(sample) = self.sampler.take_ordinary_voltage(self.now, cell, voltage_v)
+            {
+                self.heard = true;
+                self.note_sample(sample, out);
                 continue;
             }
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
@@ -514,7 +539,7 @@ impl Monitor {
 
     /// A cell's estimate after its latest step; `None` before the first.
     fn estimate(&self, index: usize) -> Option<Estimate> {
-        let sample = self.cells[index].sample.as_ref()?;
+        let sample = self.progress[index].sample.as_ref()?;
         let (soc, capacity) = (self.estimators.soc(index)?, self.capacity(sample.cell));
         let update = self.estimators.result(index).update;
         let resistance = self.resistance(index);

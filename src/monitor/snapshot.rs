@@ -203,6 +203,8 @@ impl Monitor {
         let branches = self.config.model.branches.len();
         for (cell, document) in snapshot.cells.iter().enumerate() {
             self.cells[cell].take_up(document, &self.config);
+            self.progress[cell].consumed = document.consumed;
+            self.progress[cell].updated_in_round = document.updated_in_round;
             if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
                 self.estimators.put(cell, &estimator);
             }
@@ -311,24 +313,23 @@ fn check_belief(what: &'static str, belief: Option<Belief>) -> Result<(), Unsoun
 
 impl Monitor {
     fn document(&self, cell: usize) -> CellDocument {
-        let slot = &self.cells[cell];
+        let (slot, progress) = (&self.cells[cell], &self.progress[cell]);
         CellDocument {
             estimator: self.estimators.cell(cell).snapshot(),
-            consumed: slot.consumed,
+            consumed: progress.consumed,
             trusted: slot.trusted,
             full_soc: slot.full_soc,
             tapered: slot.tapered,
             usable: slot.usable,
             discharge_resistance: slot.discharge_resistance,
             forecast: Some(slot.life.forecast.clone()),
-            updated_in_round: slot.updated_in_round,
+            updated_in_round: progress.updated_in_round,
         }
     }
 }
 
 impl CellSlot {
     fn take_up(&mut self, document: &CellDocument, config: &MonitorConfig) {
-        self.consumed = document.consumed;
         self.trusted = document.trusted;
         self.full_soc = document.full_soc;
         self.tapered = document.tapered;
@@ -336,6 +337,5 @@ impl CellSlot {
         self.discharge_resistance = document.discharge_resistance;
         let forecast = document.forecast.clone();
         self.life = forecast.map_or_else(|| CellLife::new(config), |forecast| CellLife::of(forecast, config));
-        self.updated_in_round = document.updated_in_round;
     }
 }

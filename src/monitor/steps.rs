@@ -13,12 +13,13 @@ use crate::sample::CellSample;
 
 impl Monitor {
     /// Cells mostly report in rounds: their steps are made together once all have reported, or one does for the second time.
+    #[inline]
     pub(super) fn note_sample(&mut self, sample: CellSample, out: &mut Outputs) {
         let index = sample.cell.index();
-        if self.cells[index].updated_in_round {
+        if self.progress[index].updated_in_round {
             self.close_round(out);
         }
-        self.cells[index].updated_in_round = true;
+        self.progress[index].updated_in_round = true;
         self.waiting.push(sample);
         self.updated_cells += 1;
         if self.updated_cells == self.cells.len() {
@@ -29,7 +30,7 @@ impl Monitor {
     /// The round is over: the pack's values.
     fn close_round(&mut self, out: &mut Outputs) {
         self.make_steps(out);
-        self.cells.iter_mut().for_each(|cell| cell.updated_in_round = false);
+        self.progress.iter_mut().for_each(|cell| cell.updated_in_round = false);
         self.updated_cells = 0;
         self.combine_pack(out);
     }
@@ -83,13 +84,13 @@ impl Monitor {
     /// What happened to a cell between the sample before and this one.
     fn next_step(&mut self, sample: &CellSample) -> CellStep {
         let index = sample.cell.index();
-        let slot = &mut self.cells[index];
+        let progress = &mut self.progress[index];
         let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
         let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
         let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
         // Before the first reading, and where a record goes on after it is unknown how long, nobody measured for ever.
         let mut gap_s = f64::INFINITY;
-        if let Some(before) = slot.consumed.replace(now) {
+        if let Some(before) = progress.consumed.replace(now) {
             charge_as = charge - before.charge_as;
             unmeasured_s = unmeasured - before.unmeasured_s;
             measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
@@ -117,7 +118,7 @@ impl Monitor {
         let result = self.estimators.result(index);
         let is_reset = result.reset;
         self.statistics.note_voltage(result);
-        self.cells[index].sample = Some(*sample);
+        self.progress[index].sample = Some(*sample);
         if is_reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.

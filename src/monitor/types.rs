@@ -511,6 +511,11 @@ pub struct Outputs {
 }
 
 impl Outputs {
+    /// Whether nothing has come out.
+    pub fn is_empty(&self) -> bool {
+        self.events.is_empty() && self.frames.is_empty() && self.estimates.is_empty() && self.alarm_inputs.is_empty()
+    }
+
     /// Empties the lists, keeps their memory.
     pub fn clear(&mut self) {
         self.frames.clear();

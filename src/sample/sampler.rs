@@ -7,6 +7,8 @@
 //! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records
 //! lie together and not field by field. Nothing is allocated per reading.
 
+use std::ops::Range;
+
 use serde::{Deserialize, Serialize};
 
 use super::charge::{ChargeCounter, Totals};
@@ -112,6 +114,8 @@ pub struct Sampler {
     sensors: usize,
     /// Channels with a voltage.
     voltages: usize,
+    /// The signals of the cells' own voltages; none where the pack's total is measured.
+    cell_voltages: Range<usize>,
     flow_a: f64,
     state: SamplerState,
     /// Before this no signal can become stale; `None` = not known.
@@ -147,7 +151,12 @@ impl Sampler {
             counts: ReadingCounts::default(),
         };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
-        Self { config, channels, sensors, voltages, flow_a, state, next_stale: None, moment: None }
+        let first = 1 + sensors;
+        let cell_voltages = match config.voltage_source {
+            VoltageSource::Cells => first..first + voltages,
+            VoltageSource::PackTotal { .. } => first..first,
+        };
+        Self { config, channels, sensors, voltages, cell_voltages, flow_a, state, next_stale: None, moment: None }
     }
 
     /// Other limits for the same signals.
@@ -168,11 +177,6 @@ impl Sampler {
     ) -> Option<CellSample> {
         let time = self.pass(time);
         let channel = reading.channel;
-        if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (channel, reading.value)
-            && let Some(sample) = self.ordinary_voltage(time, cell, voltage_v)
-        {
-            return Some(sample);
-        }
         let Some(slot) = self.slot(channel) else {
             self.state.unused_readings += 1;
             return None;
@@ -201,20 +205,18 @@ impl Sampler {
         }
     }
 
-    /// Takes the most frequent reading by the shortest way: a cell's good voltage after many others. `None` and nothing
-    /// changed when it may be anything else.
+    /// Takes the most frequent reading, as [`handle_reading`](Self::handle_reading) would, by the shortest way: a cell's
+    /// good voltage after many others. `None` when it may be anything else: then it has still to be taken.
     #[inline]
-    fn ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
-        if cell.index() >= self.voltages || self.config.voltage_source != VoltageSource::Cells {
-            return None;
-        }
+    pub fn take_ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
+        let time = self.pass(time);
         let moment = self.moment(time);
-        let signal = &mut self.state.signals[1 + self.sensors + cell.index()];
+        let signal = self.state.signals[self.cell_voltages.clone()].get_mut(cell.index())?;
         let clock_s = should_move_s(Channel::CellVoltage(cell), &moment.totals);
         if !signal.take_ordinary(time, voltage_v, &self.config.voltage, clock_s) {
             return None;
         }
-        self.state.counts.note(None);
+        self.state.counts.accepted += 1;
         Some(self.sample(&moment, cell, voltage_v))
     }
 

@@ -1,0 +1,132 @@
+//! The times of a replay: which part of the log is wanted, how much time it covers, and at what pace it goes.
+
+use std::time::{Duration, Instant};
+
+use super::Settings;
+use crate::quantity::Timestamp;
+
+/// A moment of the log as the user gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum When {
+    /// A stamp on the log's own clock.
+    At(Timestamp),
+    /// Nanoseconds after the log's first record.
+    After(i64),
+}
+
+impl When {
+    pub(super) fn resolve(self, first: Timestamp) -> Timestamp {
+        match self {
+            Self::At(time) => time,
+            Self::After(nanos) => first.plus_nanos(nanos),
+        }
+    }
+}
+
+/// Which records are wanted.
+pub(super) struct Window {
+    from: Option<When>,
+    pub(super) until: Option<When>,
+    /// The log's first stamp, wanted or not.
+    pub(super) first: Option<Timestamp>,
+}
+
+pub(super) enum Place {
+    Before,
+    Inside,
+    After,
+}
+
+impl Window {
+    pub(super) fn new(settings: &Settings) -> Self {
+        Self { from: settings.from, until: settings.until, first: None }
+    }
+
+    pub(super) fn judge(&mut self, time: Timestamp) -> Place {
+        let first = *self.first.get_or_insert(time);
+        if self.from.is_some_and(|from| time < from.resolve(first)) {
+            Place::Before
+        } else if self.until.is_some_and(|until| time > until.resolve(first)) {
+            Place::After
+        } else {
+            Place::Inside
+        }
+    }
+}
+
+/// How much time the record covers, and how long that took here.
+pub(super) struct Span {
+    sleep_gap_ns: i64,
+    pub(super) first: Option<Timestamp>,
+    pub(super) latest: Option<Timestamp>,
+    /// Nanoseconds, so that the sum of millions of steps is exact.
+    awake_ns: i64,
+    pub(super) started: Instant,
+}
+
+impl Span {
+    pub(super) fn new(sleep_gap_s: f64) -> Self {
+        Self {
+            sleep_gap_ns: (sleep_gap_s * 1e9) as i64,
+            first: None,
+            latest: None,
+            awake_ns: 0,
+            started: Instant::now(),
+        }
+    }
+
+    /// Notes a record; whether it follows a hole.
+    pub(super) fn advance(&mut self, time: Timestamp) -> bool {
+        self.first.get_or_insert(time);
+        let latest = *self.latest.get_or_insert(time);
+        let passed_ns = time.nanos().saturating_sub(latest.nanos());
+        if passed_ns <= 0 {
+            return false;
+        }
+        self.latest = Some(time);
+        let asleep = passed_ns > self.sleep_gap_ns;
+        self.awake_ns += if asleep { 0 } else { passed_ns };
+        asleep
+    }
+
+    pub(super) fn awake_s(&self) -> f64 {
+        self.awake_ns as f64 * 1e-9
+    }
+
+    pub(super) fn times_real_time(&self) -> f64 {
+        self.awake_s() / self.started.elapsed().as_secs_f64().max(1e-9)
+    }
+}
+
+/// Holds the replay to a multiple of real time by deadlines, so that lateness does not add up.
+pub(super) struct Pace {
+    pub(super) speed: Option<f64>,
+    anchor: Option<(Instant, Timestamp)>,
+}
+
+impl Pace {
+    pub(super) fn new(speed: Option<f64>) -> Self {
+        Self { speed, anchor: None }
+    }
+
+    /// Time starts anew with the next record: holes and unknown gaps are not waited out.
+    pub(super) fn rebase(&mut self) {
+        self.anchor = None;
+    }
+
+    #[inline]
+    pub(super) fn wait(&mut self, time: Timestamp) {
+        if let Some(speed) = self.speed {
+            self.wait_at(speed, time);
+        }
+    }
+
+    fn wait_at(&mut self, speed: f64, time: Timestamp) {
+        let (began, origin) = *self.anchor.get_or_insert_with(|| (Instant::now(), time));
+        let due = Duration::try_from_secs_f64(time.since(origin) / speed).unwrap_or_default();
+        let ahead = due.saturating_sub(began.elapsed());
+        if !ahead.is_zero() {
+            std::thread::sleep(ahead);
+        }
+    }
+}

@@ -1,0 +1,136 @@
+//! What a replay came to: counts, alarms, the cells at the end.
+
+use std::collections::BTreeMap;
+
+use serde::Serialize;
+
+use super::{CellSummary, DroppedSummary, ProtectedSummary};
+use crate::alarm::Change;
+use crate::io::log::LogCounts;
+use crate::monitor::{Event, EventKind};
+use crate::quantity::CellIndex;
+
+/// Raised alarms listed one by one; all are counted.
+const MAX_LISTED_ALARMS: usize = 1000;
+
+/// What a replay came to.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Summary {
+    /// What was read.
+    #[serde(flatten)]
+    pub log: LogCounts,
+    /// Records outside `from` and `until`.
+    pub skipped_records: u64,
+    /// Ticks handed to the core.
+    pub ticks: u64,
+    /// Estimates made (counted only when written).
+    pub estimates: u64,
+    /// Frames that would be sent.
+    pub frames_out: u64,
+    /// Bad readings of signals that came back to good.
+    pub bad_readings: u64,
+    /// Protected input messages.
+    pub protected: Vec<ProtectedSummary>,
+    /// Messages that came too often.
+    pub dropped: Vec<DroppedSummary>,
+    /// Events by kind.
+    pub events: BTreeMap<&'static str, u64>,
+    /// The first 1,000 alarms raised.
+    pub alarms_raised: Vec<Event>,
+    /// The cells at the end.
+    pub cells: Vec<CellSummary>,
+    /// First stamp, s.
+    pub first_s: Option<f64>,
+    /// Last stamp, s.
+    pub last_s: Option<f64>,
+    /// Time awake within the record, s: holes longer than the sleep gap do not count.
+    pub awake_s: f64,
+    /// Wall time, s.
+    pub wall_s: f64,
+    /// Awake time over wall time.
+    pub times_real_time: f64,
+    /// Frames read, over wall time.
+    pub frames_per_s: f64,
+    /// Voltage readings that came to an estimator, over wall time.
+    pub cell_steps_per_s: f64,
+    /// Peak resident memory, KiB, where the system tells.
+    pub peak_memory_kib: Option<u64>,
+    /// What the user should know.
+    pub notes: Vec<String>,
+}
+
+/// Counts an event; lists it if it is an alarm raised, and keeps the usable capacities.
+pub(super) fn note_event(
+    summary: &mut Summary,
+    usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    event: &Event,
+) {
+    let name = match event.kind {
+        EventKind::Mode { .. } => "mode",
+        EventKind::HalfCycle { .. } => "half_cycle",
+        EventKind::Capacity { cell, usable_capacity_ah, usable_capacity_std_ah, .. } => {
+            usable.insert(cell, (usable_capacity_ah, usable_capacity_std_ah));
+            "capacity"
+        }
+        EventKind::RemainingLife { .. } => "remaining_life",
+        EventKind::RechargePeriod { .. } => "recharge_period",
+        EventKind::Alarm { change, .. } => {
+            if change == Change::Raised && summary.alarms_raised.len() < MAX_LISTED_ALARMS {
+                summary.alarms_raised.push(*event);
+            }
+            alarm_change_name(change)
+        }
+        EventKind::SignalBad { .. } => "signal_bad",
+        EventKind::SignalGood { bad_readings, .. } => {
+            summary.bad_readings += bad_readings;
+            "signal_good"
+        }
+        EventKind::Protection { usable, .. } => {
+            if usable {
+                "protection_usable"
+            } else {
+                "protection_failed"
+            }
+        }
+        EventKind::Flood { active, .. } => {
+            if active {
+                "flood_begun"
+            } else {
+                "flood_over"
+            }
+        }
+        EventKind::Bus { .. } => "bus",
+        EventKind::J1939 { .. } => "j1939",
+        EventKind::Gap { .. } => "gap",
+        EventKind::TimeBackwards { .. } => "time_backwards",
+        EventKind::FilterReset { .. } => "filter_reset",
+        EventKind::Trust { .. } => "trust",
+        EventKind::Command { .. } => "command",
+        EventKind::BadCommand { .. } => "bad_command",
+        EventKind::Test { .. } => "test",
+        EventKind::PackReplaced { .. } => "pack_replaced",
+        EventKind::PackIdentity { .. } => "pack_identity",
+        EventKind::Reconfigured { .. } => "reconfigured",
+        EventKind::AlarmDropped { .. } => "alarm_dropped",
+        EventKind::Store { .. } => "store",
+    };
+    *summary.events.entry(name).or_default() += 1;
+}
+
+fn alarm_change_name(change: Change) -> &'static str {
+    match change {
+        Change::Raised => "alarm_raised",
+        Change::Suppressed => "alarm_suppressed",
+        Change::Resumed => "alarm_resumed",
+        Change::Latched => "alarm_latched",
+        Change::Cleared => "alarm_cleared",
+        Change::Acknowledged => "alarm_acknowledged",
+        Change::Forgotten => "alarm_forgotten",
+    }
+}
+
+/// VmHWM of /proc/self/status.
+pub(super) fn peak_memory_kib() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?.trim().strip_suffix("kB")?.trim().parse().ok()
+}
