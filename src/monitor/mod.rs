@@ -37,7 +37,7 @@ use cyclic::{Schedule, Test};
 use intake::Intake;
 use life::CellLife;
 use snapshot::{PendingRestore, Taken};
-use steps::end_state;
+use steps::{Round, end_state};
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, RuleConfig};
 use crate::can::decode::InputMap;
@@ -94,7 +94,6 @@ struct Progress {
     consumed: Option<Consumed>,
     /// The sample of the latest estimate.
     sample: Option<CellSample>,
-    updated_in_round: bool,
 }
 
 /// What is known of a cell beside its estimator and its samples.
@@ -152,8 +151,7 @@ pub struct Monitor {
     cells: Vec<CellSlot>,
     /// One for each cell.
     progress: Vec<Progress>,
-    /// Samples that wait for their step, in the order in which they came, at most one of a cell.
-    waiting: Vec<CellSample>,
+    round: Round,
     detector: TransitionDetector,
     learner: Learner,
     /// When the last half-cycle taught something; `None` = never, or nobody knows how long ago.
@@ -162,8 +160,6 @@ pub struct Monitor {
     recharge_period_s: Option<f64>,
     normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
-    /// Cells with a new estimate since the pack's values were last combined.
-    updated_cells: usize,
     alarms: AlarmEngine,
     /// When values at rest were last told to the rules, and whether they are now.
     restated_at: Timestamp,
@@ -231,7 +227,7 @@ impl Monitor {
             estimators,
             cells: vec![slot; cells],
             progress: vec![Progress::default(); cells],
-            waiting: Vec::with_capacity(cells),
+            round: Round::new(cells),
             started: false,
             heard: false,
             now: Timestamp::ZERO,
@@ -242,7 +238,6 @@ impl Monitor {
             recharge_period_s: None,
             normalised_recharge: None,
             pack: None,
-            updated_cells: 0,
             restated_at: Timestamp::from_nanos(i64::MIN),
             is_restating: true,
             nis_told_at: Timestamp::from_nanos(i64::MIN),
@@ -465,8 +460,7 @@ impl Monitor {
     /// The pack's values are not known until every cell has a new estimate.
     fn forget_pack(&mut self) {
         self.pack = None;
-        self.updated_cells = 0;
-        self.progress.iter_mut().for_each(|cell| cell.updated_in_round = false);
+        self.round.begin();
     }
 
     /// The record goes on at `time`, but how far that is from before nobody knows.
@@ -495,19 +489,27 @@ impl Monitor {
             return self.handle_command_frame(bus, frame, intact.is_ok(), out);
         }
         let mut readings = std::mem::take(&mut self.scratch.readings);
-        self.config.input.decode(bus, frame, |Reading { channel, value }| {
-            readings.push(Reading { channel, value: intact.and(value) });
+        let Self { config, now, sampler, round, heard, .. } = self;
+        config.input.decode(bus, frame, |Reading { channel, value }| {
+            let value = intact.and(value);
+            // Nearly all readings are ordinary voltages. They overtake none that is not.
+            if readings.is_empty()
+                && let (Channel::CellVoltage(cell), Ok(voltage_v)) = (channel, value)
+                && round.awaits(cell)
+                && let Some(sample) = sampler.take_ordinary_voltage(*now, cell, voltage_v)
+            {
+                round.add(sample);
+                *heard = true;
+            } else {
+                readings.push(Reading { channel, value });
+            }
         });
+        if self.round.is_complete() {
+            self.close_round(out);
+        }
         for reading in readings.drain(..) {
             if reading.channel == Channel::PackIdentity {
                 self.observe_identity(bus, reading.value, out);
-                continue;
-            }
-            if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
-                && let Some(sample) = self.sampler.take_ordinary_voltage(self.now, cell, voltage_v)
-            {
-                self.heard = true;
-                self.note_sample(sample, out);
                 continue;
             }
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);

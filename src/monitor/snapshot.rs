@@ -7,6 +7,7 @@ use super::cyclic::Schedule;
 use super::identity::Identity;
 use super::intake::IntakeState;
 use super::life::CellLife;
+use super::steps::Round;
 use super::{
     Away, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, MonitorConfig, Outputs, Statistics,
 };
@@ -140,7 +141,7 @@ impl Monitor {
             version: SNAPSHOT_VERSION,
             time: self.now,
             cells: (0..self.cells.len()).map(|cell| self.document(cell)).collect(),
-            waiting: self.waiting.clone(),
+            waiting: self.round.waiting.clone(),
             sampler: self.sampler.snapshot(),
             detector: self.detector.clone(),
             learner: self.learner.clone(),
@@ -149,7 +150,7 @@ impl Monitor {
             recharge_period_s: self.recharge_period_s,
             normalised_recharge: self.normalised_recharge,
             pack: self.pack,
-            updated_cells: self.updated_cells,
+            updated_cells: self.round.reported(),
             time_backwards: self.time_backwards,
             alarms: self.alarms.snapshot(),
             schedule: self.schedule.clone(),
@@ -204,12 +205,12 @@ impl Monitor {
         for (cell, document) in snapshot.cells.iter().enumerate() {
             self.cells[cell].take_up(document, &self.config);
             self.progress[cell].consumed = document.consumed;
-            self.progress[cell].updated_in_round = document.updated_in_round;
             if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
                 self.estimators.put(cell, &estimator);
             }
         }
-        self.waiting = snapshot.waiting;
+        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
+        self.round = Round::resume(has_reported, snapshot.waiting);
         self.all_trusted = self.cells.iter().all(|cell| cell.trusted);
         // Checked in `restore`.
         let _ = self.sampler.restore(&snapshot.sampler);
@@ -220,7 +221,6 @@ impl Monitor {
         self.recharge_period_s = snapshot.recharge_period_s;
         self.normalised_recharge = snapshot.normalised_recharge;
         self.pack = snapshot.pack;
-        self.updated_cells = snapshot.updated_cells;
         self.time_backwards = snapshot.time_backwards;
         self.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
@@ -313,17 +313,17 @@ fn check_belief(what: &'static str, belief: Option<Belief>) -> Result<(), Unsoun
 
 impl Monitor {
     fn document(&self, cell: usize) -> CellDocument {
-        let (slot, progress) = (&self.cells[cell], &self.progress[cell]);
+        let slot = &self.cells[cell];
         CellDocument {
             estimator: self.estimators.cell(cell).snapshot(),
-            consumed: progress.consumed,
+            consumed: self.progress[cell].consumed,
             trusted: slot.trusted,
             full_soc: slot.full_soc,
             tapered: slot.tapered,
             usable: slot.usable,
             discharge_resistance: slot.discharge_resistance,
             forecast: Some(slot.life.forecast.clone()),
-            updated_in_round: progress.updated_in_round,
+            updated_in_round: self.round.has_reported(cell),
         }
     }
 }

@@ -11,27 +11,77 @@ use crate::health::CellEnd;
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
 
+/// Which cells have reported since the pack's values were last combined.
+#[derive(Debug)]
+pub(super) struct Round {
+    /// Samples that wait for their step, in the order in which they came, at most one of a cell.
+    pub(super) waiting: Vec<CellSample>,
+    has_reported: Vec<bool>,
+    reported: usize,
+}
+
+impl Round {
+    pub(super) fn new(cells: usize) -> Self {
+        Self { waiting: Vec::with_capacity(cells), has_reported: vec![false; cells], reported: 0 }
+    }
+
+    /// One that goes on: which cells have reported, and what of it waits.
+    pub(super) fn resume(has_reported: Vec<bool>, waiting: Vec<CellSample>) -> Self {
+        let reported = has_reported.iter().filter(|&&reported| reported).count();
+        Self { waiting, has_reported, reported }
+    }
+
+    pub(super) fn has_reported(&self, cell: usize) -> bool {
+        self.has_reported[cell]
+    }
+
+    /// How many have.
+    pub(super) fn reported(&self) -> usize {
+        self.reported
+    }
+
+    /// Whether a sample of the cell belongs to this round: it has sent none yet, and others have to send theirs.
+    #[inline]
+    pub(super) fn awaits(&self, cell: CellIndex) -> bool {
+        !self.is_complete() && self.has_reported.get(cell.index()) == Some(&false)
+    }
+
+    /// Adds the first sample of a cell.
+    #[inline]
+    pub(super) fn add(&mut self, sample: CellSample) {
+        self.has_reported[sample.cell.index()] = true;
+        self.reported += 1;
+        self.waiting.push(sample);
+    }
+
+    #[inline]
+    pub(super) fn is_complete(&self) -> bool {
+        self.reported == self.has_reported.len()
+    }
+
+    /// The next begins. What waits still waits.
+    pub(super) fn begin(&mut self) {
+        self.has_reported.fill(false);
+        self.reported = 0;
+    }
+}
+
 impl Monitor {
     /// Cells mostly report in rounds: their steps are made together once all have reported, or one does for the second time.
-    #[inline]
     pub(super) fn note_sample(&mut self, sample: CellSample, out: &mut Outputs) {
-        let index = sample.cell.index();
-        if self.progress[index].updated_in_round {
+        if !self.round.awaits(sample.cell) {
             self.close_round(out);
         }
-        self.progress[index].updated_in_round = true;
-        self.waiting.push(sample);
-        self.updated_cells += 1;
-        if self.updated_cells == self.cells.len() {
+        self.round.add(sample);
+        if self.round.is_complete() {
             self.close_round(out);
         }
     }
 
     /// The round is over: the pack's values.
-    fn close_round(&mut self, out: &mut Outputs) {
+    pub(super) fn close_round(&mut self, out: &mut Outputs) {
         self.make_steps(out);
-        self.progress.iter_mut().for_each(|cell| cell.updated_in_round = false);
-        self.updated_cells = 0;
+        self.round.begin();
         self.combine_pack(out);
     }
 
@@ -51,10 +101,10 @@ impl Monitor {
 
     /// The same; `tells`: the rule about innovations hears of them.
     pub(super) fn step_waiting(&mut self, tells: bool, out: &mut Outputs) {
-        if self.waiting.is_empty() {
+        if self.round.waiting.is_empty() {
             return;
         }
-        let mut waiting = std::mem::take(&mut self.waiting);
+        let mut waiting = std::mem::take(&mut self.round.waiting);
         for sample in &waiting {
             let step = self.next_step(sample);
             self.estimators.add(sample.cell.index(), &step);
@@ -76,7 +126,7 @@ impl Monitor {
             }
         }
         waiting.clear();
-        self.waiting = waiting;
+        self.round.waiting = waiting;
         let estimators = &self.estimators;
         self.scratch.after_gap.drain(..).for_each(|cell| self.learner.move_mark(cell, end_state(estimators, cell)));
     }

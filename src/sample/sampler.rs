@@ -120,17 +120,36 @@ pub struct Sampler {
     state: SamplerState,
     /// Before this no signal can become stale; `None` = not known.
     next_stale: Option<Timestamp>,
-    /// What the latest readings had in common; `None` = not known (any more).
-    moment: Option<Moment>,
+    /// What the latest readings had in common.
+    moment: Moment,
 }
 
 /// What is the same for every reading of one time, as long as no current comes.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct Moment {
+    /// Whether the rest holds (still).
+    is_known: bool,
     time: Timestamp,
     totals: Totals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
+    /// The sensor that was asked last, and its value: neighbouring cells mostly share one.
+    sensor: Option<(SensorIndex, Option<f64>)>,
+}
+
+impl Moment {
+    #[inline]
+    fn sample(&self, cell: CellIndex, voltage_v: f64, temperature_c: Option<f64>) -> CellSample {
+        CellSample {
+            time: self.time,
+            cell,
+            voltage_v,
+            current_a: self.cell_current_a,
+            charge_as: self.cell_charge_as,
+            unmeasured_s: self.totals.unmeasured_s,
+            temperature_c,
+        }
+    }
 }
 
 impl Sampler {
@@ -156,7 +175,17 @@ impl Sampler {
             VoltageSource::Cells => first..first + voltages,
             VoltageSource::PackTotal { .. } => first..first,
         };
-        Self { config, channels, sensors, voltages, cell_voltages, flow_a, state, next_stale: None, moment: None }
+        Self {
+            config,
+            channels,
+            sensors,
+            voltages,
+            cell_voltages,
+            flow_a,
+            state,
+            next_stale: None,
+            moment: Moment::default(),
+        }
     }
 
     /// Other limits for the same signals.
@@ -181,10 +210,10 @@ impl Sampler {
             self.state.unused_readings += 1;
             return None;
         };
-        let moment = self.moment(time);
+        self.renew_moment(time);
         let limits = limits(&self.config, channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
-        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &moment.totals));
+        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &self.moment.totals));
         self.state.counts.note(judged.value.err());
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
@@ -196,12 +225,16 @@ impl Sampler {
             Channel::Current => {
                 let max_age_s = self.config.current.max_age_s;
                 self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
-                self.moment = None;
+                self.moment.is_known = false;
                 None
             }
-            Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
-            Channel::PackVoltage => Some(self.sample(&moment, CellIndex(0), value)),
-            Channel::CellVoltage(cell) => Some(self.sample(&moment, cell, value)),
+            Channel::Temperature(_) => {
+                self.moment.is_known = false;
+                None
+            }
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
+            Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
+            Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
         }
     }
 
@@ -210,14 +243,24 @@ impl Sampler {
     #[inline]
     pub fn take_ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
         let time = self.pass(time);
-        let moment = self.moment(time);
-        let signal = self.state.signals[self.cell_voltages.clone()].get_mut(cell.index())?;
+        self.renew_moment(time);
+        let Self { config, state, cell_voltages, moment, .. } = self;
+        let signal = state.signals[cell_voltages.clone()].get_mut(cell.index())?;
         let clock_s = should_move_s(Channel::CellVoltage(cell), &moment.totals);
-        if !signal.take_ordinary(time, voltage_v, &self.config.voltage, clock_s) {
+        if !signal.take_ordinary(time, voltage_v, &config.voltage, clock_s) {
             return None;
         }
-        self.state.counts.accepted += 1;
-        Some(self.sample(&moment, cell, voltage_v))
+        state.counts.accepted += 1;
+        let sensor = config.sensor_of_cell.get(cell.index()).copied().flatten();
+        let temperature_c = sensor.and_then(|sensor| match moment.sensor {
+            Some((same, value)) if same == sensor => value,
+            _ => {
+                let value = state.signals[1 + sensor.index()].fresh(time, &config.temperature);
+                moment.sensor = Some((sensor, value));
+                value
+            }
+        });
+        Some(moment.sample(cell, voltage_v, temperature_c))
     }
 
     /// Judges the ages at `now`; signals that have become stale go to `changes`.
@@ -250,7 +293,7 @@ impl Sampler {
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
         self.state.began = Some(time);
         self.state.latest = time;
-        (self.next_stale, self.moment) = (None, None);
+        (self.next_stale, self.moment.is_known) = (None, false);
     }
 
     /// The computer was asleep until `time`: values are as old as they are, but nothing is called silent or stale
@@ -418,33 +461,23 @@ impl Sampler {
             return Err(SamplerShape { found, allowed });
         }
         self.state.clone_from(state);
-        (self.next_stale, self.moment) = (None, None);
+        (self.next_stale, self.moment.is_known) = (None, false);
         Ok(())
     }
 
     #[inline]
-    fn moment(&mut self, time: Timestamp) -> Moment {
-        if let Some(moment) = self.moment.filter(|moment| moment.time == time) {
-            return moment;
+    fn renew_moment(&mut self, time: Timestamp) {
+        if self.moment.is_known && self.moment.time == time {
+            return;
         }
         let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
         let cell_charge_as = totals.charge_as / self.strings();
-        let moment = Moment { time, totals, cell_current_a: self.cell_current_a(time), cell_charge_as };
-        self.moment = Some(moment);
-        moment
+        let cell_current_a = self.cell_current_a(time);
+        self.moment = Moment { is_known: true, time, totals, cell_current_a, cell_charge_as, sensor: None };
     }
 
-    #[inline]
-    fn sample(&self, moment: &Moment, cell: CellIndex, voltage_v: f64) -> CellSample {
-        CellSample {
-            time: moment.time,
-            cell,
-            voltage_v,
-            current_a: moment.cell_current_a,
-            charge_as: moment.cell_charge_as,
-            unmeasured_s: moment.totals.unmeasured_s,
-            temperature_c: self.temperature_c(cell, moment.time),
-        }
+    fn sample(&self, cell: CellIndex, voltage_v: f64) -> CellSample {
+        self.moment.sample(cell, voltage_v, self.temperature_c(cell, self.moment.time))
     }
 
     /// Notes that time has come to `time`; the latest time, should it have gone back.
