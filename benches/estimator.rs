@@ -1,10 +1,12 @@
 //! One estimator step, and one round of a 96-cell pack through the whole core (frames in, frames out).
 
+use common::{example, reading};
 use packwatch::can::encode::InputEncoder;
-use packwatch::cell::{CellEstimator, CellModel, CellStep};
-use packwatch::config;
+use packwatch::cell::{CellEstimator, CellModel};
 use packwatch::monitor::{Input, Monitor, Outputs};
 use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
+
+mod common;
 
 /// Shows what a step allocates: nothing.
 #[global_allocator]
@@ -12,11 +14,6 @@ static ALLOCATOR: divan::AllocProfiler = divan::AllocProfiler::system();
 
 fn main() {
     divan::main();
-}
-
-fn example() -> config::Config {
-    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
-    config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
 }
 
 /// The example's cell with 1 to 3 RC branches.
@@ -33,17 +30,7 @@ fn ukf_step(bencher: divan::Bencher, branches: usize) {
     let mut k = 0_u32;
     bencher.bench_local(|| {
         k = k.wrapping_add(1);
-        let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
-        let step = CellStep {
-            measured_s: 1.0,
-            charge_as: current_a,
-            unmeasured_s: 0.0,
-            current_a: Some(current_a),
-            temperature_c: Some(25.0),
-            ambient_c: 25.0,
-            voltage_v: 3.7 - 0.05 * current_a,
-        };
-        divan::black_box(estimator.step(&model, &config, &step))
+        divan::black_box(estimator.step(&model, &config, &reading(k, 0)))
     });
 }
 

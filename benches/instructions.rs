@@ -9,16 +9,18 @@ use std::hint::black_box;
 use std::io::Write;
 use std::time::Instant;
 
+use common::{example, reading};
 use packwatch::can::Frame;
 use packwatch::can::dbc::Database;
 use packwatch::can::decode::{Binding, InputMap};
 use packwatch::can::encode::InputEncoder;
-use packwatch::cell::{CellEstimator, CellModel, CellStep, EstimatorBank, EstimatorConfig};
-use packwatch::config;
+use packwatch::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
 use packwatch::quantity::{BusIndex, CellIndex, Channel};
 use tempfile::NamedTempFile;
+
+mod common;
 
 /// Name, what one unit of it is, and what makes it.
 const WORKS: [Named; 8] = [
@@ -158,26 +160,10 @@ fn decode_page() -> Work {
 
 /// The example's cell with 1 to 3 RC branches.
 fn cell(branches: usize) -> (CellModel, EstimatorConfig) {
-    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
-    let monitor = config::load(path).unwrap_or_else(|faults| panic!("{faults:?}")).monitor;
+    let monitor = example().monitor;
     let mut model = monitor.model;
     model.branches = vec![model.branches[0].clone(); branches];
     (model, monitor.estimator)
-}
-
-/// Ten readings a second under a load that turns round every 3 s; a little different from cell to cell, and at a
-/// temperature between two rows of the tables, as real ones are.
-fn reading(k: u32, cell: u32) -> CellStep {
-    let current_a = if k % 60 < 30 { 1.3 } else { -1.3 };
-    CellStep {
-        measured_s: 0.1,
-        charge_as: 0.1 * current_a,
-        unmeasured_s: 0.0,
-        current_a: Some(current_a),
-        temperature_c: Some(25.0),
-        ambient_c: 25.0,
-        voltage_v: 3.7 - 0.05 * current_a + 0.0001 * f64::from(cell),
-    }
 }
 
 fn one_cell(branches: usize) -> Work {
@@ -188,14 +174,14 @@ fn pack() -> Work {
     steps(1, 96)
 }
 
-fn steps(branches: usize, cells: u32) -> Work {
+fn steps(branches: usize, cells: usize) -> Work {
     let (model, config) = cell(branches);
-    let mut pack = EstimatorBank::new(&model, &config, cells as usize);
+    let mut pack = EstimatorBank::new(&model, &config, cells);
     let mut k = 0;
     Box::new(move || {
-        for _ in 0..UNITS / cells {
+        for _ in 0..UNITS as usize / cells {
             k += 1;
-            (0..cells).for_each(|cell| pack.add(cell as usize, black_box(&reading(k, cell))));
+            (0..cells).for_each(|cell| pack.add(cell, black_box(&reading(k, cell))));
             pack.step();
         }
         pack.soc(0).map_or(0.0, |soc| soc.mean)

@@ -5,8 +5,11 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use packwatch::cell::{CellEstimator, CellStep, EstimatorBank};
-use packwatch::config;
+use common::{example, reading};
+use packwatch::cell::{CellEstimator, EstimatorBank};
+use packwatch::config::Config;
+
+mod common;
 
 /// Turns each form is timed in.
 const ROUNDS: usize = 15;
@@ -47,27 +50,8 @@ fn time(mut step: impl FnMut(u32)) -> f64 {
     started.elapsed().as_secs_f64() * 1e9 / f64::from(STEPS)
 }
 
-fn example() -> config::Config {
-    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
-    config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
-}
-
-/// A cell of a pack under a load that turns now and then; cells differ by some millivolts.
-fn step(k: u32, cell: usize) -> CellStep {
-    let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
-    CellStep {
-        measured_s: 0.1,
-        charge_as: 0.1 * current_a,
-        unmeasured_s: 0.0,
-        current_a: Some(current_a),
-        temperature_c: Some(25.0 + (cell / 8) as f64),
-        ambient_c: 25.0,
-        voltage_v: 3.7 - 0.05 * current_a + 0.0005 * cell as f64,
-    }
-}
-
 struct Plain {
-    config: config::Config,
+    config: Config,
     cells: Vec<CellEstimator>,
 }
 
@@ -79,7 +63,7 @@ impl Plain {
 
     fn step(&mut self, k: u32) {
         for (cell, estimator) in self.cells.iter_mut().enumerate() {
-            black_box(estimator.step(&self.config.monitor.model, &self.config.monitor.estimator, &step(k, cell)));
+            black_box(estimator.step(&self.config.monitor.model, &self.config.monitor.estimator, &reading(k, cell)));
         }
     }
 }
@@ -96,7 +80,7 @@ impl Bank {
     }
 
     fn step(&mut self, k: u32) {
-        (0..self.cells).for_each(|cell| self.bank.add(cell, black_box(&step(k, cell))));
+        (0..self.cells).for_each(|cell| self.bank.add(cell, black_box(&reading(k, cell))));
         self.bank.step();
         black_box(self.bank.result(0));
     }

@@ -191,13 +191,7 @@ impl AlarmEngine {
         seen: &Observation,
         changes: &mut Vec<AlarmChange>,
     ) {
-        for index in self.by_rule[usize::from(rule as u8)].clone() {
-            let Some(slot) = self.rules[index].slot(cell) else { continue };
-            // Most values are healthy ones of alarms at rest.
-            if !self.machines[slot].rest_on(&self.rules[index].config, seen) {
-                self.act(index, slot, changes, |machine, config| machine.observe(now, config, seen));
-            }
-        }
+        self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, seen));
     }
 
     /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
@@ -225,6 +219,16 @@ impl AlarmEngine {
             let is_beyond = || Verdict::of(&slots.config, &Observation::new(Some(worst))).0 != Verdict::Healthy;
             slots.restless == 0 && !is_beyond()
         })
+    }
+
+    /// A cell's or the pack's value of a rule for which [`is_quiet`](Self::is_quiet) holds: it is shown, nothing else.
+    #[inline]
+    pub fn show(&mut self, rule: Rule, cell: Option<CellIndex>, value: f64) {
+        for slots in &self.rules[self.by_rule[usize::from(rule as u8)].clone()] {
+            if let Some(slot) = slots.slot(cell) {
+                self.machines[slot].show(value);
+            }
+        }
     }
 
     /// Lets time pass for the values that hold until the next one ([`Row::is_learned`](super::rule::Row::is_learned)).
@@ -443,25 +447,13 @@ impl AlarmEngine {
         mut act: impl FnMut(&mut Machine, &RuleConfig) -> Option<Change>,
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
-            if let Some(slot) = self.rules[index].slot(cell) {
-                self.act(index, slot, changes, &mut act);
+            let Some(slot) = self.rules[index].slot(cell) else { continue };
+            let before = self.machines[slot].standing();
+            let change = act(&mut self.machines[slot], &self.rules[index].config);
+            self.file(index, slot, before);
+            if let Some(change) = change {
+                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             }
-        }
-    }
-
-    /// Lets an alarm take something, and tells what became of it.
-    fn act(
-        &mut self,
-        index: usize,
-        slot: usize,
-        changes: &mut Vec<AlarmChange>,
-        act: impl FnOnce(&mut Machine, &RuleConfig) -> Option<Change>,
-    ) {
-        let before = self.machines[slot].standing();
-        let change = act(&mut self.machines[slot], &self.rules[index].config);
-        self.file(index, slot, before);
-        if let Some(change) = change {
-            changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
         }
     }
 

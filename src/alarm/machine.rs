@@ -200,7 +200,6 @@ pub(super) struct Standing {
 }
 
 impl Machine {
-    #[inline]
     pub(super) fn standing(&self) -> Standing {
         let is_counting = self.counted_to.is_some();
         let is_rest = matches!(self.state, State::Inactive | State::Cleared);
@@ -212,18 +211,10 @@ impl Machine {
         }
     }
 
-    /// Takes a value that changes nothing but what is shown of an alarm at rest; `false` and nothing done when it is none.
+    /// Shows a value that changes nothing, without a deviation.
     #[inline]
-    pub(super) fn rest_on(&mut self, rule: &RuleConfig, seen: &Observation) -> bool {
-        if !self.standing().is_at_rest {
-            return false;
-        }
-        let (verdict, probability) = Verdict::of(rule, seen);
-        let rests = matches!(verdict, Verdict::Healthy | Verdict::Between);
-        if rests {
-            (self.seen, self.probability) = (Observation { is_new: false, ..*seen }, probability);
-        }
-        rests
+    pub(super) fn show(&mut self, value: f64) {
+        (self.seen, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
     }
 
     /// Takes a value. One that is learned while its inputs are lost (their loss ends the half-cycle before) may raise the

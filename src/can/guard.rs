@@ -110,10 +110,15 @@ impl Guards {
     }
 
     /// Checks a frame; `None` = its message is not protected, or it is a remote request, which carries no data.
+    #[inline]
     pub fn check(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
         if self.guards.is_empty() || frame.kind() == FrameKind::Remote {
             return None;
         }
+        self.check_protected(now, bus, frame)
+    }
+
+    fn check_protected(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame) -> Option<Status> {
         let key = (bus, frame.id());
         let found = self.guards.binary_search_by_key(&key, |guard| (guard.config.bus, guard.config.id)).ok()?;
         let guard = &mut self.guards[found];

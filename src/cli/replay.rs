@@ -77,7 +77,7 @@ pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     let encoder = InputEncoder::new(&config.monitor.input);
     let mut protector = InputProtector::new(&config.monitor.guards);
     LogOptions {
-        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+        interfaces: config.interface_names(),
         strict: args.strict,
         csv: CsvOptions {
             columns: args.columns.clone(),
@@ -114,20 +114,10 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
     })
 }
 
-/// From the start to the end, as fast as possible, with nothing kept.
+/// The wanted part, as fast as possible, with nothing kept.
 fn plain_settings(args: &Args, config: &Config) -> Settings {
-    Settings {
-        speed: None,
-        from: args.from,
-        until: args.until,
-        sleep_gap_s: args.input.sleep_gap,
-        snapshot: false,
-        snapshot_at: None,
-        restore: None,
-        away: None,
-        store: None,
-        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
-    }
+    let plain = Settings::plain(args.input.sleep_gap, config.interface_names());
+    Settings { from: args.from, until: args.until, ..plain }
 }
 
 fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {

@@ -132,27 +132,13 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
     let sinks = Sinks { watch: Some(Watch(watch)), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
-    let result = replay::run(&mut source, monitor, sinks, settings(args, config), &mut |progress| bar.show(progress));
+    let settings = Settings::plain(args.input.sleep_gap, config.interface_names());
+    let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
     let (summary, _) = result.map_err(|error| Failure::new(error.to_string()))?;
     // The replay has ended and with it the closure that shared the data.
     let data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     Ok((data, provenance(args, &summary)))
-}
-
-fn settings(args: &Args, config: &Config) -> Settings {
-    Settings {
-        speed: None,
-        from: None,
-        until: None,
-        sleep_gap_s: args.input.sleep_gap,
-        snapshot: false,
-        snapshot_at: None,
-        restore: None,
-        away: None,
-        store: None,
-        interfaces: config.interfaces.iter().map(|interface| interface.name.clone()).collect(),
-    }
 }
 
 fn provenance(args: &Args, summary: &Summary) -> Provenance {

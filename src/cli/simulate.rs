@@ -107,7 +107,7 @@ impl Sink {
                 Ok(Self::Bus(Player::open(interface, fd, args.speed)?))
             }
             (None, Some(path)) => {
-                let names = config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+                let names = config.interface_names();
                 Ok(Self::Log(LogWriter::create(path, names)?))
             }
             (None, None) => Err(Failure::new("neither --out nor --to, one must be given")),

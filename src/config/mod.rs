@@ -49,6 +49,13 @@ pub struct Config {
     pub store: StoreConfig,
 }
 
+impl Config {
+    /// Names of the interfaces, in the order in which they are numbered.
+    pub fn interface_names(&self) -> Vec<String> {
+        self.interfaces.iter().map(|interface| interface.name.clone()).collect()
+    }
+}
+
 /// Half-cycles kept where nobody says otherwise.
 pub const DEFAULT_MAX_HALF_CYCLES: u32 = 200_000;
 

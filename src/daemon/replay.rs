@@ -62,6 +62,22 @@ pub struct Settings {
 }
 
 impl Settings {
+    /// From the start to the end, as fast as possible, with nothing kept.
+    pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
+        Self {
+            speed: None,
+            from: None,
+            until: None,
+            sleep_gap_s,
+            snapshot: false,
+            snapshot_at: None,
+            restore: None,
+            away: None,
+            store: None,
+            interfaces,
+        }
+    }
+
     /// Every record is taken, as fast as possible, and neither it nor the state after it is kept.
     fn is_simple(&self) -> bool {
         let Self { speed, from, until, snapshot_at, store, .. } = self;

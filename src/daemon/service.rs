@@ -155,7 +155,7 @@ impl Service {
     }
 
     fn identity(&self, clock: MappedClock) -> Identity {
-        let interfaces = self.config.interfaces.iter().map(|interface| interface.name.clone()).collect();
+        let interfaces = self.config.interface_names();
         Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 

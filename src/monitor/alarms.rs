@@ -13,8 +13,8 @@ use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
 /// Period of the work that only watches the clock (staleness, debounce), s.
 pub(super) const HOUSEKEEPING_S: f64 = 0.1;
-/// Values that change nothing are told to the rules this often, s.
-pub(super) const RESTATE_S: f64 = 1.0;
+/// Values that change nothing are shown this often, s.
+const SHOW_S: f64 = 1.0;
 /// Command frames that are not obeyed are told at most this often, s.
 const BAD_COMMAND_S: f64 = 1.0;
 
@@ -51,6 +51,15 @@ struct Spread {
     is_whole: bool,
 }
 
+/// Whether values that change nothing are to be shown again, last shown at `shown_at`.
+pub(super) fn is_due(shown_at: &mut Timestamp, now: Timestamp) -> bool {
+    let is_due = now.since(*shown_at).abs() >= SHOW_S;
+    if is_due {
+        *shown_at = now;
+    }
+    is_due
+}
+
 impl MonitorConfig {
     /// Silence that the strictest threshold calls missing, s.
     fn missing_after_s(&self) -> Option<f64> {
@@ -62,10 +71,6 @@ impl MonitorConfig {
 impl Monitor {
     /// Everything the rules compare that is not learned at a transition.
     pub(super) fn watch(&mut self, out: &mut Outputs) {
-        self.is_restating = self.now.since(self.restated_at).abs() >= RESTATE_S;
-        if self.is_restating {
-            self.restated_at = self.now;
-        }
         let any_lost = self.sampler.any_lost();
         let worst = self.sampler.worst_input(self.now);
         self.watch_inputs(worst, out);
@@ -88,7 +93,10 @@ impl Monitor {
         let quiet = |(silence_s, share): (f64, f64)| {
             self.alarms.is_quiet(Rule::InputMissing, silence_s) && self.alarms.is_quiet(Rule::InputImplausible, share)
         };
-        if !self.restates(out) && worst.is_some_and(quiet) {
+        if !out.want_alarm_inputs && worst.is_some_and(quiet) {
+            if is_due(&mut self.inputs_shown_at, self.now) {
+                self.show_inputs();
+            }
             return;
         }
         let mut pack: Option<InputState> = None;
@@ -104,6 +112,23 @@ impl Monitor {
         if let Some(pack) = pack {
             self.observe_input(None, pack, out);
         }
+    }
+
+    /// The same while something has come of every input, and nothing of it changes an alarm.
+    fn show_inputs(&mut self) {
+        let (mut longest_s, mut worst_share) = (0.0_f64, 0.0_f64);
+        for &channel in self.sampler.channels() {
+            let silence_s = self.sampler.silence_s(channel, self.now).unwrap_or(0.0);
+            let share = self.sampler.bad_share(channel).unwrap_or(0.0);
+            if let Channel::CellVoltage(cell) = channel {
+                self.alarms.show(Rule::InputMissing, Some(cell), silence_s);
+                self.alarms.show(Rule::InputImplausible, Some(cell), share);
+            } else {
+                (longest_s, worst_share) = (longest_s.max(silence_s), worst_share.max(share));
+            }
+        }
+        self.alarms.show(Rule::InputMissing, None, longest_s);
+        self.alarms.show(Rule::InputImplausible, None, worst_share);
     }
 
     fn input_state(&self, channel: Channel) -> InputState {
@@ -151,12 +176,6 @@ impl Monitor {
         }
         self.report_alarms(out);
         self.all_valid_told = all_valid && all_started;
-    }
-
-    /// Whether also values that change nothing are told to the rules now: once a second, so that what is shown of an
-    /// alarm at rest is not older, and always when somebody else wants to know them.
-    pub(super) fn restates(&self, out: &Outputs) -> bool {
-        self.is_restating || out.want_alarm_inputs
     }
 
     /// Whether what an estimate of a cell is made of comes in.

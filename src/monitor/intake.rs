@@ -41,6 +41,7 @@ impl Intake {
     }
 
     /// `None` = the frame is dropped; otherwise whether its readings may be used.
+    #[inline]
     pub(super) fn judge(
         &mut self,
         now: Timestamp,
@@ -88,10 +89,14 @@ impl Intake {
         self.gate.restore(&state.dropped);
     }
 
+    #[inline]
     fn report(&mut self, time: Timestamp, out: &mut Outputs) {
-        if !self.guards.has_changes() && !self.gate.has_changes() {
-            return;
+        if self.guards.has_changes() || self.gate.has_changes() {
+            self.report_changes(time, out);
         }
+    }
+
+    fn report_changes(&mut self, time: Timestamp, out: &mut Outputs) {
         let turned = self.guards.take_changes().map(|c| EventKind::Protection {
             bus: c.bus,
             id: c.id,

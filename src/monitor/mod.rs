@@ -161,11 +161,9 @@ pub struct Monitor {
     normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
     alarms: AlarmEngine,
-    /// When values at rest were last told to the rules, and whether they are now.
-    restated_at: Timestamp,
-    is_restating: bool,
-    /// When innovations at rest were.
-    nis_told_at: Timestamp,
+    /// When values of inputs that change no alarm were last shown, and when innovations that do not.
+    inputs_shown_at: Timestamp,
+    nis_shown_at: Timestamp,
     /// Whether every cell's innovations agree with their covariance.
     all_trusted: bool,
     /// When a tick will next do something; `None` = not started.
@@ -238,9 +236,8 @@ impl Monitor {
             recharge_period_s: None,
             normalised_recharge: None,
             pack: None,
-            restated_at: Timestamp::from_nanos(i64::MIN),
-            is_restating: true,
-            nis_told_at: Timestamp::from_nanos(i64::MIN),
+            inputs_shown_at: Timestamp::from_nanos(i64::MIN),
+            nis_shown_at: Timestamp::from_nanos(i64::MIN),
             all_trusted: true,
             due: None,
             all_valid_told: false,

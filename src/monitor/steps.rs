@@ -3,7 +3,7 @@
 //! A sample waits until every cell has one, or its own has its second, or anything asks for estimates. What an estimate is
 //! does not depend on how long it waited: a step knows its sample's time and charge, and no other cell.
 
-use super::alarms::RESTATE_S;
+use super::alarms::is_due;
 use super::{Consumed, Event, EventKind, Monitor, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellStep, EstimatorBank};
@@ -110,11 +110,7 @@ impl Monitor {
             self.estimators.add(sample.cell.index(), &step);
         }
         self.estimators.step();
-        let restates = out.want_alarm_inputs || self.now.since(self.nis_told_at).abs() >= RESTATE_S;
-        if restates {
-            self.nis_told_at = self.now;
-        }
-        let is_quiet = self.all_trusted && !restates && {
+        let is_quiet = self.all_trusted && !out.want_alarm_inputs && {
             let nis = |sample: &CellSample| self.estimators.mean_nis(sample.cell.index());
             let worst = waiting.iter().fold(0.0_f64, |worst, sample| worst.max(nis(sample)));
             worst <= self.config.estimator.consistency_limit && self.alarms.is_quiet(Rule::EstimateUntrusted, worst)
@@ -124,6 +120,9 @@ impl Monitor {
             if !is_quiet {
                 self.judge_trust(sample.cell, tells, out);
             }
+        }
+        if is_quiet && tells && is_due(&mut self.nis_shown_at, self.now) {
+            self.show_trust(&waiting);
         }
         waiting.clear();
         self.round.waiting = waiting;
@@ -177,6 +176,15 @@ impl Monitor {
         self.note_taper(sample);
         if out.want_estimates {
             out.estimates.extend(self.estimate(index));
+        }
+    }
+
+    /// Shows innovations that change no alarm.
+    fn show_trust(&mut self, samples: &[CellSample]) {
+        for cell in samples.iter().map(|sample| sample.cell) {
+            if self.inputs_valid(cell) {
+                self.alarms.show(Rule::EstimateUntrusted, Some(cell), self.estimators.mean_nis(cell.index()));
+            }
         }
     }
 

@@ -120,6 +120,8 @@ pub struct Sampler {
     state: SamplerState,
     /// Before this no signal can become stale; `None` = not known.
     next_stale: Option<Timestamp>,
+    /// How many signals are known to be bad.
+    bad_signals: usize,
     /// What the latest readings had in common.
     moment: Moment,
 }
@@ -184,6 +186,7 @@ impl Sampler {
             flow_a,
             state,
             next_stale: None,
+            bad_signals: 0,
             moment: Moment::default(),
         }
     }
@@ -218,6 +221,8 @@ impl Sampler {
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
+            // One that was good before, or bad.
+            self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
             self.next_stale = None;
         }
         let value = judged.value.ok()?;
@@ -271,17 +276,18 @@ impl Sampler {
         }
         let began = self.state.began.unwrap_or(now);
         let mut next = Timestamp::from_nanos(i64::MAX);
-        for slot in 0..self.state.signals.len() {
-            let channel = self.channels[slot];
-            let limits = limits(&self.config, channel);
-            let signal = &mut self.state.signals[slot];
-            if let Some(state) = signal.poll(now, began, limits) {
-                self.state.counts.note(Some(Fault::Stale));
-                changes.push(SignalChange { channel, state });
+        for (signal, &channel) in self.state.signals.iter_mut().zip(&self.channels) {
+            if signal.is_bad() {
+                continue;
             }
-            if !signal.is_bad() {
-                next = next.min(signal.stale_from(began, limits));
+            let stale_from = signal.stale_from(began, limits(&self.config, channel));
+            if now <= stale_from {
+                next = next.min(stale_from);
+                continue;
             }
+            self.state.counts.note(Some(Fault::Stale));
+            self.bad_signals += 1;
+            changes.push(SignalChange { channel, state: Err(signal.turn_stale()) });
         }
         self.next_stale = Some(next);
     }
@@ -423,12 +429,12 @@ impl Sampler {
 
     /// Whether any signal the estimates are made of is bad or stale.
     pub fn any_bad(&self) -> bool {
-        self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
+        self.any_lost() && self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
     }
 
     /// Whether any signal at all is bad or stale.
     pub fn any_lost(&self) -> bool {
-        self.state.signals.iter().any(Signal::is_bad)
+        self.bad_signals > 0
     }
 
     /// Whether a stored state is of this many signals.
@@ -461,6 +467,7 @@ impl Sampler {
             return Err(SamplerShape { found, allowed });
         }
         self.state.clone_from(state);
+        self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
         (self.next_stale, self.moment.is_known) = (None, false);
         Ok(())
     }

@@ -104,10 +104,10 @@ impl Signal {
         true
     }
 
-    /// Judges the age; the change to tell when the signal has just become stale.
-    pub(super) fn poll(&mut self, now: Timestamp, began: Timestamp, limits: &Limits) -> Option<Result<u64, Fault>> {
-        let stale = self.fault.is_none() && now > self.stale_from(began, limits);
-        if stale { self.turn(Some(Fault::Stale), 0) } else { None }
+    /// Nothing good came for too long, on a signal that was good; says so.
+    pub(super) fn turn_stale(&mut self) -> Fault {
+        self.turn(Some(Fault::Stale), 0);
+        Fault::Stale
     }
 
     /// From when on the signal is called stale if nothing good comes: its age counts from when somebody began to listen.

@@ -56,7 +56,7 @@ impl Engine {
     /// The core and the files round it.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
         let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
-        let names: Vec<String> = service.config.interfaces.iter().map(|i| i.name.clone()).collect();
+        let names = service.config.interface_names();
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
         let mut stamped_s = 0.0;

@@ -36,7 +36,7 @@ fn log(config: &Config, folder: &Path) -> LogSource {
     let encoder = InputEncoder::new(&config.monitor.input);
     let mut protector = InputProtector::new(&config.monitor.guards);
     let options = LogOptions {
-        interfaces: config.interfaces.iter().map(|i| i.name.clone()).collect(),
+        interfaces: config.interface_names(),
         strict: true,
         csv: CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: false },
         encode_row: Box::new(move |values, frames| {
@@ -54,16 +54,11 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     let config = config();
     let mut source = log(&config, folder.path());
     let settings = Settings {
-        speed: None,
-        from: None,
-        until: None,
-        sleep_gap_s: 30.0,
         snapshot: true,
         snapshot_at: seconds.map(|seconds| When::After(seconds * 1_000_000_000)),
-        restore: None,
         away: Some(Away::AsStamped),
         store,
-        interfaces: vec!["can0".to_owned()],
+        ..Settings::plain(30.0, config.interface_names())
     };
     let monitor = Monitor::new(config.monitor);
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()

@@ -1,0 +1,25 @@
+//! The estimators' work that benches share: the example pack's cells, and what is measured of them.
+
+use packwatch::cell::CellStep;
+use packwatch::config::{self, Config};
+
+/// `config/example.toml`.
+pub(crate) fn example() -> Config {
+    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
+    config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
+}
+
+/// Ten readings a second under a load that turns round every 30 s; cells differ by some millivolts, and eight share a
+/// temperature.
+pub(crate) fn reading(k: u32, cell: usize) -> CellStep {
+    let current_a = if k % 600 < 300 { 1.0 } else { -1.0 };
+    CellStep {
+        measured_s: 0.1,
+        charge_as: 0.1 * current_a,
+        unmeasured_s: 0.0,
+        current_a: Some(current_a),
+        temperature_c: Some(25.0 + (cell / 8) as f64),
+        ambient_c: 25.0,
+        voltage_v: 3.7 - 0.05 * current_a + 0.0005 * cell as f64,
+    }
+}
