@@ -128,6 +128,8 @@ impl Ticks {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const EVERY: Option<Timestamp> = Some(Timestamp::from_nanos(i64::MIN));
@@ -214,5 +216,41 @@ mod tests {
         assert_eq!(ticks.pop(None), None);
         ticks.advance(Timestamp::from_nanos(45_000_000));
         assert_eq!(ticks.pop(EVERY), Some(Timestamp::from_nanos(30_000_000)));
+    }
+
+    proptest! {
+        /// Records some ms apart, backwards and after holes, for a core that cares for a tick every so often.
+        #[test]
+        fn records_taken_within_give_the_ticks_of_records_taken_one_by_one(
+            steps in prop::collection::vec(prop_oneof![12 => 0_i64..7, 1 => -30_i64..200, 1 => -9_000_i64..9_000], 1..200),
+            every_ms in 1_i64..60,
+        ) {
+            let (mut within, mut plain) = (Ticks::new(10, 0.05), Ticks::new(10, 0.05));
+            // The next tick that each core cares for, and its ticks.
+            let (mut dues, mut made) = ([None; 2], [const { Vec::new() }; 2]);
+            let (mut now_ms, mut short) = (100_000, 0);
+            for step in steps {
+                now_ms += step;
+                let now = Timestamp::from_nanos(now_ms * 1_000_000);
+                for (which, ticks) in [&mut within, &mut plain].into_iter().enumerate() {
+                    if which == 0 && ticks.advance_within(now, dues[0]) {
+                        short += 1;
+                        continue;
+                    }
+                    ticks.advance(now);
+                    while ticks.is_pending() {
+                        if let Some(tick) = ticks.pop(dues[which]) {
+                            dues[which] = Some(tick.plus_nanos(every_ms * 1_000_000));
+                            made[which].push(tick);
+                        }
+                    }
+                }
+                // A record may bring the next tick forward, as an alarm does.
+                if now_ms % 17 == 0 {
+                    dues = [Some(now.plus_nanos(3_000_000)); 2];
+                }
+            }
+            prop_assert_eq!(&made[0], &made[1], "{} taken within", short);
+        }
     }
 }

@@ -398,8 +398,9 @@ impl Sampler {
         for (slots, limits) in parts {
             let mut oldest = now;
             for signal in &self.state.signals[slots] {
-                oldest = oldest.min(signal.heard_at().filter(|&heard| heard >= began)?);
-                share = share.max(signal.bad_share().unwrap_or(0.0));
+                let (heard, bad_share) = signal.latest_since(began)?;
+                oldest = oldest.min(heard);
+                share = if bad_share > share { bad_share } else { share };
             }
             let silence_s = now.since(oldest);
             if silence_s > limits.max_age_s {
@@ -424,7 +425,8 @@ impl Sampler {
     pub fn voltages_fresh(&self, now: Timestamp) -> bool {
         let first = 1 + self.sensors;
         let voltages = &self.state.signals[first..first + self.voltages];
-        voltages.iter().all(|signal| signal.fresh(now, &self.config.voltage).is_some())
+        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good_at()?)));
+        oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
     }
 
     /// Whether any signal the estimates are made of is bad or stale.

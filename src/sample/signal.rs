@@ -136,6 +136,12 @@ impl Signal {
         self.heard
     }
 
+    /// When anything came, and the share of bad readings; `None` = nothing since `began`.
+    #[inline]
+    pub(super) fn latest_since(&self, began: Timestamp) -> Option<(Timestamp, f64)> {
+        Some((self.heard.filter(|&heard| heard >= began)?, self.bad_share))
+    }
+
     /// Share of bad readings, the recent ones weighing most; `None` before the first reading.
     pub(super) fn bad_share(&self) -> Option<f64> {
         (self.readings > 0).then_some(self.bad_share)

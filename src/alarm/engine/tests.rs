@@ -242,3 +242,29 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
     assert_eq!(engine.get(Rule::CapacityLow, CELL).map(|alarm| alarm.occurrences), Some(0), "forgotten");
     assert_eq!(engine.count(), 2);
 }
+
+#[test]
+fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
+    let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
+    let mut seen = AlarmEngine::new(rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec(), 2);
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    let (mut quiet, mut loud, mut changes) = (0, 0, Vec::new());
+    for second in 0..5000 {
+        let (now, r) = (at(f64::from(second)), rules[rng.random_range(0..3)]);
+        let cell = [None, CELL, Some(CellIndex(1)), Some(CellIndex(2))][rng.random_range(0..4)];
+        // Now and then a stretch beyond the threshold.
+        let value = rng.random_range(0.0..3.2) + if second % 1000 > 900 { 1.0 } else { 0.0 };
+        let mut shown = seen.clone();
+        let is_quiet = seen.is_quiet(r, value);
+        let before = changes.len();
+        see(&mut seen, now, r, cell, Some(value), &mut changes);
+        if is_quiet {
+            shown.show(r, cell, value);
+            assert_eq!(format!("{shown:?}"), format!("{seen:?}"), "{r:?} {cell:?} {value}");
+            assert_eq!(changes.len(), before);
+        }
+        quiet += u32::from(is_quiet);
+        loud += u32::from(!is_quiet);
+    }
+    assert!(quiet > 500 && loud > 500 && changes.len() > 4, "{quiet} quiet, {loud} loud, {} changes", changes.len());
+}

@@ -1,5 +1,7 @@
 //! Scenarios over the whole sample stage; the charge counter's arithmetic is tested beside it.
 
+use proptest::prelude::*;
+
 use super::*;
 
 fn at(seconds: f64) -> Timestamp {
@@ -289,4 +291,66 @@ fn every_slot_is_found_again_through_its_channel() {
     let slots: Vec<_> = sampler.channels().iter().map(|&channel| sampler.slot(channel)).collect();
     assert_eq!(slots.len(), 1 + 86 + 1024);
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
+}
+
+/// Readings of a cell as they may come: mostly ordinary ones, some that are not.
+fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
+    let volts = prop_oneof![
+        8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),
+        1 => prop::sample::select(vec![Ok(f64::NAN), Ok(1.0), Ok(9.0), Ok(4.2), Err(Fault::NotAvailable)]),
+    ];
+    let cell = (0_u16..4).prop_map(|cell| Channel::CellVoltage(CellIndex(cell)));
+    prop_oneof![
+        8 => (cell, volts),
+        1 => (-5.0..8.0).prop_map(|current_a| (Channel::Current, Ok(current_a))),
+        1 => (20.0..30.0).prop_map(|celsius| (SENSOR, Ok(celsius))),
+        1 => Just((Channel::PackVoltage, Ok(3.7))),
+    ]
+}
+
+proptest! {
+    /// Steps of time in units of 0.1 s: none, a few, backwards, and some after which values are too old.
+    #[test]
+    fn an_ordinary_voltage_is_taken_as_any_other_reading_is(
+        source in prop::sample::select(vec![VoltageSource::Cells, VoltageSource::PackTotal { series: 1 }]),
+        readings in prop::collection::vec((reading(), prop_oneof![6 => 0_i32..3, 1 => -4_i32..80]), 1..300),
+    ) {
+        let mut config = SampleConfig { voltage_source: source, reported_soc: Some(limits(0.0, 1.0, 5.0)), ..config() };
+        config.voltage = Limits { max_rate_per_s: Some(0.3), stuck_after_s: Some(2.0), ..config.voltage };
+        let (mut quick, mut plain) = (Bench::new(config.clone()), Bench::new(config));
+        let (mut tenths, mut ordinary) = (0, 0);
+        for ((channel, value), step) in readings {
+            tenths += step;
+            let time = f64::from(tenths) / 10.0;
+            let short = match (channel, value) {
+                (Channel::CellVoltage(cell), Ok(volts)) => quick.sampler.take_ordinary_voltage(at(time), cell, volts),
+                _ => None,
+            };
+            ordinary += usize::from(short.is_some());
+            let sample = short.or_else(|| quick.give(time, channel, value));
+            prop_assert_eq!(sample, plain.give(time, channel, value));
+            let (quick, plain) = (&quick.sampler, &plain.sampler);
+            prop_assert_eq!((quick.any_lost(), quick.voltages_fresh(at(time))), (plain.any_lost(), plain.voltages_fresh(at(time))));
+        }
+        prop_assert_eq!(format!("{:?}", quick.sampler.snapshot()), format!("{:?}", plain.sampler.snapshot()));
+        prop_assert_eq!(quick.changes, plain.changes);
+        prop_assert!(source == VoltageSource::Cells || ordinary == 0);
+    }
+
+    #[test]
+    fn the_number_of_bad_signals_is_that_of_the_bad_signals(
+        readings in prop::collection::vec((reading(), 0_i32..80), 1..100),
+    ) {
+        let mut bench = Bench::new(config());
+        let mut tenths = 0;
+        for ((channel, value), step) in readings {
+            tenths += step;
+            bench.give(f64::from(tenths) / 10.0, channel, value);
+            bench.sampler.poll(at(f64::from(tenths) / 10.0 + 0.05), &mut bench.changes);
+            let bad = bench.sampler.state.signals.iter().filter(|signal| signal.is_bad()).count();
+            prop_assert_eq!(bench.sampler.bad_signals, bad);
+            let restored = bench.sampler.clone().restore(&bench.sampler.snapshot());
+            prop_assert_eq!(restored, Ok(()));
+        }
+    }
 }
