@@ -19,7 +19,7 @@ use std::array::from_fn;
 
 use super::super::noise::{MAX_WALK_S, REST_REPEATS_S};
 use super::super::{BRANCHES, CAPACITY, LOG_RESISTANCE, square};
-use super::tables::{ERROR_V, Spot, Tables, branch};
+use super::tables::{Around, ERROR_V, Spot, Tables, branch};
 use crate::cell::config::{Discretisation, EstimatorConfig};
 use crate::cell::model::{CellModel, ERROR_WINDOW_S};
 use crate::filter::lanes::{Lanes, Mask};
@@ -61,10 +61,9 @@ pub(super) struct Input<const L: usize> {
     pub(super) charge_as: Lanes<L>,
     pub(super) current_a: Lanes<L>,
     pub(super) voltage_v: Lanes<L>,
+    pub(super) temperature_c: Lanes<L>,
     /// What the measured time leaves of memories.
     pub(super) kept: Kept<L>,
-    /// Places of the temperatures in the tables: [`Tables::isotherm`].
-    pub(super) isotherms: [usize; L],
 }
 
 /// What a time leaves of what fades with it.
@@ -285,16 +284,18 @@ impl<const L: usize> Ratios<L> {
 /// One ordinary step.
 #[inline(always)]
 pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &mut Around<L, W>,
     c: &Constants,
     before: &State<L, N, T>,
     input: &Input<L>,
 ) -> (State<L, N, T>, Outcome<L>) {
+    tables.warm(around, &input.temperature_c);
     let ratio = before.mean[LOG_RESISTANCE].exp();
-    let (mean, covariance, has_factor) = predict(tables, c, before, input, ratio);
+    let (mean, covariance, has_factor) = predict(tables, around, c, before, input, ratio);
     let mut x = State { mean, covariance, memory: before.memory };
     let information_s = remember(c, &mut x, input);
-    let mut outcome = update(tables, c, &mut x, input, ratio, information_s);
+    let mut outcome = update(tables, around, c, &mut x, input, ratio, information_s);
     x.memory[INFORMATION_S] = Lanes::splat(0.0);
     let forget = Lanes::splat(1.0) - input.kept.consistency;
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
@@ -324,8 +325,8 @@ struct BranchAt<const L: usize> {
 
 impl<const L: usize> BranchAt<L> {
     #[inline(always)]
-    fn new<const W: usize>(tables: &Tables<W>, c: &Constants, input: &Input<L>, spot: &Spot<L>, i: usize) -> Self {
-        let (r_ohm, tau_s) = tables.branch(spot, i - BRANCHES);
+    fn new<const W: usize>(c: &Constants, input: &Input<L>, spot: &Spot<L, W>, i: usize) -> Self {
+        let (r_ohm, tau_s) = spot.branch(i - BRANCHES);
         let ratio = input.measured_s / tau_s;
         let exact = (-ratio).exp();
         let one = Lanes::splat(1.0);
@@ -403,21 +404,20 @@ struct BranchParts<const L: usize> {
 /// first column has other tables, that of the second another resistance.
 #[inline(always)]
 fn branch_parts<const L: usize, const N: usize, const W: usize>(
-    tables: &Tables<W>,
     c: &Constants,
     input: &Input<L>,
-    spots: &[Spot<L>; 3],
+    spots: &[Spot<L, W>; 3],
     l: &[[Lanes<L>; N]; COLUMNS],
     (i, before_v, drive, ratios): (usize, Lanes<L>, Lanes<L>, &Ratios<L>),
 ) -> BranchParts<L> {
     let one = Lanes::splat(1.0);
-    let here = BranchAt::new(tables, c, input, &spots[0], i);
+    let here = BranchAt::new(c, input, &spots[0], i);
     let kept = here.kept;
     let gain = here.r_ohm * drive * (one - kept);
     let centre_v = gain + before_v * kept;
     let reach = l[0][i] * c.scale;
-    let plus = BranchAt::new(tables, c, input, &spots[1], i).voltage_v(drive * ratios.first[0], before_v + reach);
-    let minus = BranchAt::new(tables, c, input, &spots[2], i).voltage_v(drive * ratios.first[1], before_v - reach);
+    let plus = BranchAt::new(c, input, &spots[1], i).voltage_v(drive * ratios.first[0], before_v + reach);
+    let minus = BranchAt::new(c, input, &spots[2], i).voltage_v(drive * ratios.first[1], before_v - reach);
     let mut parts = Parts::NONE;
     parts.put(c, 0, plus, minus, centre_v);
     parts.odd[1] = gain * ratios.second[0] + kept * l[1][i];
@@ -430,7 +430,8 @@ fn branch_parts<const L: usize, const N: usize, const W: usize>(
 /// The circuit's equations over the measured time: mean, covariance, and where the covariance before had a factor.
 #[inline(always)]
 fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &mut Around<L, W>,
     c: &Constants,
     x: &State<L, N, T>,
     input: &Input<L>,
@@ -441,7 +442,7 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     let charge_ah = input.charge_as * (1.0 / 3600.0);
     let moved = charge_ah / x.mean[CAPACITY];
     let soc = soc_parts(c, &l, x.mean[CAPACITY], charge_ah);
-    let spots = tables.spots(&input.isotherms, x.mean[0] - moved * 0.5, l[0][0] * c.scale);
+    let spots = tables.spots(around, x.mean[0] - moved * 0.5, l[0][0] * c.scale);
     let ratios = Ratios::new(c, &l);
     let mean_current_a = (input.charge_as / dt).or_else(dt.above_number(0.0), Lanes::splat(0.0));
     let drive = ratio * mean_current_a;
@@ -458,7 +459,7 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     p[log_resistance] = p[log_resistance] + dt.at_most(MAX_WALK_S) * c.log_resistance_variance_per_s;
     let mut done = [(Parts::NONE, Lanes::splat(0.0)); N];
     for i in BRANCHES..N {
-        let branch = branch_parts(tables, c, input, &spots, &l, (i, x.mean[i], drive, &ratios));
+        let branch = branch_parts(c, input, &spots, &l, (i, x.mean[i], drive, &ratios));
         let Parts { odd, even } = branch.parts;
         let u_shift = branch.parts.shift(c);
         done[i] = (branch.parts, branch.kept);
@@ -527,7 +528,8 @@ struct Foreseen<const L: usize> {
 impl<const L: usize> Foreseen<L> {
     #[inline(always)]
     fn new<const N: usize, const T: usize, const W: usize>(
-        tables: &Tables<W>,
+        tables: &mut Tables<W>,
+        around: &mut Around<L, W>,
         c: &Constants,
         x: &State<L, N, T>,
         input: &Input<L>,
@@ -535,21 +537,22 @@ impl<const L: usize> Foreseen<L> {
         ratio: Lanes<L>,
     ) -> Self {
         let reach = l[0][0] * c.scale;
-        let spots = tables.spots(&input.isotherms, x.mean[0], reach);
-        let ratios = Ratios::new(c, l);
-        let (mut ocv_v, slope_v, r0_ohm) = tables.ocv_and_r0(&spots[0]);
-        let (plus_v, _, plus_ohm) = tables.ocv_and_r0(&spots[1]);
-        let (minus_v, _, minus_ohm) = tables.ocv_and_r0(&spots[2]);
-        let mut side_v = [plus_v, minus_v];
         let mut parts = Parts::NONE;
-        if c.ocv_ageing_shift != 0.0 {
-            (ocv_v, side_v) = aged_voltages(tables, c, x, input, l, &mut parts);
+        let aged = (c.ocv_ageing_shift != 0.0).then(|| aged_voltages(tables, around, c, x, l, &mut parts));
+        let spots = tables.spots(around, x.mean[0], reach);
+        let ratios = Ratios::new(c, l);
+        let (mut ocv_v, slope_v, r0_ohm) = spots[0].ocv_and_r0();
+        let (plus_v, _, plus_ohm) = spots[1].ocv_and_r0();
+        let (minus_v, _, minus_ohm) = spots[2].ocv_and_r0();
+        let mut side_v = [plus_v, minus_v];
+        if let Some(aged) = aged {
+            (ocv_v, side_v) = aged;
         }
         let mut settled_ohm = r0_ohm;
         let mut branches_v = Lanes::splat(0.0);
         let mut branches = [Lanes::splat(0.0); COLUMNS];
         for i in BRANCHES..N {
-            settled_ohm = settled_ohm + tables.one(&spots[0], branch(i - BRANCHES));
+            settled_ohm = settled_ohm + spots[0].one(branch(i - BRANCHES));
             branches_v = branches_v + x.mean[i];
             for k in 0..COLUMNS {
                 branches[k] = branches[k] + l[k][i];
@@ -565,7 +568,7 @@ impl<const L: usize> Foreseen<L> {
         parts.even[1] = parts.even[1] - drop_v * ratios.second[1];
         parts.odd[2] = parts.odd[2] - branches[2];
         let base_variance = if tables.has_error() {
-            tables.one(&spots[0], ERROR_V).square() * ERROR_WINDOW_S
+            spots[0].one(ERROR_V).square() * ERROR_WINDOW_S
         } else {
             Lanes::splat(c.model_variance)
         };
@@ -577,10 +580,10 @@ impl<const L: usize> Foreseen<L> {
 /// another.
 #[inline(always)]
 fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &Around<L, W>,
     c: &Constants,
     x: &State<L, N, T>,
-    input: &Input<L>,
     l: &[[Lanes<L>; N]; COLUMNS],
     parts: &mut Parts<L>,
 ) -> (Lanes<L>, [Lanes<L>; 2]) {
@@ -599,7 +602,7 @@ fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>
     // A loop, not seven copies of the look-up: few cells are modelled so.
     let mut voltages = [Lanes::splat(0.0); 7];
     for (voltage, (soc, capacity_ah)) in voltages.iter_mut().zip(places) {
-        *voltage = aged_ocv_v(tables, c, &input.isotherms, soc, capacity_ah);
+        *voltage = aged_ocv_v(tables, around, c, soc, capacity_ah);
     }
     let [centre_v, plus, minus, plus_1, minus_1, plus_2, minus_2] = voltages;
     parts.put(c, 1, plus_1, minus_1, centre_v);
@@ -610,7 +613,8 @@ fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>
 /// The measurement update: moves `x`, whether that may be used or not.
 #[inline(always)]
 fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &mut Around<L, W>,
     c: &Constants,
     x: &mut State<L, N, T>,
     input: &Input<L>,
@@ -618,7 +622,7 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     information_s: Lanes<L>,
 ) -> Outcome<L> {
     let Factor { columns: l, rest, is_positive } = Factor::<L, N>::new(&x.covariance);
-    let foreseen = Foreseen::new(tables, c, x, input, &l, ratio);
+    let foreseen = Foreseen::new(tables, around, c, x, input, &l, ratio);
     let Parts { odd, even } = foreseen.parts;
     let shift_v = foreseen.parts.shift(c);
 
@@ -666,9 +670,9 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
 /// Open-circuit voltage of a cell that has aged to a capacity, V: that of a new one at [`CellModel::ocv_soc`].
 #[inline(always)]
 fn aged_ocv_v<const L: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &Around<L, W>,
     c: &Constants,
-    isotherms: &[usize; L],
     soc: Lanes<L>,
     capacity_ah: Lanes<L>,
 ) -> Lanes<L> {
@@ -676,5 +680,5 @@ fn aged_ocv_v<const L: usize, const W: usize>(
     let lost = (one - capacity_ah / c.new_capacity_ah) * c.ocv_ageing_shift;
     let inside = soc.at_least(0.0).at_most(1.0);
     let soc = soc + lost.at_least(-0.9).at_most(0.9) * inside * (one - inside);
-    tables.ocv_and_r0(&tables.spot(isotherms, soc)).0
+    tables.ocv_v(around, &soc)
 }
