@@ -11,9 +11,9 @@ use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lanes<const L: usize>(pub [f64; L]);
 
-/// L answers.
+/// L answers, all bits set for yes and none for no: as wide as the numbers they choose between.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Mask<const L: usize>(pub [bool; L]);
+pub struct Mask<const L: usize>([u64; L]);
 
 macro_rules! arithmetic {
     ($trait:ident, $method:ident, $op:tt) => {
@@ -70,16 +70,47 @@ impl<const L: usize> Not for Mask<L> {
 }
 
 impl<const L: usize> Mask<L> {
+    /// The answers a function gives.
+    #[inline(always)]
+    pub fn from_fn(mut answer: impl FnMut(usize) -> bool) -> Self {
+        Self(from_fn(|i| if answer(i) { u64::MAX } else { 0 }))
+    }
+
+    /// The same answer in every lane.
+    #[inline(always)]
+    pub const fn splat(answer: bool) -> Self {
+        Self([if answer { u64::MAX } else { 0 }; L])
+    }
+
+    /// The answer of a lane.
+    #[inline(always)]
+    pub fn lane(self, lane: usize) -> bool {
+        self.0[lane] != 0
+    }
+
+    /// Changes the answer of a lane.
+    #[inline(always)]
+    pub fn set_lane(&mut self, lane: usize, answer: bool) {
+        self.0[lane] = if answer { u64::MAX } else { 0 };
+    }
+
     /// Whether every lane says yes.
     #[inline(always)]
     pub fn all(self) -> bool {
-        self.0.iter().all(|&lane| lane)
+        self.0.iter().fold(u64::MAX, |all, lane| all & lane) != 0
+    }
+
+    /// Whether one lane alone says yes.
+    #[inline(always)]
+    pub fn is_one(self) -> bool {
+        // Yes is -1.
+        self.0.iter().fold(0, |sum: u64, lane| sum.wrapping_add(*lane)) == u64::MAX
     }
 
     /// Whether any lane says yes.
     #[inline(always)]
     pub fn any(self) -> bool {
-        self.0.iter().any(|&lane| lane)
+        self.0.iter().fold(0, |any, lane| any | lane) != 0
     }
 }
 
@@ -145,25 +176,25 @@ impl<const L: usize> Lanes<L> {
     /// Whether each lane is above the other's; no where one is NaN.
     #[inline(always)]
     pub fn above(self, other: Self) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i] > other.0[i]))
+        Mask::from_fn(|i| self.0[i] > other.0[i])
     }
 
     /// The same for one limit.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i] > limit))
+        Mask::from_fn(|i| self.0[i] > limit)
     }
 
     /// Whether each lane is neither NaN nor infinite.
     #[inline(always)]
     pub fn is_finite(self) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i].abs() < f64::INFINITY))
+        Mask::from_fn(|i| self.0[i].abs() < f64::INFINITY)
     }
 
     /// Each lane of `self` where the mask says yes, else of `other`.
     #[inline(always)]
     pub fn or_else(self, mask: Mask<L>, other: Self) -> Self {
-        Self(from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
+        Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
     /// e^x to within three units in the last place; 0 below -708, e^709 above 709

@@ -95,13 +95,13 @@ macro_rules! each_lane {
 /// The inputs of a block's cells.
 #[derive(Debug, Clone, Copy)]
 struct BlockInput {
-    is_present: [bool; WIDTH],
+    is_present: Mask<WIDTH>,
     input: Input<WIDTH>,
 }
 
 impl BlockInput {
     const NONE: Self = Self {
-        is_present: [false; WIDTH],
+        is_present: Mask::splat(false),
         input: Input {
             measured_s: Lanes([1.0; WIDTH]),
             charge_as: Lanes([0.0; WIDTH]),
@@ -172,7 +172,7 @@ impl EstimatorBank {
             None => self.modelled_c(cell, step),
         };
         let (block, lane) = (&mut self.inputs[cell / WIDTH], cell % WIDTH);
-        block.is_present[lane] = true;
+        block.is_present.set_lane(lane, true);
         let input = &mut block.input;
         input.temperature_c.0[lane] = temperature_c;
         input.measured_s.0[lane] = step.measured_s;
@@ -376,10 +376,11 @@ impl<const N: usize, const T: usize, const W: usize> StepAll<'_, N, T, W> {
     #[inline(always)]
     fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
-        for (block, input) in self.inputs.iter_mut().enumerate() {
+        for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
             // Ordinary by its input, but not by what came of it.
             for lane in 0..WIDTH {
-                if std::mem::take(&mut input.is_present[lane]) {
+                if input.is_present.lane(lane) {
+                    input.is_present.set_lane(lane, false);
                     self.others.push((block * WIDTH + lane, input.step(lane)));
                 }
             }
@@ -420,30 +421,29 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
     ) {
         let states = self.blocks.iter_mut().zip(&mut self.around).zip(inputs);
         for (((state, around), block), (cells, results)) in states.zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH))) {
-            let count = block.is_present.iter().filter(|&&present| present).count();
-            if count == 0 {
+            if !block.is_present.any() {
                 continue;
             }
             block.fill_absent();
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             let (around, own) = around;
-            if !WIDE || count == 1 {
+            if !WIDE || block.is_present.is_one() {
                 for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
-                    if block.is_present[lane] {
+                    if block.is_present.lane(lane) {
                         step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell, result);
                     }
                 }
                 continue;
             }
             let (new, outcome) = kernel::step(&mut self.tables, around, c, state, &block.input);
-            let made = outcome.is_usable & Mask(block.is_present);
+            let made = outcome.is_usable & block.is_present;
             if made.all() {
                 *state = new;
             } else {
                 state.take_where(made, &new);
             }
             for lane in 0..cells.len() {
-                if made.0[lane] {
+                if made.lane(lane) {
                     block.note(lane, lane, &outcome, &mut cells[lane], &mut results[lane]);
                 }
             }
@@ -505,7 +505,7 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
 ) {
     let one = State::of_lane(state, lane);
     let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
-    if outcome.is_usable.0[0] {
+    if outcome.is_usable.lane(0) {
         state.set_lane(lane, &new);
         block.note(lane, 0, &outcome, cell, result);
     }
@@ -515,10 +515,10 @@ impl BlockInput {
     /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
     #[inline(always)]
     fn fill_absent(&mut self) {
-        let present = self.is_present.iter().position(|&present| present).unwrap_or(0);
-        let time_s = self.input.measured_s.0[present];
-        for (time, is_present) in self.input.measured_s.0.iter_mut().zip(self.is_present) {
-            *time = if is_present { *time } else { time_s };
+        if !self.is_present.all() {
+            let present = (0..WIDTH).position(|lane| self.is_present.lane(lane)).unwrap_or(0);
+            let time_s = Lanes::splat(self.input.measured_s.0[present]);
+            self.input.measured_s = self.input.measured_s.or_else(self.is_present, time_s);
         }
     }
 
@@ -547,7 +547,7 @@ impl BlockInput {
         cell: &mut Cell,
         result: &mut StepResult,
     ) {
-        self.is_present[lane] = false;
+        self.is_present.set_lane(lane, false);
         cell.memory.last_current_a = self.input.current_a.0[lane];
         cell.memory.temperature_c = Some(self.input.temperature_c.0[lane]);
         (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);

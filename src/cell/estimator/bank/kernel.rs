@@ -208,26 +208,11 @@ struct Factor<const L: usize, const N: usize> {
 impl<const L: usize, const N: usize> Factor<L, N> {
     #[inline(always)]
     fn new<const T: usize>(covariance: &[Lanes<L>; T]) -> Self {
-        let zero = Lanes::splat(0.0);
-        let mut columns = [[zero; N]; COLUMNS];
-        for k in 0..COLUMNS {
-            // NaN where there is no factor: it goes on into every result.
-            let mut pivot = covariance[at(k, k)];
-            for done in &columns[..k] {
-                pivot = pivot - done[k].square();
-            }
-            let root = pivot.sqrt();
-            let inverse = root.reciprocal();
-            columns[k][k] = root;
-            for i in k + 1..N {
-                let mut below = covariance[at(i, k)];
-                for done in &columns[..k] {
-                    below = below - done[i] * done[k];
-                }
-                columns[k][i] = below * inverse;
-            }
-        }
-        let mut rest = [[zero; N]; N];
+        let first = column::<L, N, T, 0>(covariance, []);
+        let second = column::<L, N, T, 1>(covariance, [&first]);
+        let third = column::<L, N, T, 2>(covariance, [&first, &second]);
+        let columns = [first, second, third];
+        let mut rest = [[Lanes::splat(0.0); N]; N];
         for i in COLUMNS..N {
             for j in COLUMNS..=i {
                 let mut left = covariance[at(i, j)];
@@ -241,14 +226,30 @@ impl<const L: usize, const N: usize> Factor<L, N> {
     }
 }
 
+/// Column K of the factor, from those before it. NaN where there is none: it goes on into every result.
+#[inline(always)]
+fn column<const L: usize, const N: usize, const T: usize, const K: usize>(
+    covariance: &[Lanes<L>; T],
+    done: [&[Lanes<L>; N]; K],
+) -> [Lanes<L>; N] {
+    let left = |i: usize| done.iter().fold(covariance[at(i, K)], |left, done| left - done[i] * done[K]);
+    let root = left(K).sqrt();
+    let inverse = root.reciprocal();
+    let mut column = [Lanes::splat(0.0); N];
+    column[K] = root;
+    for i in K + 1..N {
+        column[i] = left(i) * inverse;
+    }
+    column
+}
+
 /// Whether what is left has a factor, too.
 #[inline(always)]
 fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mask<L> {
-    let zero = Lanes::splat(0.0);
     let mut left = *rest;
-    let mut positive = Mask([true; L]);
+    let mut positive = Mask::splat(true);
     for k in COLUMNS..N {
-        positive = positive & left[k][k].above(zero);
+        positive = positive & left[k][k].above_number(0.0);
         for i in k + 1..N {
             let factor = left[i][k] / left[k][k];
             for j in k + 1..=i {
