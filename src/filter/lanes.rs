@@ -201,7 +201,21 @@ impl<const L: usize> Lanes<L> {
     /// and for NaN: who must know of a NaN looks at what it was made of.
     #[inline(always)]
     pub fn exp(self) -> Self {
-        Self(from_fn(|i| exp(self.0[i])))
+        // x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n
+        // is added to the exponent's bits.
+        let x = self.at_most(709.0);
+        let clamped = x.at_least(LEAST);
+        let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
+        let n = shifted - ROUNDER;
+        let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
+        // Even and odd powers apart: two short chains instead of a long one.
+        let r2 = r.square();
+        let even = EXP_EVEN.iter().fold(Self::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
+        let odd = EXP_ODD.iter().fold(Self::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
+        let series = even + odd * r;
+        // The lowest bits of `shifted` are n; those above fall off.
+        let scale = |i: usize| series.0[i].to_bits().wrapping_add(shifted.0[i].to_bits() << 52);
+        Self(from_fn(|i| f64::from_bits(scale(i)))).or_else(x.above_number(LEAST), Self::splat(0.0))
     }
 
     /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
@@ -209,25 +223,6 @@ impl<const L: usize> Lanes<L> {
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))
     }
-}
-
-/// x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n is
-/// added to the exponent's bits.
-#[inline(always)]
-fn exp(x: f64) -> f64 {
-    let x = if x < 709.0 { x } else { 709.0 };
-    let clamped = if x > LEAST { x } else { LEAST };
-    let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
-    let n = shifted - ROUNDER;
-    let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
-    // Even and odd powers apart: two short chains instead of a long one.
-    let r2 = r * r;
-    let even = EXP_EVEN.iter().fold(1.0 / 479_001_600.0, |sum, factor| sum * r2 + factor);
-    let odd = EXP_ODD.iter().fold(1.0 / 39_916_800.0, |sum, factor| sum * r2 + factor);
-    let series = even + odd * r;
-    // The lowest bits of `shifted` are n; those above fall off.
-    let scaled = f64::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 52));
-    if x > LEAST { scaled } else { 0.0 }
 }
 
 /// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).

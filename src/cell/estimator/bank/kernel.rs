@@ -301,14 +301,11 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     let forget = Lanes::splat(1.0) - input.kept.consistency;
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
     // One number that is not finite makes the sum one that is not.
-    let mut sum = x.mean[0];
-    for number in x.mean[1..].iter().chain(&x.covariance) {
+    let mut sum = outcome.innovation_variance + outcome.test_ratio;
+    for number in x.mean.iter().chain(&x.covariance) {
         sum = sum + *number;
     }
-    let mut least = x.covariance[at(0, 0)];
-    for i in 1..N {
-        least = least.smaller(x.covariance[at(i, i)]);
-    }
+    let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
     (x, outcome)
 }
@@ -659,12 +656,13 @@ fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     for i in 0..N {
         let gain = cross[i] * inverse;
         x.mean[i] = x.mean[i] + gain * innovation_v;
-        for j in 0..=i {
-            x.covariance[at(i, j)] = x.covariance[at(i, j)] - gain * cross[j];
+        for j in 0..N {
+            if j <= i {
+                x.covariance[at(i, j)] = x.covariance[at(i, j)] - gain * cross[j];
+            }
         }
     }
-    let is_within = !test_ratio.above_number(c.gate_limit) & total.above_number(0.0) & total.is_finite();
-    let is_usable = is_positive & is_within & test_ratio.is_finite();
+    let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.gate_limit);
     Outcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
 }
 
