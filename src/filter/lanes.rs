@@ -201,27 +201,57 @@ impl<const L: usize> Lanes<L> {
     /// and for NaN: who must know of a NaN looks at what it was made of.
     #[inline(always)]
     pub fn exp(self) -> Self {
-        // x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n
-        // is added to the exponent's bits.
         let x = self.at_most(709.0);
-        let clamped = x.at_least(LEAST);
-        let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
-        let n = shifted - ROUNDER;
-        let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
-        // Even and odd powers apart: two short chains instead of a long one.
-        let r2 = r.square();
-        let even = EXP_EVEN.iter().fold(Self::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
-        let odd = EXP_ODD.iter().fold(Self::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
-        let series = even + odd * r;
-        // The lowest bits of `shifted` are n; those above fall off.
-        let scale = |i: usize| series.0[i].to_bits().wrapping_add(shifted.0[i].to_bits() << 52);
-        Self(from_fn(|i| f64::from_bits(scale(i)))).or_else(x.above_number(LEAST), Self::splat(0.0))
+        let series = ExpSeries::new(x.at_least(LEAST));
+        let scaled = series.scaled(series.even + series.odd, |bits, exponent| bits.wrapping_add(exponent));
+        scaled.or_else(x.above_number(LEAST), Self::splat(0.0))
+    }
+
+    /// e^x and e^-x, to within three units in the last place; x is held within 708, and there where it is NaN.
+    #[inline(always)]
+    pub fn exp_of_both_signs(self) -> (Self, Self) {
+        let series = ExpSeries::new(self.at_most(-LEAST).at_least(LEAST));
+        (
+            series.scaled(series.even + series.odd, |bits, exponent| bits.wrapping_add(exponent)),
+            series.scaled(series.even - series.odd, |bits, exponent| bits.wrapping_sub(exponent)),
+        )
     }
 
     /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
     #[inline(always)]
     pub fn ln(self) -> Self {
         Self(from_fn(|i| ln(self.0[i])))
+    }
+}
+
+/// x = n ln 2 + r with |r| <= ln 2 / 2, and e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16).
+struct ExpSeries<const L: usize> {
+    /// A number with n in its lowest bits.
+    shifted: Lanes<L>,
+    /// Even powers of r.
+    even: Lanes<L>,
+    /// Odd ones.
+    odd: Lanes<L>,
+}
+
+impl<const L: usize> ExpSeries<L> {
+    #[inline(always)]
+    fn new(x: Lanes<L>) -> Self {
+        let shifted = x * std::f64::consts::LOG2_E + ROUNDER;
+        let n = shifted - ROUNDER;
+        let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
+        // Even and odd powers apart: two short chains instead of a long one.
+        let r2 = r.square();
+        let even = EXP_EVEN.iter().fold(Lanes::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
+        let odd = EXP_ODD.iter().fold(Lanes::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
+        Self { shifted, even, odd: odd * r }
+    }
+
+    /// A sum with n added to its exponent's bits, or taken off.
+    #[inline(always)]
+    fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
+        // What is above n in `shifted` falls off.
+        Lanes(from_fn(|i| f64::from_bits(change(sum.0[i].to_bits(), self.shifted.0[i].to_bits() << 52))))
     }
 }
 

@@ -73,27 +73,32 @@ pub(super) struct Kept<const L: usize> {
     load: Lanes<L>,
     /// Of the consistency monitor's.
     consistency: Lanes<L>,
+    /// 1 / time, 1/s; 0 where no time passed.
+    per_s: Lanes<L>,
 }
 
 impl<const L: usize> Kept<L> {
     /// Nothing fades.
-    pub(super) const NONE: Self = Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]) };
+    pub(super) const NONE: Self = Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
 
     #[inline(always)]
     pub(super) fn after(c: &Constants, time_s: Lanes<L>) -> Self {
         Self {
             load: (-(time_s / c.load_memory_s)).exp(),
             consistency: (-(time_s.at_least(1e-3) / c.consistency_window_s)).exp(),
+            per_s: time_s.reciprocal().or_else(time_s.above_number(0.0), Lanes::splat(0.0)),
         }
     }
 
     /// The same of every lane.
     pub(super) fn splat(one: &Kept<1>) -> Self {
-        Self { load: Lanes::splat(one.load.0[0]), consistency: Lanes::splat(one.consistency.0[0]) }
+        let splat = |x: &Lanes<1>| Lanes::splat(x.0[0]);
+        Self { load: splat(&one.load), consistency: splat(&one.consistency), per_s: splat(&one.per_s) }
     }
 
     pub(super) fn lane(&self, lane: usize) -> Kept<1> {
-        Kept { load: Lanes([self.load.0[lane]]), consistency: Lanes([self.consistency.0[lane]]) }
+        let take = |x: &Lanes<L>| Lanes([x.0[lane]]);
+        Kept { load: take(&self.load), consistency: take(&self.consistency), per_s: take(&self.per_s) }
     }
 }
 
@@ -271,12 +276,11 @@ struct Ratios<const L: usize> {
 impl<const L: usize> Ratios<L> {
     #[inline(always)]
     fn new<const N: usize>(c: &Constants, columns: &[[Lanes<L>; N]; COLUMNS]) -> Self {
-        let up = (columns[0][LOG_RESISTANCE] * c.scale).exp();
-        let grown = (columns[1][LOG_RESISTANCE] * c.scale).exp();
-        let shrunk = grown.reciprocal();
+        let (up, down) = (columns[0][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
+        let (grown, shrunk) = (columns[1][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
         let per_scale = 1.0 / c.scale;
         Self {
-            first: [up, up.reciprocal()],
+            first: [up, down],
             second: [(grown - shrunk) * (0.5 * per_scale), ((grown + shrunk) * 0.5 - Lanes::splat(1.0)) * per_scale],
         }
     }
@@ -368,14 +372,15 @@ impl<const L: usize> Parts<L> {
     }
 }
 
-/// SOC after the charge `charge_ah` was taken out, `moved` at the centre: linear but for the charge over the capacity.
+/// What the charge `charge_ah` that was taken out does to the SOC: what it loses at the centre, and over the pairs, linear
+/// but for the charge over the capacity.
 #[inline(always)]
 fn soc_parts<const L: usize, const N: usize>(
     c: &Constants,
     l: &[[Lanes<L>; N]; COLUMNS],
     capacity_ah: Lanes<L>,
     charge_ah: Lanes<L>,
-) -> Parts<L> {
+) -> (Lanes<L>, Parts<L>) {
     let per_capacity = capacity_ah.reciprocal();
     let mut parts = Parts::NONE;
     for k in 0..COLUMNS {
@@ -385,7 +390,7 @@ fn soc_parts<const L: usize, const N: usize>(
         parts.even[k] = -(parts.odd[k] * spread * per_capacity);
     }
     parts.odd[0] = parts.odd[0] + l[0][0];
-    parts
+    (charge_ah * per_capacity, parts)
 }
 
 /// What a branch becomes.
@@ -438,12 +443,10 @@ fn predict<const L: usize, const N: usize, const T: usize, const W: usize>(
     let Factor { columns: l, is_positive, .. } = Factor::<L, N>::new(&x.covariance);
     let dt = input.measured_s;
     let charge_ah = input.charge_as * (1.0 / 3600.0);
-    let moved = charge_ah / x.mean[CAPACITY];
-    let soc = soc_parts(c, &l, x.mean[CAPACITY], charge_ah);
+    let (moved, soc) = soc_parts(c, &l, x.mean[CAPACITY], charge_ah);
     let spots = tables.spots(around, x.mean[0] - moved * 0.5, l[0][0] * c.scale);
     let ratios = Ratios::new(c, &l);
-    let mean_current_a = (input.charge_as / dt).or_else(dt.above_number(0.0), Lanes::splat(0.0));
-    let drive = ratio * mean_current_a;
+    let drive = ratio * (input.charge_as * input.kept.per_s);
 
     let soc_shift = soc.shift(c);
     let (mut mean, mut p) = (x.mean, x.covariance);
@@ -491,7 +494,7 @@ fn remember<const L: usize, const N: usize, const T: usize>(
     let dt = input.measured_s;
     let moved_as = input.charge_as.abs();
     let load_a = x.memory[LOAD_A];
-    let mean_a = moved_as / dt;
+    let mean_a = moved_as * input.kept.per_s;
     let kept_a = mean_a + (load_a - mean_a) * input.kept.load;
     x.memory[LOAD_A] = kept_a.or_else(dt.above_number(0.0), load_a);
 
