@@ -420,7 +420,9 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         results: &mut [StepResult],
     ) {
         let states = self.blocks.iter_mut().zip(&mut self.around).zip(inputs);
-        for (((state, around), block), (cells, results)) in states.zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH))) {
+        for (((state, around), block), (cells, results)) in
+            states.zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH)))
+        {
             if !block.is_present.any() {
                 continue;
             }

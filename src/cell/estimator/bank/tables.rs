@@ -74,8 +74,8 @@ impl<const W: usize> Tables<W> {
     pub(super) fn new(model: &CellModel) -> Self {
         let temperatures = model.temperature_c.len();
         let intervals = model.soc.len() - 1;
-        let nodes = (0..=temperatures)
-            .flat_map(|t| (0..intervals).map(move |s| row(model, t.min(temperatures - 1), s)));
+        let nodes =
+            (0..=temperatures).flat_map(|t| (0..intervals).map(move |s| row(model, t.min(temperatures - 1), s)));
         let mut borders = model.soc.clone();
         (borders[0], borders[intervals]) = (f64::NEG_INFINITY, f64::INFINITY);
         Self {
