@@ -11,9 +11,9 @@ use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lanes<const L: usize>(pub [f64; L]);
 
-/// L answers.
+/// L answers, all bits set for yes and none for no: as wide as the numbers they choose between.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Mask<const L: usize>(pub [bool; L]);
+pub struct Mask<const L: usize>([u64; L]);
 
 macro_rules! arithmetic {
     ($trait:ident, $method:ident, $op:tt) => {
@@ -70,16 +70,47 @@ impl<const L: usize> Not for Mask<L> {
 }
 
 impl<const L: usize> Mask<L> {
+    /// The answers a function gives.
+    #[inline(always)]
+    pub fn from_fn(mut answer: impl FnMut(usize) -> bool) -> Self {
+        Self(from_fn(|i| if answer(i) { u64::MAX } else { 0 }))
+    }
+
+    /// The same answer in every lane.
+    #[inline(always)]
+    pub const fn splat(answer: bool) -> Self {
+        Self([if answer { u64::MAX } else { 0 }; L])
+    }
+
+    /// The answer of a lane.
+    #[inline(always)]
+    pub fn lane(self, lane: usize) -> bool {
+        self.0[lane] != 0
+    }
+
+    /// Changes the answer of a lane.
+    #[inline(always)]
+    pub fn set_lane(&mut self, lane: usize, answer: bool) {
+        self.0[lane] = if answer { u64::MAX } else { 0 };
+    }
+
     /// Whether every lane says yes.
     #[inline(always)]
     pub fn all(self) -> bool {
-        self.0.iter().all(|&lane| lane)
+        self.0.iter().fold(u64::MAX, |all, lane| all & lane) != 0
+    }
+
+    /// Whether one lane alone says yes.
+    #[inline(always)]
+    pub fn is_one(self) -> bool {
+        // Yes is -1.
+        self.0.iter().fold(0, |sum: u64, lane| sum.wrapping_add(*lane)) == u64::MAX
     }
 
     /// Whether any lane says yes.
     #[inline(always)]
     pub fn any(self) -> bool {
-        self.0.iter().any(|&lane| lane)
+        self.0.iter().fold(0, |any, lane| any | lane) != 0
     }
 }
 
@@ -145,32 +176,45 @@ impl<const L: usize> Lanes<L> {
     /// Whether each lane is above the other's; no where one is NaN.
     #[inline(always)]
     pub fn above(self, other: Self) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i] > other.0[i]))
+        Mask::from_fn(|i| self.0[i] > other.0[i])
     }
 
     /// The same for one limit.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i] > limit))
+        Mask::from_fn(|i| self.0[i] > limit)
     }
 
     /// Whether each lane is neither NaN nor infinite.
     #[inline(always)]
     pub fn is_finite(self) -> Mask<L> {
-        Mask(from_fn(|i| self.0[i].abs() < f64::INFINITY))
+        Mask::from_fn(|i| self.0[i].abs() < f64::INFINITY)
     }
 
     /// Each lane of `self` where the mask says yes, else of `other`.
     #[inline(always)]
     pub fn or_else(self, mask: Mask<L>, other: Self) -> Self {
-        Self(from_fn(|i| if mask.0[i] { self.0[i] } else { other.0[i] }))
+        Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
     /// e^x to within three units in the last place; 0 below -708, e^709 above 709
     /// and for NaN: who must know of a NaN looks at what it was made of.
     #[inline(always)]
     pub fn exp(self) -> Self {
-        Self(from_fn(|i| exp(self.0[i])))
+        let x = self.at_most(709.0);
+        let series = ExpSeries::new(x.at_least(LEAST));
+        let scaled = series.scaled(series.even + series.odd, |bits, exponent| bits.wrapping_add(exponent));
+        scaled.or_else(x.above_number(LEAST), Self::splat(0.0))
+    }
+
+    /// e^x and e^-x, to within three units in the last place; x is held within 708, and there where it is NaN.
+    #[inline(always)]
+    pub fn exp_of_both_signs(self) -> (Self, Self) {
+        let series = ExpSeries::new(self.at_most(-LEAST).at_least(LEAST));
+        (
+            series.scaled(series.even + series.odd, |bits, exponent| bits.wrapping_add(exponent)),
+            series.scaled(series.even - series.odd, |bits, exponent| bits.wrapping_sub(exponent)),
+        )
     }
 
     /// ln x for a normal, positive x, to within two units in the last place of the larger of it and 1e-3.
@@ -180,23 +224,35 @@ impl<const L: usize> Lanes<L> {
     }
 }
 
-/// x = n ln 2 + r with |r| <= ln 2 / 2; e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16), then n is
-/// added to the exponent's bits.
-#[inline(always)]
-fn exp(x: f64) -> f64 {
-    let x = if x < 709.0 { x } else { 709.0 };
-    let clamped = if x > LEAST { x } else { LEAST };
-    let shifted = clamped * std::f64::consts::LOG2_E + ROUNDER;
-    let n = shifted - ROUNDER;
-    let r = (clamped - n * LN_2_HIGH) - n * LN_2_LOW;
-    // Even and odd powers apart: two short chains instead of a long one.
-    let r2 = r * r;
-    let even = EXP_EVEN.iter().fold(1.0 / 479_001_600.0, |sum, factor| sum * r2 + factor);
-    let odd = EXP_ODD.iter().fold(1.0 / 39_916_800.0, |sum, factor| sum * r2 + factor);
-    let series = even + odd * r;
-    // The lowest bits of `shifted` are n; those above fall off.
-    let scaled = f64::from_bits(series.to_bits().wrapping_add(shifted.to_bits() << 52));
-    if x > LEAST { scaled } else { 0.0 }
+/// x = n ln 2 + r with |r| <= ln 2 / 2, and e^r by its Taylor series to r^12 / 12! (the rest is below 2e-16).
+struct ExpSeries<const L: usize> {
+    /// A number with n in its lowest bits.
+    shifted: Lanes<L>,
+    /// Even powers of r.
+    even: Lanes<L>,
+    /// Odd ones.
+    odd: Lanes<L>,
+}
+
+impl<const L: usize> ExpSeries<L> {
+    #[inline(always)]
+    fn new(x: Lanes<L>) -> Self {
+        let shifted = x * std::f64::consts::LOG2_E + ROUNDER;
+        let n = shifted - ROUNDER;
+        let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
+        // Even and odd powers apart: two short chains instead of a long one.
+        let r2 = r.square();
+        let even = EXP_EVEN.iter().fold(Lanes::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
+        let odd = EXP_ODD.iter().fold(Lanes::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
+        Self { shifted, even, odd: odd * r }
+    }
+
+    /// A sum with n added to its exponent's bits, or taken off.
+    #[inline(always)]
+    fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
+        // What is above n in `shifted` falls off.
+        Lanes(from_fn(|i| f64::from_bits(change(sum.0[i].to_bits(), self.shifted.0[i].to_bits() << 52))))
+    }
 }
 
 /// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).

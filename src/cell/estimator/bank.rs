@@ -10,9 +10,11 @@
 mod kernel;
 mod tables;
 
+use std::array::from_fn;
+
 use kernel::{Constants, INFORMATION_S, Input, Kept, LOAD_A, MEAN_NIS, Outcome, REST_S, State, at};
 use nalgebra::{SMatrix, SVector};
-use tables::Tables;
+use tables::{Around, Tables};
 
 use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, StepResult, thermal_c, widened};
 use crate::cell::config::EstimatorConfig;
@@ -46,8 +48,6 @@ struct Cell {
     /// What the kernel works with (load, consistency, information, rest) is in the lane.
     memory: Memory,
     has_filter: bool,
-    /// Where the rows of its temperature were.
-    isotherm: usize,
 }
 
 impl Cell {
@@ -69,6 +69,8 @@ enum Filters {
 struct Lane<const N: usize, const T: usize, const W: usize> {
     tables: Tables<W>,
     blocks: Vec<State<WIDTH, N, T>>,
+    /// Of each block, for steps of all its cells together, and of each cell, for its own.
+    around: Vec<(Around<WIDTH, W>, [Around<1, W>; WIDTH])>,
     rhythm: Rhythm,
 }
 
@@ -93,22 +95,20 @@ macro_rules! each_lane {
 /// The inputs of a block's cells.
 #[derive(Debug, Clone, Copy)]
 struct BlockInput {
-    is_present: [bool; WIDTH],
-    temperature_c: [f64; WIDTH],
+    is_present: Mask<WIDTH>,
     input: Input<WIDTH>,
 }
 
 impl BlockInput {
     const NONE: Self = Self {
-        is_present: [false; WIDTH],
-        temperature_c: [25.0; WIDTH],
+        is_present: Mask::splat(false),
         input: Input {
             measured_s: Lanes([1.0; WIDTH]),
             charge_as: Lanes([0.0; WIDTH]),
             current_a: Lanes([0.0; WIDTH]),
             voltage_v: Lanes([0.0; WIDTH]),
+            temperature_c: Lanes([25.0; WIDTH]),
             kept: Kept::NONE,
-            isotherms: [0; WIDTH],
         },
     };
 }
@@ -123,7 +123,7 @@ impl EstimatorBank {
             _ => Filters::Three(Lane::new(model, blocks)),
         };
         let memory = CellEstimator::new(config).memory;
-        let cell = Cell { memory, has_filter: false, isotherm: 0 };
+        let cell = Cell { memory, has_filter: false };
         let idle = StepResult { update: None, reset: false };
         let mut bank = Self {
             constants: each_lane!(&filters, x => x.constants(model, config)),
@@ -172,9 +172,9 @@ impl EstimatorBank {
             None => self.modelled_c(cell, step),
         };
         let (block, lane) = (&mut self.inputs[cell / WIDTH], cell % WIDTH);
-        block.is_present[lane] = true;
-        block.temperature_c[lane] = temperature_c;
+        block.is_present.set_lane(lane, true);
         let input = &mut block.input;
+        input.temperature_c.0[lane] = temperature_c;
         input.measured_s.0[lane] = step.measured_s;
         input.charge_as.0[lane] = step.charge_as;
         input.current_a.0[lane] = current_a;
@@ -376,10 +376,11 @@ impl<const N: usize, const T: usize, const W: usize> StepAll<'_, N, T, W> {
     #[inline(always)]
     fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
-        for (block, input) in self.inputs.iter_mut().enumerate() {
+        for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
             // Ordinary by its input, but not by what came of it.
             for lane in 0..WIDTH {
-                if std::mem::take(&mut input.is_present[lane]) {
+                if input.is_present.lane(lane) {
+                    input.is_present.set_lane(lane, false);
                     self.others.push((block * WIDTH + lane, input.step(lane)));
                 }
             }
@@ -396,8 +397,10 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         let mut mean = [zero; N];
         mean[CAPACITY] = Lanes::splat(1e3);
         let state = State { mean, covariance, memory: [zero; kernel::MEMORY] };
+        let tables = Tables::new(model);
         Self {
-            tables: Tables::new(model),
+            around: vec![(Around::new(&tables), from_fn(|_| Around::new(&tables))); blocks],
+            tables,
             blocks: vec![state; blocks],
             rhythm: Rhythm { time_s: f64::NAN, kept: Kept::NONE },
         }
@@ -416,36 +419,33 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         cells: &mut [Cell],
         results: &mut [StepResult],
     ) {
-        let blocks = self.blocks.iter_mut().zip(inputs).zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH)));
-        for ((state, block), (cells, results)) in blocks {
-            let count = block.is_present.iter().filter(|&&present| present).count();
-            if count == 0 {
+        let states = self.blocks.iter_mut().zip(&mut self.around).zip(inputs);
+        for (((state, around), block), (cells, results)) in
+            states.zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH)))
+        {
+            if !block.is_present.any() {
                 continue;
-            }
-            self.tables.begin_block();
-            for (lane, cell) in cells.iter_mut().enumerate() {
-                cell.isotherm = self.tables.isotherm(block.temperature_c[lane], cell.isotherm);
-                block.input.isotherms[lane] = cell.isotherm;
             }
             block.fill_absent();
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
-            if !WIDE || count == 1 {
+            let (around, own) = around;
+            if !WIDE || block.is_present.is_one() {
                 for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
-                    if block.is_present[lane] {
-                        step_alone(&self.tables, c, state, block, lane, cell, result);
+                    if block.is_present.lane(lane) {
+                        step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell, result);
                     }
                 }
                 continue;
             }
-            let (new, outcome) = kernel::step(&self.tables, c, state, &block.input);
-            let made = outcome.is_usable & Mask(block.is_present);
+            let (new, outcome) = kernel::step(&mut self.tables, around, c, state, &block.input);
+            let made = outcome.is_usable & block.is_present;
             if made.all() {
                 *state = new;
             } else {
                 state.take_where(made, &new);
             }
             for lane in 0..cells.len() {
-                if made.0[lane] {
+                if made.lane(lane) {
                     block.note(lane, lane, &outcome, &mut cells[lane], &mut results[lane]);
                 }
             }
@@ -496,7 +496,8 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
 /// The step of one cell of a block. Not a part of the vector code: it is needed once, not once per width.
 #[inline(never)]
 fn step_alone<const N: usize, const T: usize, const W: usize>(
-    tables: &Tables<W>,
+    tables: &mut Tables<W>,
+    around: &mut Around<1, W>,
     c: &Constants,
     state: &mut State<WIDTH, N, T>,
     block: &mut BlockInput,
@@ -505,8 +506,8 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
     result: &mut StepResult,
 ) {
     let one = State::of_lane(state, lane);
-    let (new, outcome) = kernel::step(tables, c, &one, &block.input.lane(lane));
-    if outcome.is_usable.0[0] {
+    let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
+    if outcome.is_usable.lane(0) {
         state.set_lane(lane, &new);
         block.note(lane, 0, &outcome, cell, result);
     }
@@ -516,24 +517,24 @@ impl BlockInput {
     /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
     #[inline(always)]
     fn fill_absent(&mut self) {
-        let present = self.is_present.iter().position(|&present| present).unwrap_or(0);
-        let time_s = self.input.measured_s.0[present];
-        for (time, is_present) in self.input.measured_s.0.iter_mut().zip(self.is_present) {
-            *time = if is_present { *time } else { time_s };
+        if !self.is_present.all() {
+            let present = (0..WIDTH).position(|lane| self.is_present.lane(lane)).unwrap_or(0);
+            let time_s = Lanes::splat(self.input.measured_s.0[present]);
+            self.input.measured_s = self.input.measured_s.or_else(self.is_present, time_s);
         }
     }
 
     /// The step that was put into a lane.
     fn step(&self, lane: usize) -> CellStep {
-        let Self { temperature_c, input, .. } = self;
+        let input = &self.input;
         CellStep {
             measured_s: input.measured_s.0[lane],
             charge_as: input.charge_as.0[lane],
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
-            temperature_c: Some(temperature_c[lane]),
+            temperature_c: Some(input.temperature_c.0[lane]),
             // Not asked for where the temperature is known.
-            ambient_c: temperature_c[lane],
+            ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
         }
     }
@@ -548,9 +549,9 @@ impl BlockInput {
         cell: &mut Cell,
         result: &mut StepResult,
     ) {
-        self.is_present[lane] = false;
+        self.is_present.set_lane(lane, false);
         cell.memory.last_current_a = self.input.current_a.0[lane];
-        cell.memory.temperature_c = Some(self.temperature_c[lane]);
+        cell.memory.temperature_c = Some(self.input.temperature_c.0[lane]);
         (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
         let update = Update {
             innovation: outcome.innovation_v.0[from],
@@ -571,8 +572,8 @@ impl Input<WIDTH> {
             charge_as: take(&self.charge_as),
             current_a: take(&self.current_a),
             voltage_v: take(&self.voltage_v),
+            temperature_c: take(&self.temperature_c),
             kept: self.kept.lane(lane),
-            isotherms: [self.isotherms[lane]],
         }
     }
 }

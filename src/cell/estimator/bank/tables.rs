@@ -16,7 +16,7 @@ pub(super) const ERROR_V: usize = 4;
 /// Resistance of the first branch, ohm; then its time constant, s, then the next branch's.
 const BRANCHES: usize = 6;
 
-/// Temperatures whose rows are kept: more than a block has lanes.
+/// Temperatures whose rows are kept.
 const KEPT: usize = 64;
 
 /// Where branch `i`'s resistance is; its time constant follows.
@@ -28,25 +28,43 @@ pub(super) const fn branch(i: usize) -> usize {
 #[derive(Debug, Clone)]
 pub(super) struct Tables<const W: usize> {
     model: CellModel,
-    /// Where one interval of SOC ends and the next begins.
+    /// Where each interval of SOC ends and the next begins; beyond the ends of the tables the outer ones go on.
     borders: Vec<f64>,
     /// Rows at the model's temperatures, temperature by temperature; the highest twice, so that each has an upper neighbour.
     nodes: Vec<[f64; W]>,
     /// Rows at the temperatures of `kept`.
     rows: Vec<[f64; W]>,
     kept: [f64; KEPT],
-    /// The block of cells that needed each of them last.
-    needed_by: [u64; KEPT],
-    block: u64,
-    /// Which makes room next, if the present block does not need it.
+    /// Which makes room next.
     next: usize,
     has_error: bool,
 }
 
-/// Places of L cells in the tables.
+/// The lines of L cells at three places each, about its SOC and on both sides: kept from step to step, as a cell stays in
+/// an interval for thousands of them.
+#[derive(Debug, Clone)]
+pub(super) struct Around<const L: usize, const W: usize> {
+    temperature_c: [f64; L],
+    /// Where the rows of the temperatures were.
+    isotherms: [usize; L],
+    places: [Lines<L, W>; 3],
+}
+
+/// The lines of L cells at one place each.
+#[derive(Debug, Clone)]
+struct Lines<const L: usize, const W: usize> {
+    interval: [usize; L],
+    /// Where the intervals begin.
+    from: Lanes<L>,
+    /// Where the next ones do.
+    to: Lanes<L>,
+    row: [Lanes<L>; W],
+}
+
+/// Lines of L cells, and where on them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Spot<const L: usize> {
-    row: [usize; L],
+pub(super) struct Spot<'a, const L: usize, const W: usize> {
+    row: &'a [Lanes<L>; W],
     soc: Lanes<L>,
     /// SOC held at the ends of the tables.
     inside: Lanes<L>,
@@ -55,15 +73,16 @@ pub(super) struct Spot<const L: usize> {
 impl<const W: usize> Tables<W> {
     pub(super) fn new(model: &CellModel) -> Self {
         let temperatures = model.temperature_c.len();
-        let nodes = (0..=temperatures)
-            .flat_map(|t| (0..model.soc.len() - 1).map(move |s| row(model, t.min(temperatures - 1), s)));
+        let intervals = model.soc.len() - 1;
+        let nodes =
+            (0..=temperatures).flat_map(|t| (0..intervals).map(move |s| row(model, t.min(temperatures - 1), s)));
+        let mut borders = model.soc.clone();
+        (borders[0], borders[intervals]) = (f64::NEG_INFINITY, f64::INFINITY);
         Self {
-            borders: model.soc[1..model.soc.len() - 1].to_vec(),
+            borders,
             nodes: nodes.collect(),
-            rows: vec![[0.0; W]; KEPT * (model.soc.len() - 1)],
+            rows: vec![[0.0; W]; KEPT * intervals],
             kept: [f64::NAN; KEPT],
-            needed_by: [0; KEPT],
-            block: 0,
             next: 0,
             has_error: model.voltage_error_v.is_some(),
             model: model.clone(),
@@ -74,18 +93,9 @@ impl<const W: usize> Tables<W> {
         self.has_error
     }
 
-    /// The isotherms asked for from here on stay until this is called again; fewer than [`KEPT`] of them.
-    #[inline(always)]
-    pub(super) fn begin_block(&mut self) {
-        self.block += 1;
-    }
-
-    /// Number of the rows of a temperature; `hint` is what it was the last time.
-    #[inline(always)]
-    pub(super) fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
-        let slot = if self.kept[hint % KEPT] == temperature_c { hint % KEPT } else { self.find(temperature_c) };
-        self.needed_by[slot] = self.block;
-        slot
+    /// Number of the rows of a temperature, until the next is asked for; `hint` is what it was the last time.
+    fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
+        if self.kept[hint % KEPT] == temperature_c { hint % KEPT } else { self.find(temperature_c) }
     }
 
     /// The rows of a temperature are found among the kept ones, or made.
@@ -94,9 +104,6 @@ impl<const W: usize> Tables<W> {
     fn find(&mut self, temperature_c: f64) -> usize {
         if let Some(found) = self.kept.iter().position(|&kept| kept == temperature_c) {
             return found;
-        }
-        while self.needed_by[self.next] == self.block {
-            self.next = (self.next + 1) % KEPT;
         }
         let slot = self.next;
         self.next = (slot + 1) % KEPT;
@@ -116,65 +123,136 @@ impl<const W: usize> Tables<W> {
     }
 
     fn intervals(&self) -> usize {
-        self.borders.len() + 1
+        self.borders.len() - 1
     }
 
-    /// The places of L states of charge.
+    /// The interval of a state of charge.
+    fn interval(&self, soc: f64) -> usize {
+        self.borders[1..self.intervals()].iter().filter(|&&border| soc >= border).count()
+    }
+
+    /// Takes the lines of `around` at these temperatures.
     #[inline(always)]
-    pub(super) fn spot<const L: usize>(&self, isotherms: &[usize; L], soc: Lanes<L>) -> Spot<L> {
-        let mut interval = [0_u64; L];
-        for &border in &self.borders {
-            for (interval, soc) in interval.iter_mut().zip(soc.0) {
-                *interval += u64::from(soc >= border);
+    pub(super) fn warm<const L: usize>(&mut self, around: &mut Around<L, W>, temperature_c: &Lanes<L>) {
+        let same = (0..L).fold(true, |same, lane| same & (around.temperature_c[lane] == temperature_c.0[lane]));
+        if !same {
+            self.follow_temperatures(around, temperature_c);
+        }
+    }
+
+    #[cold]
+    #[inline(never)]
+    fn follow_temperatures<const L: usize>(&mut self, around: &mut Around<L, W>, temperature_c: &Lanes<L>) {
+        for lane in 0..L {
+            if around.temperature_c[lane] != temperature_c.0[lane] {
+                around.temperature_c[lane] = temperature_c.0[lane];
+                let isotherm = self.isotherm(temperature_c.0[lane], around.isotherms[lane]);
+                around.isotherms[lane] = isotherm;
+                around.places.iter_mut().for_each(|lines| self.copy(isotherm, lines, lane));
             }
         }
-        let mut row = [0; L];
-        for lane in 0..L {
-            row[lane] = isotherms[lane] * self.intervals() + interval[lane] as usize;
-        }
-        Spot { row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
-    /// The places of L states of charge, and of those `reach` above and below.
+    /// The places of L states of charge, and of those `reach` above and below, at the temperatures of the last
+    /// [`Self::warm`].
     #[inline(always)]
-    pub(super) fn spots<const L: usize>(&self, isotherms: &[usize; L], soc: Lanes<L>, reach: Lanes<L>) -> [Spot<L>; 3] {
-        [self.spot(isotherms, soc), self.spot(isotherms, soc + reach), self.spot(isotherms, soc - reach)]
+    pub(super) fn spots<'a, const L: usize>(
+        &mut self,
+        around: &'a mut Around<L, W>,
+        soc: Lanes<L>,
+        reach: Lanes<L>,
+    ) -> [Spot<'a, L, W>; 3] {
+        let all = [soc, soc + reach, soc - reach];
+        let mut same = true;
+        for (lines, soc) in around.places.iter().zip(&all) {
+            same = (0..L).fold(same, |same, lane| same & lines.holds(soc, lane));
+        }
+        if !same {
+            self.follow_charges(around, &all);
+        }
+        let [a, b, c] = &around.places;
+        [Spot::new(a, all[0]), Spot::new(b, all[1]), Spot::new(c, all[2])]
     }
 
-    /// Values at SOC 0 and slopes of the quantity at `at` and the one behind it.
-    #[inline(always)]
-    fn lines<const L: usize>(&self, spot: &Spot<L>, at: usize) -> [Lanes<L>; 4] {
-        let [mut a, mut b, mut c, mut d] = [[0.0; L]; 4];
-        for lane in 0..L {
-            let row = &self.rows[spot.row[lane]];
-            (a[lane], b[lane], c[lane], d[lane]) = (row[at], row[at + 1], row[at + 2], row[at + 3]);
+    #[cold]
+    #[inline(never)]
+    fn follow_charges<const L: usize>(&mut self, around: &mut Around<L, W>, all: &[Lanes<L>; 3]) {
+        for (lines, soc) in around.places.iter_mut().zip(all) {
+            for lane in 0..L {
+                if !lines.holds(soc, lane) {
+                    let interval = self.interval(soc.0[lane]);
+                    lines.interval[lane] = interval;
+                    (lines.from.0[lane], lines.to.0[lane]) = (self.borders[interval], self.borders[interval + 1]);
+                    let isotherm = self.isotherm(around.temperature_c[lane], around.isotherms[lane]);
+                    around.isotherms[lane] = isotherm;
+                    self.copy(isotherm, lines, lane);
+                }
+            }
         }
-        [Lanes(a), Lanes(b), Lanes(c), Lanes(d)]
+    }
+
+    /// Copies the lines of a lane's interval.
+    fn copy<const L: usize>(&self, isotherm: usize, lines: &mut Lines<L, W>, lane: usize) {
+        let row = &self.rows[isotherm * self.intervals() + lines.interval[lane]];
+        lines.row.iter_mut().zip(row).for_each(|(lanes, value)| lanes.0[lane] = *value);
+    }
+
+    /// Open-circuit voltages at other states of charge, V.
+    #[inline(never)]
+    pub(super) fn ocv_v<const L: usize>(&mut self, around: &Around<L, W>, soc: &Lanes<L>) -> Lanes<L> {
+        Lanes(std::array::from_fn(|lane| {
+            let isotherm = self.isotherm(around.temperature_c[lane], around.isotherms[lane]);
+            let row = &self.rows[isotherm * self.intervals() + self.interval(soc.0[lane])];
+            row[OCV_V] + row[OCV_V + 1] * soc.0[lane]
+        }))
+    }
+}
+
+impl<const L: usize, const W: usize> Around<L, W> {
+    /// Of no temperature yet.
+    pub(super) fn new(tables: &Tables<W>) -> Self {
+        let zero = Lanes::splat(0.0);
+        let lines = Lines {
+            interval: [0; L],
+            from: Lanes::splat(tables.borders[0]),
+            to: Lanes::splat(tables.borders[1]),
+            row: [zero; W],
+        };
+        Self { temperature_c: [f64::NAN; L], isotherms: [0; L], places: [lines.clone(), lines.clone(), lines] }
+    }
+}
+
+impl<const L: usize, const W: usize> Lines<L, W> {
+    /// Whether they are those of a lane's state of charge.
+    #[inline(always)]
+    fn holds(&self, soc: &Lanes<L>, lane: usize) -> bool {
+        (soc.0[lane] >= self.from.0[lane]) & (soc.0[lane] < self.to.0[lane])
+    }
+}
+
+impl<'a, const L: usize, const W: usize> Spot<'a, L, W> {
+    #[inline(always)]
+    fn new(lines: &'a Lines<L, W>, soc: Lanes<L>) -> Self {
+        Self { row: &lines.row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
     /// Open-circuit voltage, V, its slope, V per unit of SOC, and series resistance, ohm.
     #[inline(always)]
-    pub(super) fn ocv_and_r0<const L: usize>(&self, spot: &Spot<L>) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
-        let [ocv_v, slope_v, r0_ohm, per_soc] = self.lines(spot, OCV_V);
-        (ocv_v + slope_v * spot.soc, slope_v, r0_ohm + per_soc * spot.inside)
+    pub(super) fn ocv_and_r0(&self) -> (Lanes<L>, Lanes<L>, Lanes<L>) {
+        let slope_v = self.row[OCV_V + 1];
+        (self.row[OCV_V] + slope_v * self.soc, slope_v, self.one(R0_OHM))
     }
 
     /// Resistance, ohm, and time constant, s, of a branch.
     #[inline(always)]
-    pub(super) fn branch<const L: usize>(&self, spot: &Spot<L>, i: usize) -> (Lanes<L>, Lanes<L>) {
-        let [ohm, ohm_per_soc, tau_s, tau_per_soc] = self.lines(spot, branch(i));
-        (ohm + ohm_per_soc * spot.inside, tau_s + tau_per_soc * spot.inside)
+    pub(super) fn branch(&self, i: usize) -> (Lanes<L>, Lanes<L>) {
+        (self.one(branch(i)), self.one(branch(i) + 2))
     }
 
     /// One quantity, held at the ends of the tables.
     #[inline(always)]
-    pub(super) fn one<const L: usize>(&self, spot: &Spot<L>, at: usize) -> Lanes<L> {
-        let [mut start, mut slope] = [[0.0; L]; 2];
-        for lane in 0..L {
-            let row = &self.rows[spot.row[lane]];
-            (start[lane], slope[lane]) = (row[at], row[at + 1]);
-        }
-        Lanes(start) + Lanes(slope) * spot.inside
+    pub(super) fn one(&self, at: usize) -> Lanes<L> {
+        self.row[at] + self.row[at + 1] * self.inside
     }
 }
 
