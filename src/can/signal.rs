@@ -476,9 +476,7 @@ impl SignalPlan {
             ByteOrder::LittleEndian => {
                 (u128::from_le_bytes(bytes) & !place(self.all_ones()) | place(code)).to_le_bytes()
             }
-            ByteOrder::BigEndian => {
-                (u128::from_be_bytes(bytes) & !place(self.all_ones()) | place(code)).to_be_bytes()
-            }
+            ByteOrder::BigEndian => (u128::from_be_bytes(bytes) & !place(self.all_ones()) | place(code)).to_be_bytes(),
         };
         let bytes = changed(padded(payload, from));
         payload.iter_mut().skip(from).zip(bytes).for_each(|(to, byte)| *to = byte);

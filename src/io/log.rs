@@ -293,6 +293,7 @@ impl State {
             text = &text[line.line_len..];
             count += 1;
             if line.time < latest {
+                std::hint::cold_path();
                 backwards += 1;
             } else {
                 latest = line.time;

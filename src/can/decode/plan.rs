@@ -4,7 +4,9 @@
 //! for bit. What is rare (floats, signals over nine bytes, a code for "not available" amid the good ones, a selector with too
 //! many codes for a table) goes the binding's own way.
 
+use std::hint::cold_path;
 use std::ops::Range;
+use std::sync::Arc;
 
 use super::{Binding, Channel, MuxTest, Reading};
 use crate::can::Frame;
@@ -22,8 +24,6 @@ const MAX_VISITS: usize = 1 << 16;
 pub(super) struct Plans {
     numbers: IdTable,
     messages: Vec<MessagePlan>,
-    /// One for each binding.
-    signals: Vec<Plan>,
 }
 
 /// One message.
@@ -37,7 +37,10 @@ struct MessagePlan {
 /// Neighbours among the bindings that are there or not there together.
 #[derive(Debug, Clone, PartialEq)]
 struct Visit {
-    bindings: Range<usize>,
+    /// Those bindings, compiled; one list however many pages have it.
+    plans: Arc<[Plan]>,
+    /// The first of them among all bindings.
+    first: usize,
     /// Payloads of this length carry them all; [`NEVER`] where it is still to be found out whether they are there.
     bytes_needed: usize,
 }
@@ -56,20 +59,25 @@ struct Pages {
     visits: Vec<Visit>,
 }
 
+/// Words of a [`Wire`].
+const FAR: u8 = 2;
+
 /// Where the bits of a number are.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Place {
+    /// Which of [`Wire::words`]; for a signal that is in none of them, [`FAR`] more.
+    word: u8,
     /// Eight bytes of the payload from here on hold the signal.
     window: u8,
-    /// Which of [`Wire::words`].
-    word: u8,
     up: u8,
     down: u8,
 }
 
 impl Place {
     fn new(shifts: &Shifts) -> Self {
-        Self { window: shifts.window, word: u8::from(shifts.is_big_endian), up: shifts.up, down: shifts.down }
+        let order = u8::from(shifts.is_big_endian);
+        let word = if shifts.window == 0 { order } else { FAR + order };
+        Self { word, window: shifts.window, up: shifts.up, down: shifts.down }
     }
 }
 
@@ -92,33 +100,45 @@ struct Plan {
 
 /// A payload as signals are taken from it.
 struct Wire<'a> {
-    payload: &'a [u8],
-    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
-    words: [u64; 2],
     frame: &'a Frame,
+    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
+    words: [u64; FAR as usize],
 }
 
 impl<'a> Wire<'a> {
-    #[inline]
+    /// Of a frame with a payload.
+    #[inline(always)]
     fn new(frame: &'a Frame) -> Self {
         let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        Self { payload: frame.data(), words: [word, word.swap_bytes()], frame }
+        Self { frame, words: [word, word.swap_bytes()] }
+    }
+
+    #[inline(always)]
+    fn has(&self, bytes: usize) -> bool {
+        self.frame.len() >= bytes
     }
 
     /// The bits at a place, the lowest at the bottom.
     #[inline(always)]
     fn bits(&self, place: &Place) -> u64 {
-        let word = if place.window == 0 { self.words[usize::from(place.word & 1)] } else { self.far_word(place) };
+        let word = match self.words.get(usize::from(place.word)) {
+            Some(word) => *word,
+            None => {
+                cold_path();
+                self.far_word(place)
+            }
+        };
         word << (place.up & 63) >> (place.down & 63)
     }
 
     /// A word that does not begin with the payload.
+    #[inline(always)]
     fn far_word(&self, place: &Place) -> u64 {
         let from = usize::from(place.window);
         // The window of a signal lies within the longest payload.
         let bytes = self.frame.padded_data().get(from..).and_then(|rest| rest.first_chunk());
         let word = bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        if place.word == 0 { word } else { word.swap_bytes() }
+        if place.word == FAR { word } else { word.swap_bytes() }
     }
 }
 
@@ -130,7 +150,6 @@ impl Plans {
         Self {
             numbers: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
             messages: messages.iter().map(|runs| MessagePlan::new(bindings, runs)).collect(),
-            signals: bindings.iter().map(Plan::new).collect(),
         }
     }
 
@@ -140,18 +159,18 @@ impl Plans {
         let Some(message) = self.messages.get(self.numbers.number(bus, frame.id())) else { return };
         let wire = Wire::new(frame);
         for visit in message.visits(&wire) {
-            let range = visit.bindings.clone();
-            if wire.payload.len() < visit.bytes_needed {
-                decode_plainly(&bindings[range], wire.payload, &mut each);
+            if !wire.has(visit.bytes_needed) {
+                cold_path();
+                decode_plainly(&bindings[visit.first..][..visit.plans.len()], frame.data(), &mut each);
                 continue;
             }
-            let mut plans = self.signals[range.clone()].iter();
-            while let Some(plan) = plans.next() {
+            for (n, plan) in visit.plans.iter().enumerate() {
                 // Two places rather than one value made of both: the good one then stays in a register.
                 match plan.good(&wire) {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
                     None => {
-                        let value = plain_value(&bindings[range.end - 1 - plans.len()], wire.payload);
+                        cold_path();
+                        let value = plain_value(&bindings[visit.first + n], frame.data());
                         each(Reading { channel: plan.channel, value });
                     }
                 }
@@ -188,23 +207,33 @@ pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut im
 }
 
 impl Visit {
-    fn new(bindings: &[Binding], run: &Range<usize>, check: bool) -> Self {
-        let needed = bindings[run.clone()].iter().map(|binding| binding.plan.bytes_needed());
-        let bytes_needed = if check { NEVER } else { needed.max().unwrap_or(0) };
-        Self { bindings: run.clone(), bytes_needed }
+    /// Of neighbours that are certainly there.
+    fn new(bindings: &[Binding], run: &Range<usize>) -> Self {
+        let bindings = &bindings[run.clone()];
+        let bytes_needed = bindings.iter().map(|binding| binding.plan.bytes_needed()).max().unwrap_or(0);
+        Self { plans: bindings.iter().map(Plan::new).collect(), first: run.start, bytes_needed }
+    }
+
+    /// Of the same, of which it is still to be found out.
+    fn to_be_checked(&self) -> Self {
+        Self { bytes_needed: NEVER, ..self.clone() }
     }
 }
 
 impl MessagePlan {
     fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
-        let visit = |run: &Range<usize>| Visit::new(bindings, run, !bindings[run.start].mux.is_empty());
-        Self { all: runs.iter().map(visit).collect(), pages: Pages::new(bindings, runs) }
+        let visits: Vec<_> = runs.iter().map(|run| Visit::new(bindings, run)).collect();
+        let pages = Pages::new(bindings, runs, &visits);
+        let tests = |run: &Range<usize>| bindings[run.start].mux.len();
+        let all =
+            visits.into_iter().zip(runs).map(|(visit, run)| if tests(run) > 0 { visit.to_be_checked() } else { visit });
+        Self { all: all.collect(), pages }
     }
 
     #[inline]
     fn visits(&self, wire: &Wire<'_>) -> &[Visit] {
         match &self.pages {
-            Some(pages) if wire.payload.len() >= pages.bytes_needed => pages.of(wire),
+            Some(pages) if wire.has(pages.bytes_needed) => pages.of(wire),
             _ => &self.all,
         }
     }
@@ -212,7 +241,7 @@ impl MessagePlan {
 
 impl Pages {
     /// By the selector most runs depend on; `None` without one, or when a table would be too large.
-    fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Option<Self> {
+    fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[Visit]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
         let selector = runs.iter().flat_map(tests).map(|test| test.plan).max_by_key(|plan| dependents(*plan))?;
@@ -230,12 +259,12 @@ impl Pages {
         // The last code stands for every one above: no range reaches it.
         for code in 0..=codes {
             let start = pages.visits.len();
-            for run in runs {
+            for (run, visit) in runs.iter().zip(all) {
                 if !may_hold(selector, tests(run), code) {
                     continue;
                 }
                 let check = tests(run).iter().any(|test| test.plan != selector);
-                pages.visits.push(Visit::new(bindings, run, check));
+                pages.visits.push(if check { visit.to_be_checked() } else { visit.clone() });
             }
             pages.codes.push(start..pages.visits.len());
             if pages.visits.len() > MAX_VISITS {
@@ -265,7 +294,7 @@ impl Plan {
         let nothing = Self {
             channel,
             // One bit, and no code is good.
-            place: Place { window: 0, word: 0, up: 0, down: 63 },
+            place: Place { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,
             more_good: 0,

@@ -197,8 +197,11 @@ fn codes_for_not_available_are_told_at_the_ends_of_the_range_and_amid_it() {
     };
     for missing in [vec![], vec![0x80], vec![0x7F], vec![0x81, 0x80, 0x7F], vec![0xFF], vec![0x7E, 0x180]] {
         for code in i8::MIN..=i8::MAX {
-            let expected =
-                if missing.contains(&u64::from(code.cast_unsigned())) { Err(Fault::NotAvailable) } else { Ok(f64::from(code)) };
+            let expected = if missing.contains(&u64::from(code.cast_unsigned())) {
+                Err(Fault::NotAvailable)
+            } else {
+                Ok(f64::from(code))
+            };
             assert_eq!(value(missing.clone(), code), expected, "{missing:X?}");
         }
     }

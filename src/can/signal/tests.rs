@@ -169,7 +169,8 @@ fn a_code_with_more_bits_than_the_signal_is_refused() {
 #[test]
 fn nearest_is_what_round_gives_at_every_kind_of_number() {
     let half_below = 0.5_f64.next_down();
-    let ends = [0.0, -0.0, 0.5, half_below, 0.5_f64.next_up(), 1.5, 2.5, 4503599627370495.5, 4503599627370497.0, 1e18, 1e19];
+    let ends =
+        [0.0, -0.0, 0.5, half_below, 0.5_f64.next_up(), 1.5, 2.5, 4503599627370495.5, 4503599627370497.0, 1e18, 1e19];
     let odd = [9223372036854774784.0, 9223372036854775808.0, f64::MAX, f64::INFINITY, f64::MIN_POSITIVE, 1e-320];
     for number in ends.into_iter().chain(odd).flat_map(|number| [number, -number]) {
         assert_eq!(nearest(number), number.round() as i64, "{number:?}");
