@@ -115,8 +115,7 @@ impl FloodGate {
     /// Whether a frame is taken in; time never runs backwards except after [`Self::restart`].
     #[inline]
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
-        let Some(found) = self.numbers.get(bus, id) else { return true };
-        let bucket = &mut self.buckets[found];
+        let Some(bucket) = self.buckets.get_mut(self.numbers.number(bus, id)) else { return true };
         let spent = bucket.spent_until.map_or(now, |spent| spent.max(now)).plus_nanos(self.frame_ns);
         if spent <= now.plus_nanos(bucket.burst_ns) {
             bucket.spent_until = Some(spent);

@@ -43,16 +43,17 @@ impl IdTable {
         table
     }
 
-    /// The message's number.
+    /// Where among things that are numbered as the messages (at most `u32::MAX` of them) the message's is; beyond their end
+    /// for a message that has none.
     #[inline]
-    pub(crate) fn get(&self, bus: BusIndex, id: CanId) -> Option<usize> {
-        let ids = self.buses.get(bus.index())?;
+    pub(crate) fn number(&self, bus: BusIndex, id: CanId) -> usize {
+        let Some(ids) = self.buses.get(bus.index()) else { return usize::MAX };
         let number = match id {
             CanId::Standard(raw) if usize::from(raw) < STANDARD_IDS => ids.standard[usize::from(raw)],
             _ => ids.others.binary_search_by_key(&id, |(id, _)| *id).map_or(NONE, |at| ids.others[at].1),
         };
         // Lossless: at least 32 bits on every machine this runs on.
-        (number != NONE).then_some(number as usize)
+        number as usize
     }
 }
 
@@ -86,7 +87,8 @@ mod tests {
             (BusIndex(1), CanId::Standard(0x100)),
         ];
         let table = IdTable::new(given);
-        let found = |bus, id| table.get(BusIndex(bus), id);
+        let numbers: Vec<usize> = (0..given.len()).collect();
+        let found = |bus, id| numbers.get(table.number(BusIndex(bus), id)).copied();
         assert_eq!(found(1, CanId::Extended(0x100)), Some(0));
         assert_eq!(found(1, CanId::Standard(0x100)), Some(1), "the first of two");
         assert_eq!(found(3, CanId::Standard(0x7FF)), Some(2));

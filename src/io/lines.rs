@@ -97,12 +97,13 @@ impl Lines {
         &self.buffer[self.start..self.end]
     }
 
-    /// Takes the first `len` bytes of [`unread`](Self::unread), which are one line with its line feed.
+    /// Takes the first `len` bytes of [`unread`](Self::unread), which are `count` lines with their line feeds.
     #[inline]
-    pub(super) fn take_line(&mut self, len: usize) {
-        debug_assert_eq!(memchr::memchr(b'\n', self.unread()), Some(len - 1), "one line");
+    pub(super) fn take_lines(&mut self, len: usize, count: u64) {
+        debug_assert_eq!(memchr::memchr_iter(b'\n', &self.unread()[..len]).count() as u64, count, "whole lines");
+        debug_assert!(len == 0 || self.unread()[len - 1] == b'\n', "the last is whole too");
         self.start += len;
-        self.number += 1;
+        self.number += count;
     }
 
     /// The next line, or `None` at the end.

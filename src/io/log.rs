@@ -4,6 +4,8 @@
 //! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
 //! after it, and an unknown gap is put before it. Everything that is not handed on is counted in [`LogCounts`].
 
+mod record;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,8 +19,10 @@ use super::journal::{self, Mark};
 use super::lines::{self, Lines, RawLine};
 use crate::can::Frame;
 use crate::can::decode::Channel;
-use crate::monitor::{Away, BusEvent, Command, Input};
+use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
+
+pub use record::{Batch, Record};
 
 /// Where a part with an unknown gap before it is put: this long after the record so far.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
@@ -54,108 +58,6 @@ impl std::fmt::Debug for LogOptions {
     }
 }
 
-/// An input that owns its frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Record {
-    /// A frame.
-    Frame {
-        /// When.
-        time: Timestamp,
-        /// Where.
-        bus: BusIndex,
-        /// What.
-        frame: Frame,
-    },
-    /// Only in journals.
-    Tick {
-        /// When.
-        time: Timestamp,
-    },
-    /// An interface event.
-    Bus {
-        /// When.
-        time: Timestamp,
-        /// Where.
-        bus: BusIndex,
-        /// What.
-        event: BusEvent,
-    },
-    /// The time between this and what came before is unknown.
-    UnknownGap {
-        /// The stamp from which the record goes on.
-        time: Timestamp,
-    },
-    /// Somebody asked for something.
-    Command {
-        /// When.
-        time: Timestamp,
-        /// What.
-        command: Command,
-    },
-    /// Whether files could be written changed.
-    Store {
-        /// When.
-        time: Timestamp,
-        /// They could.
-        works: bool,
-    },
-    /// The recorded run took another configuration over here.
-    Reload {
-        /// When.
-        time: Timestamp,
-    },
-    /// The recorded run took up a stored state here.
-    Restore {
-        /// When.
-        time: Timestamp,
-        /// How old the state was.
-        away: Away,
-    },
-}
-
-impl Record {
-    /// As the core takes it; `None` for what is not its input.
-    pub fn input(&self) -> Option<Input<'_>> {
-        Some(match self {
-            Self::Frame { time, bus, frame } => Input::Frame { time: *time, bus: *bus, frame },
-            Self::Tick { time } => Input::Tick { time: *time },
-            Self::Bus { time, bus, event } => Input::Bus { time: *time, bus: *bus, event: *event },
-            Self::UnknownGap { time } => Input::UnknownGap { time: *time },
-            Self::Command { time, command } => Input::Command { time: *time, command: *command },
-            Self::Store { time, works } => Input::Store { time: *time, works: *works },
-            Self::Restore { .. } | Self::Reload { .. } => return None,
-        })
-    }
-
-    /// Its stamp.
-    pub fn time(&self) -> Timestamp {
-        match *self {
-            Self::Frame { time, .. }
-            | Self::Tick { time }
-            | Self::Bus { time, .. }
-            | Self::UnknownGap { time }
-            | Self::Command { time, .. }
-            | Self::Store { time, .. }
-            | Self::Reload { time }
-            | Self::Restore { time, .. } => time,
-        }
-    }
-
-    fn at(mut self, placed: Timestamp) -> Self {
-        match &mut self {
-            Self::Frame { time, .. }
-            | Self::Tick { time }
-            | Self::Bus { time, .. }
-            | Self::UnknownGap { time }
-            | Self::Command { time, .. }
-            | Self::Store { time, .. }
-            | Self::Reload { time }
-            | Self::Restore { time, .. } => *time = placed,
-        }
-        self
-    }
-}
-
 /// What was read, and what of it was not handed on.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
@@ -183,36 +85,6 @@ pub struct LogCounts {
     pub unknown_gaps: u64,
     /// CSV values that no input frame could carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
-}
-
-/// Records in a row, of memory that is used again and again.
-#[derive(Debug)]
-pub struct Batch {
-    records: Box<[Record]>,
-    len: usize,
-    carries_ticks: bool,
-}
-
-impl Batch {
-    /// Most records at once: 12 KiB, which stay in the processor's nearest memory beside the estimators'.
-    pub const MAX: usize = 128;
-
-    /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may be read a little further
-    /// than the records used say.
-    pub fn new(max: usize) -> Self {
-        let nothing = Record::Tick { time: Timestamp::ZERO };
-        Self { records: vec![nothing; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
-    }
-
-    /// The records.
-    pub fn records(&self) -> &[Record] {
-        &self.records[..self.len]
-    }
-
-    /// Whether the log they are from carries its own ticks.
-    pub fn carries_ticks(&self) -> bool {
-        self.carries_ticks
-    }
 }
 
 /// Reads logs one after another.
@@ -248,8 +120,7 @@ struct State {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
-    /// Of the interfaces with names of usual length: the name as a usual line has it, and the number.
-    keys: Vec<(u64, BusIndex)>,
+    /// Knows the interfaces.
     usual: usual::UsualLines,
     /// Interfaces that are not configured get a number too.
     adopt: bool,
@@ -274,9 +145,8 @@ impl LogSource {
             state: State {
                 counts: LogCounts::default(),
                 strict: options.strict,
-                keys: keys(&options.interfaces),
+                usual: usual::UsualLines::new(&options.interfaces),
                 interfaces: options.interfaces,
-                usual: usual::UsualLines::default(),
                 adopt: false,
                 shift_ns: 0,
                 latest: None,
@@ -323,9 +193,10 @@ impl LogSource {
                 return Ok(Some(record));
             }
             if let Some(Open { form: Form::Text { lines, .. }, .. }) = &mut self.current
-                && let Some(record) = self.state.usual_record(lines)
+                && let mut slot = [record::NOTHING]
+                && self.state.usual_records(lines, &mut slot) > 0
             {
-                return Ok(Some(record));
+                return Ok(Some(slot[0]));
             }
             let Some(open) = &mut self.current else {
                 let Some(path) = self.files.pop_front() else { return Ok(None) };
@@ -371,18 +242,13 @@ impl LogSource {
             && self.queue.is_empty()
         {
             batch.carries_ticks = *journal;
-            while batch.len < batch.records.len()
-                && let Some(record) = self.state.usual_record(lines)
-            {
-                batch.records[batch.len] = record;
-                batch.len += 1;
-            }
+            batch.len = self.state.usual_records(lines, &mut batch.slots);
             if batch.len > 0 {
                 return Ok(true);
             }
         }
         let Some(record) = self.next_record()? else { return Ok(false) };
-        (batch.records[0], batch.len, batch.carries_ticks) = (record, 1, self.carries_ticks());
+        (batch.slots[0], batch.len, batch.carries_ticks) = (record, 1, self.carries_ticks());
         Ok(true)
     }
 
@@ -413,26 +279,33 @@ fn named_csv(path: &Path) -> bool {
     name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
-fn keys(interfaces: &[String]) -> Vec<(u64, BusIndex)> {
-    let numbered = (0..u8::MAX).map(BusIndex).zip(interfaces);
-    numbered.filter_map(|(bus, name)| Some((usual::name_key(name.as_bytes())?, bus))).collect()
-}
-
 impl State {
-    /// The next record of a text log, if it is a frame in a usual line of a known interface and not the first of its
-    /// file: exactly what the long way ([`next_text`](Self::next_text), [`place`](Self::place)) gives for it.
-    #[inline(always)]
-    fn usual_record(&mut self, lines: &mut Lines) -> Option<Record> {
-        let latest = self.latest.filter(|_| !self.fresh)?;
-        let line = self.usual.parse(lines.unread())?;
-        let bus = self.keys.iter().find(|(key, _)| *key == line.name_key)?.1;
-        lines.take_line(line.line_len);
-        self.counts.lines += 1;
-        self.counts.frames += 1;
-        let time = line.time.plus_nanos(self.shift_ns);
-        self.counts.time_backwards += u64::from(time < latest);
-        self.latest = Some(latest.max(time));
-        Some(Record::Frame { time, bus, frame: line.frame() })
+    /// The next records of a text log into these slots, as long as they are frames in usual lines of known interfaces and
+    /// not the first of their file; how many. Exactly what the long way ([`next_text`](Self::next_text),
+    /// [`place`](Self::place)) gives for them.
+    fn usual_records(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
+        let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
+        let all = lines.unread();
+        let (mut text, mut count, mut backwards) = (all, 0, 0);
+        for slot in slots {
+            let Some(line) = self.usual.parse(text) else { break };
+            *slot = Record::Frame { time: line.time, bus: line.bus, frame: line.frame() };
+            text = &text[line.line_len..];
+            count += 1;
+            if line.time < latest {
+                std::hint::cold_path();
+                backwards += 1;
+            } else {
+                latest = line.time;
+            }
+        }
+        let len = all.len() - text.len();
+        lines.take_lines(len, count);
+        self.counts.lines += count;
+        self.counts.frames += count;
+        self.counts.time_backwards += backwards;
+        self.latest = Some(latest);
+        count as usize
     }
 
     fn bad(&mut self, what: impl FnOnce() -> String) -> Result<(), LogError> {
@@ -545,7 +418,7 @@ impl State {
         let name = String::from_utf8_lossy(interface);
         if self.adopt && self.interfaces.len() < MAX_ADOPTED {
             self.interfaces.push(name.into_owned());
-            self.keys = keys(&self.interfaces);
+            self.usual.know(&self.interfaces);
             return u8::try_from(self.interfaces.len() - 1).ok().map(BusIndex);
         }
         let foreign = &mut self.counts.foreign;
@@ -588,6 +461,7 @@ impl State {
                 self.shift_ns = latest.plus_nanos(UNKNOWN_GAP_NS).nanos().saturating_sub(raw.nanos());
                 gap = true;
             }
+            self.usual.shift(self.shift_ns);
         }
         let time = raw.plus_nanos(self.shift_ns);
         if self.latest.is_some_and(|latest| time < latest) {

@@ -1,16 +1,18 @@
 //! The bindings compiled for reading: which message, which page of it, and per signal shifts, factors and limits.
 //!
 //! Everything here only finds sooner, and computes with fewer branches, what [`Binding`] says; results are the same bit
-//! for bit. What is rare (floats, signals over nine bytes, several codes for "not available", a selector with too many
-//! codes for a table) goes the binding's own way.
+//! for bit. What is rare (floats, signals over nine bytes, a code for "not available" amid the good ones, a selector with too
+//! many codes for a table) goes the binding's own way.
 
+use std::hint::cold_path;
 use std::ops::Range;
+use std::sync::Arc;
 
 use super::{Binding, Channel, MuxTest, Reading};
 use crate::can::Frame;
 use crate::can::id_table::IdTable;
 use crate::can::signal::{Shifts, SignalPlan, float_of_signed};
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Fault};
 
 /// Codes a selector may have to be looked up in a table: ten bits. Selectors have 4 to 8.
 const MAX_CODES: u64 = 1024;
@@ -22,8 +24,6 @@ const MAX_VISITS: usize = 1 << 16;
 pub(super) struct Plans {
     numbers: IdTable,
     messages: Vec<MessagePlan>,
-    /// One for each binding.
-    signals: Vec<Plan>,
 }
 
 /// One message.
@@ -37,40 +37,60 @@ struct MessagePlan {
 /// Neighbours among the bindings that are there or not there together.
 #[derive(Debug, Clone, PartialEq)]
 struct Visit {
-    bindings: Range<usize>,
-    /// Payloads of this length carry them all.
+    /// Those bindings, compiled; one list however many pages have it.
+    plans: Arc<[Plan]>,
+    /// The first of them among all bindings.
+    first: usize,
+    /// Payloads of this length carry them all; [`NEVER`] where it is still to be found out whether they are there.
     bytes_needed: usize,
-    /// Whether they are there is still to be found out.
-    check: bool,
 }
+
+/// More than any payload has.
+const NEVER: usize = usize::MAX;
 
 /// What a selector's codes bring.
 #[derive(Debug, Clone, PartialEq)]
 struct Pages {
-    selector: SignalPlan,
+    selector: Place,
     /// A payload of this length carries every selector of the message; of shorter ones, each signal is judged for itself.
     bytes_needed: usize,
-    /// Per code, and last for every code above: where its visits begin. One more at the end.
-    starts: Vec<usize>,
+    /// Per code, and last for every code above: where its visits are.
+    codes: Vec<Range<usize>>,
     visits: Vec<Visit>,
 }
 
-/// One signal: what a good code becomes. Whatever is not certainly good is left to the binding.
+/// Words of a [`Wire`].
+const FAR: u8 = 2;
+
+/// Where the bits of a number are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Place {
+    /// Which of [`Wire::words`]; for a signal that is in none of them, [`FAR`] more.
+    word: u8,
+    /// Eight bytes of the payload from here on hold the signal.
+    window: u8,
+    up: u8,
+    down: u8,
+}
+
+impl Place {
+    fn new(shifts: &Shifts) -> Self {
+        let order = u8::from(shifts.is_big_endian);
+        let word = if shifts.window == 0 { order } else { FAR + order };
+        Self { word, window: shifts.window, up: shifts.up, down: shifts.down }
+    }
+}
+
+/// One signal: what a good code becomes. Whatever is not certainly good is left to the binding. 64 bytes, the least that is
+/// loaded at once.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Plan {
     channel: Channel,
-    /// Eight bytes of the payload from here on hold the signal.
-    window: u8,
-    /// Which of [`Wire::words`].
-    word: u8,
-    up: u8,
-    down: u8,
+    place: Place,
     /// The highest bit of a signed signal, 0 for an unsigned one: flipped and subtracted it extends the sign.
     sign: u64,
-    /// A code that means "not available"; one that the signal cannot have where there is none.
-    not_available: u64,
-    /// Codes whose values are within the DBC's and the configured range: the first, and how many follow it.
-    first_good: i64,
+    /// Good codes, those within the DBC's and the configured range: the first, its sign flipped, and how many follow it.
+    first_good: u64,
     more_good: u64,
     factor: f64,
     offset: f64,
@@ -80,29 +100,45 @@ struct Plan {
 
 /// A payload as signals are taken from it.
 struct Wire<'a> {
-    payload: &'a [u8],
-    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
-    words: [u64; 2],
     frame: &'a Frame,
+    /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
+    words: [u64; FAR as usize],
 }
 
 impl<'a> Wire<'a> {
-    #[inline]
+    /// Of a frame with a payload.
+    #[inline(always)]
     fn new(frame: &'a Frame) -> Self {
         let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        Self { payload: frame.data(), words: [word, word.swap_bytes()], frame }
+        Self { frame, words: [word, word.swap_bytes()] }
     }
 
-    #[inline]
-    fn word(&self, plan: &Plan) -> u64 {
-        if plan.window == 0 {
-            return self.words[usize::from(plan.word & 1)];
-        }
-        let from = usize::from(plan.window);
+    #[inline(always)]
+    fn has(&self, bytes: usize) -> bool {
+        self.frame.len() >= bytes
+    }
+
+    /// The bits at a place, the lowest at the bottom.
+    #[inline(always)]
+    fn bits(&self, place: &Place) -> u64 {
+        let word = match self.words.get(usize::from(place.word)) {
+            Some(word) => *word,
+            None => {
+                cold_path();
+                self.far_word(place)
+            }
+        };
+        word << (place.up & 63) >> (place.down & 63)
+    }
+
+    /// A word that does not begin with the payload.
+    #[inline(always)]
+    fn far_word(&self, place: &Place) -> u64 {
+        let from = usize::from(place.window);
         // The window of a signal lies within the longest payload.
         let bytes = self.frame.padded_data().get(from..).and_then(|rest| rest.first_chunk());
         let word = bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        if plan.word == 0 { word } else { word.swap_bytes() }
+        if place.word == FAR { word } else { word.swap_bytes() }
     }
 }
 
@@ -114,67 +150,90 @@ impl Plans {
         Self {
             numbers: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
             messages: messages.iter().map(|runs| MessagePlan::new(bindings, runs)).collect(),
-            signals: bindings.iter().map(Plan::new).collect(),
         }
     }
 
     /// See [`super::InputMap::decode`].
     #[inline]
     pub(super) fn decode(&self, bindings: &[Binding], bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
-        let Some(number) = self.numbers.get(bus, frame.id()) else { return };
+        let Some(message) = self.messages.get(self.numbers.number(bus, frame.id())) else { return };
         let wire = Wire::new(frame);
-        for visit in self.messages[number].visits(wire.payload) {
-            let range = visit.bindings.clone();
-            if visit.check || wire.payload.len() < visit.bytes_needed {
-                decode_plainly(&bindings[range], wire.payload, &mut each);
+        for visit in message.visits(&wire) {
+            if !wire.has(visit.bytes_needed) {
+                cold_path();
+                decode_plainly(&bindings[visit.first..][..visit.plans.len()], frame.data(), &mut each);
                 continue;
             }
-            for (plan, index) in self.signals[range.clone()].iter().zip(range.start..) {
+            for (n, plan) in visit.plans.iter().enumerate() {
                 // Two places rather than one value made of both: the good one then stays in a register.
                 match plan.good(&wire) {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
-                    None => decode_one(&bindings[index], wire.payload, &mut each),
+                    None => {
+                        cold_path();
+                        let value = plain_value(&bindings[visit.first + n], frame.data());
+                        each(Reading { channel: plan.channel, value });
+                    }
                 }
             }
         }
     }
 }
 
-/// One binding that is there, as it says.
+/// Whether the payload carries bindings that are there or not there together.
 #[cold]
-fn decode_one(binding: &Binding, payload: &[u8], each: &mut impl FnMut(Reading)) {
-    each(Reading { channel: binding.channel, value: binding.value(payload) });
+#[inline(never)]
+fn present(bindings: &[Binding], payload: &[u8]) -> Result<bool, Fault> {
+    bindings.first().map_or(Ok(false), |first| first.holds(payload))
+}
+
+/// What a binding that is there says, in full.
+#[cold]
+#[inline(never)]
+fn plain_value(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
+    binding.value(payload)
 }
 
 /// Bindings that are there or not there together, as they say.
+#[inline(always)]
 pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
-    let present = bindings.first().map_or(Ok(false), |first| first.holds(payload));
+    let present = present(bindings, payload);
     if present == Ok(false) {
         return;
     }
     for binding in bindings {
-        let value = present.and_then(|_| binding.value(payload));
+        let value = present.and_then(|_| plain_value(binding, payload));
         each(Reading { channel: binding.channel, value });
     }
 }
 
 impl Visit {
-    fn new(bindings: &[Binding], run: &Range<usize>, check: bool) -> Self {
-        let needed = bindings[run.clone()].iter().map(|binding| binding.plan.bytes_needed());
-        Self { bindings: run.clone(), bytes_needed: needed.max().unwrap_or(0), check }
+    /// Of neighbours that are certainly there.
+    fn new(bindings: &[Binding], run: &Range<usize>) -> Self {
+        let bindings = &bindings[run.clone()];
+        let bytes_needed = bindings.iter().map(|binding| binding.plan.bytes_needed()).max().unwrap_or(0);
+        Self { plans: bindings.iter().map(Plan::new).collect(), first: run.start, bytes_needed }
+    }
+
+    /// Of the same, of which it is still to be found out.
+    fn to_be_checked(&self) -> Self {
+        Self { bytes_needed: NEVER, ..self.clone() }
     }
 }
 
 impl MessagePlan {
     fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
-        let visit = |run: &Range<usize>| Visit::new(bindings, run, !bindings[run.start].mux.is_empty());
-        Self { all: runs.iter().map(visit).collect(), pages: Pages::new(bindings, runs) }
+        let visits: Vec<_> = runs.iter().map(|run| Visit::new(bindings, run)).collect();
+        let pages = Pages::new(bindings, runs, &visits);
+        let tests = |run: &Range<usize>| bindings[run.start].mux.len();
+        let all =
+            visits.into_iter().zip(runs).map(|(visit, run)| if tests(run) > 0 { visit.to_be_checked() } else { visit });
+        Self { all: all.collect(), pages }
     }
 
     #[inline]
-    fn visits(&self, payload: &[u8]) -> &[Visit] {
+    fn visits(&self, wire: &Wire<'_>) -> &[Visit] {
         match &self.pages {
-            Some(pages) if payload.len() >= pages.bytes_needed => pages.of(payload),
+            Some(pages) if wire.has(pages.bytes_needed) => pages.of(wire),
             _ => &self.all,
         }
     }
@@ -182,7 +241,7 @@ impl MessagePlan {
 
 impl Pages {
     /// By the selector most runs depend on; `None` without one, or when a table would be too large.
-    fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Option<Self> {
+    fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[Visit]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
         let selector = runs.iter().flat_map(tests).map(|test| test.plan).max_by_key(|plan| dependents(*plan))?;
@@ -192,21 +251,22 @@ impl Pages {
             return None;
         }
         let mut pages = Self {
-            selector,
+            selector: Place::new(&selector.shifts()?),
             bytes_needed: runs.iter().flat_map(tests).map(|test| test.plan.bytes_needed()).max()?,
-            starts: vec![0],
+            codes: Vec::new(),
             visits: Vec::new(),
         };
         // The last code stands for every one above: no range reaches it.
         for code in 0..=codes {
-            for run in runs {
-                if !pages.may_hold(tests(run), code) {
+            let start = pages.visits.len();
+            for (run, visit) in runs.iter().zip(all) {
+                if !may_hold(selector, tests(run), code) {
                     continue;
                 }
                 let check = tests(run).iter().any(|test| test.plan != selector);
-                pages.visits.push(Visit::new(bindings, run, check));
+                pages.visits.push(if check { visit.to_be_checked() } else { visit.clone() });
             }
-            pages.starts.push(pages.visits.len());
+            pages.codes.push(start..pages.visits.len());
             if pages.visits.len() > MAX_VISITS {
                 return None;
             }
@@ -214,19 +274,18 @@ impl Pages {
         Some(pages)
     }
 
-    /// Whether the selector's code leaves room for the run to be there.
-    fn may_hold(&self, tests: &[MuxTest], code: u64) -> bool {
-        tests.iter().filter(|test| test.plan == self.selector).all(|test| test.allows(code))
-    }
-
     #[inline]
-    fn of(&self, payload: &[u8]) -> &[Visit] {
-        let above = self.starts.len() - 2;
-        // A payload long enough always has a code.
-        let code =
-            self.selector.raw(payload).map_or(above, |code| usize::try_from(code).map_or(above, |c| c.min(above)));
-        &self.visits[self.starts[code]..self.starts[code + 1]]
+    fn of(&self, wire: &Wire<'_>) -> &[Visit] {
+        let code = usize::try_from(wire.bits(&self.selector)).unwrap_or(usize::MAX);
+        // There is one code at least: the one that stands for every one above.
+        let visits = &self.codes[code.min(self.codes.len() - 1)];
+        &self.visits[visits.clone()]
     }
+}
+
+/// Whether the selector's code leaves room for the run to be there.
+fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
+    tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }
 
 impl Plan {
@@ -234,32 +293,25 @@ impl Plan {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let nothing = Self {
             channel,
-            window: 0,
-            word: 0,
-            up: 0,
-            down: 63,
+            // One bit, and no code is good.
+            place: Place { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
-            // Of 64 bits one is left: no code is good.
-            not_available: u64::MAX,
-            first_good: i64::MAX,
+            first_good: u64::MAX,
             more_good: 0,
             factor: 0.0,
             offset: 0.0,
             scale,
             shift,
         };
-        let is_usual = binding.not_available.len() <= 1 && scale.is_finite() && scale != 0.0 && shift.is_finite();
+        let is_usual = scale.is_finite() && scale != 0.0 && shift.is_finite();
         let Some(shifts) = binding.plan.shifts().filter(|_| is_usual) else { return nothing };
-        let Some((first, last)) = good_codes(binding, &shifts) else { return nothing };
+        let sign = if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 };
+        let good = good_codes(binding, &shifts).and_then(|good| available_codes(binding, sign, good));
+        let Some((first, last)) = good else { return nothing };
         Self {
-            window: shifts.window,
-            word: u8::from(shifts.is_big_endian),
-            up: shifts.up,
-            down: shifts.down,
-            sign: if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 },
-            // At most 63 bits: no code has all 64.
-            not_available: binding.not_available.first().copied().unwrap_or(u64::MAX),
-            first_good: first,
+            place: Place::new(&shifts),
+            sign,
+            first_good: first.cast_unsigned().wrapping_add(sign),
             more_good: first.abs_diff(last),
             factor: shifts.factor,
             offset: shifts.offset,
@@ -268,14 +320,26 @@ impl Plan {
     }
 
     /// The value in the program's unit and sign, if it is good; the payload carries the signal.
-    #[inline]
+    #[inline(always)]
     fn good(&self, wire: &Wire<'_>) -> Option<f64> {
-        let raw = wire.word(self) << (self.up & 63) >> (self.down & 63);
-        let code = (raw ^ self.sign).wrapping_sub(self.sign).cast_signed();
-        let is_good =
-            (raw != self.not_available) & (code.wrapping_sub(self.first_good).cast_unsigned() <= self.more_good);
+        let flipped = wire.bits(&self.place) ^ self.sign;
+        let code = flipped.wrapping_sub(self.sign).cast_signed();
+        let is_good = flipped.wrapping_sub(self.first_good) <= self.more_good;
         is_good.then(|| (float_of_signed(code) * self.factor + self.offset) * self.scale + self.shift)
     }
+}
+
+/// The good codes without those that mean "not available", which are at the ends almost always; `None` where one is in the midst.
+fn available_codes(binding: &Binding, sign: u64, (mut first, mut last): (i64, i64)) -> Option<(i64, i64)> {
+    let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
+    let missing: Vec<i64> = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed()).collect();
+    while first < last && missing.contains(&first) {
+        first += 1;
+    }
+    while first < last && missing.contains(&last) {
+        last -= 1;
+    }
+    (!missing.iter().any(|code| (first..=last).contains(code))).then_some((first, last))
 }
 
 /// The first and the last code whose value is within both ranges. Every step from the code to the value keeps the order

@@ -189,6 +189,26 @@ fn a_configured_code_for_not_available_counts_beside_the_range() {
 }
 
 #[test]
+fn codes_for_not_available_are_told_at_the_ends_of_the_range_and_amid_it() {
+    let value = |not_available: Vec<u64>, code: i8| {
+        let layout = SignalLayout { length_bits: 8, value_type: ValueType::Signed, ..SELECTOR };
+        let binding = Binding { not_available, plan: layout.plan().unwrap(), ..bind("Pack.Temperature", sensor(0)) };
+        readings(&InputMap::new(vec![binding]), 0, &Frame::classic(PACK, &code.to_le_bytes()).unwrap())[0].1
+    };
+    for missing in [vec![], vec![0x80], vec![0x7F], vec![0x81, 0x80, 0x7F], vec![0xFF], vec![0x7E, 0x180]] {
+        for code in i8::MIN..=i8::MAX {
+            let expected = if missing.contains(&u64::from(code.cast_unsigned())) {
+                Err(Fault::NotAvailable)
+            } else {
+                Ok(f64::from(code))
+            };
+            assert_eq!(value(missing.clone(), code), expected, "{missing:X?}");
+        }
+    }
+    assert_eq!(value((0..256).collect(), 0), Err(Fault::NotAvailable));
+}
+
+#[test]
 fn another_interface_another_kind_of_identifier_and_remote_requests_are_other_things() {
     let frame = Frame::classic(PACK, &[0; 6]).unwrap();
     assert_eq!(readings(&map(), 0, &frame).len(), 3);
@@ -238,7 +258,9 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
         });
     let plan = layout.prop_filter_map("a layout that can be read", |layout| layout.plan().ok());
     let range = prop_oneof![Just((f64::NEG_INFINITY, f64::INFINITY)), (-1e3..0.0, 0.0..1e3)];
-    let codes = prop::collection::vec(prop_oneof![0..4u64, any::<u64>()], 0..3);
+    // Of many lengths the lowest and the highest codes, unsigned and signed; and any.
+    let end = (0..64u32, 0..3u64).prop_map(|(down, below)| (u64::MAX >> down).saturating_sub(below));
+    let codes = prop::collection::vec(prop_oneof![0..4u64, end, any::<u64>()], 0..4);
     let page = prop::collection::vec((prop::sample::select(vec![0u16, 4, 60]), 0..5u64, 0..3u64), 0..3);
     let binding = (0..2u8, 0..3u32, plan, [number.clone(), number], codes, range, page);
     let binding = binding.prop_map(|(bus, id, plan, [scale, offset], not_available, range, page)| {

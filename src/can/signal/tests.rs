@@ -166,7 +166,41 @@ fn a_code_with_more_bits_than_the_signal_is_refused() {
     assert_eq!(payload, [0x0A]);
 }
 
+#[test]
+fn nearest_is_what_round_gives_at_every_kind_of_number() {
+    let half_below = 0.5_f64.next_down();
+    let ends =
+        [0.0, -0.0, 0.5, half_below, 0.5_f64.next_up(), 1.5, 2.5, 4503599627370495.5, 4503599627370497.0, 1e18, 1e19];
+    let odd = [9223372036854774784.0, 9223372036854775808.0, f64::MAX, f64::INFINITY, f64::MIN_POSITIVE, 1e-320];
+    for number in ends.into_iter().chain(odd).flat_map(|number| [number, -number]) {
+        assert_eq!(nearest(number), number.round() as i64, "{number:?}");
+    }
+    assert_eq!(nearest(f64::NAN), 0);
+}
+
+/// [`SignalPlan::code`] of integers as it is defined, in numbers that hold every code.
+fn code_by_definition(layout: &SignalLayout, value: f64) -> u64 {
+    let (low, high) = layout.code_limits();
+    let code = (((value - layout.offset) / layout.factor).round() as i128).clamp(low, high);
+    (code as u64) & layout.plan().unwrap().all_ones()
+}
+
 proptest! {
+    #[test]
+    fn any_number_is_rounded_as_round_does(number in prop_oneof![any::<f64>(), -1e3..1e3f64, (-1000..1000i32).prop_map(|n| f64::from(n) / 2.0)]) {
+        prop_assert_eq!(nearest(number), number.round() as i64);
+    }
+
+    #[test]
+    fn any_value_gets_the_code_that_the_definition_gives(
+        l in fitting_layout(),
+        value in prop_oneof![any::<f64>(), -1e6..1e6f64, Just(f64::INFINITY), Just(f64::NEG_INFINITY), -1e20..1e20f64],
+    ) {
+        let is_integer = matches!(l.value_type, ValueType::Unsigned | ValueType::Signed);
+        prop_assume!(is_integer && !value.is_nan());
+        prop_assert_eq!(l.plan().unwrap().code(value), Some(code_by_definition(&l, value)));
+    }
+
     #[test]
     fn raw_equals_the_bits_one_by_one(l in fitting_layout(), payload in prop::collection::vec(any::<u8>(), 64)) {
         prop_assert_eq!(l.plan().unwrap().raw(&payload), Ok(bit_by_bit(&l, &payload)));

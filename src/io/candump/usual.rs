@@ -6,7 +6,7 @@
 //! converted a word at a time (bytes of a `u64` as lanes), with the first byte of the text lowest.
 
 use crate::can::{CanId, Frame};
-use crate::quantity::Timestamp;
+use crate::quantity::{BusIndex, Timestamp};
 
 /// Every byte of a word 1, and its highest bit.
 const ONES: u64 = 0x0101_0101_0101_0101;
@@ -15,6 +15,10 @@ const HIGHS: u64 = 0x8080_8080_8080_8080;
 const ZEROS: u64 = b'0' as u64 * ONES;
 /// Bytes that are looked at: the longest usual line has 60. Where less text is left, the full grammar reads it.
 const WINDOW: usize = 64;
+/// Bytes that are looked at from the identifier on: at most 23 of stamp and 8 of name come before.
+const BODY: usize = 32;
+/// Bytes that are looked at from the payload on: sixteen digits, carriage return, line feed.
+const PAYLOAD: usize = 18;
 /// Seconds are eight digits and two: up to this many hundreds no nanosecond count overflows.
 const MAX_HUNDREDS: u64 = 92_233_719;
 
@@ -23,8 +27,8 @@ const MAX_HUNDREDS: u64 = 92_233_719;
 pub(crate) struct Usual {
     /// Its stamp.
     pub(crate) time: Timestamp,
-    /// The interface's name, if it is what [`name_key`] gives for one; anything else may have a line's end in it, and is none.
-    pub(crate) name_key: u64,
+    /// Its interface.
+    pub(crate) bus: BusIndex,
     /// Identifier.
     pub(crate) id: CanId,
     /// Payload bytes, the first lowest, zeros above.
@@ -37,72 +41,133 @@ pub(crate) struct Usual {
 
 impl Usual {
     /// The frame.
-    #[inline]
+    #[inline(always)]
     pub(crate) fn frame(&self) -> Frame {
         Frame::of_word(self.id, self.payload, self.payload_len)
     }
 }
 
-/// A name of up to seven bytes and the space that ends it as one word; two names have the same key only if they are the
-/// same. `None` for names that no usual line has.
-pub(crate) fn name_key(name: &[u8]) -> Option<u64> {
-    if !(1..=7).contains(&name.len()) || name.contains(&b' ') || name.contains(&b'\n') {
-        return None;
-    }
-    let mut bytes = [0; 8];
-    bytes[..name.len()].copy_from_slice(name);
-    bytes[name.len()] = b' ';
-    Some(u64::from_le_bytes(bytes))
+/// An interface with a name of up to seven bytes, ready to be found.
+#[derive(Debug, Clone, Copy)]
+struct Interface {
+    /// The name and the space that ends it; two names have the same word only if they are the same.
+    name: u64,
+    /// The bytes of a word that these are.
+    mask: u64,
+    /// How many they are.
+    len: u8,
+    bus: BusIndex,
 }
 
-/// Reads usual lines; remembers the second of the last one, since thousands of lines share it.
+impl Interface {
+    /// `None` for names that no usual line has.
+    fn new(name: &[u8], bus: BusIndex) -> Option<Self> {
+        if !(1..=7).contains(&name.len()) || name.contains(&b' ') || name.contains(&b'\n') {
+            return None;
+        }
+        let mut bytes = [0; 8];
+        bytes[..name.len()].copy_from_slice(name);
+        bytes[name.len()] = b' ';
+        let mask = u64::MAX >> (56 - 8 * name.len());
+        Some(Self { name: u64::from_le_bytes(bytes), mask, len: name.len() as u8 + 1, bus })
+    }
+}
+
+/// Reads usual lines of known interfaces; remembers the second of the last one, since thousands of lines share it.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct UsualLines {
+    interfaces: Vec<Interface>,
+    shift_ns: i64,
     /// The first twelve bytes of the last line, up to the decimal point, as two words that overlap.
     head: [u64; 2],
-    second_ns: u64,
+    /// That second, moved.
+    second_ns: i64,
 }
 
 impl UsualLines {
+    /// For interfaces of these names, in the order of their numbers.
+    pub(crate) fn new(interfaces: &[String]) -> Self {
+        let mut lines = Self::default();
+        lines.know(interfaces);
+        lines
+    }
+
+    /// These are the interfaces from here on.
+    pub(crate) fn know(&mut self, interfaces: &[String]) {
+        let numbered = (0..u8::MAX).map(BusIndex).zip(interfaces);
+        self.interfaces = numbered.filter_map(|(bus, name)| Interface::new(name.as_bytes(), bus)).collect();
+    }
+
+    /// Stamps are moved by so much from here on.
+    pub(crate) fn shift(&mut self, shift_ns: i64) {
+        *self = Self { interfaces: std::mem::take(&mut self.interfaces), shift_ns, ..Self::default() };
+    }
+
     /// Reads the first line of `text`; `None` where it is none of the usual ones, or too little text is left to tell.
     #[inline(always)]
     pub(crate) fn parse(&mut self, text: &[u8]) -> Option<Usual> {
         let text: &[u8; WINDOW] = text.first_chunk()?;
         let head = [word(text, 0), word(text, 4)];
         if head != self.head {
-            self.second_ns = second_ns(text)?;
-            self.head = head;
+            self.begin_second(text, head)?;
         }
-        let (fraction_ns, name_at) = fraction_ns(text)?;
-        rest(text, Timestamp::from_nanos((self.second_ns + fraction_ns).cast_signed()), name_at)
+        let (fraction_ns, name_at) = match micros_ns(word(text, 12)) {
+            Some(nanos) => (nanos, 20),
+            None => (nine_digits(text)?, 23),
+        };
+        let time = Timestamp::from_nanos(self.second_ns + fraction_ns.cast_signed());
+        // Where a line goes on depends on its name's length. Found by comparing, that is foreseen; counted, it would be waited for.
+        let name = word(text, name_at);
+        let interface = self.interfaces.iter().find(|known| name & known.mask == known.name)?;
+        let body_at = name_at + usize::from(interface.len);
+        let body: &[u8; BODY] = text.get(body_at..body_at + BODY)?.first_chunk()?;
+        if body[3] != b'#' {
+            return extended(body, time, interface.bus, body_at);
+        }
+        let [high, middle, low] = [0, 1, 2].map(|place: usize| u32::from(ID_DIGITS[place][usize::from(body[place])]));
+        payload::<4>(body, CanId::standard(high | middle | low)?, time, interface.bus, body_at)
+    }
+
+    /// A line with another second than the last one.
+    #[inline(never)]
+    fn begin_second(&mut self, text: &[u8; WINDOW], head: [u64; 2]) -> Option<()> {
+        let second_ns = second_ns(text)?.cast_signed().checked_add(self.shift_ns)?;
+        // Any fraction of it can be told too.
+        second_ns.checked_add(1_000_000_000)?;
+        (self.second_ns, self.head) = (second_ns, head);
+        Some(())
     }
 }
 
-/// What follows the stamp.
-#[inline(always)]
-fn rest(text: &[u8; WINDOW], time: Timestamp, name_at: usize) -> Option<Usual> {
-    let (name_key, name_len) = name(word(text, name_at))?;
-    let (id, at) = identifier(text, name_at + name_len + 1)?;
-    if text[at + 16] == b'\n' {
-        let payload = hex_sixteen(text.get(at..at + 16)?.first_chunk()?)?;
-        return Some(Usual { time, name_key, id, payload, payload_len: 8, line_len: at + 17 });
-    }
-    let (first, second) = (hex_word(word(text, at)), hex_word(word(text, at + 8)));
-    let all = first.value | second.value << 32;
-    let digits = if first.bad != 0 { first.good() } else { 8 + second.good() };
-    let line_feed = at + digits + usize::from(text[at + digits] == b'\r');
-    if text[line_feed] != b'\n' || digits % 2 != 0 {
+/// An identifier of eight digits and what follows it.
+#[inline(never)]
+fn extended(body: &[u8; BODY], time: Timestamp, bus: BusIndex, body_at: usize) -> Option<Usual> {
+    let digits = hex_word(word(body, 0));
+    if digits.bad != 0 || body[8] != b'#' {
         return None;
     }
-    let payload_len = digits / 2;
-    // Bytes beyond the payload are what bytes that are no digits happened to give.
-    let payload = if payload_len == 8 { all } else { all & !(u64::MAX << (8 * payload_len)) };
-    Some(Usual { time, name_key, id, payload, payload_len: payload_len as u8, line_len: line_feed + 1 })
+    let id = CanId::extended(u32::try_from(digits.value).ok()?.swap_bytes())?;
+    payload::<9>(body, id, time, bus, body_at)
+}
+
+/// The payload, which begins `AT` bytes after the identifier, and the line's end.
+#[inline(always)]
+fn payload<const AT: usize>(
+    body: &[u8; BODY],
+    id: CanId,
+    time: Timestamp,
+    bus: BusIndex,
+    body_at: usize,
+) -> Option<Usual> {
+    let text: &[u8; PAYLOAD] = body[AT..].first_chunk()?;
+    let (payload, payload_len, len) =
+        if text[16] == b'\n' { (hex_sixteen(text.first_chunk()?)?, 8, 17) } else { short_payload(text)? };
+    Some(Usual { time, bus, id, payload, payload_len, line_len: body_at + AT + len })
 }
 
 /// Eight bytes of the text; zeros beyond its end, which no caller reaches.
 #[inline(always)]
-fn word(text: &[u8; WINDOW], at: usize) -> u64 {
+fn word(text: &[u8], at: usize) -> u64 {
     text.get(at..).and_then(|rest| rest.first_chunk()).map_or(0, |bytes| u64::from_le_bytes(*bytes))
 }
 
@@ -117,18 +182,25 @@ fn second_ns(text: &[u8; WINDOW]) -> Option<u64> {
     Some((hundreds * 100 + tens * 10 + ones) * 1_000_000_000)
 }
 
-/// Six or nine digits and `) ` from byte 12 on, in nanoseconds; the place after it.
+/// Six digits and `) `, in nanoseconds.
 #[inline(always)]
-fn fraction_ns(text: &[u8; WINDOW]) -> Option<(u64, usize)> {
-    // Two zeros before the six digits make a word of eight.
-    let word = (word(text, 11) << 8) & !0xFFFF | (ZEROS & 0xFFFF);
-    let nanos = digits(word)? * 1000;
-    if text[18] == b')' {
-        return (text[19] == b' ').then_some((nanos, 20));
+fn micros_ns(text: u64) -> Option<u64> {
+    const ZERO: u64 = u64::from_le_bytes(*b"000000) ");
+    // Bytes that are right become 0 to 9, and 0 where there is no choice. Added to these, no wrong one stays below 0x80.
+    const WRONG: u64 = 0x7F7F_7676_7676_7676;
+    let digits = text ^ ZERO;
+    if (digits | digits.wrapping_add(WRONG)) & HIGHS != 0 {
+        return None;
     }
-    let [a, b, c] = [text[18], text[19], text[20]].map(|byte| u64::from(byte.wrapping_sub(b'0')));
-    let is_good = a <= 9 && b <= 9 && c <= 9 && text[21] == b')' && text[22] == b' ';
-    is_good.then_some((nanos + 100 * a + 10 * b + c, 23))
+    // Two zeros before the six digits make eight.
+    Some(number::<1000>(digits << 16))
+}
+
+/// Nine digits and `) ` from byte 12 on, in nanoseconds.
+fn nine_digits(text: &[u8; WINDOW]) -> Option<u64> {
+    let nanos = digits(word(text, 12))? * 10;
+    let last = u64::from(text[20].wrapping_sub(b'0'));
+    (last <= 9 && text[21] == b')' && text[22] == b' ').then_some(nanos + last)
 }
 
 /// The number that eight digits make, the first byte the highest.
@@ -138,39 +210,69 @@ fn digits(text: u64) -> Option<u64> {
     if (digits | digits.wrapping_add(0x76 * ONES)) & HIGHS != 0 {
         return None;
     }
+    Some(number::<1>(digits))
+}
+
+/// The number that eight bytes of 0 to 9 make, the first the highest, times `UNIT`; below 2^32 with it.
+#[inline(always)]
+fn number<const UNIT: u64>(digits: u64) -> u64 {
     let pairs = (digits.wrapping_mul(10 << 8 | 1) >> 8) & 0x00FF_00FF_00FF_00FF;
     let fours = (pairs.wrapping_mul(100 << 16 | 1) >> 16) & 0x0000_FFFF_0000_FFFF;
-    Some(fours.wrapping_mul(10_000 << 32 | 1) >> 32)
+    fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32
 }
 
-/// Key and length of the name that a word begins with.
-#[inline(always)]
-fn name(word: u64) -> Option<(u64, usize)> {
-    let differs = word ^ (u64::from(b' ') * ONES);
-    // The lowest flag is exact; those above it may be wrong.
-    let spaces = differs.wrapping_sub(ONES) & !differs & HIGHS;
-    let len = spaces.trailing_zeros() as usize / 8;
-    if !(1..=7).contains(&len) {
-        return None;
-    }
-    Some((word & (u64::MAX >> (56 - 8 * len)), len))
-}
-
-/// An identifier of three or eight digits and the `#` after it; the place after that.
-#[inline(always)]
-fn identifier(text: &[u8; WINDOW], at: usize) -> Option<(CanId, usize)> {
-    if text[at + 3] == b'#' {
-        let [a, b, c] = [text[at], text[at + 1], text[at + 2]].map(|byte| u32::from(super::HEX[usize::from(byte)]));
-        if (a | b | c) > 15 {
-            return None;
+/// What a hex digit adds to a standard identifier in the first, second and third place; above all identifiers for what is none.
+static ID_DIGITS: [[u16; 256]; 3] = {
+    let mut table = [[u16::MAX; 256]; 3];
+    let mut byte = 0;
+    while byte < 256 {
+        let digit = super::HEX[byte] as u16;
+        if digit < 16 {
+            table[0][byte] = digit << 8;
+            table[1][byte] = digit << 4;
+            table[2][byte] = digit;
         }
-        return Some((CanId::standard(a << 8 | b << 4 | c)?, at + 4));
+        byte += 1;
     }
-    let digits = hex_word(word(text, at));
-    if digits.bad != 0 || text[at + 8] != b'#' {
+    table
+};
+
+/// Up to eight bytes of payload and the line's end; how many bytes, and the length of all that. (Eight come here before a
+/// carriage return.)
+#[inline(never)]
+fn short_payload(text: &[u8; PAYLOAD]) -> Option<(u64, u8, usize)> {
+    let (first, second) = (hex_word(word(text, 0)), hex_word(word(text, 8)));
+    let all = first.value | second.value << 32;
+    let digits = if first.bad != 0 { first.good() } else { 8 + second.good() };
+    let line_feed = digits + usize::from(text[digits] == b'\r');
+    if text[line_feed] != b'\n' || digits % 2 != 0 {
         return None;
     }
-    Some((CanId::extended(u32::try_from(digits.value).ok()?.swap_bytes())?, at + 9))
+    let payload_len = digits / 2;
+    // Bytes beyond the payload are what bytes that are no digits happened to give.
+    let payload = if payload_len == 8 { all } else { all & !(u64::MAX << (8 * payload_len)) };
+    Some((payload, payload_len as u8, line_feed + 1))
+}
+
+/// Eight bytes of two hex digits each, the first lowest. Loops over sixteen bytes: the compiler makes one instruction of each
+/// step.
+#[inline(always)]
+fn hex_sixteen(text: &[u8; 16]) -> Option<u64> {
+    let (mut values, mut wrong) = ([0; 16], [0; 16]);
+    for ((&byte, value), wrong) in text.iter().zip(&mut values).zip(&mut wrong) {
+        // 0 to 9 for a digit, at least 16 for anything else.
+        let digit = byte.wrapping_add(0xFF - b'9').saturating_sub(6).wrapping_sub(0xF0);
+        // 10 to 15 for a letter, at least 16 for anything else.
+        let letter = (byte & 0xDF).wrapping_sub(b'A').saturating_add(10);
+        *value = digit.min(letter);
+        *wrong = *value & 0xF0;
+    }
+    if u128::from_ne_bytes(wrong) != 0 {
+        return None;
+    }
+    let (first, second) = values.split_at(8);
+    let [first, second] = packed([word(first, 0), word(second, 0)]);
+    Some(first & 0xFFFF_FFFF | second << 32)
 }
 
 /// Eight bytes read as hex digits.
@@ -189,29 +291,6 @@ impl HexWord {
     }
 }
 
-/// Eight bytes of two hex digits each, the first lowest. Loops over sixteen bytes: the compiler makes one instruction of each.
-#[inline(always)]
-fn hex_sixteen(text: &[u8; 16]) -> Option<u64> {
-    let digits: [u8; 16] = std::array::from_fn(|i| text[i].wrapping_sub(b'0'));
-    let letters: [u8; 16] = std::array::from_fn(|i| (text[i] | 0x20).wrapping_sub(b'a'));
-    let bad: [u8; 16] = std::array::from_fn(|i| u8::from(digits[i] > 9) & u8::from(letters[i] > 5));
-    let values: [u8; 16] = std::array::from_fn(|i| if digits[i] > 9 { letters[i].wrapping_add(10) } else { digits[i] });
-    if u128::from_ne_bytes(bad) != 0 {
-        return None;
-    }
-    let (first, second) = values.split_at(8);
-    let word = |bytes: &[u8]| bytes.first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
-    Some(packed(word(first)) | packed(word(second)) << 32)
-}
-
-/// Eight values below 16, in pairs of which the first is the upper half, as four bytes.
-#[inline(always)]
-fn packed(nibbles: u64) -> u64 {
-    let pairs = (nibbles << 4 | nibbles >> 8) & 0x00FF_00FF_00FF_00FF;
-    let fours = (pairs | pairs >> 8) & 0x0000_FFFF_0000_FFFF;
-    (fours | fours >> 16) & 0xFFFF_FFFF
-}
-
 #[inline(always)]
 fn hex_word(word: u64) -> HexWord {
     // Lanes hold at most 0x7F before each addition, so that none carries into the next.
@@ -220,7 +299,25 @@ fn hex_word(word: u64) -> HexWord {
     let letter = (low | (0x20 * ONES)) ^ (0x60 * ONES);
     let letters = letter.wrapping_add(0x7F * ONES) & !letter.wrapping_add(0x79 * ONES) & HIGHS;
     let bad = ((no_digit & !letters) | word) & HIGHS;
-    HexWord { bad, value: packed((word & (0x0F * ONES)) + (letters >> 7) * 9) }
+    let [value] = packed([(word & (0x0F * ONES)) + (letters >> 7) * 9]);
+    HexWord { bad, value: value & 0xFFFF_FFFF }
+}
+
+/// Of each word eight values below 16, in pairs of which the first is the upper half, as four bytes; what is above them means
+/// nothing. Step by step over all words, for the compiler's sake as in [`hex_sixteen`].
+#[inline(always)]
+fn packed<const N: usize>(mut words: [u64; N]) -> [u64; N] {
+    for word in &mut words {
+        // Twelve bits up, the upper half comes to stand above the lower one.
+        *word = (word.wrapping_mul(0x1001) >> 8) & 0x00FF_00FF_00FF_00FF;
+    }
+    for word in &mut words {
+        *word = (*word | *word >> 8) & 0x0000_FFFF_0000_FFFF;
+    }
+    for word in &mut words {
+        *word |= *word >> 16;
+    }
+    words
 }
 
 #[cfg(test)]
@@ -233,19 +330,24 @@ mod tests {
     /// What follows in the log, so that the window is full.
     const MORE: &str = "(1700000000.123456) can0 123#1122334455667788\n(1700000000.123457) can0 123#\n";
 
-    /// The line as the quick way reads it, checked against the full grammar: whatever it says must be the same.
+    /// The line as the quick way reads it, checked against the full grammar: whatever it says must be the same. The line's
+    /// interface is made known, with the number 1, if it can be.
     fn quick(lines: &mut UsualLines, line: &[u8]) -> Option<Usual> {
         let text = [line, b"\n", MORE.as_bytes()].concat();
-        let usual = lines.parse(&text)?;
-        if usual.name_key.to_le_bytes().contains(&b'\n') {
-            return None;
-        }
         let first = memchr::memchr(b'\n', &text).expect("there is one");
-        assert_eq!(usual.line_len, first + 1, "{:?}", String::from_utf8_lossy(line));
-        let Ok(Line::Frame { time, interface, frame, .. }) = parse_line(&text[..first]) else {
+        let plain = parse_line(&text[..first]);
+        let name = match plain {
+            Ok(Line::Frame { interface, .. }) => String::from_utf8_lossy(interface).into_owned(),
+            _ => "can0".to_owned(),
+        };
+        lines.know(&["none".to_owned(), name.clone()]);
+        let usual = lines.parse(&text)?;
+        let Ok(Line::Frame { time, interface, frame, .. }) = plain else {
             panic!("no frame: {:?}", String::from_utf8_lossy(line));
         };
-        assert_eq!((usual.time, Some(usual.name_key), usual.frame()), (time, name_key(interface), frame));
+        let told = (usual.line_len, usual.time, usual.bus, usual.frame());
+        let bus = BusIndex(u8::from(interface != b"none"));
+        assert_eq!(told, (first + 1, time, bus, frame), "{:?}", String::from_utf8_lossy(line));
         Some(usual)
     }
 
@@ -313,6 +415,30 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn unknown_interfaces_are_left_to_the_full_grammar() {
+        let line = |name: &str| format!("(1700000000.123456) {name} 123#11\n{MORE}");
+        let mut reader = UsualLines::new(&["can1".to_owned(), "a name".to_owned(), "vcan10".to_owned(), String::new()]);
+        let mut bus = |name: &str| reader.parse(line(name).as_bytes()).map(|usual| usual.bus);
+        assert_eq!((bus("can1"), bus("vcan10")), (Some(BusIndex(0)), Some(BusIndex(2))));
+        for name in ["can0", "can", "can10", "vcan1", "vcan100", "a name", "a", "", "can1\n"] {
+            assert_eq!(bus(name), None, "{name:?}");
+        }
+    }
+
+    #[test]
+    fn stamps_are_moved_from_the_next_line_on_or_left_to_the_full_grammar() {
+        let line = format!("(9223371999.999999) can0 123#11\n{MORE}");
+        let mut reader = UsualLines::new(&["can0".to_owned()]);
+        let mut time = |shift_ns| {
+            reader.shift(shift_ns);
+            reader.parse(line.as_bytes()).map(|usual| usual.time.nanos())
+        };
+        let raw = 9_223_371_999_999_999_000;
+        assert_eq!((time(0), time(-5), time(5)), (Some(raw), Some(raw - 5), Some(raw + 5)));
+        assert_eq!((time(i64::MAX), time(0)), (None, Some(raw)), "beyond what can be told");
     }
 
     #[test]
