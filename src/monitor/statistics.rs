@@ -181,14 +181,17 @@ impl Statistics {
         }
     }
 
-    /// Counts a voltage reading by what it did to its cell's estimate.
-    pub(super) fn note_voltage(&mut self, result: &StepResult) {
-        let count = match result.update {
-            Some(update) if update.accepted => &mut self.voltages_used,
-            Some(_) => &mut self.voltages_gated,
-            None => &mut self.voltages_without_current,
-        };
-        *count += 1;
+    /// Counts voltage readings by what they did to their cells' estimates.
+    pub(super) fn note_voltages<'a>(&mut self, results: impl Iterator<Item = &'a StepResult>) {
+        let (mut all, mut compared, mut used) = (0, 0, 0);
+        for StepResult { update, .. } in results {
+            all += 1;
+            compared += u64::from(update.is_some());
+            used += u64::from(update.is_some_and(|update| update.accepted));
+        }
+        self.voltages_used += used;
+        self.voltages_gated += compared - used;
+        self.voltages_without_current += all - compared;
     }
 
     fn bus(&mut self, bus: BusIndex) -> &mut BusStatistics {

@@ -110,9 +110,9 @@ impl Monitor {
             self.estimators.add(sample.cell.index(), &step);
         }
         self.estimators.step();
+        self.statistics.note_voltages(waiting.iter().map(|sample| self.estimators.result(sample.cell.index())));
         let is_quiet = self.all_trusted && !out.want_alarm_inputs && {
-            let nis = |sample: &CellSample| self.estimators.mean_nis(sample.cell.index());
-            let worst = waiting.iter().fold(0.0_f64, |worst, sample| worst.max(nis(sample)));
+            let worst = self.estimators.worst_nis();
             worst <= self.config.estimator.consistency_limit && self.alarms.is_quiet(Rule::EstimateUntrusted, worst)
         };
         for sample in &waiting {
@@ -164,11 +164,8 @@ impl Monitor {
     /// What follows from a cell's step.
     fn take_estimate(&mut self, sample: &CellSample, out: &mut Outputs) {
         let index = sample.cell.index();
-        let result = self.estimators.result(index);
-        let is_reset = result.reset;
-        self.statistics.note_voltage(result);
         self.progress[index].sample = Some(*sample);
-        if is_reset {
+        if self.estimators.result(index).reset {
             out.events.push(Event { time: self.now, kind: EventKind::FilterReset { cell: sample.cell } });
             // The SOC jumped: what it crosses on the way is no charging.
             self.recharge.discard();

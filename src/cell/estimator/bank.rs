@@ -268,6 +268,19 @@ impl EstimatorBank {
         each_lane!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
+    /// The largest of all cells', not below 0; one that is no number counts as infinite.
+    pub fn worst_nis(&self) -> f64 {
+        let larger = |a: f64, b: f64| match () {
+            () if b <= a => a,
+            () if b > a => b,
+            () => f64::INFINITY,
+        };
+        let worst = each_lane!(&self.filters, x => x.blocks.iter().fold([0.0; WIDTH], |worst, block| {
+            std::array::from_fn(|lane| larger(worst[lane], block.memory[MEAN_NIS].0[lane]))
+        }));
+        worst.into_iter().fold(0.0, larger)
+    }
+
     /// Temperature the filter works with, degrees C.
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         self.cells[cell].memory.temperature_c

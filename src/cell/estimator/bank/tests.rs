@@ -155,6 +155,8 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
                     .max((ours.test_ratio - theirs.test_ratio).abs());
             }
         }
+        let worst_nis = (0..CELLS).map(|cell| bank.mean_nis(cell)).fold(0.0, f64::max);
+        assert_eq!(bank.worst_nis(), worst_nis, "{time}");
     }
     assert!(accepted > rounds as usize * 10 && resets > 0, "{accepted} {resets}");
     (soc, learned)
