@@ -178,3 +178,30 @@ fn until_reads_no_further_than_it_says() {
     let summary: serde_json::Value = serde_json::from_str(&output).expect("JSON");
     assert_eq!((&summary["lines"], &summary["last_s"]), (&101.into(), &1_700_000_099.0.into()));
 }
+
+#[test]
+fn a_log_read_at_a_run_gives_what_it_gives_record_by_record() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let text = fs::read_to_string(log(folder.path())).expect("readable");
+    let mut rows: Vec<String> = text.lines().map(str::to_owned).collect();
+    // A hole after which the recorder was asleep, a row of before, and one of long before.
+    rows.extend([4000, 4001, 3999, 4002, 4003, 900, 901, 902].map(|second| format!("{second},2.0,3.6,24.5")));
+    let path = folder.path().join("holes.csv");
+    fs::write(&path, rows.join("\n")).expect("written");
+    // With an end far beyond the log's, each record is looked at before the next is read.
+    let results = [&[][..], &["--until", "+1000000"][..]].map(|one_by_one| {
+        let paths = ["estimates", "events", "frames", "snapshot"].map(|kind| folder.path().join(kind));
+        let [estimates, events, frames, snapshot] = paths.each_ref().map(|path| path.to_str().expect("UTF-8"));
+        let files = ["--estimates", estimates, "--events", events, "--frames", frames, "--snapshot", snapshot];
+        let args = [&[path.to_str().expect("UTF-8"), "--json"], &files[..], one_by_one].concat();
+        let mut summary: serde_json::Value = serde_json::from_str(&stdout_of(&replay(&args).success())).expect("JSON");
+        let of_this_run = ["wall_s", "times_real_time", "frames_per_s", "cell_steps_per_s", "peak_memory_kib"];
+        for key in of_this_run {
+            summary.as_object_mut().expect("an object").remove(key).expect("told");
+        }
+        (summary, paths.map(|path| fs::read(path).expect("result written")))
+    });
+    assert_eq!(results[0], results[1]);
+    let events = &results[0].0["events"];
+    assert!(events["gap"].as_u64() >= Some(2) && events["time_backwards"].as_u64() >= Some(1), "{events}");
+}

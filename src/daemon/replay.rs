@@ -80,7 +80,19 @@ impl Settings {
 
     /// Every record is taken, as fast as possible, and neither it nor the state after it is kept.
     fn is_simple(&self) -> bool {
-        let Self { speed, from, until, snapshot_at, store, .. } = self;
+        // Every field, so that a new one is not overlooked.
+        let Self {
+            speed,
+            from,
+            until,
+            snapshot_at,
+            store,
+            sleep_gap_s: _,
+            snapshot: _,
+            restore: _,
+            away: _,
+            interfaces: _,
+        } = self;
         speed.is_none() && from.is_none() && until.is_none() && snapshot_at.is_none() && store.is_none()
     }
 }

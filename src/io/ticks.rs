@@ -208,6 +208,17 @@ mod tests {
     }
 
     #[test]
+    fn records_between_two_ticks_the_core_cares_for_are_taken_within() {
+        let mut ticks = Ticks::new(10, 30.0);
+        ticks.advance(Timestamp::from_nanos(0));
+        while ticks.pop(EVERY).is_some() {}
+        let due = Some(Timestamp::from_nanos(100_000_000));
+        let within = |ms: i64| ticks.advance_within(Timestamp::from_nanos(ms * 1_000_000), due);
+        assert_eq!([1, 9, 10, 11, 99, 100, 101].map(within), [true, true, true, true, true, true, false]);
+        assert_eq!(ticks.pop(due), None, "nothing was taken of the last");
+    }
+
+    #[test]
     fn skipping_leaves_the_grid_where_it_was() {
         let mut ticks = Ticks::new(10, 30.0);
         ticks.advance(Timestamp::from_nanos(3_000_000));

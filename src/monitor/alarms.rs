@@ -51,8 +51,8 @@ struct Spread {
     is_whole: bool,
 }
 
-/// Whether values that change nothing are to be shown again, last shown at `shown_at`.
-pub(super) fn is_due(shown_at: &mut Timestamp, now: Timestamp) -> bool {
+/// Whether values that change nothing are to be shown again, last shown at `shown_at`; when they are, that is now.
+pub(super) fn take_show_due(shown_at: &mut Timestamp, now: Timestamp) -> bool {
     let is_due = now.since(*shown_at).abs() >= SHOW_S;
     if is_due {
         *shown_at = now;
@@ -94,7 +94,7 @@ impl Monitor {
             self.alarms.is_quiet(Rule::InputMissing, silence_s) && self.alarms.is_quiet(Rule::InputImplausible, share)
         };
         if !out.want_alarm_inputs && worst.is_some_and(quiet) {
-            if is_due(&mut self.inputs_shown_at, self.now) {
+            if take_show_due(&mut self.inputs_shown_at, self.now) {
                 self.show_inputs();
             }
             return;

@@ -509,6 +509,13 @@ impl Monitor {
                 self.observe_identity(bus, reading.value, out);
                 continue;
             }
+            if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
+                && let Some(sample) = self.sampler.take_ordinary_voltage(self.now, cell, voltage_v)
+            {
+                self.heard = true;
+                self.note_sample(sample, out);
+                continue;
+            }
             let sample = self.sampler.handle_reading(self.now, reading, &mut self.scratch.signal_changes);
             self.note_heard(&reading);
             self.report_signals(out);

@@ -43,6 +43,7 @@ pub struct Snapshot {
     #[serde(default)]
     normalised_recharge: Option<Belief>,
     pack: Option<PackState>,
+    /// For programs before this one; here the cells that have reported are counted.
     updated_cells: usize,
     time_backwards: u64,
     alarms: AlarmState,

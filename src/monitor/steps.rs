@@ -3,7 +3,7 @@
 //! A sample waits until every cell has one, or its own has its second, or anything asks for estimates. What an estimate is
 //! does not depend on how long it waited: a step knows its sample's time and charge, and no other cell.
 
-use super::alarms::is_due;
+use super::alarms::take_show_due;
 use super::{Consumed, Event, EventKind, Monitor, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellStep, EstimatorBank};
@@ -46,9 +46,10 @@ impl Round {
         !self.is_complete() && self.has_reported.get(cell.index()) == Some(&false)
     }
 
-    /// Adds the first sample of a cell.
+    /// Adds a sample that is [awaited](Self::awaits).
     #[inline]
     pub(super) fn add(&mut self, sample: CellSample) {
+        debug_assert!(!self.has_reported[sample.cell.index()], "a second sample of {:?}", sample.cell);
         self.has_reported[sample.cell.index()] = true;
         self.reported += 1;
         self.waiting.push(sample);
@@ -59,8 +60,9 @@ impl Round {
         self.reported == self.has_reported.len()
     }
 
-    /// The next begins. What waits still waits.
+    /// The next begins; the steps of the last are made.
     pub(super) fn begin(&mut self) {
+        debug_assert!(self.waiting.is_empty(), "{} samples whose step was not made", self.waiting.len());
         self.has_reported.fill(false);
         self.reported = 0;
     }
@@ -121,7 +123,7 @@ impl Monitor {
                 self.judge_trust(sample.cell, tells, out);
             }
         }
-        if is_quiet && tells && is_due(&mut self.nis_shown_at, self.now) {
+        if is_quiet && tells && take_show_due(&mut self.nis_shown_at, self.now) {
             self.show_trust(&waiting);
         }
         waiting.clear();

@@ -126,7 +126,8 @@ pub struct Sampler {
     moment: Moment,
 }
 
-/// What is the same for every reading of one time, as long as no current comes.
+/// What is the same for every reading of one time, as long as no current comes (and no temperature, for what was asked of
+/// its sensor).
 #[derive(Debug, Clone, Copy, Default)]
 struct Moment {
     /// Whether the rest holds (still).
@@ -137,21 +138,6 @@ struct Moment {
     cell_charge_as: f64,
     /// The sensor that was asked last, and its value: neighbouring cells mostly share one.
     sensor: Option<(SensorIndex, Option<f64>)>,
-}
-
-impl Moment {
-    #[inline]
-    fn sample(&self, cell: CellIndex, voltage_v: f64, temperature_c: Option<f64>) -> CellSample {
-        CellSample {
-            time: self.time,
-            cell,
-            voltage_v,
-            current_a: self.cell_current_a,
-            charge_as: self.cell_charge_as,
-            unmeasured_s: self.totals.unmeasured_s,
-            temperature_c,
-        }
-    }
 }
 
 impl Sampler {
@@ -221,7 +207,7 @@ impl Sampler {
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
-            // One that was good before, or bad.
+            // Only a good signal turns bad, and only a bad one good: the count never passes below 0.
             self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
             self.next_stale = None;
         }
@@ -234,7 +220,7 @@ impl Sampler {
                 None
             }
             Channel::Temperature(_) => {
-                self.moment.is_known = false;
+                self.moment.sensor = None;
                 None
             }
             Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
@@ -256,16 +242,7 @@ impl Sampler {
             return None;
         }
         state.counts.accepted += 1;
-        let sensor = config.sensor_of_cell.get(cell.index()).copied().flatten();
-        let temperature_c = sensor.and_then(|sensor| match moment.sensor {
-            Some((same, value)) if same == sensor => value,
-            _ => {
-                let value = state.signals[1 + sensor.index()].fresh(time, &config.temperature);
-                moment.sensor = Some((sensor, value));
-                value
-            }
-        });
-        Some(moment.sample(cell, voltage_v, temperature_c))
+        Some(self.sample(cell, voltage_v))
     }
 
     /// Judges the ages at `now`; signals that have become stale go to `changes`.
@@ -327,10 +304,8 @@ impl Sampler {
     }
 
     /// Temperature of a cell, degrees C, when its sensor's last good reading is fresh.
-    #[inline]
     pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
-        let sensor = (*self.config.sensor_of_cell.get(cell.index())?)?;
-        self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
+        self.sensor_c(self.sensor_of(cell)?, now)
     }
 
     /// Age of the last good value, s; from the start or the last waking when there is none since. `None` = the channel feeds nothing.
@@ -485,8 +460,35 @@ impl Sampler {
         self.moment = Moment { is_known: true, time, totals, cell_current_a, cell_charge_as, sensor: None };
     }
 
-    fn sample(&self, cell: CellIndex, voltage_v: f64) -> CellSample {
-        self.moment.sample(cell, voltage_v, self.temperature_c(cell, self.moment.time))
+    /// The sample of a good voltage at the moment.
+    #[inline]
+    fn sample(&mut self, cell: CellIndex, voltage_v: f64) -> CellSample {
+        let time = self.moment.time;
+        let temperature_c = self.sensor_of(cell).and_then(|sensor| match self.moment.sensor {
+            Some((asked, value)) if asked == sensor => value,
+            _ => {
+                let value = self.sensor_c(sensor, time);
+                self.moment.sensor = Some((sensor, value));
+                value
+            }
+        });
+        CellSample {
+            time,
+            cell,
+            voltage_v,
+            current_a: self.moment.cell_current_a,
+            charge_as: self.moment.cell_charge_as,
+            unmeasured_s: self.moment.totals.unmeasured_s,
+            temperature_c,
+        }
+    }
+
+    fn sensor_of(&self, cell: CellIndex) -> Option<SensorIndex> {
+        *self.config.sensor_of_cell.get(cell.index())?
+    }
+
+    fn sensor_c(&self, sensor: SensorIndex, now: Timestamp) -> Option<f64> {
+        self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
     }
 
     /// Notes that time has come to `time`; the latest time, should it have gone back.

@@ -246,7 +246,11 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
 #[test]
 fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
     let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
-    let mut seen = AlarmEngine::new(rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec(), 2);
+    let mut configs = rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec();
+    // Two thresholds of one rule, and one that cannot judge a value without its deviation.
+    configs.push(RuleConfig { severity: Severity::Severe, ..rule(Rule::InputMissing, 3.1, 0.2, 1.0, 1) });
+    configs[2].when = When::Probability(0.9);
+    let mut seen = AlarmEngine::new(configs, 2);
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let (mut quiet, mut loud, mut changes) = (0, 0, Vec::new());
     for second in 0..5000 {
@@ -256,6 +260,7 @@ fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
         let value = rng.random_range(0.0..3.2) + if second % 1000 > 900 { 1.0 } else { 0.0 };
         let mut shown = seen.clone();
         let is_quiet = seen.is_quiet(r, value);
+        assert!(!is_quiet || r != Rule::CellImbalance);
         let before = changes.len();
         see(&mut seen, now, r, cell, Some(value), &mut changes);
         if is_quiet {

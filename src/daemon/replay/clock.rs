@@ -130,3 +130,16 @@ impl Pace {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hole_of_exactly_the_sleep_gap_is_awake_and_a_longer_one_is_not() {
+        let mut span = Span::new(30.0);
+        let mut advance = |nanos| span.advance(Timestamp::from_nanos(nanos));
+        assert_eq!([0, 30_000_000_000, 60_000_000_001].map(&mut advance), [false, false, true]);
+        assert_eq!(span.awake_s(), 30.0);
+    }
+}

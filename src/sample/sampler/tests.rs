@@ -330,7 +330,10 @@ proptest! {
             let sample = short.or_else(|| quick.give(time, channel, value));
             prop_assert_eq!(sample, plain.give(time, channel, value));
             let (quick, plain) = (&quick.sampler, &plain.sampler);
-            prop_assert_eq!((quick.any_lost(), quick.voltages_fresh(at(time))), (plain.any_lost(), plain.voltages_fresh(at(time))));
+            prop_assert_eq!(quick.any_lost(), plain.state.signals.iter().any(Signal::is_bad));
+            let voltages = &plain.state.signals[1 + plain.sensors..][..plain.voltages];
+            let fresh = voltages.iter().all(|signal| signal.fresh(at(time), &plain.config.voltage).is_some());
+            prop_assert_eq!(quick.voltages_fresh(at(time)), fresh);
         }
         prop_assert_eq!(format!("{:?}", quick.sampler.snapshot()), format!("{:?}", plain.sampler.snapshot()));
         prop_assert_eq!(quick.changes, plain.changes);
@@ -349,8 +352,27 @@ proptest! {
             bench.sampler.poll(at(f64::from(tenths) / 10.0 + 0.05), &mut bench.changes);
             let bad = bench.sampler.state.signals.iter().filter(|signal| signal.is_bad()).count();
             prop_assert_eq!(bench.sampler.bad_signals, bad);
-            let restored = bench.sampler.clone().restore(&bench.sampler.snapshot());
-            prop_assert_eq!(restored, Ok(()));
+            let mut restored = Sampler::new(config());
+            prop_assert_eq!(restored.restore(&bench.sampler.snapshot()), Ok(()));
+            restored.handle_gap(at(f64::from(tenths)));
+            restored.reconfigure(&config());
+            prop_assert_eq!(restored.bad_signals, bad);
         }
     }
+}
+
+#[test]
+fn voltages_of_a_pack_at_work_are_ordinary_from_the_second_on() {
+    let mut bench = Bench::new(config());
+    let mut ordinary = 0;
+    for tenth in 0..100 {
+        let time = f64::from(tenth) / 10.0;
+        bench.ok(time, Channel::Current, f64::from(tenth % 7));
+        let voltage_v = 3.7 + 0.001 * f64::from(tenth % 5);
+        match bench.sampler.take_ordinary_voltage(at(time), CellIndex(0), voltage_v) {
+            Some(_) => ordinary += 1,
+            None => assert!(bench.ok(time, CELL, voltage_v).is_some()),
+        }
+    }
+    assert_eq!(ordinary, 99);
 }
