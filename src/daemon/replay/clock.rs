@@ -140,6 +140,6 @@ mod tests {
         let mut span = Span::new(30.0);
         let mut advance = |nanos| span.advance(Timestamp::from_nanos(nanos));
         assert_eq!([0, 30_000_000_000, 60_000_000_001].map(&mut advance), [false, false, true]);
-        assert_eq!(span.awake_s(), 30.0);
+        assert_eq!(span.awake_ns, 30_000_000_000);
     }
 }
