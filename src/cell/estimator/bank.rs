@@ -203,6 +203,7 @@ impl EstimatorBank {
     }
 
     /// What became of a cell's last step.
+    #[inline]
     pub fn result(&self, cell: usize) -> &StepResult {
         &self.results[cell]
     }
@@ -225,6 +226,7 @@ impl EstimatorBank {
     }
 
     /// State of charge; `None` before the first voltage.
+    #[inline]
     pub fn soc(&self, cell: usize) -> Option<Belief> {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         has_filter.then(|| {
@@ -246,12 +248,14 @@ impl EstimatorBank {
     }
 
     /// ln of the resistance relative to new.
+    #[inline]
     pub fn log_resistance(&self, cell: usize) -> Belief {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         if *has_filter { self.belief(cell, LOG_RESISTANCE) } else { memory.log_resistance }
     }
 
     /// Capacity as the filter works with it now, Ah.
+    #[inline]
     pub fn capacity(&self, cell: usize) -> Belief {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         if *has_filter { self.belief(cell, CAPACITY) } else { memory.capacity }
@@ -263,12 +267,14 @@ impl EstimatorBank {
     }
 
     /// Mean normalised innovation squared: [`CellEstimator::mean_nis`].
+    #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_lane!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
     /// Temperature the filter works with, degrees C.
+    #[inline]
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         self.cells[cell].memory.temperature_c
     }
@@ -330,6 +336,7 @@ impl EstimatorBank {
         (0..self.cells.len()).for_each(|cell| self.change(cell, &mut change));
     }
 
+    #[inline]
     fn belief(&self, cell: usize, i: usize) -> Belief {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_lane!(&self.filters, x => {
@@ -444,11 +451,12 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             } else {
                 state.take_where(made, &new);
             }
-            for lane in 0..cells.len() {
+            for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
                 if made.lane(lane) {
-                    block.note(lane, lane, &outcome, &mut cells[lane], &mut results[lane]);
+                    block.input.note(lane, lane, &outcome, cell, result);
                 }
             }
+            block.is_present = block.is_present & !made;
         }
     }
 
@@ -509,7 +517,8 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
     let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
     if outcome.is_usable.lane(0) {
         state.set_lane(lane, &new);
-        block.note(lane, 0, &outcome, cell, result);
+        block.input.note(lane, 0, &outcome, cell, result);
+        block.is_present.set_lane(lane, false);
     }
 }
 
@@ -538,29 +547,6 @@ impl BlockInput {
             voltage_v: input.voltage_v.0[lane],
         }
     }
-
-    /// Notes that the step of a lane is made.
-    #[inline(always)]
-    fn note<const L: usize>(
-        &mut self,
-        lane: usize,
-        from: usize,
-        outcome: &Outcome<L>,
-        cell: &mut Cell,
-        result: &mut StepResult,
-    ) {
-        self.is_present.set_lane(lane, false);
-        cell.memory.last_current_a = self.input.current_a.0[lane];
-        cell.memory.temperature_c = Some(self.input.temperature_c.0[lane]);
-        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
-        let update = Update {
-            innovation: outcome.innovation_v.0[from],
-            innovation_variance: outcome.innovation_variance.0[from],
-            test_ratio: outcome.test_ratio.0[from],
-            accepted: true,
-        };
-        *result = StepResult { update: Some(update), reset: false };
-    }
 }
 
 impl Input<WIDTH> {
@@ -575,6 +561,28 @@ impl Input<WIDTH> {
             temperature_c: take(&self.temperature_c),
             kept: self.kept.lane(lane),
         }
+    }
+
+    /// Notes that the step of a lane is made, with what became of it in lane `from` of the outcome.
+    #[inline(always)]
+    fn note<const L: usize>(
+        &self,
+        lane: usize,
+        from: usize,
+        outcome: &Outcome<L>,
+        cell: &mut Cell,
+        result: &mut StepResult,
+    ) {
+        cell.memory.last_current_a = self.current_a.0[lane];
+        cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
+        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
+        let update = Update {
+            innovation: outcome.innovation_v.0[from],
+            innovation_variance: outcome.innovation_variance.0[from],
+            test_ratio: outcome.test_ratio.0[from],
+            accepted: true,
+        };
+        *result = StepResult { update: Some(update), reset: false };
     }
 }
 

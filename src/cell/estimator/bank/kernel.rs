@@ -9,6 +9,7 @@
 //! * The state is ordered so that only the first three columns of the Cholesky factor L move what the circuit is not
 //!   linear in. Those of the branches add up to P less the first three columns: they are never computed.
 //! * SOC differs in one pair only, so a phase looks its tables up at three places and not at 2 N + 1.
+//! * A cell's lines of the tables are kept from step to step: [`Around`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and where they may be
