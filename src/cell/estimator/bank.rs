@@ -437,9 +437,9 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             let (around, own) = around;
             if !WIDE || block.is_present.is_one() {
-                for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
+                for (lane, cell) in cells.iter_mut().zip(results).enumerate() {
                     if block.is_present.lane(lane) {
-                        step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell, result);
+                        step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell);
                     }
                 }
                 continue;
@@ -510,8 +510,7 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
     state: &mut State<WIDTH, N, T>,
     block: &mut BlockInput,
     lane: usize,
-    cell: &mut Cell,
-    result: &mut StepResult,
+    (cell, result): (&mut Cell, &mut StepResult),
 ) {
     let one = State::of_lane(state, lane);
     let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
