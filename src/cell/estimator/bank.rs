@@ -349,7 +349,7 @@ impl EstimatorBank {
 impl Rhythm {
     #[inline(always)]
     fn kept(&mut self, c: &Constants, time_s: &Lanes<WIDTH>) -> Kept<WIDTH> {
-        if time_s.0.iter().all(|&time_s| time_s == self.time_s) {
+        if time_s.0.iter().fold(true, |same, &time_s| same & (time_s == self.time_s)) {
             return Kept::splat(&self.kept);
         }
         let kept = Kept::after(c, *time_s);

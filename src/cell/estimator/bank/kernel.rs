@@ -187,9 +187,15 @@ impl<const N: usize, const T: usize> State<1, N, T> {
 impl<const L: usize, const N: usize, const T: usize> State<L, N, T> {
     /// Puts the state of one cell into a lane.
     pub(super) fn set_lane(&mut self, lane: usize, one: &State<1, N, T>) {
-        let all = self.mean.iter_mut().chain(&mut self.covariance).chain(&mut self.memory);
-        let new = one.mean.iter().chain(&one.covariance).chain(&one.memory);
-        all.zip(new).for_each(|(all, new)| all.0[lane] = new.0[0]);
+        for i in 0..N {
+            self.mean[i].0[lane] = one.mean[i].0[0];
+        }
+        for i in 0..T {
+            self.covariance[i].0[lane] = one.covariance[i].0[0];
+        }
+        for i in 0..MEMORY {
+            self.memory[i].0[lane] = one.memory[i].0[0];
+        }
     }
 
     /// The new state where the mask says so.
@@ -227,8 +233,11 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
     // One number that is not finite makes the sum one that is not.
     let mut sum = outcome.innovation_variance + outcome.test_ratio;
-    for number in x.mean.iter().chain(&x.covariance) {
-        sum = sum + *number;
+    for i in 0..N {
+        sum = sum + x.mean[i];
+    }
+    for i in 0..T {
+        sum = sum + x.covariance[i];
     }
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);
