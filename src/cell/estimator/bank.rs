@@ -7,22 +7,24 @@
 //! against: SOC within 1e-9 over 100,000 steps. Which of the two steps a cell depends on that cell alone, and a
 //! lane's bits do not depend on the lanes beside it, so a cell's estimates are the same in any company.
 
+mod input;
 mod kernel;
 mod tables;
 
 use std::array::from_fn;
 
-use kernel::{Constants, INFORMATION_S, Input, Kept, LOAD_A, MEAN_NIS, Outcome, REST_S, State, at};
+use input::BlockInput;
+use kernel::{Constants, INFORMATION_S, Kept, LOAD_A, MEAN_NIS, REST_S, State, at};
 use nalgebra::{SMatrix, SVector};
 use tables::{Around, Tables};
 
 use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, StepResult, thermal_c, widened};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, MAX_BRANCHES};
-use crate::filter::lanes::{Lanes, Mask};
-use crate::filter::{Belief, Gaussian, Update};
+use crate::filter::lanes::Lanes;
+use crate::filter::{Belief, Gaussian};
 
-/// Cells of a block: two of AVX2's vectors.
+/// Cells of a block: one of AVX-512's vectors, two of AVX2's (4 and 16 were measured, too: slower with either).
 const WIDTH: usize = 8;
 
 /// The estimators of a pack's cells.
@@ -89,27 +91,6 @@ macro_rules! each_lane {
             Filters::Two($x) => $body,
             Filters::Three($x) => $body,
         }
-    };
-}
-
-/// The inputs of a block's cells.
-#[derive(Debug, Clone, Copy)]
-struct BlockInput {
-    is_present: Mask<WIDTH>,
-    input: Input<WIDTH>,
-}
-
-impl BlockInput {
-    const NONE: Self = Self {
-        is_present: Mask::splat(false),
-        input: Input {
-            measured_s: Lanes([1.0; WIDTH]),
-            charge_as: Lanes([0.0; WIDTH]),
-            current_a: Lanes([0.0; WIDTH]),
-            voltage_v: Lanes([0.0; WIDTH]),
-            temperature_c: Lanes([25.0; WIDTH]),
-            kept: Kept::NONE,
-        },
     };
 }
 
@@ -518,70 +499,6 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
         state.set_lane(lane, &new);
         block.input.note(lane, 0, &outcome, cell, result);
         block.is_present.set_lane(lane, false);
-    }
-}
-
-impl BlockInput {
-    /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
-    #[inline(always)]
-    fn fill_absent(&mut self) {
-        if !self.is_present.all() {
-            let present = (0..WIDTH).position(|lane| self.is_present.lane(lane)).unwrap_or(0);
-            let time_s = Lanes::splat(self.input.measured_s.0[present]);
-            self.input.measured_s = self.input.measured_s.or_else(self.is_present, time_s);
-        }
-    }
-
-    /// The step that was put into a lane.
-    fn step(&self, lane: usize) -> CellStep {
-        let input = &self.input;
-        CellStep {
-            measured_s: input.measured_s.0[lane],
-            charge_as: input.charge_as.0[lane],
-            unmeasured_s: 0.0,
-            current_a: Some(input.current_a.0[lane]),
-            temperature_c: Some(input.temperature_c.0[lane]),
-            // Not asked for where the temperature is known.
-            ambient_c: input.temperature_c.0[lane],
-            voltage_v: input.voltage_v.0[lane],
-        }
-    }
-}
-
-impl Input<WIDTH> {
-    #[inline(always)]
-    fn lane(&self, lane: usize) -> Input<1> {
-        let take = |x: &Lanes<WIDTH>| Lanes([x.0[lane]]);
-        Input {
-            measured_s: take(&self.measured_s),
-            charge_as: take(&self.charge_as),
-            current_a: take(&self.current_a),
-            voltage_v: take(&self.voltage_v),
-            temperature_c: take(&self.temperature_c),
-            kept: self.kept.lane(lane),
-        }
-    }
-
-    /// Notes that the step of a lane is made, with what became of it in lane `from` of the outcome.
-    #[inline(always)]
-    fn note<const L: usize>(
-        &self,
-        lane: usize,
-        from: usize,
-        outcome: &Outcome<L>,
-        cell: &mut Cell,
-        result: &mut StepResult,
-    ) {
-        cell.memory.last_current_a = self.current_a.0[lane];
-        cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
-        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
-        let update = Update {
-            innovation: outcome.innovation_v.0[from],
-            innovation_variance: outcome.innovation_variance.0[from],
-            test_ratio: outcome.test_ratio.0[from],
-            accepted: true,
-        };
-        *result = StepResult { update: Some(update), reset: false };
     }
 }
 
