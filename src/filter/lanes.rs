@@ -72,7 +72,7 @@ impl<const L: usize> Not for Mask<L> {
 impl<const L: usize> Mask<L> {
     /// The answers a function gives.
     #[inline(always)]
-    pub fn from_fn(mut answer: impl FnMut(usize) -> bool) -> Self {
+    fn from_fn(mut answer: impl FnMut(usize) -> bool) -> Self {
         Self(from_fn(|i| if answer(i) { u64::MAX } else { 0 }))
     }
 
@@ -306,6 +306,38 @@ mod tests {
         }
         assert_eq!(Lanes([0.0, -0.0, f64::NEG_INFINITY, -1e300]).exp(), Lanes([1.0, 1.0, 0.0, 0.0]));
         assert!(Lanes([1e300]).exp().0[0].is_finite());
+    }
+
+    #[test]
+    fn exp_of_both_signs_is_that_of_the_library() {
+        let mut x = -708.0;
+        while x <= 708.0 {
+            let (up, down) = Lanes([x]).exp_of_both_signs();
+            for (ours, theirs) in [(up.0[0], libm::exp(x)), (down.0[0], libm::exp(-x))] {
+                assert!((ours - theirs).abs() <= 3.0 * f64::EPSILON * theirs, "{x}: {ours} {theirs}");
+            }
+            x += 0.0137;
+        }
+        let (up, down) = Lanes([0.0, 1e300, -1e300, f64::NAN]).exp_of_both_signs();
+        assert_eq!((up.0[0], down.0[0]), (1.0, 1.0));
+        assert_eq!((up.0[1], down.0[1]), (down.0[2], up.0[2]));
+        assert!(up.0.iter().chain(&down.0).all(|x| x.is_finite() && *x > 0.0));
+    }
+
+    #[test]
+    fn answers_are_counted_lane_by_lane() {
+        let mut mask = Lanes([1.0, f64::NAN, -1.0, f64::INFINITY]).above_number(0.0);
+        assert_eq!([0, 1, 2, 3].map(|lane| mask.lane(lane)), [true, false, false, true]);
+        assert_eq!((mask.any(), mask.is_one(), mask.all()), (true, false, false));
+        mask.set_lane(3, false);
+        assert_eq!((mask.any(), mask.is_one(), mask.all()), (true, true, false));
+        mask.set_lane(0, false);
+        assert_eq!((mask.any(), mask.is_one(), mask.all()), (false, false, false));
+        assert_eq!(((!mask).all(), Mask::<4>::splat(true)), (true, !mask));
+        assert_eq!(
+            Lanes([1.0, 2.0]).or_else(Lanes([0.0, 1.0]).above_number(0.5), Lanes([7.0, 8.0])),
+            Lanes([7.0, 2.0])
+        );
     }
 
     #[test]

@@ -7,22 +7,24 @@
 //! against: SOC within 1e-9 over 100,000 steps. Which of the two steps a cell depends on that cell alone, and a
 //! lane's bits do not depend on the lanes beside it, so a cell's estimates are the same in any company.
 
+mod input;
 mod kernel;
 mod tables;
 
 use std::array::from_fn;
 
-use kernel::{Constants, INFORMATION_S, Input, Kept, LOAD_A, MEAN_NIS, Outcome, REST_S, State, at};
+use input::BlockInput;
+use kernel::{Constants, INFORMATION_S, Kept, LOAD_A, MEAN_NIS, REST_S, State, at};
 use nalgebra::{SMatrix, SVector};
 use tables::{Around, Tables};
 
 use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, StepResult, thermal_c, widened};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, MAX_BRANCHES};
-use crate::filter::lanes::{Lanes, Mask};
-use crate::filter::{Belief, Gaussian, Update};
+use crate::filter::lanes::Lanes;
+use crate::filter::{Belief, Gaussian};
 
-/// Cells of a block: two of AVX2's vectors.
+/// Cells of a block: one of AVX-512's vectors, two of AVX2's (4 and 16 were measured, too: slower with either).
 const WIDTH: usize = 8;
 
 /// The estimators of a pack's cells.
@@ -89,27 +91,6 @@ macro_rules! each_lane {
             Filters::Two($x) => $body,
             Filters::Three($x) => $body,
         }
-    };
-}
-
-/// The inputs of a block's cells.
-#[derive(Debug, Clone, Copy)]
-struct BlockInput {
-    is_present: Mask<WIDTH>,
-    input: Input<WIDTH>,
-}
-
-impl BlockInput {
-    const NONE: Self = Self {
-        is_present: Mask::splat(false),
-        input: Input {
-            measured_s: Lanes([1.0; WIDTH]),
-            charge_as: Lanes([0.0; WIDTH]),
-            current_a: Lanes([0.0; WIDTH]),
-            voltage_v: Lanes([0.0; WIDTH]),
-            temperature_c: Lanes([25.0; WIDTH]),
-            kept: Kept::NONE,
-        },
     };
 }
 
@@ -203,6 +184,7 @@ impl EstimatorBank {
     }
 
     /// What became of a cell's last step.
+    #[inline]
     pub fn result(&self, cell: usize) -> &StepResult {
         &self.results[cell]
     }
@@ -225,6 +207,7 @@ impl EstimatorBank {
     }
 
     /// State of charge; `None` before the first voltage.
+    #[inline]
     pub fn soc(&self, cell: usize) -> Option<Belief> {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         has_filter.then(|| {
@@ -246,12 +229,14 @@ impl EstimatorBank {
     }
 
     /// ln of the resistance relative to new.
+    #[inline]
     pub fn log_resistance(&self, cell: usize) -> Belief {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         if *has_filter { self.belief(cell, LOG_RESISTANCE) } else { memory.log_resistance }
     }
 
     /// Capacity as the filter works with it now, Ah.
+    #[inline]
     pub fn capacity(&self, cell: usize) -> Belief {
         let Cell { memory, has_filter, .. } = &self.cells[cell];
         if *has_filter { self.belief(cell, CAPACITY) } else { memory.capacity }
@@ -263,6 +248,7 @@ impl EstimatorBank {
     }
 
     /// Mean normalised innovation squared: [`CellEstimator::mean_nis`].
+    #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_lane!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
@@ -282,6 +268,7 @@ impl EstimatorBank {
     }
 
     /// Temperature the filter works with, degrees C.
+    #[inline]
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         self.cells[cell].memory.temperature_c
     }
@@ -343,6 +330,7 @@ impl EstimatorBank {
         (0..self.cells.len()).for_each(|cell| self.change(cell, &mut change));
     }
 
+    #[inline]
     fn belief(&self, cell: usize, i: usize) -> Belief {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         each_lane!(&self.filters, x => {
@@ -355,7 +343,7 @@ impl EstimatorBank {
 impl Rhythm {
     #[inline(always)]
     fn kept(&mut self, c: &Constants, time_s: &Lanes<WIDTH>) -> Kept<WIDTH> {
-        if time_s.0.iter().all(|&time_s| time_s == self.time_s) {
+        if time_s.0.iter().fold(true, |same, &time_s| same & (time_s == self.time_s)) {
             return Kept::splat(&self.kept);
         }
         let kept = Kept::after(c, *time_s);
@@ -443,9 +431,9 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
             let (around, own) = around;
             if !WIDE || block.is_present.is_one() {
-                for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
+                for (lane, cell) in cells.iter_mut().zip(results).enumerate() {
                     if block.is_present.lane(lane) {
-                        step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell, result);
+                        step_alone(&mut self.tables, &mut own[lane], c, state, block, lane, cell);
                     }
                 }
                 continue;
@@ -457,11 +445,12 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
             } else {
                 state.take_where(made, &new);
             }
-            for lane in 0..cells.len() {
+            for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
                 if made.lane(lane) {
-                    block.note(lane, lane, &outcome, &mut cells[lane], &mut results[lane]);
+                    block.input.note(lane, lane, &outcome, cell, result);
                 }
             }
+            block.is_present = block.is_present & !made;
         }
     }
 
@@ -515,79 +504,14 @@ fn step_alone<const N: usize, const T: usize, const W: usize>(
     state: &mut State<WIDTH, N, T>,
     block: &mut BlockInput,
     lane: usize,
-    cell: &mut Cell,
-    result: &mut StepResult,
+    (cell, result): (&mut Cell, &mut StepResult),
 ) {
     let one = State::of_lane(state, lane);
     let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
     if outcome.is_usable.lane(0) {
         state.set_lane(lane, &new);
-        block.note(lane, 0, &outcome, cell, result);
-    }
-}
-
-impl BlockInput {
-    /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
-    #[inline(always)]
-    fn fill_absent(&mut self) {
-        if !self.is_present.all() {
-            let present = (0..WIDTH).position(|lane| self.is_present.lane(lane)).unwrap_or(0);
-            let time_s = Lanes::splat(self.input.measured_s.0[present]);
-            self.input.measured_s = self.input.measured_s.or_else(self.is_present, time_s);
-        }
-    }
-
-    /// The step that was put into a lane.
-    fn step(&self, lane: usize) -> CellStep {
-        let input = &self.input;
-        CellStep {
-            measured_s: input.measured_s.0[lane],
-            charge_as: input.charge_as.0[lane],
-            unmeasured_s: 0.0,
-            current_a: Some(input.current_a.0[lane]),
-            temperature_c: Some(input.temperature_c.0[lane]),
-            // Not asked for where the temperature is known.
-            ambient_c: input.temperature_c.0[lane],
-            voltage_v: input.voltage_v.0[lane],
-        }
-    }
-
-    /// Notes that the step of a lane is made.
-    #[inline(always)]
-    fn note<const L: usize>(
-        &mut self,
-        lane: usize,
-        from: usize,
-        outcome: &Outcome<L>,
-        cell: &mut Cell,
-        result: &mut StepResult,
-    ) {
-        self.is_present.set_lane(lane, false);
-        cell.memory.last_current_a = self.input.current_a.0[lane];
-        cell.memory.temperature_c = Some(self.input.temperature_c.0[lane]);
-        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
-        let update = Update {
-            innovation: outcome.innovation_v.0[from],
-            innovation_variance: outcome.innovation_variance.0[from],
-            test_ratio: outcome.test_ratio.0[from],
-            accepted: true,
-        };
-        *result = StepResult { update: Some(update), reset: false };
-    }
-}
-
-impl Input<WIDTH> {
-    #[inline(always)]
-    fn lane(&self, lane: usize) -> Input<1> {
-        let take = |x: &Lanes<WIDTH>| Lanes([x.0[lane]]);
-        Input {
-            measured_s: take(&self.measured_s),
-            charge_as: take(&self.charge_as),
-            current_a: take(&self.current_a),
-            voltage_v: take(&self.voltage_v),
-            temperature_c: take(&self.temperature_c),
-            kept: self.kept.lane(lane),
-        }
+        block.input.note(lane, 0, &outcome, cell, result);
+        block.is_present.set_lane(lane, false);
     }
 }
 

@@ -9,6 +9,7 @@
 //! * The state is ordered so that only the first three columns of the Cholesky factor L move what the circuit is not
 //!   linear in. Those of the branches add up to P less the first three columns: they are never computed.
 //! * SOC differs in one pair only, so a phase looks its tables up at three places and not at 2 N + 1.
+//! * A cell's lines of the tables are kept from step to step: [`Around`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
 //! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and where they may be
@@ -186,9 +187,15 @@ impl<const N: usize, const T: usize> State<1, N, T> {
 impl<const L: usize, const N: usize, const T: usize> State<L, N, T> {
     /// Puts the state of one cell into a lane.
     pub(super) fn set_lane(&mut self, lane: usize, one: &State<1, N, T>) {
-        let all = self.mean.iter_mut().chain(&mut self.covariance).chain(&mut self.memory);
-        let new = one.mean.iter().chain(&one.covariance).chain(&one.memory);
-        all.zip(new).for_each(|(all, new)| all.0[lane] = new.0[0]);
+        for i in 0..N {
+            self.mean[i].0[lane] = one.mean[i].0[0];
+        }
+        for i in 0..T {
+            self.covariance[i].0[lane] = one.covariance[i].0[0];
+        }
+        for i in 0..MEMORY {
+            self.memory[i].0[lane] = one.memory[i].0[0];
+        }
     }
 
     /// The new state where the mask says so.
@@ -226,8 +233,11 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
     // One number that is not finite makes the sum one that is not.
     let mut sum = outcome.innovation_variance + outcome.test_ratio;
-    for number in x.mean.iter().chain(&x.covariance) {
-        sum = sum + *number;
+    for i in 0..N {
+        sum = sum + x.mean[i];
+    }
+    for i in 0..T {
+        sum = sum + x.covariance[i];
     }
     let least = (1..N).fold(x.covariance[at(0, 0)], |least, i| least.smaller(x.covariance[at(i, i)]));
     outcome.is_usable = outcome.is_usable & has_factor & sum.is_finite() & least.above_number(0.0);

@@ -2,7 +2,11 @@
 //!
 //! Per interval of SOC one row with the line of every quantity (value at SOC 0 and slope), so that one place gives all of
 //! them without a division. Temperatures change slowly and are shared by cells: the rows of a temperature are made once
-//! and kept until room is needed for another ([`KEPT`] of them).
+//! and kept until room is needed for another ([`KEPT`] of them). A cell stays in its interval for thousands of steps: the
+//! lines it is on are kept beside its state ([`Around`]), lane by lane, and what is left of a look-up is a comparison.
+//! What is kept depends on temperature and SOC alone, so results do not depend on what was kept.
+//!
+//! In: states of charge, degrees C. Out: V, ohm, s.
 
 use crate::cell::model::CellModel;
 use crate::filter::lanes::Lanes;

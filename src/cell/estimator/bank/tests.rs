@@ -222,6 +222,26 @@ fn a_cell_does_not_know_its_company() {
 }
 
 #[test]
+fn a_cell_in_another_interval_finds_its_temperature_though_others_had_its_room() {
+    let (model, config) = (model(1), config());
+    let mut together = EstimatorBank::new(&model, &config, 2);
+    let mut alone = EstimatorBank::new(&model, &config, 1);
+    let mut pack = Pack::new(&model, 2);
+    let mut socs = Vec::new();
+    for time in 0..4500 {
+        // One cell keeps its temperature, the other has more of them than are kept.
+        let at = |cell: usize| if cell == 0 { 20.0 } else { 0.01 * f64::from(time) };
+        let mut steps = pack.round(time);
+        steps.iter_mut().for_each(|(cell, step)| step.temperature_c = Some(at(*cell)));
+        step(&mut together, &steps);
+        step(&mut alone, &steps[..1]);
+        assert_eq!(together.cell(0).snapshot(), alone.cell(0).snapshot(), "{time}");
+        socs.push(alone.soc(0).expect("started").mean);
+    }
+    assert!(socs.iter().any(|soc| *soc > 0.55) && socs.iter().any(|soc| *soc < 0.45));
+}
+
+#[test]
 fn what_is_put_in_is_what_comes_out() {
     let (model, config) = (model(3), config());
     let mut bank = EstimatorBank::new(&model, &config, 9);

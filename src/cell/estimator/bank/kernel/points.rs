@@ -21,10 +21,10 @@ pub(super) struct Factor<const L: usize, const N: usize> {
 impl<const L: usize, const N: usize> Factor<L, N> {
     #[inline(always)]
     pub(super) fn new<const T: usize>(covariance: &[Lanes<L>; T]) -> Self {
-        let first = column::<L, N, T, 0>(covariance, []);
-        let second = column::<L, N, T, 1>(covariance, [&first]);
-        let third = column::<L, N, T, 2>(covariance, [&first, &second]);
-        let columns = [first, second, third];
+        let first = Column::new::<T, 0>(covariance, []);
+        let second = Column::new::<T, 1>(covariance, [&first]);
+        let third = Column::new::<T, 2>(covariance, [&first, &second]);
+        let columns = [first.scaled, second.scaled, third.scaled];
         let mut rest = [[Lanes::splat(0.0); N]; N];
         for i in COLUMNS..N {
             for j in COLUMNS..=i {
@@ -39,21 +39,40 @@ impl<const L: usize, const N: usize> Factor<L, N> {
     }
 }
 
-/// Column K of the factor, from those before it. NaN where there is none: it goes on into every result.
-#[inline(always)]
-fn column<const L: usize, const N: usize, const T: usize, const K: usize>(
-    covariance: &[Lanes<L>; T],
-    done: [&[Lanes<L>; N]; K],
-) -> [Lanes<L>; N] {
-    let left = |i: usize| done.iter().fold(covariance[at(i, K)], |left, done| left - done[i] * done[K]);
-    let root = left(K).sqrt();
-    let inverse = root.reciprocal();
-    let mut column = [Lanes::splat(0.0); N];
-    column[K] = root;
-    for i in K + 1..N {
-        column[i] = left(i) * inverse;
+/// A column of the factor.
+struct Column<const L: usize, const N: usize> {
+    /// What the columns before it leave of the covariance.
+    left: [Lanes<L>; N],
+    per_pivot: Lanes<L>,
+    /// The same over the root of the pivot: the factor's column.
+    scaled: [Lanes<L>; N],
+}
+
+impl<const L: usize, const N: usize> Column<L, N> {
+    /// Column K, from those before it: these are not waited for until their roots are known. NaN where there is none: it
+    /// goes on into every result.
+    #[inline(always)]
+    fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
+        let mut left = [Lanes::splat(0.0); N];
+        for i in K..N {
+            left[i] = covariance[at(i, K)];
+        }
+        for done in done {
+            let factor = done.left[K] * done.per_pivot;
+            for i in K..N {
+                left[i] = left[i] - done.left[i] * factor;
+            }
+        }
+        let root = left[K].sqrt();
+        let per_pivot = left[K].reciprocal();
+        let per_root = root * per_pivot;
+        let mut scaled = [Lanes::splat(0.0); N];
+        scaled[K] = root;
+        for i in K + 1..N {
+            scaled[i] = left[i] * per_root;
+        }
+        Self { left, per_pivot, scaled }
     }
-    column
 }
 
 /// Whether what is left has a factor, too.
