@@ -121,7 +121,10 @@ impl UsualLines {
         let time = Timestamp::from_nanos(self.second_ns + fraction_ns.cast_signed());
         // Where a line goes on depends on its name's length. Found by comparing, that is foreseen; counted, it would be waited for.
         let name = word(text, name_at);
-        let interface = self.interfaces.iter().find(|known| name & known.mask == known.name)?;
+        let is_known = |known: &&Interface| name & known.mask == known.name;
+        // Most logs are of one interface: no loop for the first.
+        let interface =
+            self.interfaces.first().filter(is_known).or_else(|| self.interfaces.iter().skip(1).find(is_known))?;
         let body_at = name_at + usize::from(interface.len);
         let body: &[u8; BODY] = text.get(body_at..body_at + BODY)?.first_chunk()?;
         if body[3] != b'#' {
