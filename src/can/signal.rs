@@ -135,6 +135,12 @@ fn nearest(number: f64) -> i64 {
     towards_zero.saturating_add(i64::from(rest >= 0.5) - i64::from(rest <= -0.5))
 }
 
+/// The nearest code to a number where codes are unsigned and have 64 bits.
+#[cold]
+fn wide_code(number: f64, low: i128, high: i128) -> u64 {
+    low_64(integer_of(number.round()).clamp(low, high))
+}
+
 /// The lowest 64 bits of a two's complement number.
 fn low_64(code: i128) -> u64 {
     let bytes = code.to_le_bytes();
@@ -402,8 +408,7 @@ impl SignalPlan {
         let code = (value - self.offset) / self.factor;
         let bits = match (i64::try_from(low), i64::try_from(high)) {
             (Ok(low), Ok(high)) => nearest(code).clamp(low, high).cast_unsigned(),
-            // Unsigned, of 64 bits.
-            _ => low_64(integer_of(code.round()).clamp(low, high)),
+            _ => wide_code(code, low, high),
         };
         Some(bits & self.all_ones())
     }

@@ -59,7 +59,7 @@ struct Pages {
     visits: Vec<Visit>,
 }
 
-/// Words of a [`Wire`].
+/// How many [`Wire::words`] there are.
 const FAR: u8 = 2;
 
 /// Where the bits of a number are.
