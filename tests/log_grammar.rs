@@ -54,6 +54,21 @@ fn every_form_of_frame_is_read() {
 }
 
 #[test]
+fn a_foreign_interface_is_adopted_once_whatever_its_name_is_made_of() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("a.log");
+    let lines =
+        (0..100).map(|n| [&b"(1700000000.000000) can\xFF 123#11\n"[..], b"(1700000000.000000) can7 123#22\n"][n % 2]);
+    std::fs::write(&path, lines.collect::<Vec<_>>().concat()).expect("written");
+    let mut source = LogSource::new([path], options(false));
+    source.adopt_foreign();
+    let configured = source.interfaces().len();
+    while source.next_record().expect("readable").is_some() {}
+    assert_eq!(source.interfaces()[configured..], ["can\u{FFFD}", "can7"]);
+    assert_eq!((source.counts().frames, source.counts().foreign.len()), (100, 0));
+}
+
+#[test]
 fn stamps_names_and_directions_are_read() {
     let parts = |line: &str| match parse_line(line.as_bytes()) {
         Ok(Line::Frame { time, interface, transmitted, .. }) => {

@@ -121,16 +121,6 @@ impl<const L: usize> Lanes<L> {
         Self([value; L])
     }
 
-    /// The first L of `values`.
-    ///
-    /// # Panics
-    /// When there are fewer.
-    #[inline(always)]
-    pub fn load(values: &[f64]) -> Self {
-        let values = &values[..L];
-        Self(from_fn(|i| values[i]))
-    }
-
     /// Square of each lane.
     #[inline(always)]
     pub fn square(self) -> Self {
@@ -197,8 +187,8 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x to within three units in the last place; 0 below -708, e^709 above 709
-    /// and for NaN: who must know of a NaN looks at what it was made of.
+    /// e^x with a relative error below 3 x 2^-52; 0 from -708 down, e^709 above 709 and for NaN: who must know of a NaN looks at
+    /// what it was made of.
     #[inline(always)]
     pub fn exp(self) -> Self {
         let x = self.at_most(709.0);
@@ -207,7 +197,7 @@ impl<const L: usize> Lanes<L> {
         scaled.or_else(x.above_number(LEAST), Self::splat(0.0))
     }
 
-    /// e^x and e^-x, to within three units in the last place; x is held within 708, and there where it is NaN.
+    /// e^x and e^-x, with a relative error below 3 x 2^-52; x is held within 708, and is 708 where it is NaN.
     #[inline(always)]
     pub fn exp_of_both_signs(self) -> (Self, Self) {
         let series = ExpSeries::new(self.at_most(-LEAST).at_least(LEAST));

@@ -412,10 +412,10 @@ impl State {
 
     /// The interface's number; one that is not configured is counted.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
-        if let Some(index) = self.interfaces.iter().position(|name| name.as_bytes() == interface) {
+        let name = String::from_utf8_lossy(interface);
+        if let Some(index) = self.interfaces.iter().position(|known| *known == name) {
             return u8::try_from(index).ok().map(BusIndex);
         }
-        let name = String::from_utf8_lossy(interface);
         if self.adopt && self.interfaces.len() < MAX_ADOPTED {
             self.interfaces.push(name.into_owned());
             self.usual.know(&self.interfaces);

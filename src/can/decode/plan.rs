@@ -1,8 +1,8 @@
 //! The bindings compiled for reading: which message, which page of it, and per signal shifts, factors and limits.
 //!
 //! Everything here only finds sooner, and computes with fewer branches, what [`Binding`] says; results are the same bit
-//! for bit. What is rare (floats, signals over nine bytes, a code for "not available" amid the good ones, a selector with too
-//! many codes for a table) goes the binding's own way.
+//! for bit. What is rare (floats, signals of 64 bits or over nine bytes, a scale that is 0 or not finite, codes beyond one for
+//! "not available" amid the good ones, a selector with too many codes for a table) goes the binding's own way.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -305,6 +305,10 @@ impl Plan {
         };
         let is_usual = scale.is_finite() && scale != 0.0 && shift.is_finite();
         let Some(shifts) = binding.plan.shifts().filter(|_| is_usual) else { return nothing };
+        let limits = [shifts.low, shifts.high, binding.range.0, binding.range.1];
+        if limits.iter().any(|limit| limit.is_nan()) {
+            return nothing;
+        }
         let sign = if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 };
         let good = good_codes(binding, &shifts).and_then(|good| available_codes(binding, sign, good));
         let Some((first, last)) = good else { return nothing };
@@ -329,17 +333,17 @@ impl Plan {
     }
 }
 
-/// The good codes without those that mean "not available", which are at the ends almost always; `None` where one is in the midst.
-fn available_codes(binding: &Binding, sign: u64, (mut first, mut last): (i64, i64)) -> Option<(i64, i64)> {
+/// Of the good codes the longest run without one that means "not available": those are at the ends almost always, and what
+/// lies beyond one in the midst goes the binding's own way.
+fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
-    let missing: Vec<i64> = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed()).collect();
-    while first < last && missing.contains(&first) {
-        first += 1;
-    }
-    while first < last && missing.contains(&last) {
-        last -= 1;
-    }
-    (!missing.iter().any(|code| (first..=last).contains(code))).then_some((first, last))
+    let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
+    let mut missing: Vec<i64> = signed.filter(|code| (first..=last).contains(code)).collect();
+    missing.sort_unstable();
+    // At most 63 bits: there is a number before the first and after the last.
+    let begins = std::iter::once(first).chain(missing.iter().map(|code| code + 1));
+    let ends = missing.iter().map(|code| code - 1).chain([last]);
+    begins.zip(ends).filter(|(begin, end)| begin <= end).max_by_key(|(begin, end)| begin.abs_diff(*end))
 }
 
 /// The first and the last code whose value is within both ranges. Every step from the code to the value keeps the order

@@ -195,7 +195,8 @@ fn codes_for_not_available_are_told_at_the_ends_of_the_range_and_amid_it() {
         let binding = Binding { not_available, plan: layout.plan().unwrap(), ..bind("Pack.Temperature", sensor(0)) };
         readings(&InputMap::new(vec![binding]), 0, &Frame::classic(PACK, &code.to_le_bytes()).unwrap())[0].1
     };
-    for missing in [vec![], vec![0x80], vec![0x7F], vec![0x81, 0x80, 0x7F], vec![0xFF], vec![0x7E, 0x180]] {
+    let several = [vec![0x81, 0x80, 0x7F], vec![0x7E, 0x180], vec![0xFF, 0, 0x20, 0xFF], vec![5, 3, 4, 0xF0]];
+    for missing in [vec![], vec![0x80], vec![0x7F], vec![0xFF]].into_iter().chain(several) {
         for code in i8::MIN..=i8::MAX {
             let expected = if missing.contains(&u64::from(code.cast_unsigned())) {
                 Err(Fault::NotAvailable)
@@ -257,7 +258,8 @@ fn any_bindings() -> impl Strategy<Value = Vec<Binding>> {
             SignalLayout { start_bit, length_bits, byte_order, value_type, factor, offset, minimum, maximum }
         });
     let plan = layout.prop_filter_map("a layout that can be read", |layout| layout.plan().ok());
-    let range = prop_oneof![Just((f64::NEG_INFINITY, f64::INFINITY)), (-1e3..0.0, 0.0..1e3)];
+    let limits = prop::sample::select(vec![(f64::NEG_INFINITY, f64::INFINITY), (f64::NAN, 5.0), (0.0, f64::NAN)]);
+    let range = prop_oneof![2 => limits, 3 => (-1e3..0.0, 0.0..1e3)];
     // Of many lengths the lowest and the highest codes, unsigned and signed; and any.
     let end = (0..64u32, 0..3u64).prop_map(|(down, below)| (u64::MAX >> down).saturating_sub(below));
     let codes = prop::collection::vec(prop_oneof![0..4u64, end, any::<u64>()], 0..4);

@@ -2,9 +2,10 @@
 //!
 //! Almost every step is an ordinary one: the current was measured all the time since the last voltage, and the voltage is
 //! within the gate. Those are made by the [`kernel`], [`WIDTH`] cells at a time, over structures of arrays; wider
-//! instructions are chosen at run time. Whatever else there is (a first voltage, a gap, no current, a reading beyond the
-//! gate, a covariance without a factor) is done by the readable [`CellEstimator`], which is also what the kernel is tested
-//! against: SOC within 1e-9 over 100,000 steps. Which of the two steps a cell depends on that cell alone, and a
+//! instructions are chosen at run time (without the feature `lab` there are none, and cells are stepped one by one).
+//! Whatever else there is (a first voltage, a gap, no current, a reading beyond the gate, a covariance without a factor)
+//! is done by the readable [`CellEstimator`], which is also what the kernel is tested against: SOC within 1e-9 over 100,000
+//! steps. Which of the two steps a cell takes depends on that cell alone, and a
 //! lane's bits do not depend on the lanes beside it, so a cell's estimates are the same in any company.
 
 mod input;

@@ -2,8 +2,8 @@
 //!
 //! In: text that begins with a line. Out: what the full grammar gives for that line, or `None`, which says nothing but "use
 //! the full grammar": a stamp of ten digits with six or nine decimals, one space, a name of 1 to 7 bytes, one space, a
-//! standard or extended identifier, and up to eight bytes of payload are all that is known here. The numbers are
-//! converted a word at a time (bytes of a `u64` as lanes), with the first byte of the text lowest.
+//! standard or extended identifier, and up to eight bytes of payload are all that is known here. Numbers are
+//! converted several bytes at a time (as lanes of a `u64`, the first byte lowest, or by loops that become vectors).
 
 use crate::can::{CanId, Frame};
 use crate::quantity::{BusIndex, Timestamp};
@@ -13,7 +13,7 @@ const ONES: u64 = 0x0101_0101_0101_0101;
 const HIGHS: u64 = 0x8080_8080_8080_8080;
 /// The digit 0 in every byte.
 const ZEROS: u64 = b'0' as u64 * ONES;
-/// Bytes that are looked at: the longest usual line has 60. Where less text is left, the full grammar reads it.
+/// Bytes that are looked at: the longest usual line has 58. Where less text is left, the full grammar reads it.
 const WINDOW: usize = 64;
 /// Bytes that are looked at from the identifier on: at most 23 of stamp and 8 of name come before.
 const BODY: usize = 32;
@@ -156,7 +156,7 @@ fn extended(body: &[u8; BODY], time: Timestamp, bus: BusIndex, body_at: usize) -
     payload::<9>(body, id, time, bus, body_at)
 }
 
-/// The payload, which begins `AT` bytes after the identifier, and the line's end.
+/// The payload, which begins `AT` bytes after where the identifier begins, and the line's end.
 #[inline(always)]
 fn payload<const AT: usize>(
     body: &[u8; BODY],

@@ -6,7 +6,8 @@
 //! lines it is on are kept beside its state ([`Around`]), lane by lane, and what is left of a look-up is a comparison.
 //! What is kept depends on temperature and SOC alone, so results do not depend on what was kept.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s.
+//! In: states of charge, degrees C. Out: V, ohm, s. What is no number gives values that are none, in its own lane alone: such
+//! a step is not usable.
 
 use crate::cell::model::CellModel;
 use crate::filter::lanes::Lanes;
@@ -20,7 +21,7 @@ pub(super) const ERROR_V: usize = 4;
 /// Resistance of the first branch, ohm; then its time constant, s, then the next branch's.
 const BRANCHES: usize = 6;
 
-/// Temperatures whose rows are kept.
+/// Temperatures whose rows are kept: more than packs have sensors. With more, rows are made again, and results stay.
 const KEPT: usize = 64;
 
 /// Where branch `i`'s resistance is; its time constant follows.

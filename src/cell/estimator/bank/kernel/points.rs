@@ -92,7 +92,7 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// The resistance ratios of the sigma points: at the centre, and growth over the first two pairs.
+/// The resistance ratios of the sigma points over that at the centre: those of the first two pairs differ from it.
 pub(super) struct Ratios<const L: usize> {
     /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],
@@ -123,7 +123,7 @@ pub(super) struct Parts<const L: usize> {
 impl<const L: usize> Parts<L> {
     pub(super) const NONE: Self = Self { odd: [Lanes([0.0; L]); COLUMNS], even: [Lanes([0.0; L]); COLUMNS] };
 
-    /// Of the first pair, from what its plus and minus point and the centre became.
+    /// Of pair `k`, from what its plus and minus point and the centre became.
     #[inline(always)]
     pub(super) fn put(&mut self, c: &Constants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
         self.odd[k] = (plus - minus) * (0.5 / c.scale);
