@@ -10,7 +10,7 @@ use ratatui::style::Color;
 use super::app::{HISTORY, News, Page};
 use super::*;
 use crate::status::document::Document;
-use crate::status::sample::sample;
+use crate::cli::status::sample::sample;
 use crate::quantity::Timestamp;
 
 fn app() -> App {
