@@ -10,7 +10,7 @@ use super::Failure;
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config::{self, Config};
 use crate::replay::{self, Settings, Sinks, Summary, Watch};
-use crate::store::Reader;
+use crate::store::HistoryReader;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::report::{self, Data, Origin, Setting};
@@ -103,7 +103,7 @@ fn write(path: &Path, page: &str) -> io::Result<()> {
 type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
-    let reader = Reader::open(folder).map_err(Failure::new)?;
+    let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
     if let Some(broken) = &verdict.broken {

@@ -3,9 +3,9 @@
 //! | request | keys | answer |
 //! | --- | --- | --- |
 //! | `alarms` | `all` (false): those at rest too | [`AlarmList`] |
-//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); what is left out means every | [`Done`] |
-//! | `pack_replaced` | | [`Done`] |
-//! | `test` | `rule`, `seconds` (0 ends a test) | [`Done`] |
+//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); what is left out means every | [`CommandOutcome`] |
+//! | `pack_replaced` | | [`CommandOutcome`] |
+//! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
 //! Every line has `version`. Anything else is answered with what was found and what is allowed.
 
@@ -40,7 +40,7 @@ pub enum Answer {
     /// To `alarms`.
     Alarms(AlarmList),
     /// To every command.
-    Done(Done),
+    Outcome(CommandOutcome),
     /// It was not done: what was found, what is allowed.
     Error(String),
 }
@@ -73,7 +73,7 @@ pub struct UnknownAlarms {
 
 /// What became of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Done {
+pub struct CommandOutcome {
     /// When, on the daemon's clock.
     pub time: Timestamp,
     /// Alarms changed.
@@ -143,7 +143,7 @@ impl Answer {
     pub fn to_line(&self) -> Vec<u8> {
         let written = match self {
             Self::Alarms(list) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: list }),
-            Self::Done(done) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: done }),
+            Self::Outcome(done) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: done }),
             Self::Error(error) => {
                 let contents = &json!({ "error": error });
                 serde_json::to_vec(&Envelope { version: VERSION, ok: false, contents })
@@ -299,19 +299,19 @@ mod tests {
 
     #[test]
     fn an_answer_is_its_contents_or_its_error() {
-        let done = Done { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
-        assert_eq!(contents::<Done>(&Answer::Done(done.clone()).to_line()), Ok(done.clone()));
-        assert_eq!(contents::<Done>(&Answer::Error("no \"way\"".to_owned()).to_line()), Err("no \"way\"".to_owned()));
-        let unlike = contents::<AlarmList>(&Answer::Done(done).to_line()).unwrap_err();
+        let done = CommandOutcome { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
+        assert_eq!(contents::<CommandOutcome>(&Answer::Outcome(done.clone()).to_line()), Ok(done.clone()));
+        assert_eq!(contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()), Err("no \"way\"".to_owned()));
+        let unlike = contents::<AlarmList>(&Answer::Outcome(done).to_line()).unwrap_err();
         assert!(unlike.contains("missing field `thresholds`"), "{unlike}");
-        assert!(contents::<Done>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1"));
+        assert!(contents::<CommandOutcome>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1"));
     }
 
     proptest! {
         #[test]
         fn any_bytes_are_a_request_or_a_fault(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
             let _ = Request::parse(&bytes);
-            let _ = contents::<Done>(&bytes);
+            let _ = contents::<CommandOutcome>(&bytes);
         }
 
         #[test]

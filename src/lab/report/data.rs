@@ -3,7 +3,7 @@
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
 use super::trace::Trace;
-use crate::store::{Entry, Filter, Kind, Reader};
+use crate::store::{HistoryEntry, HistoryQuery, HistoryTable, HistoryReader};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
 
@@ -114,9 +114,9 @@ impl Data {
     ///
     /// # Errors
     /// When the file cannot be read.
-    pub fn of_store(reader: &Reader) -> Result<Self, String> {
+    pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         let mut data = Self::new(Origin::Store);
-        let entries = reader.entries(&Filter::default())?;
+        let entries = reader.entries(&HistoryQuery::default())?;
         let pack = entries.iter().map(|entry| entry.pack).max();
         data.source.pack = pack;
         entries.iter().filter(|entry| Some(entry.pack) == pack).for_each(|entry| data.take_entry(entry));
@@ -129,13 +129,13 @@ impl Data {
     }
 
     /// Takes a row of a store.
-    fn take_entry(&mut self, entry: &Entry) {
+    fn take_entry(&mut self, entry: &HistoryEntry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
         self.span(time_s);
         let row = Values(entry);
         let cell = row.number("cell").map(|cell| cell as usize);
         match (entry.kind, cell) {
-            (Kind::HalfCycle, Some(cell)) => self.halves.push(Half {
+            (HistoryTable::HalfCycle, Some(cell)) => self.halves.push(Half {
                 time_s,
                 cell,
                 is_charge: row.text("mode") == "charge",
@@ -143,7 +143,7 @@ impl Data {
                 duration_s: row.number("duration_s").unwrap_or(f64::NAN),
                 mean_temperature_c: row.number("mean_temperature_c"),
             }),
-            (Kind::Capacity, Some(cell)) => self.learned.push(Learned {
+            (HistoryTable::Capacity, Some(cell)) => self.learned.push(Learned {
                 time_s,
                 cell,
                 measured_ah: row.number("measured_ah"),
@@ -152,7 +152,7 @@ impl Data {
                 usable_ah: row.pair("usable_capacity_ah", "usable_capacity_std_ah"),
                 resistance: row.pair("resistance_ratio", "resistance_ratio_std").unwrap_or((f64::NAN, f64::NAN)),
             }),
-            (Kind::Alarm, cell) => self.alarms.push(AlarmRow {
+            (HistoryTable::Alarm, cell) => self.alarms.push(AlarmRow {
                 time_s,
                 rule: row.text("rule"),
                 severity: row.text("severity"),
@@ -162,14 +162,14 @@ impl Data {
                 value: row.number("value"),
                 threshold: row.number("threshold"),
             }),
-            (Kind::Reset, cell) => {
+            (HistoryTable::Reset, cell) => {
                 let of = cell.map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
                 let detail = row.text("detail");
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason").replace('_', " "))));
             }
             // A row of a cell without its number: the store writes none. And the forecast is made anew here.
-            (Kind::HalfCycle | Kind::Capacity, None) | (Kind::RemainingLife, _) => {}
+            (HistoryTable::HalfCycle | HistoryTable::Capacity, None) | (HistoryTable::RemainingLife, _) => {}
         }
     }
 
@@ -293,7 +293,7 @@ fn word(value: &impl serde::Serialize) -> String {
 }
 
 /// The values of a row by name.
-struct Values<'a>(&'a Entry);
+struct Values<'a>(&'a HistoryEntry);
 
 impl Values<'_> {
     fn value(&self, name: &str) -> Option<&serde_json::Value> {

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 use tokio::io::AsyncRead;
 
-use super::super::protocol::{Done, contents};
+use super::super::protocol::{CommandOutcome, contents};
 use super::*;
 use crate::monitor::Command;
 use crate::quantity::Timestamp;
@@ -16,7 +16,7 @@ fn block_on(test: impl Future<Output = ()>) {
 }
 
 fn done(changed: u32) -> Answer {
-    Answer::Done(Done { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
+    Answer::Outcome(CommandOutcome { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
 }
 
 /// A server whose loop answers everything with the number of requests so far.
@@ -26,7 +26,7 @@ async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
 
 async fn serve_patiently(folder: &TempDir, max_silence: Duration) -> (ControlServer, PathBuf) {
     let path = folder.path().join("control.sock");
-    let (sender, mut requests) = mpsc::channel::<Asked>(MAX_CONNECTIONS);
+    let (sender, mut requests) = mpsc::channel::<PendingRequest>(MAX_CONNECTIONS);
     tokio::spawn(async move {
         let mut count = 0;
         while let Some(asked) = requests.recv().await {
@@ -58,7 +58,7 @@ fn requests_of_a_connection_are_answered_in_turn() {
         let mut client = connect(&path).await;
         for count in 1..4 {
             client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            let done: Done = contents(line(&mut client).await.as_bytes()).unwrap();
+            let done: CommandOutcome = contents(line(&mut client).await.as_bytes()).unwrap();
             assert_eq!(done.changed, count);
         }
         client.write_all(b"rubbish\n").await.unwrap();

@@ -74,7 +74,7 @@ fn ready_comes_with_the_first_usable_reading_and_not_before() {
 
 #[test]
 fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_interface() {
-    let mut scene = Scene::new(Some(restored_words(Some(12.4))));
+    let mut scene = Scene::new(Some(describe_restored(Some(12.4))));
     scene.bus(0.0, 0, BusEvent::Up);
     scene.bus(0.1, 1, BusEvent::Missing);
     assert!(!scene.tick(9.8).ready);
@@ -86,7 +86,7 @@ fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_inter
     let frame = good_frame();
     scene.feed(1.5, |time| Input::Frame { time, bus: BusIndex(0), frame });
     assert_eq!(
-        scene.readiness.told,
+        scene.readiness.reported,
         "running: 2 interfaces, first frame after 11.5 s, restored state 12 s old; can1 is missing"
     );
 }
@@ -103,7 +103,7 @@ fn changes_are_told_at_most_once_a_second_and_the_last_one_always() {
     }
     assert!(told <= 3, "{told} lines in 2 s");
     scene.wait(2);
-    assert!(scene.readiness.told.ends_with("; can0 is missing"), "{}", scene.readiness.told);
+    assert!(scene.readiness.reported.ends_with("; can0 is missing"), "{}", scene.readiness.reported);
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
     for _ in 0..20 {
         scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
     }
-    assert_eq!(scene.readiness.told, "running: 2 interfaces, first frame after 0.0 s");
+    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
 }
 
 #[test]
@@ -126,10 +126,10 @@ fn a_refused_reload_stays_in_the_line_until_one_is_taken() {
     let frame = good_frame();
     scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
     scene.readiness.note_reload(Some("pack.toml:3: pack.cells = 0,\nmust be 1 to 1024".to_owned()));
-    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("told at once");
     assert!(line.ends_with("; reload refused: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");
     scene.readiness.note_reload(None);
-    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("told at once");
     assert!(!line.contains("reload"), "{line}");
 }
 

@@ -19,7 +19,7 @@ fn serve(folder: &TempDir, limits: Limits) -> (StatusServer, PathBuf) {
 }
 
 fn draft(cells: u16, pid: u32) -> Draft {
-    Draft { document: Document { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
+    Draft { document: StatusDocument { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
 }
 
 /// Offers until the thread takes it.
@@ -58,7 +58,7 @@ fn a_client_gets_one_document_and_the_end() {
     let early = connect(&path);
     offer(&server, 96, 1);
     let told = parse(&rest(early)).unwrap();
-    assert_eq!(told, Document { pid: 1, events: Vec::new(), ..sample(96) });
+    assert_eq!(told, StatusDocument { pid: 1, events: Vec::new(), ..sample(96) });
     let line = StatusClient::new(Some(&path)).line().unwrap();
     assert_eq!(parse(&line).unwrap(), told);
     assert_eq!(server.clients().served, 2);

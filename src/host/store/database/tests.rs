@@ -1,25 +1,25 @@
 //! Commits, restores, the chain and its faults, thinning, migration and damaged files, on real databases.
 
 use super::super::folder::{DATABASE, Folder};
-use super::super::reader::{Filter, Kind, Reader};
-use super::super::rows::Row;
+use super::super::parts::JsonParts;
+use super::super::reader::{HistoryQuery, HistoryReader};
+use super::super::rows::HistoryTable;
 use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
 use super::super::verify;
 use super::*;
 use crate::alarm::Change;
-use crate::monitor::EventKind;
 use crate::quantity::Timestamp;
 
 fn stamp(seconds: f64) -> Stamp {
     Stamp::replayed(Timestamp::from_secs(seconds))
 }
 
-fn batch(seconds: f64, kinds: &[EventKind]) -> Batch {
-    Batch { stamp: stamp(seconds), rows: kinds.iter().map(|kind| Row::Event(*kind)).collect() }
+fn batch(seconds: f64, kinds: &[EventKind]) -> RowBatch {
+    RowBatch { stamp: stamp(seconds), rows: kinds.iter().map(|kind| HistoryRow::Event(*kind)).collect() }
 }
 
 fn state(numbers: &[f64]) -> StateRecord {
-    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
+    StateRecord { parts: JsonParts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
 }
 
 fn open(folder: &Path) -> Database {
@@ -42,7 +42,7 @@ fn filled(folder: &Path) -> Database {
 }
 
 fn broken_row(folder: &Path) -> (String, i64) {
-    let verdict = Reader::open(folder).unwrap().verify().unwrap();
+    let verdict = HistoryReader::open(folder).unwrap().verify().unwrap();
     verdict.broken.map(|broken| (broken.table, broken.row)).unwrap_or_default()
 }
 
@@ -145,10 +145,10 @@ fn another_pack_closes_one_history_and_opens_the_next() {
     assert_eq!(packs, [(1, Some(9_000_000_000_000_000)), (2, None)]);
     drop(database);
     let entries =
-        Reader::open(folder.path()).unwrap().entries(&Filter { limit: Some(2), ..Filter::default() }).unwrap();
+        HistoryReader::open(folder.path()).unwrap().entries(&HistoryQuery { limit: Some(2), ..HistoryQuery::default() }).unwrap();
     assert_eq!(
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
-        [(Kind::Reset, 1), (Kind::Capacity, 2)]
+        [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]
     );
 }
 
@@ -175,20 +175,20 @@ fn a_history_of_before_the_remaining_lives_is_read_as_it_is_and_goes_on() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
     let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..1]).unwrap();
-    let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(Row::Event).collect();
-    old.commit(&[Batch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
+    let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(HistoryRow::Event).collect();
+    old.commit(&[RowBatch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
     drop(old);
-    let kinds = || -> Vec<Kind> {
-        let reader = Reader::open(folder.path()).unwrap();
+    let kinds = || -> Vec<HistoryTable> {
+        let reader = HistoryReader::open(folder.path()).unwrap();
         assert_eq!(reader.verify().unwrap().broken, None);
-        reader.entries(&Filter::default()).unwrap().iter().map(|entry| entry.kind).collect()
+        reader.entries(&HistoryQuery::default()).unwrap().iter().map(|entry| entry.kind).collect()
     };
-    assert_eq!(kinds(), [Kind::Capacity]);
+    assert_eq!(kinds(), [HistoryTable::Capacity]);
     let mut database = open(folder.path());
-    let batch = Batch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
+    let batch = RowBatch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
     database.commit(&[batch], None).unwrap();
     drop(database);
-    assert_eq!(kinds(), [Kind::Capacity, Kind::Capacity, Kind::RemainingLife]);
+    assert_eq!(kinds(), [HistoryTable::Capacity, HistoryTable::Capacity, HistoryTable::RemainingLife]);
 }
 
 #[test]
@@ -277,11 +277,11 @@ fn what_is_no_database_is_set_aside() {
 fn a_folder_belongs_to_one_process() {
     let place = tempfile::tempdir().unwrap();
     let mut first = Folder::new(place.path().join("made/on the way"), 1000);
-    first.take().unwrap();
+    first.lock().unwrap();
     let mut second = Folder::new(place.path().join("made/on the way"), 1000);
-    assert_eq!(second.take().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
+    assert_eq!(second.lock().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
     drop(first);
-    second.take().unwrap();
+    second.lock().unwrap();
 }
 
 #[test]
@@ -304,19 +304,19 @@ fn a_checkpoint_overwrites_its_pages_in_place() {
 fn a_history_can_be_read_while_it_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
-    let reader = Reader::open(folder.path()).unwrap();
-    let all = reader.entries(&Filter::default()).unwrap();
+    let reader = HistoryReader::open(folder.path()).unwrap();
+    let all = reader.entries(&HistoryQuery::default()).unwrap();
     assert_eq!(all.len(), 360);
     database.commit(&[batch(9e6, &[alarm(Change::Cleared)])], None).unwrap();
-    let filter = Filter { kinds: vec![Kind::Alarm], limit: Some(1), ..Filter::default() };
+    let filter = HistoryQuery { kinds: vec![HistoryTable::Alarm], limit: Some(1), ..HistoryQuery::default() };
     let last = &reader.entries(&filter).unwrap()[0];
     assert_eq!((last.seq, last.wall_ns), (Some(201), 9_000_000_000_000_000));
     assert_eq!(last.values[3], "cleared");
-    let of_cell = Filter {
+    let of_cell = HistoryQuery {
         cell: Some(2),
         since_ns: Some(86_400_000_000_000),
         until_ns: Some(2 * 86_400_000_000_000),
-        ..Filter::default()
+        ..HistoryQuery::default()
     };
     assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
 }

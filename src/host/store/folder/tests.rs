@@ -1,7 +1,7 @@
 //! A damaged database replaced, with the power cut after each step.
 
 use super::super::database::Counts;
-use super::super::reader::{Filter, Reader};
+use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::rows::tests::capacity;
 use super::super::tests::document;
 use super::*;
@@ -18,11 +18,10 @@ fn damaged() -> tempfile::TempDir {
     for hundredth in 0..200_u32 {
         let learned: Vec<EventKind> =
             (0..4).map(|cell| capacity(cell, Some(2.0), f64::from(hundredth) / 100.0)).collect();
-        let rows = learned.into_iter().map(Row::Event).collect();
-        database.commit(&[Batch { stamp: state.stamp, rows }], None).unwrap();
+        let rows = learned.into_iter().map(HistoryRow::Event).collect();
+        database.commit(&[RowBatch { stamp: state.stamp, rows }], None).unwrap();
     }
-    let parts = Parts::of(&state.to_json().unwrap()).unwrap();
-    database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
+    database.commit(&[], Some(StateRecord::new(&state, true, false).unwrap())).unwrap();
     database.close().unwrap();
     let file = File::options().write(true).open(place.path().join(DATABASE)).unwrap();
     let at = file.metadata().unwrap().len() * 2 / 5;
@@ -45,9 +44,9 @@ fn start(place: &Path) -> (Counts, usize) {
         .collect();
     assert!(names.is_empty(), "{names:?}");
     assert!(place.join("packwatch.db.damaged-1").exists() && !place.join("packwatch.db.damaged-2").exists());
-    let reader = Reader::open(place).unwrap();
+    let reader = HistoryReader::open(place).unwrap();
     assert_eq!(reader.verify().unwrap().broken, None);
-    let told = reader.entries(&Filter::default()).unwrap();
+    let told = reader.entries(&HistoryQuery::default()).unwrap();
     (counts, told.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
 }
 
@@ -98,7 +97,7 @@ fn a_replacement_that_cannot_be_made_leaves_the_damaged_database_where_it_is() {
     fs::create_dir_all(place.path().join("packwatch.db.new/x")).unwrap();
     let mut folder = Folder::new(place.path().to_owned(), 1000);
     let now = document(1, 150, 1_800_000_050).stamp;
-    folder.take().unwrap();
+    folder.lock().unwrap();
     assert!(matches!(folder.fill_replacement(WHY, &now), Err(OpenError::Unavailable(_))));
     assert!(place.path().join(DATABASE).exists());
     // Not again and again.

@@ -2,7 +2,7 @@
 
 use super::super::folder::DATABASE;
 use super::super::rows::tests::{capacity, half_cycle};
-use super::super::rows::{Batch, Row};
+use super::super::rows::{RowBatch, HistoryRow};
 use super::*;
 use crate::monitor::EventKind;
 
@@ -12,8 +12,8 @@ fn open(path: &Path) -> Database {
 
 fn commit(database: &mut Database, seconds: f64, kinds: &[EventKind]) {
     let stamp = Stamp::replayed(Timestamp::from_secs(seconds));
-    let rows = kinds.iter().copied().map(Row::Event).collect();
-    database.commit(&[Batch { stamp, rows }], None).unwrap();
+    let rows = kinds.iter().copied().map(HistoryRow::Event).collect();
+    database.commit(&[RowBatch { stamp, rows }], None).unwrap();
 }
 
 #[test]
