@@ -53,6 +53,6 @@ replayed() {
 # takes more than 2.5 s (the logs say how long it was away) what the drive's largest current moves meanwhile unseen: 6.2 A of
 # 2.6 Ah are 0.066 points a second. A tenth on top, for the time between the last sample seen and the state's stamp.
 restart_bar() {
-    cat -- "$@" | sed -nE 's/.*state taken up.* away=([0-9.]+).*/\1/p' |
+    cat -- "$@" | sed -nE 's/.*state restored.* away=([0-9.]+).*/\1/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'
 }

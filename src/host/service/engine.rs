@@ -144,7 +144,7 @@ impl Engine {
     fn dispatch_outputs(&mut self, time: Timestamp, links: &[LinkOutput]) {
         self.commit_learned(time);
         for transmit in &self.outputs.frames {
-            if !self.barrier.take(transmit) {
+            if !self.barrier.hold(transmit) {
                 send(links, transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };

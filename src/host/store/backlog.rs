@@ -81,9 +81,9 @@ impl Backlog {
             for batch in &mut self.batches {
                 let before = batch.rows.len();
                 batch.rows.retain(|row| {
-                    let goes = excess > 0 && row.is_detail() == detail && !row.replaces_pack();
-                    excess -= usize::from(goes);
-                    !goes
+                    let is_dropped = excess > 0 && row.is_detail() == detail && !row.replaces_pack();
+                    excess -= usize::from(is_dropped);
+                    !is_dropped
                 });
                 let gone = before - batch.rows.len();
                 self.rows -= gone;
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_detail_goes_first_and_is_counted() {
+    fn the_oldest_detail_is_dropped_first_and_counted() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![alarm(Change::Raised)]));
         for cell in 0..4000 {
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_could_not_be_written_come_again_in_their_order() {
+    fn rows_that_could_not_be_written_are_returned_in_their_order() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![capacity(1, Some(2.0), 2.0)]));
         let taken = backlog.take(&Stamp::replayed(Timestamp::ZERO));

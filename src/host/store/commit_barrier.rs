@@ -35,7 +35,7 @@ impl CommitBarrier {
     }
 
     /// Holds a frame that announces something while a ticket is open; `false` = it may be sent.
-    pub fn take(&mut self, transmit: &Transmit) -> bool {
+    pub fn hold(&mut self, transmit: &Transmit) -> bool {
         let last = self.tickets.back().filter(|_| transmit.announces);
         self.held.extend(last.map(|(ticket, _)| (*ticket, *transmit)));
         last.is_some()
@@ -75,42 +75,42 @@ mod tests {
         Transmit { time: Timestamp::ZERO, bus: BusIndex(0), frame, announces: true }
     }
 
-    fn sent(hold: &mut CommitBarrier, ticket: u64) -> Vec<u8> {
+    fn sent(barrier: &mut CommitBarrier, ticket: u64) -> Vec<u8> {
         let mut sent = Vec::new();
-        hold.release(ticket, |transmit| sent.push(transmit.frame.data()[0]));
+        barrier.release(ticket, |transmit| sent.push(transmit.frame.data()[0]));
         sent
     }
 
     #[test]
-    fn while_a_ticket_is_open_all_that_announces_waits_and_keeps_its_order() {
+    fn while_a_ticket_is_open_announcing_frames_wait_and_keep_their_order() {
         let now = Instant::now();
-        let mut hold = CommitBarrier::default();
+        let mut barrier = CommitBarrier::default();
         let (control, data, health) = (0x10, 0x11, 0x12);
-        assert!(!hold.take(&frame(health, 0)), "nothing to wait for");
-        hold.begin(1, now);
+        assert!(!barrier.hold(&frame(health, 0)), "nothing to wait for");
+        barrier.begin(1, now);
         // A transfer's announcement, its packets on later ticks, a cyclic frame between them.
         for (id, data) in [(control, 1), (data, 2), (health, 3), (data, 4)] {
-            assert!(hold.take(&frame(id, data)));
+            assert!(barrier.hold(&frame(id, data)));
         }
-        assert!(!hold.take(&Transmit { announces: false, ..frame(0x13, 9) }), "a state goes");
-        hold.begin(2, now);
-        assert!(hold.take(&frame(data, 5)));
-        assert_eq!(sent(&mut hold, 1), [1, 2, 3, 4]);
-        assert!(hold.take(&frame(health, 6)));
-        assert_eq!(sent(&mut hold, 2), [5, 6]);
-        assert!(!hold.take(&frame(health, 7)), "all is on the disk");
+        assert!(!barrier.hold(&Transmit { announces: false, ..frame(0x13, 9) }), "a status frame is sent");
+        barrier.begin(2, now);
+        assert!(barrier.hold(&frame(data, 5)));
+        assert_eq!(sent(&mut barrier, 1), [1, 2, 3, 4]);
+        assert!(barrier.hold(&frame(health, 6)));
+        assert_eq!(sent(&mut barrier, 2), [5, 6]);
+        assert!(!barrier.hold(&frame(health, 7)), "all is on the disk");
     }
 
     #[test]
     fn nothing_waits_longer_than_the_limit() {
         let now = Instant::now();
-        let mut hold = CommitBarrier::default();
-        hold.begin(1, now);
-        hold.begin(2, now + MAX_WAIT / 2);
-        assert_eq!(hold.overdue(now + MAX_WAIT / 2), None);
-        assert_eq!(hold.overdue(now + MAX_WAIT), Some(1));
-        assert_eq!(hold.overdue(now + 2 * MAX_WAIT), Some(2));
-        hold.release(2, |_| {});
-        assert_eq!(hold.overdue(now + 2 * MAX_WAIT), None);
+        let mut barrier = CommitBarrier::default();
+        barrier.begin(1, now);
+        barrier.begin(2, now + MAX_WAIT / 2);
+        assert_eq!(barrier.overdue(now + MAX_WAIT / 2), None);
+        assert_eq!(barrier.overdue(now + MAX_WAIT), Some(1));
+        assert_eq!(barrier.overdue(now + 2 * MAX_WAIT), Some(2));
+        barrier.release(2, |_| {});
+        assert_eq!(barrier.overdue(now + 2 * MAX_WAIT), None);
     }
 }

@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pack_that_turns_every_minute_writes_what_moves() {
+    fn a_pack_that_reverses_every_minute_writes_only_changes() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440 {
@@ -267,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn an_alarm_that_flickers_without_end_is_written_now_and_then_with_its_ends() {
+    fn a_flickering_alarm_is_written_now_and_then_with_its_first_and_last_row() {
         let mut history_filter = HistoryFilter::default();
         let (mut commits, mut rows) = (0, 0);
         for second in 0..86_400 {
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_misfits_keeps_no_other_alarm_from_the_disk() {
+    fn a_misfit_delays_no_other_alarm() {
         let mut history_filter = HistoryFilter::default();
         let of = |of_rule, of_severity, of_cell| {
             let mut kind = alarm(Change::Raised);
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_wait_go_with_a_checkpoint_but_not_with_every_one_for_ever() {
+    fn waiting_rows_go_with_a_checkpoint_but_not_with_every_one() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440_u32 {

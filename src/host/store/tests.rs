@@ -65,7 +65,7 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()
 }
 
-/// A monitor that has taken the state up.
+/// A monitor that has restored the state.
 fn restored(snapshot: Snapshot) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     let time = snapshot.time;
@@ -113,7 +113,7 @@ pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument 
 }
 
 #[test]
-fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
+fn the_newer_of_the_two_states_comes_first_with_its_age() {
     const WALL_S: i64 = 1_800_000_000;
     let now = document(1, 100, WALL_S).stamp;
     let of = |running: Option<StateDocument>, stored: Option<StateDocument>| -> Vec<(&str, Downtime)> {
@@ -143,10 +143,10 @@ fn answer(store: &Store, ticket: u64) -> StoreProgress {
 }
 
 #[test]
-fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
+fn a_failing_disk_is_reported_at_once_and_gets_everything_when_it_works() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
-    // A file where the folder should be: nothing can be made there.
+    // A file in place of the folder: nothing can be created there.
     std::fs::write(&state, "").unwrap();
     let (store, found) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
     let mut store = store.unwrap();
@@ -188,7 +188,7 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
     }
     // After 1 s, with 2 s to the next.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets answered meanwhile are no attempts.
+    // Tickets answered meanwhile cause no attempt.
     let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
         let ticket = write_queue.submit(None, document(1, 1, 1), false);
@@ -227,7 +227,7 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     store.finish(&monitor, Timestamp::from_secs(9.0));
     let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
     let mut store = store.unwrap();
-    // Pages that were in memory may never have been read again: then the start finds it.
+    // Cached pages may not have been read again: then the start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
     let ticket = learn(&mut store, 10.0);
     assert!(answer(&store, ticket).works);
@@ -270,7 +270,7 @@ fn reasons(folder: &Path) -> Vec<String> {
 }
 
 #[test]
-fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
+fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
     const ASIDE: &str = "database, set aside earlier";
     let place = tempfile::tempdir().unwrap();
     let open = || {
@@ -286,7 +286,7 @@ fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
     assert_eq!(states(&found), [(DATABASE_SOURCE, 2.0), (ASIDE, 1.0)]);
-    // Stays, however many states come after it.
+    // It stays, whatever the number of later states.
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(DATABASE_SOURCE, 3.0), (ASIDE, 1.0)]);
@@ -303,7 +303,7 @@ fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
 }
 
 #[test]
-fn a_state_of_another_version_is_told_and_not_overwritten() {
+fn a_state_of_another_version_is_reported_and_not_overwritten() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let now = document(1, 1, 1).stamp;

@@ -1,5 +1,5 @@
-//! Screens as they are drawn, against those in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` writes them anew:
-//! look at them before they are committed.
+//! Drawn screens, compared with the files in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` rewrites the files:
+//! check them before a commit.
 
 use std::path::PathBuf;
 
@@ -92,14 +92,14 @@ fn screens_without_a_daemon() {
     app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
     app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
     check("lost_80x24", &mut app, SMALL);
-    // Nothing of what was true is on the screen.
+    // No stale value is on the screen.
     assert!(!drawn(&mut app, LARGE).to_string().contains("SOC"));
     app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(96))));
     assert!(drawn(&mut app, LARGE).to_string().contains("SOC"));
 }
 
 #[test]
-fn a_daemon_that_says_nothing_is_lost() {
+fn a_silent_daemon_is_reported_as_lost() {
     let mut app = watched(1, 1);
     let received_at = sample(1).wall_time;
     app.poll(received_at.plus_secs(2.9));
@@ -125,7 +125,7 @@ fn a_silent_cell_is_not_painted_as_trusted() {
     let mut app = app();
     app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(3))));
     let screen = drawn(&mut app, SMALL);
-    // The first row of the map: trusted, not trusted, silent; the chosen one is the first.
+    // The first row of the map: trusted, not trusted, silent; the selected one is the first.
     let row =
         (0..SMALL.1).find(|row| (0..5).map(|x| screen.buffer()[(x, *row)].symbol()).eq([" ", " ", " ", "1", " "]));
     let colours: Vec<Color> = [5, 9, 13].map(|x| screen.buffer()[(x, row.unwrap())].fg).to_vec();
@@ -133,7 +133,7 @@ fn a_silent_cell_is_not_painted_as_trusted() {
 }
 
 #[test]
-fn every_size_is_drawn_and_every_key_taken_without_a_fault() {
+fn every_size_and_every_key_is_handled_without_a_fault() {
     for cells in [1, 2, 96, 1024] {
         let mut app = watched(cells, 2);
         for size in [(1, 1), (40, 12), (41, 13), (57, 30), (200, 12), (80, 24), (300, 100)] {

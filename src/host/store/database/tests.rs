@@ -47,7 +47,7 @@ fn broken_row(folder: &Path) -> (String, i64) {
 }
 
 #[test]
-fn what_was_committed_is_there_after_opening_again() {
+fn a_commit_is_there_after_reopening() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
     database.commit(&[], Some(state(&[1.5; 300]))).unwrap();
@@ -89,12 +89,12 @@ fn every_change_of_a_chained_row_is_found_and_named() {
 }
 
 #[test]
-fn the_number_of_a_pack_is_in_its_row_and_in_the_chain() {
+fn the_identity_of_a_pack_is_in_its_row_and_in_the_chain() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
     let another = EventKind::PackReplaced { capacity_ah: Some(1.9), capacity_std_ah: Some(0.1) };
-    let told = |identity| EventKind::PackIdentity { identity };
-    database.commit(&[batch(1.0, &[told(4711.0)]), batch(2.0, &[another, told(4712.0)])], None).unwrap();
+    let identified = |identity| EventKind::PackIdentity { identity };
+    database.commit(&[batch(1.0, &[identified(4711.0)]), batch(2.0, &[another, identified(4712.0)])], None).unwrap();
     let connection = database.connection();
     let of = |id: i64| -> String {
         connection.query_row("SELECT identity FROM pack WHERE id = ?1", [id], |row| row.get(0)).unwrap()
@@ -153,7 +153,7 @@ fn another_pack_closes_one_history_and_opens_the_next() {
 }
 
 #[test]
-fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
+fn an_older_layout_is_migrated_with_its_rows() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
     drop(filled(folder.path()));
@@ -163,7 +163,7 @@ fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
     assert_eq!(database.counts().chained, 200);
     assert_eq!(database.connection().query_row("SELECT id FROM added", [], |row| row.get::<_, i64>(0)).unwrap(), 40);
     drop(database);
-    // And now it is a newer one: for the present program not to touch.
+    // Now it is a newer layout, which the present program must not touch.
     let before = std::fs::read(&path).unwrap();
     let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
     assert_eq!(newer, OpenError::Newer { found: 3, known: 2 });
@@ -171,7 +171,7 @@ fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
 }
 
 #[test]
-fn a_history_of_before_the_remaining_lives_is_read_as_it_is_and_goes_on() {
+fn a_history_of_layout_version_1_is_read_and_continued() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
     let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..1]).unwrap();
@@ -225,7 +225,7 @@ fn damage(path: &Path, from: f64, bytes: usize) {
 }
 
 #[test]
-fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
+fn a_damaged_database_is_set_aside_and_its_rows_are_copied() {
     for from in [0.3, 0.5, 0.7, 0.9] {
         let place = tempfile::tempdir().unwrap();
         drop(filled(place.path()));
@@ -236,14 +236,14 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
         assert!(place.path().join("packwatch.db.damaged-1").exists(), "{from}");
         let saved = opening.database.counts();
         assert!(saved.chained > 100 && saved.chained < 200, "{from}: {saved:?}");
-        let told: i64 = opening
+        let reports: i64 = opening
             .database
             .connection()
             .query_row("SELECT count(*) FROM reset WHERE reason = 'damaged'", [], |row| row.get(0))
             .unwrap();
-        assert_eq!(told, 1, "{from}");
+        assert_eq!(reports, 1, "{from}");
         assert_eq!(verify::verify(opening.database.connection()).unwrap().broken, None, "{from}");
-        // Nothing that was changed has come over.
+        // No changed row was copied.
         let odd: i64 = opening
             .database
             .connection()
@@ -254,7 +254,7 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
 }
 
 #[test]
-fn what_is_no_database_is_set_aside() {
+fn a_file_that_is_no_database_is_set_aside() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let makers: [&dyn Fn(); 3] = [
@@ -334,7 +334,7 @@ fn a_delta_never_fits_another_full_record_of_its_number() {
         statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
     };
     assert_eq!(serials(&database), [1, 1]);
-    // The full record can no longer be read: numbers begin anew.
+    // The full record can no longer be read: numbers restart.
     database.connection().execute("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", []).unwrap();
     drop(database);
     let mut database = open(folder.path());
@@ -347,11 +347,11 @@ fn a_delta_never_fits_another_full_record_of_its_number() {
 }
 
 #[test]
-fn a_moment_goes_with_its_last_row() {
+fn a_moment_is_deleted_with_its_last_row() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
     for day in 0..1200_u32 {
-        // Every fifth transition teaches something; now and then there is an alarm.
+        // Every fifth transition has a capacity, some have an alarm.
         let mut learned = vec![half_cycle(0)];
         learned.extend((day % 5 == 0).then(|| capacity(0, Some(2.0), 1.9)));
         learned.extend((day % 7 == 0).then(|| alarm(Change::Raised)));

@@ -29,7 +29,7 @@ fn damaged() -> tempfile::TempDir {
     place
 }
 
-/// What a start finds: chained rows, and how often the damage is told.
+/// Starts and returns the chained rows and the number of reports of the damage.
 fn start(place: &Path) -> (Counts, usize) {
     let now = document(1, 200, 1_800_000_100).stamp;
     let opening = Folder::new(place.to_owned(), 1000).open(&now).unwrap();
@@ -46,15 +46,15 @@ fn start(place: &Path) -> (Counts, usize) {
     assert!(place.join("packwatch.db.damaged-1").exists() && !place.join("packwatch.db.damaged-2").exists());
     let reader = HistoryReader::open(place).unwrap();
     assert_eq!(reader.verify().unwrap().broken, None);
-    let told = reader.entries(&HistoryQuery::default()).unwrap();
-    (counts, told.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
+    let rows = reader.entries(&HistoryQuery::default()).unwrap();
+    (counts, rows.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
 }
 
-/// When the power goes, and what is in the folder then.
+/// The time of the power cut, and the files in the folder then.
 type Cut<'a> = (&'a str, &'a dyn Fn(&Path));
 
 #[test]
-fn a_replacement_that_was_cut_short_is_begun_again_or_finished() {
+fn an_interrupted_replacement_is_repeated_or_finished() {
     let uncut = start(damaged().path());
     assert!(uncut.0.chained > 400 && uncut.0.chained < 800 && uncut.1 == 1, "{uncut:?}");
     let stamp = document(1, 150, 1_800_000_050).stamp;
@@ -93,16 +93,16 @@ fn a_history_is_no_place_for_a_replay_while_its_replacement_waits() {
 #[test]
 fn a_replacement_that_cannot_be_made_leaves_the_damaged_database_where_it_is() {
     let place = damaged();
-    // Nothing can be made under that name.
+    // No file can be created under that name.
     fs::create_dir_all(place.path().join("packwatch.db.new/x")).unwrap();
     let mut folder = Folder::new(place.path().to_owned(), 1000);
     let now = document(1, 150, 1_800_000_050).stamp;
     folder.lock().unwrap();
     assert!(matches!(folder.fill_replacement(WHY, &now), Err(OpenError::Unavailable(_))));
     assert!(place.path().join(DATABASE).exists());
-    // Not again and again.
-    let told = folder.fill_replacement(WHY, &now).unwrap_err().to_string();
-    assert!(told.contains("less than 600 s ago"), "{told}");
+    // Not at every attempt.
+    let error = folder.fill_replacement(WHY, &now).unwrap_err().to_string();
+    assert!(error.contains("less than 600 s ago"), "{error}");
     fs::remove_dir_all(place.path().join("packwatch.db.new")).unwrap();
     drop(folder);
     start(place.path());

@@ -1,11 +1,11 @@
-//! What a power cut leaves of the estimates: a state that went through JSON and a delta's rounding, of an age the clocks say.
+//! Estimates after a power cut: a state that went through JSON and the rounding of a delta, with an age from the clocks.
 
 use nalgebra::DMatrix;
 use serde_json::Value;
 
 use super::*;
 
-/// A state of `late` as the database gives it back, stored as what differs from `early`.
+/// The state `late` as the database returns it, stored as the difference to `early`.
 fn from_the_disk(early: &StateDocument, late: &StateDocument) -> StateDocument {
     let parts = |document: &StateDocument| JsonParts::of(&serde_json::to_vec(document).unwrap()).unwrap();
     let base = parts(early);
@@ -48,7 +48,7 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
 }
 
 #[test]
-fn means_and_covariances_outlive_a_power_cut() {
+fn means_and_covariances_survive_a_power_cut() {
     let taken = |seconds: i64, boottime_s: i64| {
         let snapshot = Box::new(snapshot(Some(seconds), None));
         StateDocument { snapshot, ..document(1, boottime_s, 1_800_000_000 + boottime_s) }
@@ -66,7 +66,7 @@ fn means_and_covariances_outlive_a_power_cut() {
         compare((&a["mean"], &a["covariance"]), (&b["mean"], &b["covariance"]), &format!("filter at {seconds} s"));
         let [a, b] = [drift(&before), drift(&after)];
         compare((&a["x"], &a["p"]), (&b["x"], &b["p"]), &format!("capacity at {seconds} s"));
-        // And it is taken up, as old as the clocks say.
+        // The state is restored, with the age that the clocks give.
         let found = candidates(None, Some(back), &now, WallClock::Reliable).remove(0);
         let age_s = (10_000 - seconds) as f64;
         assert_eq!(found.downtime, Downtime::Seconds(age_s));
