@@ -46,7 +46,7 @@ MOVING = (1, 3)  # charge, discharge
 # Of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/restart.rs
+LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/integration/restart.rs
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 
