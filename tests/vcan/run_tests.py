@@ -81,6 +81,7 @@ class Outcome:
 
 
 Report = Callable[[Outcome], None]
+CHILDREN: set[subprocess.Popen] = set()
 
 
 def read_head(path: Path) -> VcanTest:
@@ -185,19 +186,24 @@ class Run:
 
 
 def call(command: list, while_waiting: Callable[[], None] = lambda: None) -> tuple[int, str]:
-    """Exit status and output. A program that ends this one takes the command, and so its kernel, with it."""
+    """Exit status and output of a command."""
     with tempfile.TemporaryFile("w+", errors="replace") as output:
         child = subprocess.Popen(list(map(str, command)), stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
-        try:
-            while child.poll() is None:
-                time.sleep(POLL_S)
-                while_waiting()
-        finally:
-            if child.poll() is None:
-                child.send_signal(signal.SIGTERM)
-                child.wait()
+        CHILDREN.add(child)
+        while child.poll() is None:
+            time.sleep(POLL_S)
+            while_waiting()
+        CHILDREN.discard(child)
         output.seek(0)
         return child.returncode, output.read()
+
+
+def stop_all() -> None:
+    """Ends every kernel: with-vcan passes the signal on and cleans up."""
+    for child in list(CHILDREN):
+        child.send_signal(signal.SIGTERM)
+    for child in list(CHILDREN):
+        child.wait()
 
 
 def run(tests: list[VcanTest], report: Report, jobs: int = JOBS) -> None:
@@ -234,6 +240,8 @@ def main() -> int:
     paths = [path.resolve() for path in options.tests] or sorted(HERE.glob("*.test"))
     tests = [test for test in map(read_head, paths) if test.is_smoke or not options.smoke]
     set_environment()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda number, _: (stop_all(), os._exit(128 + number)))
     outcomes, lock = [], threading.Lock()
 
     def report(outcome: Outcome) -> None:
