@@ -27,23 +27,11 @@
 //! * Inside, current is positive for discharge, SOC is a fraction; wire units end in [`can`].
 //! * A bad reading is data with a fault; nothing unknown looks healthy.
 
-pub mod alarm;
-pub mod can;
-pub mod cell;
+pub use packwatch_core::{alarm, can, cell, doctor, filter, health, monitor, quantity, sample, sim};
+pub use packwatch_host::{config, control, diagnosis, exporter, io, logging, replay, service, status, store};
+#[cfg(feature = "lab")]
+pub use packwatch_lab::{self as lab, ident};
+#[cfg(feature = "lab")]
+pub use packwatch_regress as regress;
+
 pub mod cli;
-pub mod config;
-pub mod daemon;
-pub mod doctor;
-pub mod filter;
-pub mod health;
-#[cfg(feature = "lab")]
-pub mod ident;
-pub mod io;
-#[cfg(feature = "lab")]
-pub mod lab;
-pub mod monitor;
-pub mod quantity;
-#[cfg(feature = "lab")]
-pub mod regress;
-pub mod sample;
-pub mod sim;

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use super::Failure;
 use super::control_args::{ControlArgs, print};
 use crate::alarm::{Alarm, Rule, Severity, State, Unit};
-use crate::daemon::control::protocol::{AlarmList, Request, contents};
+use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
 
@@ -145,7 +145,7 @@ pub(super) fn state_name(state: State) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::daemon::control::protocol::UnknownAlarms;
+    use crate::control::protocol::UnknownAlarms;
     use crate::quantity::Timestamp;
 
     fn alarm() -> Alarm {

@@ -8,9 +8,9 @@ use super::Failure;
 use super::alarms::{cell, severity, with_unit};
 use super::control_args::{ControlArgs, SelectorArgs, print};
 use crate::alarm::Alarm;
-use crate::daemon::control::answer::refusal;
-use crate::daemon::control::client::ControlClient;
-use crate::daemon::control::protocol::{Done, Request};
+use crate::control::answer::refusal;
+use crate::control::client::ControlClient;
+use crate::control::protocol::{Done, Request};
 use crate::monitor::Command;
 
 /// Arguments of `acknowledge` and `clear`.

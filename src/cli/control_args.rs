@@ -6,7 +6,7 @@ use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use crate::alarm::{Rule, Selector, Severity};
 use crate::cli::Failure;
-use crate::daemon::control::client::ControlClient;
+use crate::control::client::ControlClient;
 use crate::quantity::{CellIndex, MAX_CELLS};
 
 /// Where the daemon listens.

@@ -14,8 +14,8 @@ use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 use crate::config::{self, Survey};
-use crate::daemon::doctor::{self, Interrupt};
-use crate::daemon::replay::Progress;
+use crate::diagnosis::{self, Interrupt};
+use crate::replay::Progress;
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
 
@@ -122,7 +122,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
         pack_total: survey.plan.is_pack_total,
     };
     let bar = Bar::new(&args.logs);
-    let result = doctor::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
+    let result = diagnosis::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
         bar.show(Progress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });
@@ -142,7 +142,7 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     let bar = ProgressBar::with_draw_target(Some((1000.0 * wanted_s) as u64), ProgressDrawTarget::stderr_with_hz(5));
     let template = "listening {bar:32} {msg} (Ctrl-C ends early)";
     bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-    let result = doctor::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
+    let result = diagnosis::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
         bar.set_position((1000.0 * progress.seconds) as u64);
         bar.set_message(format!("{:.0} of {wanted_s:.0} s, {} frames", progress.seconds, progress.frames));
     });

@@ -4,8 +4,8 @@ use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::Failure;
-use crate::daemon::status::standard_path;
-use crate::daemon::{exporter, logging};
+use crate::status::standard_path;
+use crate::{exporter, logging};
 
 /// Arguments of `exporter`.
 #[derive(Debug, clap::Args)]

@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 
 use super::Failure;
 use super::control_args::print;
-use crate::daemon::store::{self, Entry, Filter, Kind, Reader};
+use crate::store::{self, Entry, Filter, Kind, Reader};
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};

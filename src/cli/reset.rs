@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::Failure;
 use super::command;
 use super::control_args::{ControlArgs, print};
-use crate::daemon::store;
+use crate::store;
 
 /// Arguments of `reset`.
 #[derive(Debug, clap::Args)]

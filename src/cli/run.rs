@@ -5,14 +5,14 @@ use std::time::Duration;
 
 use super::Failure;
 use crate::config;
-use crate::daemon::control::ControlSetting;
-use crate::daemon::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
-use crate::daemon::snapshot_file;
-use crate::daemon::status::document::ConfigFile;
-use crate::daemon::store::StateSetting;
-use crate::daemon::{logging, service::Service};
+use crate::control::ControlSetting;
+use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
+use crate::io::snapshot_file;
+use crate::status::document::ConfigFile;
+use crate::store::StateSetting;
+use crate::{logging, service::Service};
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
-use crate::monitor::Away;
+use crate::monitor::Downtime;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]
@@ -34,7 +34,7 @@ pub(crate) struct Args {
     restore: Option<PathBuf>,
     /// Age of the stored state, where its stamp does not tell (it came from a log), or unknown
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
-    away: Option<Away>,
+    away: Option<Downtime>,
     /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
     /// /var/lib/packwatch where that can be made). The state in it is taken up, unless --restore says another
     #[arg(long, value_name = "DIR")]
@@ -84,10 +84,10 @@ fn ready_seconds(text: &str) -> Result<f64, String> {
 }
 
 /// Age of a stored state.
-pub(crate) fn away(text: &str) -> Result<Away, String> {
+pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     match text {
-        "unknown" => Ok(Away::Unknown),
-        _ => seconds(text).map(Away::Seconds).map_err(|must| format!("{must}, or unknown")),
+        "unknown" => Ok(Downtime::Unknown),
+        _ => seconds(text).map(Downtime::Seconds).map_err(|must| format!("{must}, or unknown")),
     }
 }
 

@@ -8,9 +8,9 @@ use std::path::PathBuf;
 
 use super::Failure;
 use super::control_args::print;
-use crate::daemon::status::client::{StatusClient, parse};
-use crate::daemon::status::document::Document;
-use crate::daemon::status::metrics::openmetrics;
+use crate::status::client::{StatusClient, parse};
+use crate::status::document::Document;
+use crate::status::metrics::openmetrics;
 
 /// Exit code when no daemon tells its status.
 const EXIT_UNREACHABLE: u8 = 3;
@@ -128,7 +128,7 @@ fn store(document: &Document) -> String {
 
 /// The configuration in a few characters: its name and the beginning of its fingerprint.
 fn config(document: &Document) -> String {
-    let file = |config: &crate::daemon::status::document::ConfigFile| {
+    let file = |config: &crate::status::document::ConfigFile| {
         format!("{} ({})", config.path, config.sha256.get(..8).unwrap_or_default())
     };
     document.config.as_ref().map_or_else(|| "-".to_owned(), file)

@@ -12,7 +12,7 @@ use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
 use crate::alarm::{Rule, State};
 use crate::config;
-use crate::daemon::alarm_test::{self, ChannelReport, Real};
+use crate::control::test_alarm::{self, ChannelReport, Real};
 use crate::io::stamp;
 use crate::monitor::MAX_TEST_S;
 
@@ -43,7 +43,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load(&args.config)?;
     let duration = Duration::from_secs_f64(args.duration);
-    let reports = alarm_test::run(&config, &args.control.client(), args.rule, duration).map_err(Failure::new)?;
+    let reports = test_alarm::run(&config, &args.control.client(), args.rule, duration).map_err(Failure::new)?;
     print(&table(args.rule, &reports))?;
     let bad = reports.iter().filter(|report| !report.is_good());
     let bad: Vec<String> = bad.map(|report| format!("{} ({})", report.interface, report.what)).collect();
@@ -145,7 +145,7 @@ mod tests {
     use super::*;
     use crate::can::CanId;
     use crate::can::j1939::TroubleCode;
-    use crate::daemon::alarm_test::Seen;
+    use crate::control::test_alarm::Seen;
 
     fn dm1(seen: Seen) -> String {
         let report = ChannelReport {

@@ -8,37 +8,37 @@
 mod axis;
 mod files;
 mod heat;
-mod lanes;
+mod state_bands;
 mod plot;
 mod style;
 mod svg;
 mod thin;
 
-pub(crate) use axis::{Axis, Scale};
-pub(crate) use files::{Format, PlotError, write, write_stack};
-pub(crate) use heat::Heat;
-pub(crate) use lanes::{Lane, Lanes, Span};
-pub(crate) use plot::{Chart, Layer, Point, Shape};
-pub(crate) use style::{Ink, variables};
-pub(crate) use svg::escape;
+pub use axis::{Axis, Scale};
+pub use files::{Format, PlotError, write, write_stack};
+pub use heat::Heat;
+pub use state_bands::{Lane, Lanes, Span};
+pub use plot::{Chart, Layer, Point, Shape};
+pub use style::{Ink, variables};
+pub use svg::escape;
 
 /// Width and height of a picture, pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Size {
-    pub(crate) width: f64,
-    pub(crate) height: f64,
+pub struct Size {
+    pub width: f64,
+    pub height: f64,
 }
 
 impl Size {
     /// For a screen or a page.
-    pub(crate) const WIDE: Self = Self { width: 840.0, height: 290.0 };
+    pub const WIDE: Self = Self { width: 840.0, height: 290.0 };
     /// For a phone.
-    pub(crate) const NARROW: Self = Self { width: 350.0, height: 270.0 };
+    pub const NARROW: Self = Self { width: 350.0, height: 270.0 };
 }
 
 /// Anything that can be drawn.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Picture {
+pub enum Picture {
     Chart(Chart),
     Lanes(Lanes),
     Heat(Heat),
@@ -46,7 +46,7 @@ pub(crate) enum Picture {
 
 impl Picture {
     /// The elements inside an `<svg>`, and the height they take.
-    pub(crate) fn draw(&self, size: Size) -> (String, f64) {
+    pub fn draw(&self, size: Size) -> (String, f64) {
         match self {
             Self::Chart(chart) => chart.draw(size),
             Self::Lanes(lanes) => lanes.draw(size),
@@ -55,7 +55,7 @@ impl Picture {
     }
 
     /// What it shows, in a few words.
-    pub(crate) fn title(&self) -> &str {
+    pub fn title(&self) -> &str {
         match self {
             Self::Chart(chart) => &chart.title,
             Self::Lanes(lanes) => &lanes.title,
@@ -73,7 +73,7 @@ impl Picture {
     }
 
     /// An `<svg>` element to stand in a page; its colours come from the page.
-    pub(crate) fn inline(&self, size: Size, class: &str) -> String {
+    pub fn inline(&self, size: Size, class: &str) -> String {
         let (body, height) = self.draw(size);
         let (width, title) = (size.width, escape(self.title()));
         let description = escape(self.description());

@@ -4,16 +4,16 @@
 //! In: a configuration and logs of any form `replay` reads. Each log is replayed by itself, the logs on all cores; a log
 //! that fails is told and the others go on. Memory is bounded by what is kept per log, not by its length.
 
-pub(crate) mod drive;
-pub(crate) mod export;
-pub(crate) mod judge;
-mod lanes;
+pub mod drive;
+pub mod export;
+pub mod judge;
+mod variant_batch;
 mod track;
-pub(crate) mod truth;
-pub(crate) mod variants;
-pub(crate) mod whatif;
+pub mod truth;
+pub mod variants;
+pub mod whatif;
 
-pub(crate) use drive::{Opened, Reading};
+pub use drive::{Opened, Reading};
 
 use rayon::prelude::*;
 
@@ -21,7 +21,7 @@ use rayon::prelude::*;
 ///
 /// # Errors
 /// When the threads cannot be started.
-pub(crate) fn in_parallel<T: Sync, R: Send>(
+pub fn in_parallel<T: Sync, R: Send>(
     items: &[T],
     jobs: Option<usize>,
     work: impl Fn(usize, &T) -> R + Sync,

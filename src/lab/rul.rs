@@ -20,7 +20,7 @@ use serde::Serialize;
 pub use history::{History, HistoryError, Row};
 pub use truth::end_of_life;
 
-use crate::health::{Axis, Forecast, Passed, Reading, RemainingLife, TooThin};
+use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not decide a mean.
 pub const WORST_ERROR: f64 = 1.0;
@@ -155,7 +155,7 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> Now {
         used: history.rows.last().map_or(0.0, |row| row.used),
         level_ah: forecast.level_ah(),
         rate_ah: forecast.rate_ah(),
-        refused: remaining.as_ref().err().map(TooThin::to_string),
+        refused: remaining.as_ref().err().map(InsufficientData::to_string),
         remaining: remaining.ok(),
     }
 }
@@ -238,7 +238,7 @@ fn fed(history: &History, moment: f64) -> Forecast {
             // Part of the way to the next reading has gone, without a reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
-            forecast.update(Passed { cycles, days, rest_days }, None);
+            forecast.update(Usage { cycles, days, rest_days }, None);
             break;
         }
         let reading = Reading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };

@@ -89,7 +89,7 @@ fn inverse_deviations(inputs: &[f64], data: &Data) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::regress::Basis;
+    use crate::Basis;
 
     fn data(rows: usize) -> Data {
         let inputs = (0..rows).map(|k| k as f64).collect();

@@ -335,7 +335,7 @@ fn planted_violations_are_found_with_file_and_line() {
             "sim may not import crate::cell::estimator",
         ),
         ("io/mod.rs", "use crate::daemon::Clock;", "io may not import crate::daemon::Clock"),
-        ("main.rs", "fn main() { packwatch::daemon::run(); }", "main may not import crate::daemon::run"),
+        ("main.rs", "fn main() { packwatch::run(); }", "main may not import crate::service::run"),
         ("novel/mod.rs", "", "src/novel/mod.rs:1: module novel has no row"),
     ];
     for (file, source, expected) in planted {

@@ -9,7 +9,7 @@ use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
 use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource, Record};
-use packwatch::monitor::{Away, BusEvent, Input};
+use packwatch::monitor::{Downtime, BusEvent, Input};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
 
@@ -355,7 +355,7 @@ fn a_journal_gives_back_what_was_written() {
     ];
     inputs.extend(events.map(|event| Input::Bus { time: at(1_700_000_001_000_000_000), bus: BusIndex(1), event }));
     let mut journal = JournalWriter::new(Vec::new(), vec!["can0".into(), "can1".into()]).expect("memory");
-    let aways = [Away::Seconds(0.1), Away::AsStamped, Away::Unknown];
+    let aways = [Downtime::Seconds(0.1), Downtime::AsStamped, Downtime::Unknown];
     let taken_up = at(1_700_000_000_000_000_000);
     aways.iter().try_for_each(|away| journal.restored(taken_up, *away)).expect("memory");
     inputs.iter().try_for_each(|input| journal.append(input)).expect("memory");

@@ -4,7 +4,7 @@
 //! by what damage or a failed calculation may leave. What is taken up is fed a charge and a discharge.
 
 use crate::support::rig::{Rig, learned};
-use packwatch::monitor::{Away, EventKind, Monitor, RestoreError, Snapshot};
+use packwatch::monitor::{Downtime, EventKind, Monitor, RestoreError, Snapshot};
 use serde_json::Value;
 
 /// The way to every number of a document.
@@ -73,7 +73,7 @@ fn one_damaged_number_is_refused_or_harmless() {
             };
             rig.monitor = Monitor::new(rig.config.clone());
             rig.deci = start_deci;
-            if rig.monitor.restore(snapshot, Away::Seconds(0.1)).is_err() {
+            if rig.monitor.restore(snapshot, Downtime::Seconds(0.1)).is_err() {
                 refused += 1;
                 continue;
             }
@@ -93,7 +93,7 @@ fn what_is_refused_says_which_number_it_is_and_what_it_may_be() {
     let covariance = document.pointer_mut("/cells/1/estimator/covariance").unwrap().as_array_mut().unwrap();
     *covariance.last_mut().unwrap() = (-0.25).into();
     let mut rig = Rig::new("");
-    let error = rig.monitor.restore(serde_json::from_value(document).unwrap(), Away::AsStamped).unwrap_err();
+    let error = rig.monitor.restore(serde_json::from_value(document).unwrap(), Downtime::AsStamped).unwrap_err();
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
     let told = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-40 to 1e20";
     assert_eq!(error.to_string(), told);

@@ -8,7 +8,7 @@ use std::path::Path;
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
-use packwatch::monitor::{Away, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
+use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
 use packwatch::quantity::{BusIndex, Timestamp};
 use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
 
@@ -114,7 +114,7 @@ fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
 const WHAT: [&str; 3] = ["estimates", "events", "frames"];
 
 /// The differences between a monitor that never stopped and ones restored at `splits`: a line for the first of each kind.
-fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Away) -> Vec<String> {
+fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Downtime) -> Vec<String> {
     let mut found = Vec::new();
     for &split in splits {
         let (mut whole, mut out) = (Monitor::new(config.clone()), wanting_estimates());
@@ -174,13 +174,13 @@ fn results(found: Vec<String>, frames: bool) -> Vec<String> {
 #[test]
 fn a_restored_cell_estimates_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    assert_same(&results(differences(&config, &records, &splits(&records, 6, false), Away::AsStamped), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 6, false), Downtime::AsStamped), false));
 }
 
 #[test]
 fn a_restored_cell_that_was_not_away_estimates_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Away::Seconds(0.0)), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Downtime::Seconds(0.0)), false));
 }
 
 #[test]
@@ -194,27 +194,27 @@ fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
         out.events.iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. }))
     });
     let split = told.expect("a half-cycle");
-    assert_same(&results(differences(&config, &records, &[split], Away::AsStamped), false));
+    assert_same(&results(differences(&config, &records, &[split], Downtime::AsStamped), false));
 }
 
 #[test]
 fn a_restored_pack_estimates_as_if_it_had_never_stopped() {
     let (config, records) = pack();
-    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Away::AsStamped), false));
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), false));
 }
 
 #[test]
 fn a_restored_cell_sends_as_if_it_had_never_stopped() {
     let (config, records) = paper();
-    let mut found = differences(&config, &records, &splits(&records, 3, false), Away::AsStamped);
-    found.extend(differences(&config, &records, &splits(&records, 2, true), Away::Seconds(0.0)));
+    let mut found = differences(&config, &records, &splits(&records, 3, false), Downtime::AsStamped);
+    found.extend(differences(&config, &records, &splits(&records, 2, true), Downtime::Seconds(0.0)));
     assert_same(&results(found, true));
 }
 
 #[test]
 fn a_restored_pack_sends_as_if_it_had_never_stopped() {
     let (config, records) = pack();
-    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Away::AsStamped), true));
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
 }
 
 /// The whole run against one that goes on with an `edit`ed configuration from one split to the next: a line for the first

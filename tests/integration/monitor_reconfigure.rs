@@ -4,8 +4,8 @@ use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{Change, Rule, Severity, State};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
-use packwatch::health::{Axis, Forecast, Passed, Reading};
-use packwatch::monitor::{Away, Command, EventKind, Input, Monitor, MonitorConfig};
+use packwatch::health::{Axis, Forecast, Usage, Reading};
+use packwatch::monitor::{Downtime, Command, EventKind, Input, Monitor, MonitorConfig};
 use packwatch::quantity::CellIndex;
 
 const HOT: &str = "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n";
@@ -116,14 +116,14 @@ fn another_end_of_life_is_not_judged_by_what_remained_until_the_old_one() {
     // 2.36 Ah are left, 0.004 Ah are lost in a cycle: some 70 cycles to 2.08 Ah, 135 to 1.82 Ah.
     let mut forecast = Forecast::new(Axis::Cycles, 2.6);
     for cycle in 0..60 {
-        let passed = Passed { cycles: 1.0, days: 0.5, rest_days: 0.0 };
+        let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };
         let capacity_ah = 2.6 - 0.004 * f64::from(cycle);
         forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
     }
     let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     (0..2).for_each(|cell| stored["cells"][cell]["forecast"] = serde_json::to_value(&forecast).unwrap());
     rig.monitor = Monitor::new(rig.config.clone());
-    rig.monitor.restore(serde_json::from_value(stored).unwrap(), Away::AsStamped).unwrap();
+    rig.monitor.restore(serde_json::from_value(stored).unwrap(), Downtime::AsStamped).unwrap();
     rig.seconds(1);
     let cycles = |rig: &Rig| rig.monitor.pack_remaining_life().unwrap().1.cycles.unwrap().median;
     assert!((50.0..90.0).contains(&cycles(&rig)), "{}", cycles(&rig));

@@ -3,7 +3,7 @@
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{Change, Rule, Selector, State};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Away, BusEvent, Command, EventKind, Input, Outputs, Source};
+use packwatch::monitor::{Downtime, BusEvent, Command, EventKind, Input, Outputs, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 
 impl Rig {
@@ -23,7 +23,7 @@ fn after_an_unknown_time_away_nothing_is_sure_but_what_was_learned() {
     let (capacity, before) = (rig.monitor.capacity(CellIndex(1)), rig.soc_std(0));
     // Nobody measures the current: only the gap speaks.
     rig.current_a = None;
-    rig.restart(Away::Unknown);
+    rig.restart(Downtime::Unknown);
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(before < 0.05 && rig.soc_std(0) > 0.25, "{before} {}", rig.soc_std(0));
@@ -34,14 +34,14 @@ fn after_an_unknown_time_away_nothing_is_sure_but_what_was_learned() {
 fn a_state_from_the_future_is_of_unknown_age() {
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 36_000);
-    rig.restart(Away::AsStamped);
+    rig.restart(Downtime::AsStamped);
     rig.seconds(1);
     assert_eq!(rig.gaps(), [None]);
     assert!(rig.soc_std(0) > 0.25, "{}", rig.soc_std(0));
     // Interfaces that merge out of order are no clock that was set.
     let mut rig = learned();
     (rig.current_a, rig.deci) = (None, rig.deci - 5);
-    rig.restart(Away::AsStamped);
+    rig.restart(Downtime::AsStamped);
     rig.seconds(1);
     assert_eq!(rig.gaps(), []);
     assert!(rig.soc_std(0) < 0.05, "{}", rig.soc_std(0));
@@ -63,7 +63,7 @@ fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
 
 #[test]
 fn what_was_learned_survives_every_restart_bit_for_bit() {
-    for away in [Away::Seconds(0.5), Away::Seconds(3.0), Away::Seconds(3e4), Away::Seconds(3e8), Away::Unknown] {
+    for away in [Downtime::Seconds(0.5), Downtime::Seconds(3.0), Downtime::Seconds(3e4), Downtime::Seconds(3e8), Downtime::Unknown] {
         let mut rig = learned();
         let before = learned_parts(&rig);
         assert!(before[0].to_string().contains("mean") && before[2].to_string().contains("true"));
@@ -98,8 +98,8 @@ impl Rig {
 }
 
 /// Every way to be away.
-const AWAYS: [Away; 5] =
-    [Away::Seconds(0.0), Away::Seconds(2.0), Away::Seconds(60.0), Away::Seconds(3e5), Away::Unknown];
+const AWAYS: [Downtime; 5] =
+    [Downtime::Seconds(0.0), Downtime::Seconds(2.0), Downtime::Seconds(60.0), Downtime::Seconds(3e5), Downtime::Unknown];
 
 #[test]
 fn raised_acknowledged_latched_and_past_alarms_come_back_as_they_were() {
@@ -147,7 +147,7 @@ fn no_frame_after_a_restart_says_that_a_raised_alarm_is_over() {
 
 #[test]
 fn what_a_debounce_has_counted_is_kept_and_the_time_away_is_not_counted() {
-    for away in [Away::Seconds(60.0), Away::Seconds(3e5)] {
+    for away in [Downtime::Seconds(60.0), Downtime::Seconds(3e5)] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 7);
         assert_eq!(rig.stands(Rule::TemperatureHigh).0, State::Pending);
@@ -165,7 +165,7 @@ fn a_stored_alarm_nothing_watches_any_more_is_told_and_ended() {
     rig.heat(60.0, 12);
     rig.config.rules.clear();
     (rig.events, rig.frames) = Default::default();
-    rig.restart(Away::Seconds(60.0));
+    rig.restart(Downtime::Seconds(60.0));
     rig.tick();
     let dropped = rig.events.iter().find_map(|event| match event.kind {
         EventKind::AlarmDropped { rule, active, occurrences, cell, .. } => Some((rule, active, occurrences, cell)),
@@ -173,7 +173,7 @@ fn a_stored_alarm_nothing_watches_any_more_is_told_and_ended() {
     });
     assert_eq!(dropped, Some((Rule::TemperatureHigh, true, 1, None)));
     assert_eq!(rig.last_wire(Rule::TemperatureHigh).state, 6);
-    rig.restart(Away::Seconds(60.0));
+    rig.restart(Downtime::Seconds(60.0));
     rig.tick();
     assert_eq!(rig.events.iter().filter(|e| matches!(e.kind, EventKind::AlarmDropped { .. })).count(), 1);
 }
@@ -203,9 +203,9 @@ fn a_missing_input_stays_missing_over_a_restart_until_it_is_back() {
 fn an_interface_out_of_order_stays_so_over_a_restart_until_it_is_in_order() {
     let fault = |event| move |rig: &mut Rig| rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event });
     for (event, away) in [
-        (BusEvent::Down, Away::Seconds(2.0)),
-        (BusEvent::Missing, Away::Seconds(3e4)),
-        (BusEvent::SendFailed { frames: 1 }, Away::Seconds(2.0)),
+        (BusEvent::Down, Downtime::Seconds(2.0)),
+        (BusEvent::Missing, Downtime::Seconds(3e4)),
+        (BusEvent::SendFailed { frames: 1 }, Downtime::Seconds(2.0)),
     ] {
         let mut rig = Rig::new("[[alarm]]\nrule = \"bus_fault\"\nwarning = 5\n");
         let silent = |rig: &mut Rig| (0..5).for_each(|_| rig.tick());
@@ -238,7 +238,7 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
         rig.seconds(120);
         assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
         if restarted {
-            rig.restart(Away::Seconds(away_s));
+            rig.restart(Downtime::Seconds(away_s));
         } else {
             rig.deci += 360_000;
         }
@@ -260,7 +260,7 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
     rig.voltages_v = [Some(4.0); 2];
     rig.seconds(60);
     assert_eq!(rig.stands(Rule::SocLow).0, State::Inactive);
-    rig.restart(Away::Seconds(36_000.0));
+    rig.restart(Downtime::Seconds(36_000.0));
     (rig.voltages_v, rig.current_a) = ([Some(3.1); 2], None);
     rig.seconds(1);
     assert_eq!(rig.stands(Rule::SocLow).0, State::Unknown, "the old SOC must not say that all is well");
@@ -290,7 +290,7 @@ fn an_untrusted_estimate_without_a_current_is_suppressed_once() {
 
 #[test]
 fn a_latched_alarm_that_is_beyond_again_and_counting_is_not_cleared() {
-    for away in [None, Some(Away::Seconds(2.0)), Some(Away::Seconds(600.0))] {
+    for away in [None, Some(Downtime::Seconds(2.0)), Some(Downtime::Seconds(600.0))] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 12);
         rig.heat(20.0, 12);
@@ -347,7 +347,7 @@ fn a_test_of_no_length_ends_the_one_that_runs_and_begins_none() {
 #[test]
 fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
     let j1939 = "[j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
-    for away in [Away::Seconds(0.5), Away::Seconds(20.0), Away::Unknown] {
+    for away in [Downtime::Seconds(0.5), Downtime::Seconds(20.0), Downtime::Unknown] {
         let mut rig = Rig::new(&(HOT.to_owned() + j1939));
         rig.heat(60.0, 12);
         rig.restart(away);
@@ -391,11 +391,11 @@ fn another_pack_identity_is_another_pack_also_when_it_was_changed_while_off() {
         rig.identity = odd;
         rig.tick_with_frames();
     }
-    rig.restart(Away::Seconds(3600.0));
+    rig.restart(Downtime::Seconds(3600.0));
     rig.seconds(2);
     assert_eq!((packs(&rig).1, rig.monitor.capacity(CellIndex(0))), (0, learned));
     // Changed while the computer was off.
-    rig.restart(Away::Seconds(3600.0));
+    rig.restart(Downtime::Seconds(3600.0));
     rig.identity = Some(1002.0);
     (0..4).for_each(|_| rig.tick_with_frames());
     assert_eq!(packs(&rig).1, 0);

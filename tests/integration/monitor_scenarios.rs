@@ -11,7 +11,7 @@ use packwatch::cell::{CapacityState, Discretisation};
 use packwatch::config;
 use packwatch::health::CapacityMethod;
 use packwatch::io::ticks::Ticks;
-use packwatch::monitor::{Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{CellIndex, Channel, Mode, SensorIndex, Timestamp};
 
 fn load(file: &str) -> MonitorConfig {
@@ -143,7 +143,7 @@ impl Bench {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
         let snap: Snapshot = serde_json::from_str(&text).unwrap();
         self.monitor = Monitor::new(self.config.clone());
-        self.monitor.restore(snap, Away::Seconds(away_s)).unwrap();
+        self.monitor.restore(snap, Downtime::Seconds(away_s)).unwrap();
         self.t += away_s;
     }
 }
@@ -410,7 +410,7 @@ fn snapshot_of_a_waiting_restore_is_the_restored_state() {
     let snap = b.monitor.snapshot();
     let want = serde_json::to_string(&snap).unwrap();
     let mut m = Monitor::new(b.config.clone());
-    m.restore(snap, Away::AsStamped).unwrap();
+    m.restore(snap, Downtime::AsStamped).unwrap();
     assert_eq!(serde_json::to_string(&m.snapshot()).unwrap(), want);
 }
 
@@ -523,7 +523,7 @@ fn a_state_taken_up_on_an_earlier_clock_goes_on_sending() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 60);
     let mut monitor = Monitor::new(b.config.clone());
-    monitor.restore(b.monitor.snapshot(), Away::Seconds(0.0)).unwrap();
+    monitor.restore(b.monitor.snapshot(), Downtime::Seconds(0.0)).unwrap();
     let mut out = Outputs::default();
     for tick in 0..300 {
         let time = Timestamp::from_secs(-1e6).plus_nanos(tick * 10_000_000);

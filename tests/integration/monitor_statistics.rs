@@ -1,7 +1,7 @@
 //! What the core counts, and what it shows to those who look: on hand-made frames of a pack of two cells.
 
 use crate::support::rig::{Rig, learned};
-use packwatch::monitor::{Away, BusStatistics, Statistics, Validity};
+use packwatch::monitor::{Downtime, BusStatistics, Statistics, Validity};
 use packwatch::quantity::{CellIndex, Mode};
 
 #[test]
@@ -31,7 +31,7 @@ fn counts_go_on_after_a_restart() {
     let (before, readings) = (rig.monitor.statistics().clone(), rig.monitor.reading_counts());
     assert_eq!((before.half_cycles, before.capacity_updates, before.capacity_measurements), (2, 2, 2));
     assert_eq!((before.alarms_raised.warning, before.restores), (2, 0));
-    rig.restart(Away::Seconds(3600.0));
+    rig.restart(Downtime::Seconds(3600.0));
     rig.seconds(1);
     let after = rig.monitor.statistics();
     assert_eq!((after.half_cycles, after.alarms_raised.warning, after.restores), (2, 2, 1));

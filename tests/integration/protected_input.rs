@@ -4,7 +4,7 @@
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Away, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::monitor::{Downtime, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, Timestamp};
 
 const BUS: BusIndex = BusIndex(0);
@@ -362,7 +362,7 @@ fn a_restart_keeps_the_counts_and_waits_for_a_first_frame() {
     let text = serde_json::to_string(&bench.monitor.snapshot()).unwrap();
     let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
     let mut monitor = Monitor::new(configuration());
-    monitor.restore(snapshot, Away::Seconds(10.0)).unwrap();
+    monitor.restore(snapshot, Downtime::Seconds(10.0)).unwrap();
     let mut after = Bench { counters: bench.counters, ..Bench::with(monitor) };
     after.cycle();
     after.cycle();
@@ -378,5 +378,5 @@ fn a_snapshot_of_an_earlier_version_without_these_counts_is_taken_up() {
     let mut document = serde_json::to_value(bench.monitor.snapshot()).unwrap();
     assert!(document.as_object_mut().unwrap().remove("intake").is_some());
     let mut monitor = Monitor::new(configuration());
-    monitor.restore(serde_json::from_value(document).unwrap(), Away::Seconds(1.0)).unwrap();
+    monitor.restore(serde_json::from_value(document).unwrap(), Downtime::Seconds(1.0)).unwrap();
 }

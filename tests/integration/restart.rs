@@ -10,8 +10,8 @@ use std::path::Path;
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
-use packwatch::filter::Belief;
-use packwatch::monitor::{Away, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
+use packwatch::filter::ScalarGaussian;
+use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Mode, SensorIndex, Timestamp};
 use packwatch::sim::{Pack, Scenario, Settings, Simulation, Wiring};
 
@@ -64,7 +64,7 @@ impl Live {
 
     fn restored(config: &MonitorConfig, snapshot: Snapshot) -> Self {
         let mut live = Self::new(config);
-        live.monitor.restore(snapshot, Away::AsStamped).expect("fits");
+        live.monitor.restore(snapshot, Downtime::AsStamped).expect("fits");
         live
     }
 
@@ -144,11 +144,11 @@ fn rest(pack: &mut Pack, from: Timestamp, noise: &mut Draw, moments: &mut Vec<Mo
 #[derive(Clone)]
 struct State {
     snapshot: Snapshot,
-    learned: Vec<Belief>,
+    learned: Vec<ScalarGaussian>,
 }
 
 /// Capacity of every cell.
-fn learned(monitor: &Monitor) -> Vec<Belief> {
+fn learned(monitor: &Monitor) -> Vec<ScalarGaussian> {
     (0..CELLS).map(|cell| monitor.capacity(CellIndex(cell))).collect()
 }
 

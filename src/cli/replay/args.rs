@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
 use crate::cli::run::away;
-use crate::daemon::replay::When;
+use crate::replay::When;
 use crate::io::stamp;
-use crate::monitor::Away;
+use crate::monitor::Downtime;
 
 /// Which way a CSV's positive current flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -68,7 +68,7 @@ pub(crate) struct Args {
     pub(crate) restore: Option<PathBuf>,
     /// Age of that state, or unknown (default: as the journal says, else as its stamp does)
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
-    pub(crate) away: Option<Away>,
+    pub(crate) away: Option<Downtime>,
     /// Leave out what is before; as --snapshot-at
     #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
     pub(crate) from: Option<When>,

@@ -12,7 +12,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use super::{Args, Failure, report};
 use crate::config::Config;
-use crate::daemon::replay::{self, Progress, ReplayError, Sinks, Summary, in_order};
+use crate::replay::{self, Progress, ReplayError, Sinks, Summary, in_order};
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::monitor::Monitor;

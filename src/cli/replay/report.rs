@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::daemon::replay::{Progress, ProtectedSummary, Summary};
+use crate::replay::{Progress, ProtectedSummary, Summary};
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 

@@ -25,7 +25,7 @@ impl From<Start> for score::Start {
 
 /// Error of the SOC told, points; `None` = nothing told.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Told(pub(crate) Option<f64>);
+pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 
 /// The load of the table's capacities.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -63,7 +63,7 @@ pub(crate) struct Args {
     /// and starts from its first voltage
     #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = told,
           allow_hyphen_values = true, help_heading = "Starts")]
-    pub(crate) told: Vec<Told>,
+    pub(crate) told: Vec<InitialSocError>,
     /// Standard deviation told with the SOC, points; as large as --told says when not given, and 5 at least
     #[arg(long, value_name = "POINTS", value_parser = percent_above_0, help_heading = "Starts")]
     pub(crate) soc_std: Option<f64>,
@@ -168,12 +168,12 @@ fn percent_above_0(text: &str) -> Result<f64, String> {
     number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and at most 100".to_owned()))
 }
 
-fn told(text: &str) -> Result<Told, String> {
+fn told(text: &str) -> Result<InitialSocError, String> {
     if text == "none" {
-        return Ok(Told(None));
+        return Ok(InitialSocError(None));
     }
     let value = number(text).map_err(|_| "must be a number of points or none".to_owned())?;
-    if value.abs() <= 100.0 { Ok(Told(Some(value))) } else { Err("must be -100 to 100".to_owned()) }
+    if value.abs() <= 100.0 { Ok(InitialSocError(Some(value))) } else { Err("must be -100 to 100".to_owned()) }
 }
 
 fn capacity_error(text: &str) -> Result<f64, String> {
@@ -226,7 +226,7 @@ mod tests {
         assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
         assert_eq!(load("2,-10,2.7"), Ok(Load { current_a: 2.0, temperature_c: -10.0, cutoff_v: 2.7 }));
         assert!(["2,24", "0,24,2.7", "2,24,2.7,1", "a,b,c"].iter().all(|text| load(text).is_err()));
-        assert_eq!((told("none"), told("-20")), (Ok(Told(None)), Ok(Told(Some(-20.0)))));
+        assert_eq!((told("none"), told("-20")), (Ok(InitialSocError(None)), Ok(InitialSocError(Some(-20.0)))));
         assert!(told("-101").is_err() && told("NaN").is_err() && part("1").is_err() && capacity_error("-100").is_err());
     }
 

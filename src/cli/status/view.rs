@@ -21,7 +21,7 @@ use tokio::time::interval;
 
 use app::{App, Key};
 
-use crate::daemon::status::stream_path;
+use crate::status::stream_path;
 
 /// The screen is drawn at least this often: it says for how long there was no news.
 const DRAW_PERIOD: Duration = Duration::from_secs(1);

@@ -37,7 +37,7 @@ const MARGIN: f64 = 0.06;
 
 /// What the numbers of an axis are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) enum Scale {
+pub enum Scale {
     #[default]
     Number,
     /// Seconds since 1970, written as dates (UTC).
@@ -46,21 +46,21 @@ pub(crate) enum Scale {
 
 /// One axis.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Axis {
+pub struct Axis {
     /// With unit.
-    pub(crate) label: String,
-    pub(crate) scale: Scale,
+    pub label: String,
+    pub scale: Scale,
     /// Ends; `None` = from the data.
-    pub(crate) range: Option<(f64, f64)>,
+    pub range: Option<(f64, f64)>,
 }
 
 impl Axis {
     /// Numbers, as far as the data go.
-    pub(crate) fn number(label: &str) -> Self {
+    pub fn number(label: &str) -> Self {
         Self { label: label.to_owned(), ..Self::default() }
     }
 
-    pub(crate) fn within(self, low: f64, high: f64) -> Self {
+    pub fn within(self, low: f64, high: f64) -> Self {
         Self { range: Some((low, high)), ..self }
     }
 

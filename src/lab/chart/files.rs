@@ -20,7 +20,7 @@ const FAMILIES: [&str; 5] = ["DejaVu Sans", "Noto Sans", "Liberation Sans", "Ari
 
 /// What a picture is written as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Format {
+pub enum Format {
     Svg,
     Png,
 }
@@ -37,7 +37,7 @@ pub struct PlotError {
 ///
 /// # Errors
 /// The file cannot be written, or there is no font for the words of a PNG.
-pub(crate) fn write(path: &Path, picture: &Picture, format: Format) -> Result<(), PlotError> {
+pub fn write(path: &Path, picture: &Picture, format: Format) -> Result<(), PlotError> {
     write_stack(path, std::slice::from_ref(picture), format)
 }
 
@@ -45,7 +45,7 @@ pub(crate) fn write(path: &Path, picture: &Picture, format: Format) -> Result<()
 ///
 /// # Errors
 /// As [`write`].
-pub(crate) fn write_stack(path: &Path, pictures: &[Picture], format: Format) -> Result<(), PlotError> {
+pub fn write_stack(path: &Path, pictures: &[Picture], format: Format) -> Result<(), PlotError> {
     let failed = |what: String| PlotError { path: path.display().to_string(), what };
     let bytes = match format {
         Format::Svg => document(pictures, &variables()).into_bytes(),
@@ -97,7 +97,7 @@ fn png(svg: &str) -> Result<Vec<u8>, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::chart::{Axis, Chart, Ink, Layer, Shape};
+    use crate::chart::{Axis, Chart, Ink, Layer, Shape};
 
     fn picture() -> Picture {
         let layers = vec![Layer::new("95 %", Ink::Blue, Shape::Band(vec![(0.0, 0.5, 1.5), (1.0, 1.5, 2.5)]))];

@@ -13,19 +13,19 @@ const WANTED: f64 = 300.0;
 
 /// Values over rows (cells, from 1) and columns of equal width.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Heat {
-    pub(crate) title: String,
-    pub(crate) description: String,
+pub struct Heat {
+    pub title: String,
+    pub description: String,
     /// With `range`: where the columns begin and end.
-    pub(crate) x: Axis,
+    pub x: Axis,
     /// What the values are, with unit.
-    pub(crate) label: String,
+    pub label: String,
     /// Rows of values; `None` = not known.
-    pub(crate) rows: Vec<Vec<Option<f64>>>,
+    pub rows: Vec<Vec<Option<f64>>>,
     /// One per row; may be empty.
-    pub(crate) tips: Vec<String>,
+    pub tips: Vec<String>,
     /// Decimals in the legend.
-    pub(crate) decimals: usize,
+    pub decimals: usize,
 }
 
 impl Heat {

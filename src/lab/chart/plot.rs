@@ -23,16 +23,16 @@ const RIGHT: f64 = 22.0;
 
 /// A value to be drawn as a point.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Point {
-    pub(crate) x: f64,
-    pub(crate) y: f64,
+pub struct Point {
+    pub x: f64,
+    pub y: f64,
     /// Tool tip; may be empty.
-    pub(crate) tip: String,
+    pub tip: String,
 }
 
 /// What is drawn; x does not fall.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Shape {
+pub enum Shape {
     /// (x, y).
     Line(Vec<(f64, f64)>),
     /// The same, dashed.
@@ -48,28 +48,28 @@ pub(crate) enum Shape {
 
 /// One of the things drawn, later ones above earlier ones.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Layer {
+pub struct Layer {
     /// For the legend; empty = not in it.
-    pub(crate) label: String,
-    pub(crate) ink: Ink,
-    pub(crate) shape: Shape,
+    pub label: String,
+    pub ink: Ink,
+    pub shape: Shape,
 }
 
 impl Layer {
-    pub(crate) fn new(label: &str, ink: Ink, shape: Shape) -> Self {
+    pub fn new(label: &str, ink: Ink, shape: Shape) -> Self {
         Self { label: label.to_owned(), ink, shape }
     }
 }
 
 /// One pair of axes.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Chart {
-    pub(crate) title: String,
+pub struct Chart {
+    pub title: String,
     /// For those who cannot see it.
-    pub(crate) description: String,
-    pub(crate) x: Axis,
-    pub(crate) y: Axis,
-    pub(crate) layers: Vec<Layer>,
+    pub description: String,
+    pub x: Axis,
+    pub y: Axis,
+    pub layers: Vec<Layer>,
 }
 
 /// The drawing area: where it lies and what it shows.

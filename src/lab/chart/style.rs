@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 
 /// What something is drawn with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Ink {
+pub enum Ink {
     /// As words: truth, measurement.
     Plain,
     Blue,
@@ -40,7 +40,7 @@ const COLOURS: [(&str, &str, &str); 14] = [
 ];
 
 /// Steps of a heat map from the lowest to the highest.
-pub(crate) const STEPS: [&str; 9] =
+pub const STEPS: [&str; 9] =
     ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
 
 impl Ink {
@@ -52,28 +52,28 @@ impl Ink {
     }
 
     /// Class of a stroke.
-    pub(crate) fn stroke(self) -> String {
+    pub fn stroke(self) -> String {
         format!("k-{}", self.name())
     }
 
     /// Class of a solid fill.
-    pub(crate) fn fill(self) -> String {
+    pub fn fill(self) -> String {
         format!("f-{}", self.name())
     }
 
     /// Class of a see-through fill.
-    pub(crate) fn band(self) -> String {
+    pub fn band(self) -> String {
         format!("b-{}", self.name())
     }
 }
 
 /// Class of a step of a heat map.
-pub(crate) fn step_class(step: usize) -> String {
+pub fn step_class(step: usize) -> String {
     format!("h-{step}")
 }
 
 /// The colours as variables of a page or a file: light, and dark on a screen that asks for it.
-pub(crate) fn variables() -> String {
+pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
         COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))
     };

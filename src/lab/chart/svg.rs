@@ -6,7 +6,7 @@ use std::fmt::Write as _;
 const CHARACTER: f64 = 0.56;
 
 /// Text as it may stand in an element or an attribute.
-pub(crate) fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {
         match character {

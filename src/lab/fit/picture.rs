@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::{FitFailure, Outcome};
 use crate::ident::pass::residuals;
-use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
 
 /// Most panels; a page of more is not looked at.
 const MAX_PANELS: usize = 40;

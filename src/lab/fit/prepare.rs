@@ -7,7 +7,7 @@ use crate::ident::anchor::Stretch;
 use crate::ident::fit::{self, Fit, OcvCurve, Residual};
 use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
-use crate::lab::measured::{MeasuredFile, Part};
+use crate::measured::{MeasuredFile, Part};
 
 /// Temperature taken where a file has none, degrees C.
 const USUAL_C: f64 = 25.0;

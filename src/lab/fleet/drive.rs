@@ -16,31 +16,31 @@ use crate::quantity::Timestamp;
 const REPORT_EVERY: u64 = 4096;
 
 /// A log to be read, and what the user should know of how.
-pub(crate) type Opened = (LogSource, Option<String>);
+pub type Opened = (LogSource, Option<String>);
 
 /// How logs are read.
 #[derive(Clone, Copy)]
-pub(crate) struct Reading<'a> {
+pub struct Reading<'a> {
     /// Opens a log as it is read with a configuration.
-    pub(crate) open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
+    pub open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
     /// A hole longer than this means that the recorder was asleep, s.
-    pub(crate) sleep_gap_s: f64,
+    pub sleep_gap_s: f64,
 }
 
 /// What a log was.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Driven {
+pub struct Driven {
     /// What was read.
-    pub(crate) counts: LogCounts,
+    pub counts: LogCounts,
     /// First and last stamp.
-    pub(crate) span: Option<(Timestamp, Timestamp)>,
+    pub span: Option<(Timestamp, Timestamp)>,
     /// What the user should know.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
 }
 
 impl Driven {
     /// From the first stamp to the last, days.
-    pub(crate) fn days(&self) -> f64 {
+    pub fn days(&self) -> f64 {
         self.span.map_or(0.0, |(first, last)| last.since(first) / 86_400.0)
     }
 }
@@ -49,7 +49,7 @@ impl Driven {
 ///
 /// # Errors
 /// When the log cannot be read, or what `each` says.
-pub(crate) fn drive(
+pub fn drive(
     (mut source, note): Opened,
     mut monitor: Monitor,
     mut out: Outputs,
@@ -98,7 +98,7 @@ impl Driven {
     ///
     /// # Errors
     /// Nothing of it was read: what is known of why.
-    pub(crate) fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+    pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
         self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
     }

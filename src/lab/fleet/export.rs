@@ -20,20 +20,20 @@ use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned}
 use self::table::TableFile;
 use super::drive::{Driven, Reading, drive};
 use crate::config::Config;
-use crate::daemon::status::document::ConfigFile;
+use crate::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
 
-pub(crate) use columns::reference;
+pub use columns::reference;
 
 /// Version of `about.json`.
 const VERSION: u32 = 1;
 
 /// Form of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Format {
+pub enum Format {
     /// Apache Parquet, Snappy.
     Parquet,
     /// Comma-separated values with a heading.
@@ -51,39 +51,39 @@ impl Format {
 
 /// What all logs have in common.
 #[derive(Clone)]
-pub(crate) struct Settings<'a> {
+pub struct Settings<'a> {
     /// How they are read.
-    pub(crate) reading: Reading<'a>,
+    pub reading: Reading<'a>,
     /// Form of the tables.
-    pub(crate) format: Format,
+    pub format: Format,
     /// Folder for the logs' folders.
-    pub(crate) out: PathBuf,
+    pub out: PathBuf,
     /// At most one estimate per cell in each period, s; 0 = every one.
-    pub(crate) period_s: f64,
+    pub period_s: f64,
     /// Threads; `None` = all cores.
-    pub(crate) jobs: Option<usize>,
+    pub jobs: Option<usize>,
 }
 
 /// A log's tables.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Exported {
+pub struct Exported {
     /// The log.
-    pub(crate) log: PathBuf,
+    pub log: PathBuf,
     /// Folder of its tables.
-    pub(crate) folder: PathBuf,
+    pub folder: PathBuf,
     /// Rows of each table.
-    pub(crate) rows: BTreeMap<&'static str, u64>,
+    pub rows: BTreeMap<&'static str, u64>,
     /// From the first stamp to the last, days.
-    pub(crate) days: f64,
+    pub days: f64,
     /// What the user should know.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
 }
 
 /// Exports all logs; per log what was written, or why nothing was. `report` is told bytes read.
 ///
 /// # Errors
 /// When no threads can be started.
-pub(crate) fn run(
+pub fn run(
     config: &Config,
     logs: &[PathBuf],
     settings: &Settings<'_>,

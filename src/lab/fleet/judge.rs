@@ -18,7 +18,7 @@
 
 use serde::Serialize;
 
-use super::lanes::{AlarmHistory, Raise};
+use super::variant_batch::{AlarmHistory, Raise};
 use super::track::Track;
 use super::truth::{Truth, TruthKind};
 use crate::alarm::{Rule, RuleConfig};
@@ -26,7 +26,7 @@ use crate::quantity::Timestamp;
 
 /// How soon after a raise the end of life must come.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Horizon {
+pub enum Horizon {
     /// In equivalent full cycles.
     Cycles(f64),
     /// In days.
@@ -35,57 +35,57 @@ pub(crate) enum Horizon {
 
 /// A log's life, for the judgement.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Life<'a> {
+pub struct Life<'a> {
     /// Charge moved.
-    pub(crate) track: &'a Track,
+    pub track: &'a Track,
     /// What was true.
-    pub(crate) truth: Option<&'a Truth>,
+    pub truth: Option<&'a Truth>,
     /// First and last stamp.
-    pub(crate) span: (Timestamp, Timestamp),
+    pub span: (Timestamp, Timestamp),
     /// End of life; `None` = not reached.
-    pub(crate) end: Option<Timestamp>,
+    pub end: Option<Timestamp>,
     /// How soon it must come.
-    pub(crate) horizon: Option<Horizon>,
+    pub horizon: Option<Horizon>,
 }
 
 /// A raise, for people and machines.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub(crate) struct First {
+pub struct First {
     /// Stamp of the log, s.
-    pub(crate) time_s: f64,
+    pub time_s: f64,
     /// Days after the log's first stamp.
-    pub(crate) days: f64,
+    pub days: f64,
     /// Equivalent full cycles so far.
-    pub(crate) cycles: f64,
+    pub cycles: f64,
     /// Counted from 0; `None` = the pack.
-    pub(crate) cell: Option<u16>,
+    pub cell: Option<u16>,
     /// The value that raised it, in the rule's unit.
-    pub(crate) value: Option<f64>,
+    pub value: Option<f64>,
 }
 
 /// What a threshold's alarms were worth in one log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct Judged {
+pub struct Judged {
     /// The first raise.
-    pub(crate) first: Option<First>,
+    pub first: Option<First>,
     /// Raises, at any time.
-    pub(crate) raises: usize,
+    pub raises: usize,
     /// Lead, days.
-    pub(crate) lead_days: Option<f64>,
+    pub lead_days: Option<f64>,
     /// Lead, equivalent full cycles.
-    pub(crate) lead_cycles: Option<f64>,
+    pub lead_cycles: Option<f64>,
     /// The end of life came without a true raise; `None` = it did not come, or the rule is not about ageing.
-    pub(crate) missed: Option<bool>,
+    pub missed: Option<bool>,
     /// False alarms; `None` = the rule is not about ageing.
-    pub(crate) false_alarms: Option<usize>,
+    pub false_alarms: Option<usize>,
     /// Raises that nobody can judge.
-    pub(crate) open: Option<usize>,
+    pub open: Option<usize>,
     /// Raises above the true threshold; `None` = nobody knows.
-    pub(crate) false_raises: Option<usize>,
+    pub false_raises: Option<usize>,
     /// Clears before the end of life.
-    pub(crate) flickers: usize,
+    pub flickers: usize,
     /// Raises and clears that were only counted.
-    pub(crate) not_kept: u64,
+    pub not_kept: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -97,7 +97,7 @@ enum Verdict {
 }
 
 /// Judges the alarms of one threshold.
-pub(crate) fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Judged {
+pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Judged {
     let verdicts: Vec<(Verdict, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
     // Of a life that was over before there was a log nobody can tell what was missed.
@@ -160,7 +160,7 @@ impl Life<'_> {
 mod tests {
     use super::*;
     use crate::alarm::{Severity, When};
-    use crate::lab::fleet::track::Learned;
+    use crate::fleet::track::Learned;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};
 

@@ -10,7 +10,7 @@ use crate::quantity::{CellIndex, Timestamp};
 
 /// Which of the capacities was learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Learned {
+pub enum Learned {
     /// At the configured load.
     Usable,
     /// Between the open-circuit voltages.
@@ -19,7 +19,7 @@ pub(crate) enum Learned {
 
 /// A life so far.
 #[derive(Debug, Clone)]
-pub(crate) struct Track {
+pub struct Track {
     rated_ah: f64,
     learned: Learned,
     moved_ah: BTreeMap<CellIndex, f64>,
@@ -31,13 +31,13 @@ pub(crate) struct Track {
 }
 
 impl Track {
-    pub(crate) fn new(rated_ah: f64, learned: Learned) -> Self {
+    pub fn new(rated_ah: f64, learned: Learned) -> Self {
         let none = BTreeMap::new();
         Self { rated_ah, learned, moved_ah: none.clone(), capacity_ah: none, cycles: Vec::new(), weakest: Vec::new() }
     }
 
     /// Takes the events of one input.
-    pub(crate) fn observe(&mut self, events: &[Event]) {
+    pub fn observe(&mut self, events: &[Event]) {
         for event in events {
             match event.kind {
                 EventKind::HalfCycle { cell, charge_ah, .. } => self.move_charge(event.time, cell, charge_ah),
@@ -76,7 +76,7 @@ impl Track {
     }
 
     /// Equivalent full cycles up to `time`.
-    pub(crate) fn cycles_at(&self, time: Timestamp) -> f64 {
+    pub fn cycles_at(&self, time: Timestamp) -> f64 {
         let after = self.cycles.partition_point(|(at, _)| *at <= time);
         let before = after.checked_sub(1).and_then(|index| self.cycles.get(index));
         match (before, self.cycles.get(after)) {
@@ -87,24 +87,24 @@ impl Track {
     }
 
     /// Equivalent full cycles in all.
-    pub(crate) fn cycles(&self) -> f64 {
+    pub fn cycles(&self) -> f64 {
         self.cycles.last().map_or(0.0, |last| last.1)
     }
 
     /// Which capacity it follows.
-    pub(crate) fn learned(&self) -> Learned {
+    pub fn learned(&self) -> Learned {
         self.learned
     }
 
     /// From when on the weakest learned capacity stayed below `end_ah` up to the end of the log; `None` = at the end it
     /// is not below, or nothing was learned.
-    pub(crate) fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
+    pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))
     }
 
     /// The weakest learned capacity at the end, Ah.
-    pub(crate) fn last_ah(&self) -> Option<f64> {
+    pub fn last_ah(&self) -> Option<f64> {
         self.weakest.last().map(|last| last.1)
     }
 }

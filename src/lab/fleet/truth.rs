@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::io::{lines, stamp};
-use crate::lab::score::CycleTable;
+use crate::score::CycleTable;
 use crate::quantity::{CellIndex, Timestamp};
 
 /// A change of the capacity smaller than this part of it is not kept.
@@ -23,7 +23,7 @@ const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
 
 /// Which capacity the truth is of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum TruthKind {
+pub enum TruthKind {
     /// Between the open-circuit voltages.
     Capacity,
     /// As published.
@@ -32,9 +32,9 @@ pub(crate) enum TruthKind {
 
 /// The true capacities of a log.
 #[derive(Debug, Clone)]
-pub(crate) struct Truth {
+pub struct Truth {
     /// Of which kind.
-    pub(crate) kind: TruthKind,
+    pub kind: TruthKind,
     /// Per cell, in the order of time.
     cells: BTreeMap<CellIndex, Vec<(Timestamp, f64)>>,
     span: (Timestamp, Timestamp),
@@ -45,7 +45,7 @@ impl Truth {
     ///
     /// # Errors
     /// It cannot be read, is of neither form, or a field is wrong: file, line, found, allowed.
-    pub(crate) fn read(path: &Path) -> Result<Self, String> {
+    pub fn read(path: &Path) -> Result<Self, String> {
         let name = path.display();
         let unreadable = |error: std::io::Error| format!("{name}: cannot be read: {error}");
         let file = lines::open(path, &Arc::default()).map_err(unreadable)?;
@@ -76,7 +76,7 @@ impl Truth {
     }
 
     /// When the first cell fell below `end_ah`, and which.
-    pub(crate) fn falls_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
+    pub fn falls_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let of_cell = |(&cell, points): (&CellIndex, &Vec<(Timestamp, f64)>)| {
             points.iter().find(|(_, ah)| *ah < end_ah).map(|(time, _)| (*time, cell))
         };
@@ -84,14 +84,14 @@ impl Truth {
     }
 
     /// The capacity of a cell at `time`, as the last row before it says; `None` = there is none.
-    pub(crate) fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
+    pub fn capacity_ah(&self, cell: CellIndex, time: Timestamp) -> Option<f64> {
         let points = self.cells.get(&cell)?;
         let after = points.partition_point(|(at, _)| *at <= time);
         points.get(after.checked_sub(1)?).map(|(_, ah)| *ah)
     }
 
     /// First and last moment it tells of.
-    pub(crate) fn span(&self) -> (Timestamp, Timestamp) {
+    pub fn span(&self) -> (Timestamp, Timestamp) {
         self.span
     }
 }
@@ -122,13 +122,13 @@ fn read_simulated(reader: &mut csv::Reader<Box<dyn std::io::Read>>, columns: [us
 }
 
 /// The truth beside each of the logs, where there is one.
-pub(crate) fn beside(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
+pub fn beside(logs: &[PathBuf]) -> Vec<Option<PathBuf>> {
     let alone = |log: &PathBuf| logs.iter().filter(|other| other.parent() == log.parent()).count() == 1;
     logs.iter().map(|log| find(log, alone(log))).collect()
 }
 
 /// The table of cycles beside a CSV log, which tells when each began.
-pub(crate) fn cycles_beside(log: &Path) -> Option<PathBuf> {
+pub fn cycles_beside(log: &Path) -> Option<PathBuf> {
     let (stem, ending) = stem_of(log)?;
     (ending == "csv").then(|| existing(log, [format!("{stem}{CYCLES}")])).flatten()
 }

@@ -20,14 +20,14 @@ use crate::alarm::Rule;
 use crate::config::{self, Config};
 
 /// Combinations at most: a table nobody reads to its end.
-pub(crate) const MAX_COMBINATIONS: usize = 1000;
+pub const MAX_COMBINATIONS: usize = 1000;
 /// Faults quoted of one combination.
 const MAX_QUOTED: usize = 3;
 /// One `--set`.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct Choice {
+pub struct Choice {
     /// As written.
-    pub(crate) key: String,
+    pub key: String,
     values: Vec<(String, Value)>,
 }
 
@@ -78,37 +78,37 @@ fn value(text: &str) -> Value {
 
 /// One combination.
 #[derive(Debug, Clone)]
-pub(crate) struct Variant {
+pub struct Variant {
     /// What is set, as written, in the order of the choices; empty = the configuration as it is.
-    pub(crate) values: Vec<String>,
+    pub values: Vec<String>,
     /// What it means.
-    pub(crate) config: Config,
+    pub config: Config,
     /// Combinations with the same number share a replay.
-    pub(crate) replay: usize,
+    pub replay: usize,
 }
 
 /// All combinations.
 #[derive(Debug, Clone)]
-pub(crate) struct Grid {
+pub struct Grid {
     /// The keys, as written.
-    pub(crate) keys: Vec<String>,
+    pub keys: Vec<String>,
     /// The configuration as it is, then every combination.
-    pub(crate) variants: Vec<Variant>,
+    pub variants: Vec<Variant>,
     /// Replays needed per log.
-    pub(crate) replays: usize,
+    pub replays: usize,
     /// Rules that were named.
-    pub(crate) rules: Vec<Rule>,
+    pub rules: Vec<Rule>,
     /// Whether something else was set, too.
-    pub(crate) other_keys: bool,
+    pub other_keys: bool,
     /// What the user should know.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
 }
 
 /// Makes the grid.
 ///
 /// # Errors
 /// When the configuration is faulty, a key names nothing, there are too many combinations, or none of them is valid.
-pub(crate) fn grid(path: &Path, choices: &[Choice]) -> Result<Grid, Vec<String>> {
+pub fn grid(path: &Path, choices: &[Choice]) -> Result<Grid, Vec<String>> {
     let plain = config::load(path).map_err(|faults| faults.0)?;
     let root = read(path).map_err(|fault| vec![fault])?;
     let mut grid = Grid {

@@ -10,7 +10,7 @@ use serde::Serialize;
 
 use super::drive::{Driven, Reading, drive};
 use super::judge::{Horizon, Judged, Life, judge};
-use super::lanes::Lanes;
+use super::variant_batch::Lanes;
 use super::track::{Learned, Track};
 use super::truth::{Truth, TruthKind};
 use super::variants::Grid;
@@ -20,31 +20,31 @@ use crate::monitor::{Monitor, Outputs};
 
 /// A log and its truth.
 #[derive(Debug, Clone)]
-pub(crate) struct Job {
+pub struct Job {
     /// The log.
-    pub(crate) log: PathBuf,
+    pub log: PathBuf,
     /// What was true of it.
-    pub(crate) truth: Option<PathBuf>,
+    pub truth: Option<PathBuf>,
 }
 
 /// What all logs have in common.
 #[derive(Clone, Copy)]
-pub(crate) struct Settings<'a> {
+pub struct Settings<'a> {
     /// How they are read.
-    pub(crate) reading: Reading<'a>,
+    pub reading: Reading<'a>,
     /// Capacity below which a cell's life is over, Ah.
-    pub(crate) end_of_life_ah: f64,
+    pub end_of_life_ah: f64,
     /// Whether the usable capacity is compared with it, where one is configured.
-    pub(crate) judges_usable: bool,
+    pub judges_usable: bool,
     /// How soon after a raise the end of life must come.
-    pub(crate) horizon: Option<Horizon>,
+    pub horizon: Option<Horizon>,
     /// Threads; `None` = all cores.
-    pub(crate) jobs: Option<usize>,
+    pub jobs: Option<usize>,
 }
 
 /// What the end of life was judged by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub(crate) enum JudgedBy {
+pub enum JudgedBy {
     /// The true capacity.
     #[serde(rename = "true_capacity")]
     Truth,
@@ -61,7 +61,7 @@ pub(crate) enum JudgedBy {
 
 impl JudgedBy {
     /// For people.
-    pub(crate) const fn words(self) -> &'static str {
+    pub const fn words(self) -> &'static str {
         match self {
             Self::Truth => "the true capacity",
             Self::Published => "published capacities",
@@ -73,54 +73,54 @@ impl JudgedBy {
 
 /// The end of a life.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub(crate) struct EndOfLife {
+pub struct EndOfLife {
     /// Stamp of the log, s.
-    pub(crate) time_s: f64,
+    pub time_s: f64,
     /// Days after the log's first stamp.
-    pub(crate) days: f64,
+    pub days: f64,
     /// Equivalent full cycles so far.
-    pub(crate) cycles: f64,
+    pub cycles: f64,
     /// The cell whose it is, counted from 0.
-    pub(crate) cell: u16,
+    pub cell: u16,
 }
 
 /// One threshold under one combination.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct AlarmRow {
+pub struct AlarmRow {
     /// Index of the combination.
-    pub(crate) setting: usize,
+    pub setting: usize,
     /// Which rule.
-    pub(crate) rule: Rule,
+    pub rule: Rule,
     /// Its severity.
-    pub(crate) severity: Severity,
+    pub severity: Severity,
     /// What is compared with, in the rule's unit.
-    pub(crate) threshold: f64,
+    pub threshold: f64,
     /// What it was worth.
     #[serde(flatten)]
-    pub(crate) judged: Judged,
+    pub judged: Judged,
 }
 
 /// One log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub(crate) struct LogResult {
+pub struct LogResult {
     /// The log.
-    pub(crate) log: PathBuf,
+    pub log: PathBuf,
     /// Its truth.
-    pub(crate) truth: Option<PathBuf>,
+    pub truth: Option<PathBuf>,
     /// What the end of life was judged by.
-    pub(crate) judged_by: JudgedBy,
+    pub judged_by: JudgedBy,
     /// From the first stamp to the last, days.
-    pub(crate) days: f64,
+    pub days: f64,
     /// Equivalent full cycles.
-    pub(crate) cycles: f64,
+    pub cycles: f64,
     /// The weakest learned capacity at the end, Ah.
-    pub(crate) learned_ah: Option<f64>,
+    pub learned_ah: Option<f64>,
     /// `None` = not reached.
-    pub(crate) end_of_life: Option<EndOfLife>,
+    pub end_of_life: Option<EndOfLife>,
     /// Every threshold under every combination.
-    pub(crate) alarms: Vec<AlarmRow>,
+    pub alarms: Vec<AlarmRow>,
     /// What the user should know.
-    pub(crate) notes: Vec<String>,
+    pub notes: Vec<String>,
 }
 
 /// What one replay came to.
@@ -136,7 +136,7 @@ struct Replayed {
 ///
 /// # Errors
 /// When no threads can be started.
-pub(crate) fn run(
+pub fn run(
     grid: &Grid,
     jobs: &[Job],
     settings: &Settings<'_>,

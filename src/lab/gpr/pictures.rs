@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::forecast::{Forecast, Horizon, OutputForecast};
 use super::{Table, Validated, table};
-use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
 
 /// Rows of the stretch that is drawn with its interval: each can be seen.
 const STRETCH: usize = 150;

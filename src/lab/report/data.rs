@@ -3,7 +3,7 @@
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
 use super::trace::Trace;
-use crate::daemon::store::{Entry, Filter, Kind, Reader};
+use crate::store::{Entry, Filter, Kind, Reader};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
 

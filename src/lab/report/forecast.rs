@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use super::data::{Data, Learned};
 use super::{Setting, pictures};
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, Passed, Reading, Remaining, RemainingLife, TooThin};
+use crate::health::{Axis, Forecast, Usage, Reading, Remaining, RemainingLife, InsufficientData};
 
 const DAY_S: f64 = 86_400.0;
 /// Deviation of the current sensor's gain where no configuration tells one: what `capacity.current_gain_std` is by default.
@@ -56,7 +56,7 @@ pub(super) fn outlook(data: &Data, setting: &Setting<'_>) -> Result<Outlook, Str
     let end_ah = end_of_life_ah(data, setting)
         .ok_or("the record does not say which capacity is the end of life; a configuration (-c) does")?;
     let cells = cells(data, setting);
-    let lives: Vec<Result<RemainingLife, TooThin>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
+    let lives: Vec<Result<RemainingLife, InsufficientData>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
     let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
     let unknown = refused.map(|(cell, why)| too_thin(&lives, cell, why));
     let median = |life: &RemainingLife| life.cycles.or(life.days).map_or(f64::INFINITY, |left| left.median);
@@ -76,7 +76,7 @@ fn is_over(life: &RemainingLife) -> bool {
     life.cycles.or(life.days).is_some_and(|left| left.high <= 0.0)
 }
 
-fn too_thin(lives: &[Result<RemainingLife, TooThin>], cell: usize, why: TooThin) -> String {
+fn too_thin(lives: &[Result<RemainingLife, InsufficientData>], cell: usize, why: InsufficientData) -> String {
     if lives.len() == 1 {
         return told(why);
     }
@@ -84,7 +84,7 @@ fn too_thin(lives: &[Result<RemainingLife, TooThin>], cell: usize, why: TooThin)
     format!("not known of {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, told(why))
 }
 
-fn told(why: TooThin) -> String {
+fn told(why: InsufficientData) -> String {
     why.to_string().replace("+-", "\u{b1}")
 }
 
@@ -101,7 +101,7 @@ pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
         let now_s = halves[0].time_s;
         let since_before_s = before_s.map(|before_s| now_s - before_s);
         for half in halves {
-            let passed = Passed::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
+            let passed = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
             // Use without a reading is use all the same: a store leaves out capacities that say nothing new.
             let row = learned.get(&key(half.time_s, half.cell));
             cells[half.cell].update(passed, row.and_then(|row| reading(row, gain_std)));
@@ -184,8 +184,8 @@ fn digits(value: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::report::Origin;
-    use crate::lab::report::data::Half;
+    use crate::report::Origin;
+    use crate::report::data::Half;
 
     /// Full cycles of three hours each, twice a day, each cell losing its own share of 2 Ah per half-cycle.
     fn worn(halves: u32, losses: &[f64]) -> Data {
@@ -218,7 +218,7 @@ mod tests {
     }
 
     fn alarm_at(data: &mut Data, threshold: f64) {
-        data.alarms.push(crate::lab::report::data::AlarmRow {
+        data.alarms.push(crate::report::data::AlarmRow {
             time_s: 1.7e9,
             rule: "capacity_low".to_owned(),
             severity: "warning".to_owned(),

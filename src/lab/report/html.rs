@@ -3,7 +3,7 @@
 use super::data::{Data, Origin};
 use super::pictures::{self, NOT_STORED};
 use super::{Setting, forecast, summary};
-use crate::lab::chart::{Picture, Size, escape, variables};
+use crate::chart::{Picture, Size, escape, variables};
 
 /// Rows of tables; all is in the pictures, and in `packwatch history`.
 const MAX_ROWS: usize = 200;

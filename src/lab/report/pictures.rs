@@ -6,7 +6,7 @@ use super::series::{self, Step};
 use super::trace::{Moment, OF_95};
 use super::{Setting, summary};
 use crate::alarm::Rule;
-use crate::lab::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Point, Scale, Shape, Span};
+use crate::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Point, Scale, Shape, Span};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =

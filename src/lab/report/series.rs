@@ -97,7 +97,7 @@ pub(super) fn full_cycles(data: &Data, rated_ah: Option<f64>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::report::Origin;
+    use crate::report::Origin;
 
     fn pack() -> Data {
         let mut data = Data::new(Origin::Store);

@@ -332,7 +332,7 @@ fn recharge_tile(data: &Data) -> Tile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::report::data::Learned;
+    use crate::report::data::Learned;
 
     fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRow {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());

@@ -9,7 +9,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use crate::health::{Axis, Passed};
+use crate::health::{Axis, Usage};
 use crate::io::{lines, stamp};
 use crate::quantity::Timestamp;
 
@@ -68,8 +68,8 @@ struct Counted {
 
 impl Row {
     /// What passed since another.
-    pub fn since(&self, before: &Self) -> Passed {
-        Passed {
+    pub fn since(&self, before: &Self) -> Usage {
+        Usage {
             cycles: self.cycles - before.cycles,
             days: self.days - before.days,
             rest_days: self.rest_days - before.rest_days,

@@ -9,7 +9,7 @@ use super::feed::Feeder;
 use super::life::{Life, LifeScore};
 use super::soc::{self, Sample, SocScore};
 use super::{Job, ScoreError, Settings, picture, window};
-use crate::lab::measured::{MeasuredFile, Part};
+use crate::measured::{MeasuredFile, Part};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 

@@ -9,11 +9,11 @@ use crate::quantity::Timestamp;
 
 /// A discharge of the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::lab) struct Discharge {
+pub(crate) struct Discharge {
     /// When it began.
-    pub(in crate::lab) start: Timestamp,
+    pub(crate) start: Timestamp,
     /// Published capacity, Ah; `None` = not stated.
-    pub(in crate::lab) capacity_ah: Option<f64>,
+    pub(crate) capacity_ah: Option<f64>,
 }
 
 /// When each part of a measured file began, and what its discharges delivered.
@@ -21,7 +21,7 @@ pub(in crate::lab) struct Discharge {
 pub struct CycleTable {
     starts: HashMap<String, Timestamp>,
     /// In order of time; discharge number n is the n-th, from 1.
-    pub(in crate::lab) discharges: Vec<Discharge>,
+    pub(crate) discharges: Vec<Discharge>,
 }
 
 impl CycleTable {

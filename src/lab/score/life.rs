@@ -129,7 +129,7 @@ fn score(each: Vec<DischargeScore>, table: &CycleTable, threshold_ah: f64, skip:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lab::score::cycles::CycleTable;
+    use crate::score::cycles::CycleTable;
     use crate::quantity::{CellIndex, Timestamp};
 
     fn table() -> CycleTable {

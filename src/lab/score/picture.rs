@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::life::{DischargeScore, LifeScore};
 use super::soc::Sample;
 use super::{Case, STD_OF_95, Start};
-use crate::lab::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Shape};
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Shape};
 
 /// Draws the run and gives the file's path.
 pub(super) fn draw(

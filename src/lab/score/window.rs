@@ -9,7 +9,7 @@ use std::ops::Range;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::lab::measured::Part;
+use crate::measured::Part;
 
 /// The rows of part number `index` that are seen: never none of a part that has rows.
 pub(super) fn rows(part: &Part, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {

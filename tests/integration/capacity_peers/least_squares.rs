@@ -7,7 +7,7 @@
 //! AWTLS minimises sum (y - Q x)^2 / (Q^2 + 1)^2 (Q^2/sx^2 + 1/sy^2), y and sy scaled by K = sx/sy beforehand, so that
 //! Q is near the diagonal where the approximation holds: a quartic in Q. Variance: 2 over the cost's second derivative.
 
-use packwatch::filter::Belief;
+use packwatch::filter::ScalarGaussian;
 
 /// One measured swing.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,7 +42,7 @@ pub(crate) struct Peer {
 impl Peer {
     /// Starts from a capacity believed, as Plett does: by a whole swing (x = 1) of that charge, the deviation shared
     /// between both sides.
-    pub(crate) fn new(method: Method, gamma: f64, start: Belief) -> Self {
+    pub(crate) fn new(method: Method, gamma: f64, start: ScalarGaussian) -> Self {
         let mut peer = Self { method, gamma, c: [0.0; 6], x_information: 0.0, y_information: 0.0 };
         let y_variance = 0.5 * start.variance;
         let x_variance = y_variance / (start.mean * start.mean);
@@ -69,15 +69,15 @@ impl Peer {
         self.y_information = self.gamma * self.y_information + 1.0 / y_variance;
     }
 
-    pub(crate) fn capacity(&self) -> Belief {
+    pub(crate) fn capacity(&self) -> ScalarGaussian {
         let [c1, c2, c3, ..] = self.c;
         match self.method {
-            Method::Wls => Belief { mean: c2 / c1, variance: 1.0 / c1 },
+            Method::Wls => ScalarGaussian { mean: c2 / c1, variance: 1.0 / c1 },
             Method::Tls => tls([c1, c2, c3], self.scale()),
             Method::Awtls => {
                 let k = self.scale();
                 let scaled = awtls(&self.scaled(k));
-                Belief { mean: scaled.mean / k, variance: scaled.variance / (k * k) }
+                ScalarGaussian { mean: scaled.mean / k, variance: scaled.variance / (k * k) }
             }
         }
     }
@@ -95,14 +95,14 @@ impl Peer {
 }
 
 /// Minimum of (c3 - 2 c2 Q + c1 Q^2) / (1 + k^2 Q^2): errors of both sides in the fixed ratio k = sx/sy.
-fn tls([c1, c2, c3]: [f64; 3], k: f64) -> Belief {
+fn tls([c1, c2, c3]: [f64; 3], k: f64) -> ScalarGaussian {
     let k2 = k * k;
     let half = c1 - k2 * c3;
     let q = (-half + (half * half + 4.0 * k2 * c2 * c2).sqrt()) / (2.0 * k2 * c2);
     // At the minimum the slope's numerator N = k2 c2 Q^2 + half Q - c2 vanishes: the curvature is 2 N' / (1 + k2 Q^2)^2.
     let spread = 1.0 + k2 * q * q;
     let curvature = 2.0 * (2.0 * k2 * c2 * q + half) / (spread * spread);
-    Belief { mean: q, variance: 2.0 / curvature }
+    ScalarGaussian { mean: q, variance: 2.0 / curvature }
 }
 
 /// (c4 Q^4 - 2 c5 Q^3 + (c1 + c6) Q^2 - 2 c2 Q + c3) / (Q^2 + 1)^2.
@@ -112,7 +112,7 @@ fn awtls_cost([c1, c2, c3, c4, c5, c6]: &[f64; 6], q: f64) -> f64 {
 
 /// The least of that cost over its stationary points: the cost's derivative is 2 P(Q) / (Q^2 + 1)^3 with the quartic
 /// P = c5 Q^4 + (2 c4 - c1 - c6) Q^3 + 3 (c2 - c5) Q^2 + (c1 - 2 c3 + c6) Q - c2, and its second 2 P' / (Q^2 + 1)^3 there.
-fn awtls(c: &[f64; 6]) -> Belief {
+fn awtls(c: &[f64; 6]) -> ScalarGaussian {
     let [c1, c2, c3, c4, c5, c6] = *c;
     let p = [c5, 2.0 * c4 - c1 - c6, 3.0 * (c2 - c5), c1 - 2.0 * c3 + c6, -c2];
     let value = |q: f64| p.iter().fold(0.0, |sum, a| sum * q + a);
@@ -121,7 +121,7 @@ fn awtls(c: &[f64; 6]) -> Belief {
         .into_iter()
         .min_by(|a, b| awtls_cost(c, *a).total_cmp(&awtls_cost(c, *b)))
         .expect("c2 and c5 are positive: P rises from -c2 to infinity and crosses zero");
-    Belief { mean: q, variance: (q * q + 1.0).powi(3) / slope(q) }
+    ScalarGaussian { mean: q, variance: (q * q + 1.0).powi(3) / slope(q) }
 }
 
 /// Where a polynomial crosses zero upwards over (0, inf): sought in Q = tan(angle), the whole half-line in equal steps.
@@ -185,7 +185,7 @@ mod tests {
         (0..count).map(|_| one(random)).collect()
     }
 
-    fn run(method: Method, gamma: f64, start: Belief, swings: &[Swing]) -> Peer {
+    fn run(method: Method, gamma: f64, start: ScalarGaussian, swings: &[Swing]) -> Peer {
         let mut peer = Peer::new(method, gamma, start);
         swings.iter().for_each(|swing| peer.take(swing));
         peer
@@ -206,7 +206,7 @@ mod tests {
     #[test]
     fn awtls_is_the_brute_force_minimum_of_its_cost_over_the_swings_themselves() {
         for (seed, gamma) in [(1, 1.0), (2, 0.95), (3, 0.8)] {
-            let (start, list) = (Belief::from_std(8.0, 1.0), swings(&mut Random(seed), 40, false));
+            let (start, list) = (ScalarGaussian::from_std(8.0, 1.0), swings(&mut Random(seed), 40, false));
             let peer = run(Method::Awtls, gamma, start, &list);
             let k = peer.scale();
             let first = Swing { x: 1.0, x_variance: 0.5 / 64.0, y_ah: 8.0, y_variance: 0.5 };
@@ -231,7 +231,7 @@ mod tests {
     fn awtls_is_tls_where_all_deviations_have_one_ratio() {
         let list = swings(&mut Random(7), 30, true);
         // A start whose deviations have the swings' ratio too: 10 Ah.
-        let [a, b] = [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, Belief::from_std(10.0, 1.0), &list).capacity());
+        let [a, b] = [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
         assert!((a.mean - b.mean).abs() < 1e-9 && (a.variance / b.variance - 1.0).abs() < 1e-9, "{a:?} {b:?}");
     }
 
@@ -243,7 +243,7 @@ mod tests {
         for _ in 0..200 {
             let list = swings(&mut random, 100, true);
             for (i, method) in [Method::Wls, Method::Tls, Method::Awtls].into_iter().enumerate() {
-                let found = run(method, 1.0, Belief::from_std(8.0, 5.0), &list).capacity();
+                let found = run(method, 1.0, ScalarGaussian::from_std(8.0, 5.0), &list).capacity();
                 mean[i] += found.mean / 200.0;
                 covered[i] += f64::from(u8::from((found.mean - 10.0).abs() < 1.96 * found.std())) / 200.0;
             }

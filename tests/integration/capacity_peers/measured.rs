@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use packwatch::config;
-use packwatch::filter::Belief;
+use packwatch::filter::ScalarGaussian;
 use packwatch::health::UsableConfig;
 use packwatch::health::usable::usable_ah;
 use packwatch::monitor::MonitorConfig;
@@ -72,7 +72,7 @@ struct Told {
     time_s: f64,
     discharge: usize,
     published_ah: f64,
-    ours: Belief,
+    ours: ScalarGaussian,
     ratio: f64,
     ratio_std: f64,
     full_soc: f64,
@@ -164,7 +164,7 @@ impl Life {
 
     fn told(&self, event: &Value, time_s: f64, discharge: usize, published_ah: f64) -> Told {
         let number = |key: &str| event[key].as_f64().unwrap();
-        let ours = Belief::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
+        let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
         // The SOC from which it was told to start: the one that gives it again.
         let (mut low, mut high) = (0.5, 1.5);
@@ -182,7 +182,7 @@ impl Life {
     }
 
     /// What a capacity makes usable, the resistance's doubt included (its correlation with a peer's capacity is not known).
-    fn made_usable(&self, told: &Told, capacity: Belief) -> Belief {
+    fn made_usable(&self, told: &Told, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
             usable_ah(&self.config.model, self.usable(), told.full_soc, capacity_ah, ratio)
         };
@@ -190,18 +190,18 @@ impl Life {
         let by_capacity = (at(1.01 * capacity.mean, told.ratio) - mean) / (0.01 * capacity.mean);
         let by_ratio = (at(capacity.mean, 1.01 * told.ratio) - mean) / (0.01 * told.ratio);
         let std = (by_capacity * capacity.std()).hypot(by_ratio * told.ratio_std);
-        Belief::from_std(mean, std)
+        ScalarGaussian::from_std(mean, std)
     }
 
-    fn peer(&self, method: (Method, f64), swings: &[(f64, Source)]) -> Vec<Belief> {
+    fn peer(&self, method: (Method, f64), swings: &[(f64, Source)]) -> Vec<ScalarGaussian> {
         let e = &self.config.estimator;
-        let start = Belief::from_std(e.initial_capacity_ah, e.initial_capacity_std_ah);
+        let start = ScalarGaussian::from_std(e.initial_capacity_ah, e.initial_capacity_std_ah);
         let times_s = self.told.iter().map(|told| told.time_s);
         let capacities = follow(&self.config.model, &self.config.health.capacity, method, start, swings, times_s);
         self.told.iter().zip(capacities).map(|(told, capacity)| self.made_usable(told, capacity)).collect()
     }
 
-    fn scored(&self, usable: &[Belief]) -> (Score, Option<usize>) {
+    fn scored(&self, usable: &[ScalarGaussian]) -> (Score, Option<usize>) {
         let below = usable.iter().zip(&self.told).find(|(usable, _)| usable.mean < 1.4).map(|(_, told)| told.discharge);
         (score(usable.iter().zip(&self.told).map(|(&usable, told)| (usable, told.published_ah))), below)
     }

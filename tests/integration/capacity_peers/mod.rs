@@ -13,7 +13,7 @@ mod measured;
 mod simulated;
 mod swings;
 use packwatch::cell::CellModel;
-use packwatch::filter::Belief;
+use packwatch::filter::ScalarGaussian;
 use packwatch::health::CapacityConfig;
 
 use least_squares::{Method, Peer, Swing};
@@ -46,10 +46,10 @@ fn follow(
     model: &CellModel,
     config: &CapacityConfig,
     (method, gamma): (Method, f64),
-    start: Belief,
+    start: ScalarGaussian,
     swings: &[(f64, Source)],
     times_s: impl Iterator<Item = f64>,
-) -> Vec<Belief> {
+) -> Vec<ScalarGaussian> {
     let mut peer = Peer::new(method, gamma, start);
     let mut swings = swings.iter().peekable();
     let mut capacities = Vec::new();
@@ -77,7 +77,7 @@ struct Score {
 }
 
 /// Of (estimate, truth).
-fn score(pairs: impl Iterator<Item = (Belief, f64)>) -> Score {
+fn score(pairs: impl Iterator<Item = (ScalarGaussian, f64)>) -> Score {
     let (mut count, mut sum, mut covered) = (0.0, 0.0, 0.0);
     for (belief, truth) in pairs {
         let error = (belief.mean - truth).abs();

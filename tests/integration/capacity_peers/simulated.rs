@@ -8,7 +8,7 @@ use std::path::Path;
 
 use packwatch::cell::CapacityState;
 use packwatch::config;
-use packwatch::filter::Belief;
+use packwatch::filter::ScalarGaussian;
 use packwatch::health::CapacityMethod;
 use packwatch::monitor::{EventKind, MonitorConfig};
 use packwatch::sim::{Scenario, Settings};
@@ -28,7 +28,7 @@ const SETTLING: usize = 4;
 struct Told {
     time_s: f64,
     true_ah: f64,
-    ours: Belief,
+    ours: ScalarGaussian,
 }
 
 struct Life {
@@ -85,7 +85,7 @@ impl Life {
                 self.filter.push((time_s - duration_s, Source::Filter(swing)));
             }
             EventKind::Capacity { capacity_ah, capacity_std_ah, .. } => {
-                let ours = Belief::from_std(capacity_ah, capacity_std_ah);
+                let ours = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
                 self.told.push(Told { time_s, true_ah, ours });
             }
             _ => {}
@@ -94,7 +94,7 @@ impl Life {
 
     /// Of each peer in turn on these swings.
     fn peers(&self, config: &MonitorConfig, swings: &[(f64, Source)]) -> Vec<(Score, f64)> {
-        let start = Belief::from_std(config.estimator.initial_capacity_ah, config.estimator.initial_capacity_std_ah);
+        let start = ScalarGaussian::from_std(config.estimator.initial_capacity_ah, config.estimator.initial_capacity_std_ah);
         PEERS
             .iter()
             .map(|&(_, method, gamma)| {
@@ -106,9 +106,9 @@ impl Life {
     }
 
     /// Errors relative to the truth, and the last.
-    fn scored(&self, capacities: &[Belief]) -> (Score, f64) {
-        let relative = |(belief, told): (&Belief, &Told)| {
-            (Belief::from_std(belief.mean / told.true_ah, belief.std() / told.true_ah), 1.0)
+    fn scored(&self, capacities: &[ScalarGaussian]) -> (Score, f64) {
+        let relative = |(belief, told): (&ScalarGaussian, &Told)| {
+            (ScalarGaussian::from_std(belief.mean / told.true_ah, belief.std() / told.true_ah), 1.0)
         };
         let last = capacities[capacities.len() - 1].mean / self.told[self.told.len() - 1].true_ah - 1.0;
         (score(capacities.iter().zip(&self.told).skip(SETTLING).map(relative)), last)

@@ -6,7 +6,7 @@ use std::sync::{LazyLock, Mutex};
 
 use assert_cmd::Command;
 use packwatch::config;
-use packwatch::daemon::doctor::{self, Interrupt};
+use packwatch::diagnosis::{self, Interrupt};
 use packwatch::doctor::{Doctor, Report};
 use packwatch::io::csv_log::CsvOptions;
 

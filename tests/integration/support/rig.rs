@@ -10,7 +10,7 @@ use packwatch::can::encode::InputEncoder;
 use packwatch::can::{CanId, Frame};
 use packwatch::config::Config;
 use packwatch::monitor::{
-    Away, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
+    Downtime, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, ReconfigureError, Reconfigured, Snapshot,
 };
 use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex, Timestamp};
 
@@ -194,12 +194,12 @@ impl Rig {
     }
 
     /// The process ended `away` ago and starts again; the clock goes on by that, if it is known.
-    pub(crate) fn restart(&mut self, away: Away) {
+    pub(crate) fn restart(&mut self, away: Downtime) {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
         let snapshot: Snapshot = serde_json::from_str(&text).unwrap();
         self.monitor = Monitor::new(self.config.clone());
         self.monitor.restore(snapshot, away).unwrap();
-        if let Away::Seconds(seconds) = away {
+        if let Downtime::Seconds(seconds) = away {
             self.deci += Timestamp::from_secs(seconds).nanos() / 100_000_000;
         }
     }

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
-use crate::daemon::status::STALE;
-use crate::daemon::status::document::Document;
+use crate::status::STALE;
+use crate::status::document::Document;
 use crate::quantity::Timestamp;
 
 /// Documents remembered for the plots: four minutes.

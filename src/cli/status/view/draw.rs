@@ -10,7 +10,7 @@ use super::app::{App, Page};
 use super::{pages, plot};
 use crate::alarm::Severity;
 use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
-use crate::daemon::status::document::Document;
+use crate::status::document::Document;
 use crate::io::stamp;
 use crate::monitor::Validity;
 use crate::quantity::Timestamp;

@@ -10,7 +10,7 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use super::app::News;
-use crate::daemon::status::client::{check_length, explain, parse};
+use crate::status::client::{check_length, explain, parse};
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 

@@ -9,8 +9,8 @@ use ratatui::style::Color;
 
 use super::app::{HISTORY, News, Page};
 use super::*;
-use crate::daemon::status::document::Document;
-use crate::daemon::status::sample::sample;
+use crate::status::document::Document;
+use crate::status::sample::sample;
 use crate::quantity::Timestamp;
 
 fn app() -> App {

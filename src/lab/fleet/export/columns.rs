@@ -194,7 +194,7 @@ fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
 }
 
 /// The page about the columns, as Markdown.
-pub(crate) fn reference() -> String {
+pub fn reference() -> String {
     let mut page = String::from(
         "# Exported tables\n\nWritten by `packwatch export --columns-page`; the files are written from the same definition. A value that is not known is null \
          (an empty field in CSV). `log` is dictionary-encoded: it costs next to nothing, and tells logs apart in a query over all files.\n",

@@ -19,7 +19,7 @@ severe = 5.0
 
 /// The demo's configuration with the alarms above, in a folder of its own.
 fn written(folder: &tempfile::TempDir) -> PathBuf {
-    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config");
     let text = fs::read_to_string(shipped.join("demo.toml")).expect("shipped");
     let at = text.find("[[alarm]]").expect("alarms");
     let end = text.find("[output]").expect("output");

@@ -1,0 +1,160 @@
+//! What is written reads back equal, and what was written stays as it is.
+
+use proptest::prelude::*;
+
+use super::*;
+use crate::can::dbc::Multiplex;
+use crate::can::e2e::{Profile, Protection};
+use crate::can::encode::{Base, LayoutSettings, MessageSettings, layout};
+use crate::can::signal::SignalLayout;
+
+const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
+
+#[test]
+fn the_shipped_file_is_what_the_writer_makes_of_the_default_layout() {
+    let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
+    let written = layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap().to_dbc();
+    for (number, (shipped, written)) in (1..).zip(SHIPPED.lines().zip(written.lines())) {
+        assert_eq!(shipped, written, "line {number} of config/packwatch.dbc");
+    }
+    assert_eq!(SHIPPED, written);
+}
+
+#[test]
+fn shipped_files_read_back_equal() {
+    let texts =
+        [SHIPPED, include_str!("../../../../../config/pack96.dbc"), include_str!("../../../../../config/measured.dbc")];
+    for text in texts {
+        let database = Database::parse(text).unwrap();
+        assert_eq!(Database::parse_bytes(&database.to_dbc_bytes()).unwrap(), database);
+    }
+}
+
+#[test]
+fn bytes_are_one_per_character_unless_that_would_be_read_otherwise() {
+    let with_comment = |comment: &str| Database { comment: Some(comment.to_owned()), ..Default::default() };
+    assert!(with_comment("\u{b0}C").to_dbc_bytes().windows(2).any(|bytes| bytes == b"\xB0C"));
+    for comment in ["plain", "\u{b0}C", "\u{c3}\u{a9}", "\u{20ac} and \u{b0}"] {
+        let database = with_comment(comment);
+        assert_eq!(Database::parse_bytes(&database.to_dbc_bytes()).unwrap(), database, "{comment}");
+    }
+}
+
+#[test]
+fn a_quote_does_not_end_a_text() {
+    let database = Database { comment: Some("a \"b\" c\\".to_owned()), ..Default::default() };
+    let read = Database::parse(&database.to_dbc()).unwrap();
+    assert_eq!(read.comment.as_deref(), Some("a \\\"b\\\" c\\ "));
+    assert_eq!(Database::parse(&read.to_dbc()).unwrap(), read);
+}
+
+/// Words without quotes and backslashes, which are escaped when written.
+const TEXT: &str = "[ -!#-\\[\\]-~\u{b0}\u{b5}\u{20ac}]{0,12}";
+
+fn layouts() -> impl Strategy<Value = SignalLayout> {
+    let number =
+        prop_oneof![Just(0.0), -1e6..1e6_f64, (-4000..4000_i32).prop_map(|n| f64::from(n) / 40.0), any::<f64>()];
+    let number = number.prop_filter("a DBC's numbers are finite", |number| number.is_finite()).boxed();
+    let kind = prop_oneof![
+        Just(ValueType::Unsigned),
+        Just(ValueType::Signed),
+        Just(ValueType::Float32),
+        Just(ValueType::Float64)
+    ];
+    let order = prop_oneof![Just(ByteOrder::LittleEndian), Just(ByteOrder::BigEndian)];
+    (any::<u16>(), any::<u16>(), order, kind, [number.clone(), number.clone(), number.clone(), number]).prop_map(
+        |(start_bit, length_bits, byte_order, value_type, [factor, offset, minimum, maximum])| SignalLayout {
+            start_bit,
+            length_bits,
+            byte_order,
+            value_type,
+            factor,
+            offset,
+            minimum,
+            maximum,
+        },
+    )
+}
+
+prop_compose! {
+    /// A signal that is always there.
+    fn signals()(
+        layout in layouts(),
+        unit in TEXT,
+        receivers in prop::collection::vec("N[a-z0-9]{1,5}", 0..3),
+        values in prop::collection::vec((any::<i64>(), TEXT), 0..3),
+        comment in prop::option::of(TEXT),
+    ) -> Signal {
+        let (multiplex, name) = (Multiplex::default(), String::new());
+        Signal { name, layout, unit, receivers, multiplex, is_multiplexor: false, values, comment }
+    }
+}
+
+/// How a signal hangs on an earlier one: on which multiplexor, for which codes, and whether it is one itself.
+type Hanging = (Option<(prop::sample::Index, Vec<(u64, u64)>)>, bool);
+
+fn hangings() -> impl Strategy<Value = Hanging> {
+    let range =
+        prop_oneof![(0..300_u64).prop_map(|code| (code, code)), (0..300_u64, 0..9_u64).prop_map(|(a, n)| (a, a + n))];
+    let condition = prop::option::of((any::<prop::sample::Index>(), prop::collection::vec(range, 1..3)));
+    (condition, any::<bool>())
+}
+
+/// Signals with their names and conditions; nesting is kept below what is taken for a loop.
+fn assemble(parts: Vec<(Signal, Hanging)>) -> Vec<Signal> {
+    let mut made: Vec<Signal> = Vec::new();
+    for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {
+        signal.name = format!("S{number}");
+        signal.is_multiplexor = is_multiplexor;
+        let parents = made.iter().enumerate().filter(|(_, s)| s.is_multiplexor && s.multiplex.conditions.len() < 4);
+        let parents: Vec<usize> = parents.map(|(place, _)| place).collect();
+        if let (Some((which, ranges)), false) = (condition, parents.is_empty()) {
+            let selector = parents[which.index(parents.len())];
+            signal.multiplex.conditions.clone_from(&made[selector].multiplex.conditions);
+            signal.multiplex.conditions.push(MuxCondition { selector, ranges });
+        }
+        made.push(signal);
+    }
+    made
+}
+
+prop_compose! {
+    fn messages()(
+        extended in any::<bool>(),
+        len_bytes in any::<u16>(),
+        sender in prop::option::of("N[a-z0-9]{1,5}"),
+        format in prop_oneof![Just(FrameFormat::Classic), any::<bool>().prop_map(|brs| FrameFormat::Fd { brs })],
+        e2e in prop::option::of((prop_oneof![Just(Profile::P01A), Just(Profile::P01C), Just(Profile::P05)], any::<u16>())),
+        parts in prop::collection::vec((signals(), hangings()), 0..8),
+        cycle_time_ms in prop::option::of(1..=3_600_000_u32),
+        comment in prop::option::of(TEXT),
+    ) -> (bool, Message) {
+        let e2e = e2e.map(|(profile, data_id)| Protection { profile, data_id });
+        let (id, name, signals) = (CanId::Standard(0), String::new(), assemble(parts));
+        (extended, Message { id, name, len_bytes, sender, format, e2e, signals, cycle_time_ms, comment })
+    }
+}
+
+prop_compose! {
+    fn databases()(
+        nodes in prop::collection::vec("N[a-z0-9]{1,5}", 0..4),
+        comment in prop::option::of(TEXT),
+        made in prop::collection::vec(messages(), 0..5),
+    ) -> Database {
+        let name = |(number, (extended, message)): (u16, (bool, Message))| {
+            let id = if extended { CanId::Extended(0x1FFF_FFFF - u32::from(number)) } else { CanId::Standard(number) };
+            Message { id, name: format!("M{number}"), ..message }
+        };
+        Database { nodes, comment, messages: (0..).zip(made).map(name).collect() }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(500))]
+
+    #[test]
+    fn any_database_reads_back_equal(database in databases()) {
+        let read = Database::parse_bytes(&database.to_dbc_bytes());
+        prop_assert_eq!(read, Ok(database));
+    }
+}

@@ -1,0 +1,375 @@
+//! The layout of what is sent and of the command that is taken: one [`Database`] for encoder and consumers.
+//!
+//! In: a base (the built-in `config/packwatch.dbc`, or a DBC of one's own) and settings per message. Out: the base's
+//! messages with identifiers, frame formats, cycle times and end-to-end protection as set, the header's signals
+//! included. The encoder is made from it and `packwatch dbc` writes it, so that the two cannot disagree.
+//!
+//! The built-in base is fitted: steps of Ah signals grow with the cell, and profile 5, whose header is a byte longer
+//! than the room kept free, moves the signals up by that byte. A DBC of one's own is not moved: its signals must leave
+//! the header free. Everything that does not fit is told at once.
+
+use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Signal};
+use crate::can::e2e::{Profile, Protection};
+use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
+use crate::can::{CanId, FrameKind};
+
+use super::is_frame_length;
+
+/// Names of the signals that the protection fills; no value of the daemon's has one of these.
+pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble"];
+
+/// Length of a built-in message whose signals were moved for profile 5: what FD has above 8.
+const MOVED_LEN_BYTES: u16 = 12;
+
+/// Cycle time of a sent message for which neither settings nor base say one, ms.
+pub(super) const USUAL_PERIOD_MS: u32 = 1000;
+
+/// The DBC that ships with the program.
+///
+/// # Errors
+/// Never for the file as shipped (a test reads it).
+pub fn default_database() -> Result<Database, DbcError> {
+    Database::parse(include_str!("../../../../config/packwatch.dbc"))
+}
+
+/// A message of the layout.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LaidOut {
+    /// Status frame.
+    Status,
+    /// Health frame.
+    Health,
+    /// Alarm frame.
+    Alarm,
+    /// Command frame, received.
+    Command,
+}
+
+impl LaidOut {
+    /// All of them, in the order of the layout.
+    pub const ALL: [Self; 4] = [Self::Status, Self::Health, Self::Alarm, Self::Command];
+
+    /// Name of the message in the DBC.
+    pub const fn message(self) -> &'static str {
+        match self {
+            Self::Status => "PACKWATCH_Status",
+            Self::Health => "PACKWATCH_Health",
+            Self::Alarm => "PACKWATCH_Alarm",
+            Self::Command => "PACKWATCH_Command",
+        }
+    }
+}
+
+/// End-to-end protection of a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum E2eSetting {
+    /// What the base says; the built-in one: none.
+    #[default]
+    AsBase,
+    /// None.
+    Off,
+    /// This one.
+    On(Protection),
+}
+
+/// What is set for a message; `None` = as the base says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct MessageSettings {
+    /// Identifier.
+    pub id: Option<CanId>,
+    /// Whether FD frames carry it.
+    pub fd: Option<bool>,
+    /// Whether their data go at the higher bit rate.
+    pub brs: Option<bool>,
+    /// Cycle time, ms.
+    pub period_ms: Option<u32>,
+    /// Protection.
+    pub e2e: E2eSetting,
+}
+
+/// What a layout is made from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Base<'d> {
+    /// The DBC that ships with the program, fitted to a cell of this rated capacity, Ah.
+    BuiltIn {
+        /// Ah.
+        rated_capacity_ah: f64,
+    },
+    /// Another one, taken as it is.
+    Own(&'d Database),
+}
+
+/// What is set for each message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LayoutSettings {
+    /// Status frame.
+    pub status: MessageSettings,
+    /// Health frame.
+    pub health: MessageSettings,
+    /// Alarm frame.
+    pub alarm: MessageSettings,
+    /// Command frame; `None` = no command is taken.
+    pub command: Option<MessageSettings>,
+}
+
+impl LayoutSettings {
+    fn of(&self, message: LaidOut) -> Option<&MessageSettings> {
+        match message {
+            LaidOut::Status => Some(&self.status),
+            LaidOut::Health => Some(&self.health),
+            LaidOut::Alarm => Some(&self.alarm),
+            LaidOut::Command => self.command.as_ref(),
+        }
+    }
+}
+
+/// A setting that does not fit the message.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}: {what}", .message.message())]
+pub struct SettingFault {
+    /// Which message.
+    pub message: LaidOut,
+    /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`.
+    pub key: &'static str,
+    /// What is wrong, what is allowed.
+    pub what: String,
+}
+
+/// Makes the layout. A message the base does not have is left out: the plans say what is missing.
+///
+/// # Errors
+/// All settings that do not fit.
+pub fn layout(base: Base<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
+    let shipped;
+    let (database, rated_capacity_ah) = match base {
+        Base::BuiltIn { rated_capacity_ah } => {
+            // Cannot fail: a test reads the shipped file.
+            shipped = default_database().unwrap_or_default();
+            (&shipped, Some(rated_capacity_ah))
+        }
+        Base::Own(database) => (database, None),
+    };
+    let mut faults = Vec::new();
+    let mut messages = Vec::new();
+    for which in LaidOut::ALL {
+        if let (Some(settings), Some(message)) = (settings.of(which), database.message(which.message())) {
+            let mut laid_out = message.clone();
+            if let Some(rated_capacity_ah) = rated_capacity_ah {
+                fit_steps(&mut laid_out, rated_capacity_ah);
+            }
+            let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
+            apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
+            if which != LaidOut::Command {
+                laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(USUAL_PERIOD_MS));
+            }
+            messages.push(laid_out);
+        }
+    }
+    if !faults.is_empty() {
+        return Err(faults);
+    }
+    Ok(Database { nodes: database.nodes.clone(), comment: database.comment.clone(), messages })
+}
+
+/// Applies the settings to a message; `movable` = its signals may be moved.
+fn apply(
+    message: &mut Message,
+    settings: &MessageSettings,
+    movable: bool,
+    fault: &mut impl FnMut(&'static str, String),
+) {
+    message.id = settings.id.unwrap_or(message.id);
+    message.cycle_time_ms = settings.period_ms.or(message.cycle_time_ms);
+    message.format = format(message, settings);
+    let is_fd = message.format != FrameFormat::Classic;
+    if settings.brs == Some(true) && !is_fd {
+        fault("brs", "must have fd = true: classic frames have one bit rate".to_owned());
+    }
+    message.e2e = match settings.e2e {
+        E2eSetting::AsBase => message.e2e,
+        E2eSetting::Off => None,
+        E2eSetting::On(protection) => Some(protection),
+    };
+    let is_moved = movable && message.e2e.is_some_and(|e2e| e2e.profile == Profile::P05);
+    if is_moved {
+        move_up(message);
+    }
+    set_header(message);
+    if let Some(protection) = message.e2e {
+        check_header(message, protection, fault);
+    }
+    if message.len_bytes > 8 && !is_fd {
+        if is_moved {
+            let what = format!(
+                "must have fd = true here and on the interface: the header of profile 5 makes the message \
+                 {MOVED_LEN_BYTES} bytes long; 1A and 1C fit classic frames"
+            );
+            fault("e2e", what);
+        } else {
+            fault("fd", format!("must be true: message {} has {} bytes", message.name, message.len_bytes));
+        }
+    }
+}
+
+fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
+    let (was_fd, was_brs) = match message.format {
+        // A DBC that does not state the format still says it by a length that classic frames do not have.
+        FrameFormat::Classic => (message.len_bytes > 8, false),
+        FrameFormat::Fd { brs } => (true, brs),
+    };
+    match settings.fd.unwrap_or(was_fd) {
+        true => FrameFormat::Fd { brs: settings.brs.unwrap_or(was_brs) },
+        false => FrameFormat::Classic,
+    }
+}
+
+/// Makes room for the third byte of profile 5's header: all signals one byte up.
+fn move_up(message: &mut Message) {
+    for signal in &mut message.signals {
+        signal.layout.start_bit += 8;
+    }
+    message.len_bytes = MOVED_LEN_BYTES;
+}
+
+/// Puts the header's signals in place of those that may be there.
+fn set_header(message: &mut Message) {
+    let header = message.e2e.map(header_signals).unwrap_or_default();
+    let is_kept = |signal: &Signal| !HEADER_SIGNALS.contains(&signal.name.as_str());
+    // Conditions name multiplexors by their place, which changes.
+    let mut next = header.len();
+    let places = message.signals.iter().map(|signal| {
+        let place = is_kept(signal).then_some(next);
+        next += usize::from(place.is_some());
+        place
+    });
+    let places: Vec<Option<usize>> = places.collect();
+    let kept = std::mem::replace(&mut message.signals, header).into_iter().filter(is_kept);
+    message.signals.extend(kept.map(|mut signal| {
+        for condition in &mut signal.multiplex.conditions {
+            condition.selector = places.get(condition.selector).copied().flatten().unwrap_or(condition.selector);
+        }
+        signal
+    }));
+}
+
+/// The header as signals, so that a consumer can check it with nothing but the DBC.
+fn header_signals(protection: Protection) -> Vec<Signal> {
+    let Protection { profile, data_id } = protection;
+    let crc = format!("CRC of end-to-end profile {}, data id {data_id}.", profile.name());
+    let counter = format!("Rises by one with every frame, 0 to {}, then again from 0.", profile.max_counter());
+    match profile {
+        Profile::P01A => vec![header_signal("E2eCrc", 0, 8, &crc), header_signal("E2eCounter", 8, 4, &counter)],
+        Profile::P01C => vec![
+            header_signal("E2eCrc", 0, 8, &crc),
+            header_signal("E2eCounter", 8, 4, &counter),
+            header_signal("E2eDataIdNibble", 12, 4, "Low nibble of the data id's high byte."),
+        ],
+        Profile::P05 => vec![header_signal("E2eCrc", 0, 16, &crc), header_signal("E2eCounter", 16, 8, &counter)],
+    }
+}
+
+fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) -> Signal {
+    Signal {
+        name: name.to_owned(),
+        layout: SignalLayout {
+            start_bit,
+            length_bits,
+            byte_order: ByteOrder::LittleEndian,
+            value_type: ValueType::Unsigned,
+            factor: 1.0,
+            offset: 0.0,
+            minimum: 0.0,
+            maximum: f64::from((1_u32 << length_bits) - 1),
+        },
+        unit: String::new(),
+        receivers: Vec::new(),
+        multiplex: Default::default(),
+        is_multiplexor: false,
+        values: Vec::new(),
+        comment: Some(comment.to_owned()),
+    }
+}
+
+/// The header must fit into the message, and no other signal may lie in it.
+fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMut(&'static str, String)) {
+    let Protection { profile, data_id } = protection;
+    let (name, len, word) = (&message.name, usize::from(message.len_bytes), profile.name());
+    if data_id > profile.max_data_id() {
+        fault("data_id", format!("must be 0 to {:#X} with profile {word}", profile.max_data_id()));
+    }
+    if !(profile.header_bytes()..=profile.max_bytes()).contains(&len) {
+        let (least, most) = (profile.header_bytes(), profile.max_bytes());
+        fault("e2e", format!("message {name} has {len} bytes, must have {least} to {most} for profile {word}"));
+    } else if !is_frame_length(len) {
+        fault(
+            "e2e",
+            format!("message {name} has {len} bytes, must have a length that frames have: padding is not protected"),
+        );
+    }
+    let in_header = |signal: &&Signal| {
+        !HEADER_SIGNALS.contains(&signal.name.as_str()) && touches(&signal.layout, profile.header_mask())
+    };
+    for signal in message.signals.iter().filter(in_header) {
+        let what = format!(
+            "signal {name}.{} begins at bit {}, must leave the {} bits of the header of profile {word} free",
+            signal.name,
+            signal.layout.start_bit,
+            profile.header_mask().iter().map(|byte| byte.count_ones()).sum::<u32>(),
+        );
+        fault("e2e", what);
+    }
+}
+
+/// Whether one of the signal's bits is in the mask, which is of the payload's first bytes.
+fn touches(layout: &SignalLayout, mask: [u8; 3]) -> bool {
+    let (first, last) = layout.span();
+    let bit_of = |place: u32| match layout.byte_order {
+        ByteOrder::LittleEndian => place % 8,
+        ByteOrder::BigEndian => 7 - place % 8,
+    };
+    (0..)
+        .zip(mask)
+        .any(|(byte, mask)| (first.max(8 * byte)..=last.min(8 * byte + 7)).any(|p| mask >> bit_of(p) & 1 == 1))
+}
+
+/// Steps of signals in Ah: the smallest of 1, 2, 5, 10, ... times the built-in one with which the largest value the
+/// cell may have fits: twice the rated capacity, half of it for a standard deviation.
+fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
+    let largest_ah = |signal: &Signal| rated_capacity_ah * if signal.name.ends_with("Std") { 0.5 } else { 2.0 };
+    for is_std in [false, true] {
+        let belongs = |signal: &Signal| signal.unit == "Ah" && signal.name.ends_with("Std") == is_std;
+        let needed = message.signals.iter().filter(|signal| belongs(signal));
+        let needed = needed.map(|signal| times(largest_ah(signal) / signal.layout.maximum)).fold(1.0, f64::max);
+        for signal in message.signals.iter_mut().filter(|signal| belongs(signal)) {
+            signal.layout.factor = decimal(signal.layout.factor * needed);
+            signal.layout.maximum = decimal(signal.layout.maximum * needed);
+        }
+    }
+}
+
+/// The smallest of 1, 2, 5, 10, ... that is not below `needed`; the largest where none is.
+fn times(needed: f64) -> f64 {
+    /// No cell needs more: that many times 40 Ah.
+    const LARGEST: f64 = 1e6;
+    let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
+    let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);
+    ladder.find(|step| *step >= needed).unwrap_or(LARGEST)
+}
+
+/// Without the digits that arithmetic adds to a decimal number.
+fn decimal(value: f64) -> f64 {
+    format!("{value:.6}").parse().unwrap_or(value)
+}
+
+impl FrameFormat {
+    /// The frame kind that goes out.
+    pub const fn kind(self) -> FrameKind {
+        match self {
+            Self::Classic => FrameKind::Classic,
+            Self::Fd { brs } => FrameKind::Fd { brs, esi: false },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

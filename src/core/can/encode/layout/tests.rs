@@ -1,0 +1,221 @@
+//! Settings land in the layout, or are refused with their key; a layout made again from its own text stays the same.
+
+use super::*;
+use crate::can::encode::{CommandPlan, OutputPlan};
+
+const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
+
+fn built_in(settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
+    layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, settings)
+}
+
+fn on(profile: Profile, data_id: u16) -> MessageSettings {
+    MessageSettings { e2e: E2eSetting::On(Protection { profile, data_id }), ..Default::default() }
+}
+
+fn with_status(status: MessageSettings) -> LayoutSettings {
+    LayoutSettings { status, ..Default::default() }
+}
+
+/// Key and text of the one fault of an own DBC, which is the shipped one with one text replaced.
+fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, String) {
+    assert!(TEXT.contains(from), "{from}");
+    let own = Database::parse(&TEXT.replace(from, to)).unwrap();
+    let faults = layout(Base::Own(&own), &with_status(status)).unwrap_err();
+    assert_eq!((faults.len(), faults[0].message), (1, LaidOut::Status), "{faults:?}");
+    (faults[0].key, faults[0].what.clone())
+}
+
+#[test]
+fn without_settings_the_layout_is_the_shipped_file_but_for_the_command() {
+    let shipped = default_database().unwrap();
+    let made = built_in(&LayoutSettings::default()).unwrap();
+    assert_eq!(made.messages, shipped.messages[..3]);
+    let command = Some(MessageSettings::default());
+    assert_eq!(built_in(&LayoutSettings { command, ..Default::default() }).unwrap(), shipped);
+}
+
+#[test]
+fn identifiers_formats_and_periods_are_as_set() {
+    let fd = MessageSettings { fd: Some(true), brs: Some(true), ..Default::default() };
+    let settings = LayoutSettings {
+        status: MessageSettings { id: CanId::extended(5), period_ms: Some(20), ..Default::default() },
+        health: fd,
+        alarm: MessageSettings { id: CanId::standard(7), fd: Some(true), ..Default::default() },
+        command: None,
+    };
+    let plan = OutputPlan::new(&built_in(&settings).unwrap()).unwrap();
+    assert_eq!(plan.ids(), [CanId::Extended(5), CanId::Standard(0x6B1), CanId::Standard(7)]);
+    assert_eq!(plan.cycle_times_ms(), [20, 1000, 1000]);
+    let formats = [FrameFormat::Classic, FrameFormat::Fd { brs: true }, FrameFormat::Fd { brs: false }];
+    assert_eq!(plan.formats(), formats);
+}
+
+#[test]
+fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
+    let shipped = default_database().unwrap();
+    let settings = |data_id| MessageSettings { fd: Some(true), ..on(Profile::P05, data_id) };
+    let all =
+        LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: Some(settings(4)) };
+    let made = built_in(&all).unwrap();
+    for (message, shipped) in made.messages.iter().zip(&shipped.messages) {
+        assert_eq!((message.len_bytes, message.signals.len()), (12, shipped.signals.len() + 2));
+        assert_eq!((&*message.signals[0].name, &*message.signals[1].name), ("E2eCrc", "E2eCounter"));
+        for (moved, shipped) in message.signals[2..].iter().zip(&shipped.signals) {
+            assert_eq!((&moved.name, moved.layout.start_bit), (&shipped.name, shipped.layout.start_bit + 8));
+            let selector = |message: &Message, signal: &Signal| {
+                signal.multiplex.conditions.first().map(|condition| message.signals[condition.selector].name.clone())
+            };
+            let shipped_message = default_database().unwrap();
+            let shipped_message = shipped_message.message(&message.name).unwrap();
+            assert_eq!(selector(message, moved), selector(shipped_message, shipped));
+        }
+    }
+    assert!(OutputPlan::new(&made).is_ok() && CommandPlan::new(&made).is_ok());
+}
+
+#[test]
+fn profile_5_in_classic_frames_is_refused_with_what_would_do() {
+    let faults = built_in(&with_status(on(Profile::P05, 1))).unwrap_err();
+    assert_eq!(
+        faults[0].to_string(),
+        "PACKWATCH_Status: must have fd = true here and on the interface: the header of profile 5 makes the message 12 \
+         bytes long; 1A and 1C fit classic frames"
+    );
+    for profile in [Profile::P01A, Profile::P01C] {
+        let made = built_in(&with_status(on(profile, 1))).unwrap();
+        assert_eq!(made.messages[0].len_bytes, 8);
+    }
+}
+
+#[test]
+fn the_header_names_its_signals() {
+    let names = |profile| {
+        let made = built_in(&with_status(on(profile, 0x123))).unwrap();
+        let status = &made.messages[0];
+        let header = status.signals.iter().take_while(|signal| signal.name.starts_with("E2e"));
+        header
+            .map(|signal| (signal.name.clone(), signal.layout.start_bit, signal.layout.length_bits))
+            .collect::<Vec<_>>()
+    };
+    let (crc, counter) = (("E2eCrc".to_owned(), 0, 8), ("E2eCounter".to_owned(), 8, 4));
+    assert_eq!(names(Profile::P01A), [crc.clone(), counter.clone()]);
+    assert_eq!(names(Profile::P01C), [crc, counter, ("E2eDataIdNibble".to_owned(), 12, 4)]);
+}
+
+#[test]
+fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
+    let fd = |settings| MessageSettings { fd: Some(true), ..settings };
+    let settings = LayoutSettings {
+        status: fd(on(Profile::P05, 1)),
+        health: on(Profile::P01C, 2),
+        alarm: MessageSettings { id: CanId::extended(9), period_ms: Some(50), ..on(Profile::P01A, 3) },
+        command: Some(fd(on(Profile::P05, 4))),
+    };
+    let made = layout(Base::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
+    let read = Database::parse(&made.to_dbc()).unwrap();
+    assert_eq!(read, made);
+    let as_it_is = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
+    assert_eq!(layout(Base::Own(&read), &as_it_is).unwrap(), made);
+    assert_eq!(layout(Base::Own(&read), &settings).unwrap(), made, "set again");
+    let off = MessageSettings { e2e: E2eSetting::Off, ..Default::default() };
+    let plain = layout(Base::Own(&read), &with_status(off)).unwrap();
+    assert_eq!((plain.messages[0].e2e, &*plain.messages[0].signals[0].name), (None, "Soc"));
+}
+
+#[test]
+fn an_own_dbc_is_not_moved_and_must_leave_the_header_free() {
+    let status = MessageSettings { fd: Some(true), ..on(Profile::P05, 1) };
+    let (key, what) = own_fault("VERSION", "VERSION", status);
+    let wanted = "signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 bits of the header of profile 5 free";
+    assert_eq!((key, &*what), ("e2e", wanted));
+    let (key, what) = own_fault("Soc : 16|12@1+", "Soc : 11|12@0+", on(Profile::P01C, 1));
+    let wanted =
+        "signal PACKWATCH_Status.Soc begins at bit 11, must leave the 16 bits of the header of profile 1C free";
+    assert_eq!((key, &*what), ("e2e", wanted));
+}
+
+#[test]
+fn profile_1a_leaves_the_upper_half_of_the_second_byte_to_a_signal() {
+    let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 12|4@1+")).unwrap();
+    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok());
+    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01C, 1))).is_err());
+    let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|4@0+")).unwrap();
+    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok(), "the same bits, the other order");
+    let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|5@0+")).unwrap();
+    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_err());
+}
+
+#[test]
+fn lengths_that_a_frame_or_a_profile_does_not_have_are_refused() {
+    let length = |len: u32, status| own_fault("PACKWATCH_Status: 8", &format!("PACKWATCH_Status: {len}"), status);
+    let what = "message PACKWATCH_Status has 10 bytes, must have a length that frames have: padding is not protected";
+    assert_eq!(length(10, on(Profile::P01A, 1)), ("e2e", what.to_owned()));
+    let what = "message PACKWATCH_Status has 32 bytes, must have 2 to 30 for profile 1A";
+    assert_eq!(length(32, on(Profile::P01A, 1)), ("e2e", what.to_owned()));
+    let classic = MessageSettings { fd: Some(false), ..Default::default() };
+    assert_eq!(length(12, classic), ("fd", "must be true: message PACKWATCH_Status has 12 bytes".to_owned()));
+}
+
+#[test]
+fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
+    let own = Database::parse(&TEXT.replace("PACKWATCH_Status: 8", "PACKWATCH_Status: 12")).unwrap();
+    let made = layout(Base::Own(&own), &LayoutSettings::default()).unwrap();
+    assert_eq!(made.messages[0].format, FrameFormat::Fd { brs: false });
+    assert_eq!(made.messages[1].format, FrameFormat::Classic);
+}
+
+#[test]
+fn a_frame_without_a_cycle_time_gets_the_usual_one_and_consumers_are_told() {
+    let text = TEXT.replace("BA_ \"GenMsgCycleTime\" BO_ 1712 100;\n", "");
+    let made = layout(Base::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
+    assert_eq!(made.messages[0].cycle_time_ms, Some(1000));
+}
+
+#[test]
+fn settings_that_do_not_fit_are_all_told_with_their_keys() {
+    let wrong = LayoutSettings {
+        status: MessageSettings { brs: Some(true), ..Default::default() },
+        health: on(Profile::P01C, 0x1000),
+        ..Default::default()
+    };
+    let faults = built_in(&wrong).unwrap_err();
+    assert_eq!(
+        faults.iter().map(|fault| (fault.message, fault.key)).collect::<Vec<_>>(),
+        [(LaidOut::Status, "brs"), (LaidOut::Health, "data_id")]
+    );
+}
+
+#[test]
+fn steps_in_ah_fit_the_cell() {
+    let steps = |rated_capacity_ah| {
+        let made = layout(Base::BuiltIn { rated_capacity_ah }, &LayoutSettings::default()).unwrap();
+        let step = |name: &str| {
+            let layout = made.signal(name).unwrap().1.layout;
+            let share = if name.ends_with("Std") { 0.5 } else { 2.0 };
+            assert!(layout.maximum >= share * rated_capacity_ah, "{name} for {rated_capacity_ah} Ah");
+            let codes = layout.plan().unwrap().code(layout.maximum).unwrap();
+            assert_eq!(codes, layout.plan().unwrap().all_ones() - 1, "{name}: all but the code for not available");
+            layout.factor
+        };
+        let [value, threshold] =
+            ["Value_CapacityLow", "Threshold_UsableCapacityLow"].map(|name| step(&format!("PACKWATCH_Alarm.{name}")));
+        assert_eq!(threshold, decimal(2.0 * value));
+        [value, step("PACKWATCH_Health.Capacity"), step("PACKWATCH_Health.CapacityStd")]
+    };
+    assert_eq!(steps(2.6), [0.01, 0.01, 0.001]);
+    assert_eq!(steps(40.94), [0.01, 0.01, 0.001]);
+    assert_eq!(steps(40.95), [0.02, 0.01, 0.001]);
+    assert_eq!(steps(280.0), [0.1, 0.01, 0.005]);
+    assert_eq!(steps(1000.0), [0.5, 0.05, 0.01]);
+    assert_eq!(steps(100_000.0), [50.0, 5.0, 1.0]);
+}
+
+#[test]
+fn an_own_dbc_keeps_its_steps_and_loses_messages_that_are_not_the_daemons() {
+    let text = format!("{TEXT}\nBO_ 5 Other: 8 PACKWATCH\n SG_ X : 0|8@1+ (1,0) [0|0] \"Ah\" PACKWATCH\n");
+    let own = Database::parse(&text).unwrap();
+    let made = layout(Base::Own(&own), &LayoutSettings::default()).unwrap();
+    assert_eq!(made.messages, own.messages[..3]);
+    assert_eq!((&made.nodes, &made.comment), (&own.nodes, &own.comment));
+}

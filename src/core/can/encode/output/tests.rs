@@ -1,0 +1,408 @@
+//! What goes out reads back with the same DBC, and unknown never reads as a number.
+
+use super::*;
+use crate::can::e2e::Profile;
+use crate::can::encode::{Base, E2eSetting, LayoutSettings, MessageSettings, default_database, layout};
+use crate::quantity::Fault;
+
+const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
+
+/// The plan, with counters nobody looks at.
+struct Unprotected(OutputPlan);
+
+impl Unprotected {
+    fn status(&self, fields: &StatusFields) -> Frame {
+        self.0.status(fields, &mut SendCounters::default())
+    }
+
+    fn health(&self, page: usize, fields: &HealthFields) -> Frame {
+        self.0.health(page, fields, &mut SendCounters::default())
+    }
+
+    fn alarm(&self, fields: &AlarmFields) -> Frame {
+        self.0.alarm(fields, &mut SendCounters::default())
+    }
+}
+
+fn plan() -> Unprotected {
+    Unprotected(OutputPlan::new(&default_database().unwrap()).unwrap())
+}
+
+/// Raw code and physical value of `Message.Signal` in a frame.
+fn read(name: &str, frame: &Frame) -> (u64, Result<f64, Fault>) {
+    let dbc = default_database().unwrap();
+    let (_, signal) = dbc.signal(&format!("PACKWATCH_{name}")).unwrap();
+    let plan = signal.layout.plan().unwrap();
+    (plan.raw(frame.data()).unwrap(), plan.decode(frame.data()))
+}
+
+/// Asserts a value within half a bit, in the DBC's unit.
+fn says(name: &str, frame: &Frame, wanted: f64) {
+    let dbc = default_database().unwrap();
+    let half = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout.factor / 2.0 + 1e-9;
+    let (_, found) = read(name, frame);
+    assert!(found.is_ok_and(|found| (found - wanted).abs() <= half), "{name}: {found:?} for {wanted}");
+}
+
+/// Asserts the code for not available, which must lie outside the range.
+fn says_nothing(name: &str, frame: &Frame) {
+    let dbc = default_database().unwrap();
+    let codes = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.not_available_codes();
+    let (code, value) = read(name, frame);
+    assert_eq!(vec![code], codes, "{name}");
+    // Severity 0 is the one code for "not available" inside a range.
+    assert!(value == Err(Fault::OutOfRange) || name == "Alarm.Severity", "{name} reads {value:?}");
+}
+
+/// The DBC with one text replaced.
+fn faults(from: &str, to: &str) -> Vec<String> {
+    assert!(TEXT.contains(from), "{from}");
+    let dbc = Database::parse(&TEXT.replace(from, to)).unwrap();
+    OutputPlan::new(&dbc).unwrap_err().0
+}
+
+#[test]
+fn the_shipped_dbc_has_everything_and_the_cycle_times_of_the_configuration() {
+    let plan = plan().0;
+    assert_eq!(plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!(plan.cycle_times_ms(), [100, 1000, 1000]);
+    assert_eq!(plan.health_pages(), 4);
+}
+
+#[test]
+fn status_reads_back_within_half_a_bit() {
+    let fields = StatusFields {
+        soc: Some(0.7312),
+        soc_std: Some(0.0123),
+        mode: Some(Mode::Discharge),
+        validity: 2,
+        highest_severity: Some(3),
+        active_alarms: Some(17),
+        limiting_cell: Some(CellIndex(1023)),
+        unknown_rules: Some(2),
+    };
+    let frame = plan().status(&fields);
+    for (name, wanted) in [
+        ("Soc", 73.12),
+        ("SocStd", 1.23),
+        ("Mode", 3.0),
+        ("Validity", 2.0),
+        ("HighestSeverity", 3.0),
+        ("ActiveAlarms", 17.0),
+        ("LimitingCell", 1023.0),
+        ("UnknownRules", 2.0),
+    ] {
+        says(&format!("Status.{name}"), &frame, wanted);
+    }
+    assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]), "kept free for end-to-end protection");
+    for (mode, code) in [(Mode::Unknown, 0.0), (Mode::Charge, 1.0), (Mode::Rest, 2.0)] {
+        says("Status.Mode", &plan().status(&StatusFields { mode: Some(mode), ..fields }), code);
+    }
+}
+
+/// Fields of the health frame with the page each is on, a value inside, and what it reads.
+const HEALTH_VALUES: [(usize, &str, f64, f64); 11] = [
+    (0, "Capacity", 2.6, 2.6),
+    (0, "CapacityStd", 0.0213, 0.0213),
+    (0, "Soh", 0.871, 87.1),
+    (1, "RechargePeriod", 3611.0, 3611.0),
+    (1, "NormalizedRechargePeriod", 3500.4, 3500.4),
+    (2, "UsableCapacity", 2.41, 2.41),
+    (2, "UsableCapacityStd", 0.031, 0.031),
+    (2, "ResistanceRatio", 1.37, 137.0),
+    (3, "RemainingCycles", 412.3, 412.0),
+    (3, "RemainingCyclesLow", 207.8, 208.0),
+    (3, "RemainingDays", 533.0, 533.0),
+];
+
+fn health_fields(of: impl Fn(usize) -> Option<f64>) -> HealthFields {
+    HealthFields {
+        capacity_ah: of(0),
+        capacity_std_ah: of(1),
+        soh: of(2),
+        recharge_period_s: of(3),
+        normalized_recharge_period_s: of(4),
+        usable_capacity_ah: of(5),
+        usable_capacity_std_ah: of(6),
+        resistance_ratio: of(7),
+        remaining_cycles: of(8),
+        remaining_cycles_low: of(9),
+        remaining_days: of(10),
+    }
+}
+
+#[test]
+fn every_page_of_the_health_frame_reads_back_within_half_a_bit() {
+    let fields = health_fields(|n| Some(HEALTH_VALUES[n].2));
+    for (page, name, _, wanted) in HEALTH_VALUES {
+        let frame = plan().health(page, &fields);
+        says(&format!("Health.{name}"), &frame, wanted);
+        assert_eq!(read("Health.Page", &frame).0, u64::try_from(page).unwrap());
+        assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
+        assert_eq!(plan().health(page + 4, &fields), frame, "after the last page comes the first");
+    }
+}
+
+#[test]
+fn each_health_value_alone_leaves_the_others_not_available() {
+    for known in 0..HEALTH_VALUES.len() {
+        let fields = health_fields(|n| (n == known).then_some(HEALTH_VALUES[n].2));
+        for (n, (page, name, _, wanted)) in HEALTH_VALUES.into_iter().enumerate() {
+            let frame = plan().health(page, &fields);
+            if n == known {
+                says(&format!("Health.{name}"), &frame, wanted);
+            } else {
+                says_nothing(&format!("Health.{name}"), &frame);
+            }
+        }
+    }
+}
+
+#[test]
+fn what_is_not_known_is_not_available_on_every_frame() {
+    let status = plan().status(&StatusFields::default());
+    for name in STATUS.into_iter().filter(|name| *name != "Validity") {
+        says_nothing(&format!("Status.{name}"), &status);
+    }
+    says("Status.Validity", &status, 0.0);
+    for (page, name, _, _) in HEALTH_VALUES {
+        says_nothing(&format!("Health.{name}"), &plan().health(page, &HealthFields::default()));
+    }
+    for (number, rule) in (1..).zip(RULES) {
+        let frame = plan().alarm(&AlarmFields { rule: number, ..Default::default() });
+        for name in ["State", "Severity", "Cell"] {
+            says_nothing(&format!("Alarm.{name}"), &frame);
+        }
+        says_nothing(&format!("Alarm.Value_{rule}"), &frame);
+        says_nothing(&format!("Alarm.Threshold_{rule}"), &frame);
+    }
+    let nan = StatusFields { soc: Some(f64::NAN), soc_std: Some(f64::NAN), ..Default::default() };
+    assert_eq!(plan().status(&nan), status, "NaN is not known");
+}
+
+#[test]
+fn extremes_saturate_at_the_range_and_never_say_not_available() {
+    let dbc = default_database().unwrap();
+    for extreme in [f64::MAX, f64::INFINITY, f64::MIN, f64::NEG_INFINITY] {
+        let end = |name: &str| {
+            let layout = dbc.signal(&format!("PACKWATCH_{name}")).unwrap().1.layout;
+            if extreme > 0.0 { layout.maximum } else { layout.minimum }
+        };
+        let status = plan().status(&StatusFields { soc: Some(extreme), soc_std: Some(extreme), ..Default::default() });
+        for name in ["Status.Soc", "Status.SocStd"] {
+            says(name, &status, end(name));
+        }
+        let fields = health_fields(|_| Some(extreme));
+        for (page, name, _, _) in HEALTH_VALUES {
+            let name = format!("Health.{name}");
+            says(&name, &plan().health(page, &fields), end(&name));
+        }
+        for (number, rule) in (1..).zip(RULES) {
+            let value = Some(extreme);
+            let frame = plan().alarm(&AlarmFields { rule: number, value, threshold: value, ..Default::default() });
+            for name in [format!("Alarm.Value_{rule}"), format!("Alarm.Threshold_{rule}")] {
+                says(&name, &frame, end(&name));
+            }
+        }
+    }
+    let many = StatusFields {
+        active_alarms: Some(u16::MAX),
+        limiting_cell: Some(CellIndex(u16::MAX)),
+        validity: u8::MAX,
+        highest_severity: Some(u8::MAX),
+        unknown_rules: Some(u8::MAX),
+        ..Default::default()
+    };
+    let frame = plan().status(&many);
+    let ends = [
+        ("ActiveAlarms", 62.0),
+        ("LimitingCell", 1023.0),
+        ("Validity", 3.0),
+        ("HighestSeverity", 3.0),
+        ("UnknownRules", 2.0),
+    ];
+    for (name, end) in ends {
+        says(&format!("Status.{name}"), &frame, end);
+    }
+}
+
+#[test]
+fn every_rule_has_its_own_value_and_threshold() {
+    // In the rule's inside unit and as read: the share of bad readings is a fraction inside and % on the wire.
+    let values = [
+        (1.4, 1.4),
+        (1.38, 1.38),
+        (3600.0, 3600.0),
+        (2.5, 2.5),
+        (0.25, 25.0),
+        (9.51, 9.51),
+        (1.83, 183.0),
+        (0.052, 5.2),
+        (55.3, 55.3),
+        (0.0312, 3.12),
+        (87.0, 87.0),
+        (0.11, 11.0),
+        (3600.0, 3600.0),
+        (12.0, 12.0),
+    ];
+    for ((number, rule), (inside, wire)) in (1..).zip(RULES).zip(values) {
+        let fields = AlarmFields {
+            rule: number,
+            state: Some(1),
+            severity: Some(3),
+            test: false,
+            acknowledged: true,
+            cell: Some(CellIndex(96)),
+            value: Some(inside),
+            threshold: Some(inside * 1.1),
+        };
+        let frame = plan().alarm(&fields);
+        says("Alarm.Rule", &frame, f64::from(number));
+        says("Alarm.State", &frame, 1.0);
+        says("Alarm.Severity", &frame, 3.0);
+        says("Alarm.Test", &frame, 0.0);
+        says("Alarm.Acknowledged", &frame, 1.0);
+        says("Alarm.Cell", &frame, 96.0);
+        says(&format!("Alarm.Value_{rule}"), &frame, wire);
+        says(&format!("Alarm.Threshold_{rule}"), &frame, wire * 1.1);
+        assert_eq!((frame.len(), &frame.data()[..2]), (8, &[0, 0][..]));
+        let other = plan().alarm(&AlarmFields { value: None, cell: None, test: true, acknowledged: false, ..fields });
+        says_nothing(&format!("Alarm.Value_{rule}"), &other);
+        says(&format!("Alarm.Threshold_{rule}"), &other, wire * 1.1);
+        says_nothing("Alarm.Cell", &other);
+        says("Alarm.Test", &other, 1.0);
+        says("Alarm.Acknowledged", &other, 0.0);
+    }
+}
+
+#[test]
+fn the_rules_numbers_and_names_are_those_of_the_value_table() {
+    let dbc = default_database().unwrap();
+    let table = &dbc.signal("PACKWATCH_Alarm.Rule").unwrap().1.values;
+    let named = (1..).zip(RULES).map(|(number, name)| (number, name.to_owned()));
+    assert!(named.eq(table.iter().take(RULES.len()).cloned()), "{table:?}");
+}
+
+#[test]
+fn everything_missing_is_told_at_once() {
+    let text = "VERSION \"\"\nBU_: X\nBO_ 1 PACKWATCH_Status: 8 X\n SG_ Soc : 0|8@1+ (1,0) [0|100] \"%\" X\n";
+    let found = OutputPlan::new(&Database::parse(text).unwrap()).unwrap_err();
+    let mut wanted: Vec<_> =
+        STATUS.iter().skip(1).map(|name| format!("signal PACKWATCH_Status.{name} is missing")).collect();
+    wanted.extend(["Health", "Alarm"].map(|name| format!("message PACKWATCH_{name} is missing")));
+    assert_eq!(found.0, wanted);
+    assert_eq!(found.to_string().lines().count(), 9);
+}
+
+#[test]
+fn every_signal_the_daemon_fills_is_required() {
+    let rules = RULES.iter().flat_map(|rule| [format!("Value_{rule}"), format!("Threshold_{rule}")]);
+    let all = STATUS.map(|name| format!("Status.{name}")).into_iter();
+    let all = all.chain(HEALTH.map(|name| format!("Health.{name}")));
+    let all = all.chain(ALARM.map(str::to_owned).into_iter().chain(rules).map(|name| format!("Alarm.{name}")));
+    let mut count = 0;
+    for name in all.filter(|name| name != "Alarm.Rule") {
+        let mut dbc = default_database().unwrap();
+        let (message, signal) = name.split_once('.').unwrap();
+        let message = dbc.messages.iter_mut().find(|m| m.name.ends_with(message)).unwrap();
+        let position = message.signals.iter().position(|s| s.name == signal).unwrap();
+        // Renamed and not removed: the others' conditions count positions.
+        message.signals[position].name = "Other".to_owned();
+        let found = OutputPlan::new(&dbc).unwrap_err();
+        assert_eq!(found.0, [format!("signal PACKWATCH_{name} is missing")]);
+        count += 1;
+    }
+    assert_eq!(count, 8 + 8 + 5 + 28);
+}
+
+#[test]
+fn a_value_that_could_be_read_as_another_s_is_refused() {
+    assert_eq!(
+        faults("Value_InputMissing m4", "Value_InputMissing m5"),
+        ["signal PACKWATCH_Alarm.Value_InputMissing is there for the rules [5], must be for 4 alone"]
+    );
+    assert_eq!(
+        faults("Threshold_CapacityLow m1", "Threshold_CapacityLow "),
+        [
+            "signal PACKWATCH_Alarm.Threshold_CapacityLow is there for the rules [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14], must be for 1 alone"
+        ]
+    );
+    assert_eq!(faults("Page M : 16|4@1+", "Page M : 16|1@1+").len(), 6, "three signals are on page 2, three on page 3");
+}
+
+#[test]
+fn a_signal_past_its_message_or_without_layout_is_refused() {
+    assert_eq!(
+        faults("LimitingCell : 51|11@1+", "LimitingCell : 54|11@1+"),
+        ["signal PACKWATCH_Status.LimitingCell: reaches past the message's 8 bytes"]
+    );
+    assert_eq!(faults("Soc : 16|12@1+ (0.025,0)", "Soc : 16|12@1+ (0,0)").len(), 1);
+    assert_eq!(
+        faults("PACKWATCH_Health: 8", "PACKWATCH_Health: 100"),
+        ["message PACKWATCH_Health: 100 bytes, must be at most 64"]
+    );
+    assert_eq!(
+        faults("PACKWATCH_Health: 8", "PACKWATCH_Health: 12"),
+        ["message PACKWATCH_Health: 12 bytes, must be at most 8 in classic frames"]
+    );
+}
+
+#[test]
+fn a_known_value_keeps_off_the_code_for_not_available_of_every_kind_of_number() {
+    let text = TEXT
+        .replace("Soc : 16|12@1+ (0.025,0) [0|102.35]", "Soc : 16|12@1- (1,0) [0|0]")
+        .replace("SocStd : 28|8@1+ (0.1,0) [0|25.4]", "SocStd : 28|8@1+ (1,0) [0|0]")
+        .replace("VAL_ 1712 Soc 4095 \"not available\" ;\n", "");
+    let plan = Unprotected(OutputPlan::new(&Database::parse(&text).unwrap()).unwrap());
+    let codes = |value: Option<f64>| {
+        let frame = plan.status(&StatusFields { soc: value, soc_std: value, ..Default::default() });
+        (read("Status.Soc", &frame).0, read("Status.SocStd", &frame).0)
+    };
+    assert_eq!(codes(None), (0x800, 255));
+    assert_eq!(codes(Some(1e9)), (0x7FF, 254));
+    assert_eq!(codes(Some(-1e9)), (0x801, 0), "the lowest signed code is taken: the next one up");
+}
+
+#[test]
+fn every_profile_protects_every_frame_and_each_message_counts_for_itself() {
+    for profile in [Profile::P01A, Profile::P01C, Profile::P05] {
+        let settings = |data_id| MessageSettings {
+            fd: Some(true),
+            e2e: E2eSetting::On(Protection { profile, data_id }),
+            ..Default::default()
+        };
+        let settings = LayoutSettings { status: settings(1), health: settings(2), alarm: settings(3), command: None };
+        let database = layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap();
+        let plan = OutputPlan::new(&database).unwrap();
+        let [status, health, alarm] = plan.protections().map(Option::unwrap);
+        let (mut counters, mut expected) = (SendCounters::default(), 0);
+        for round in 0..600_u16 {
+            let fields = StatusFields { active_alarms: Some(round % 60), ..Default::default() };
+            let frame = plan.status(&fields, &mut counters);
+            assert_eq!(status.verified_counter(frame.data()), Some(expected), "{profile:?} {round}");
+            assert_eq!(health.verified_counter(frame.data()), None, "another frame's data id");
+            expected = profile.next_counter(expected);
+        }
+        let frame = plan.health(1, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(0));
+        let frame = plan.health(2, &HealthFields::default(), &mut counters);
+        assert_eq!(health.verified_counter(frame.data()), Some(1), "pages share the identifier and the counter");
+        let frame = plan.alarm(&AlarmFields::default(), &mut counters);
+        assert_eq!(alarm.verified_counter(frame.data()), Some(0));
+        assert_eq!(frame.kind(), FrameFormat::Fd { brs: false }.kind());
+        assert_eq!(frame.len(), if profile == Profile::P05 { 12 } else { 8 });
+    }
+}
+
+#[test]
+fn counters_survive_a_restart_and_a_change_of_the_profile() {
+    let protection = Protection { profile: Profile::P01A, data_id: 9 };
+    let status = MessageSettings { e2e: E2eSetting::On(protection), ..Default::default() };
+    let settings = LayoutSettings { status, ..Default::default() };
+    let plan = OutputPlan::new(&layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap();
+    let mut counters: SendCounters = serde_json::from_str(r#"{"status":200,"health":0,"alarm":3}"#).unwrap();
+    let frames = [(); 2].map(|()| plan.status(&StatusFields::default(), &mut counters));
+    assert_eq!(frames.map(|frame| protection.verified_counter(frame.data())), [Some(14), Some(0)]);
+    let stored = serde_json::to_string(&counters).unwrap();
+    assert_eq!(stored, r#"{"status":1,"health":0,"alarm":3}"#, "unprotected frames count nothing");
+}

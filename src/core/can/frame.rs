@@ -1,0 +1,159 @@
+//! One CAN frame as the rest of the program sees it: classic, FD or remote, without any socket.
+//!
+//! Error frames are not frames here: the drivers turn them into [`crate::monitor::BusEvent`].
+
+use serde::{Deserialize, Serialize};
+
+/// Most payload bytes a frame can carry (CAN FD).
+pub const MAX_DATA: usize = 64;
+
+/// A CAN identifier; 11 and 29 bit identifiers of the same number are different identifiers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum CanId {
+    /// 11 bit, 0 to 0x7FF.
+    Standard(u16),
+    /// 29 bit, 0 to 0x1FFF_FFFF.
+    Extended(u32),
+}
+
+impl CanId {
+    /// A standard identifier, or `None` above 0x7FF.
+    pub const fn standard(id: u32) -> Option<Self> {
+        if id <= 0x7FF { Some(Self::Standard(id as u16)) } else { None }
+    }
+
+    /// An extended identifier, or `None` above 0x1FFF_FFFF.
+    pub const fn extended(id: u32) -> Option<Self> {
+        if id <= 0x1FFF_FFFF { Some(Self::Extended(id)) } else { None }
+    }
+
+    /// The number without its kind.
+    pub const fn raw(self) -> u32 {
+        match self {
+            Self::Standard(id) => id as u32,
+            Self::Extended(id) => id,
+        }
+    }
+}
+
+impl std::fmt::Display for CanId {
+    /// As candump writes it: 3 hex digits for standard, 8 for extended.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Standard(id) => write!(f, "{id:03X}"),
+            Self::Extended(id) => write!(f, "{id:08X}"),
+        }
+    }
+}
+
+/// What kind of frame carries the data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum FrameKind {
+    /// Classic data frame, at most 8 bytes.
+    Classic,
+    /// Classic remote request: no data; the length is the length asked for.
+    Remote,
+    /// CAN FD data frame, at most 64 bytes.
+    Fd {
+        /// Bit rate switch.
+        brs: bool,
+        /// Error state indicator.
+        esi: bool,
+    },
+}
+
+/// Payload bytes, zeros after the payload. Aligned, so that a word of it that is loaded soon after the frame was copied lies
+/// within one of the copy's own stores: the processor would wait for both otherwise, longer than decoding takes.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(align(8))]
+struct Data([u8; MAX_DATA]);
+
+/// One frame: identifier, kind and payload.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Frame {
+    id: CanId,
+    kind: FrameKind,
+    len: u8,
+    data: Data,
+}
+
+impl Frame {
+    /// A classic data frame, or `None` for more than 8 bytes.
+    pub fn classic(id: CanId, data: &[u8]) -> Option<Self> {
+        (data.len() <= 8).then(|| Self::build(id, FrameKind::Classic, data))
+    }
+
+    /// An FD data frame, or `None` for a length FD cannot carry (more than 64, or a length between its steps).
+    pub fn fd(id: CanId, brs: bool, esi: bool, data: &[u8]) -> Option<Self> {
+        matches!(data.len(), 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64)
+            .then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
+    }
+
+    /// A remote request for `len` bytes, or `None` for more than 8.
+    pub fn remote(id: CanId, len: u8) -> Option<Self> {
+        (len <= 8).then_some(Self { id, kind: FrameKind::Remote, len, data: Data([0; MAX_DATA]) })
+    }
+
+    /// A classic data frame whose payload is the lowest `len` (at most 8) bytes of a word that has zeros above them.
+    #[inline]
+    pub fn of_word(id: CanId, word: u64, len: u8) -> Self {
+        debug_assert!(len <= 8 && (len == 8 || word >> (8 * len) == 0), "bytes beyond the payload are zeros");
+        let mut data = [0; MAX_DATA];
+        data[..8].copy_from_slice(&word.to_le_bytes());
+        Self { id, kind: FrameKind::Classic, len, data: Data(data) }
+    }
+
+    fn build(id: CanId, kind: FrameKind, bytes: &[u8]) -> Self {
+        let mut data = [0; MAX_DATA];
+        data[..bytes.len()].copy_from_slice(bytes);
+        Self { id, kind, len: bytes.len() as u8, data: Data(data) }
+    }
+
+    /// The identifier.
+    pub const fn id(&self) -> CanId {
+        self.id
+    }
+
+    /// Classic, remote or FD.
+    pub const fn kind(&self) -> FrameKind {
+        self.kind
+    }
+
+    /// The payload; empty for a remote request.
+    #[inline]
+    pub fn data(&self) -> &[u8] {
+        match self.kind {
+            FrameKind::Remote => &[],
+            FrameKind::Classic | FrameKind::Fd { .. } => &self.data.0[..usize::from(self.len)],
+        }
+    }
+
+    /// The payload with zeros after it; all zeros for a remote request.
+    pub(crate) const fn padded_data(&self) -> &[u8; MAX_DATA] {
+        &self.data.0
+    }
+
+    /// The payload, to be changed in place.
+    pub(crate) fn data_mut(&mut self) -> &mut [u8] {
+        match self.kind {
+            FrameKind::Remote => &mut [],
+            FrameKind::Classic | FrameKind::Fd { .. } => &mut self.data.0[..usize::from(self.len)],
+        }
+    }
+
+    /// Payload length, or for a remote request the length asked for.
+    pub const fn len(&self) -> usize {
+        self.len as usize
+    }
+
+    /// Whether the frame carries no payload bytes.
+    pub fn is_empty(&self) -> bool {
+        self.data().is_empty()
+    }
+}
+
+impl std::fmt::Debug for Frame {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Frame({}, {:?}, {:02X?})", self.id, self.kind, self.data())
+    }
+}

@@ -1,0 +1,92 @@
+//! What was measured of the cells of a block, and what is noted of them after their steps.
+//!
+//! In: steps, lane by lane. Out: the kernel's inputs, or a step again where the kernel did not make it.
+
+use super::kernel::{Input, DecayFactors, Outcome};
+use super::{Cell, WIDTH};
+use crate::cell::{CellStep, StepResult};
+use crate::filter::Update;
+use crate::filter::simd::{Lanes, Mask};
+
+/// The inputs of a block's cells.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BlockInput {
+    pub(super) is_present: Mask<WIDTH>,
+    pub(super) input: Input<WIDTH>,
+}
+
+impl BlockInput {
+    pub(super) const NONE: Self = Self {
+        is_present: Mask::splat(false),
+        input: Input {
+            measured_s: Lanes([1.0; WIDTH]),
+            charge_as: Lanes([0.0; WIDTH]),
+            current_a: Lanes([0.0; WIDTH]),
+            voltage_v: Lanes([0.0; WIDTH]),
+            temperature_c: Lanes([25.0; WIDTH]),
+            kept: DecayFactors::NONE,
+        },
+    };
+
+    /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
+    #[inline(always)]
+    pub(super) fn fill_absent(&mut self) {
+        if !self.is_present.all() {
+            let present = (0..WIDTH).position(|lane| self.is_present.lane(lane)).unwrap_or(0);
+            let time_s = Lanes::splat(self.input.measured_s.0[present]);
+            self.input.measured_s = self.input.measured_s.or_else(self.is_present, time_s);
+        }
+    }
+
+    /// The step that was put into a lane.
+    pub(super) fn step(&self, lane: usize) -> CellStep {
+        let input = &self.input;
+        CellStep {
+            measured_s: input.measured_s.0[lane],
+            charge_as: input.charge_as.0[lane],
+            unmeasured_s: 0.0,
+            current_a: Some(input.current_a.0[lane]),
+            temperature_c: Some(input.temperature_c.0[lane]),
+            // Not asked for where the temperature is known.
+            ambient_c: input.temperature_c.0[lane],
+            voltage_v: input.voltage_v.0[lane],
+        }
+    }
+}
+
+impl Input<WIDTH> {
+    #[inline(always)]
+    pub(super) fn lane(&self, lane: usize) -> Input<1> {
+        let take = |x: &Lanes<WIDTH>| Lanes([x.0[lane]]);
+        Input {
+            measured_s: take(&self.measured_s),
+            charge_as: take(&self.charge_as),
+            current_a: take(&self.current_a),
+            voltage_v: take(&self.voltage_v),
+            temperature_c: take(&self.temperature_c),
+            kept: self.kept.lane(lane),
+        }
+    }
+
+    /// Notes that the step of a lane is made, with what became of it in lane `from` of the outcome.
+    #[inline(always)]
+    pub(super) fn note<const L: usize>(
+        &self,
+        lane: usize,
+        from: usize,
+        outcome: &Outcome<L>,
+        cell: &mut Cell,
+        result: &mut StepResult,
+    ) {
+        cell.memory.last_current_a = self.current_a.0[lane];
+        cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
+        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
+        let update = Update {
+            innovation: outcome.innovation_v.0[from],
+            innovation_variance: outcome.innovation_variance.0[from],
+            test_ratio: outcome.test_ratio.0[from],
+            accepted: true,
+        };
+        *result = StepResult { update: Some(update), reset: false };
+    }
+}

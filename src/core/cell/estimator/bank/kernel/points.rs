@@ -1,0 +1,144 @@
+//! The sigma points in pairs: columns of the Cholesky factor, and what something becomes over the pair of each.
+//!
+//! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN
+//! where there is no factor.
+
+use super::{Constants, at};
+use crate::cell::estimator::LOG_RESISTANCE;
+use crate::filter::simd::{Lanes, Mask};
+
+/// Columns of the factor that move more than branch voltages.
+pub(super) const COLUMNS: usize = 3;
+
+/// The first columns of the lower Cholesky factor, and what they leave of the branches' covariance.
+pub(super) struct Factor<const L: usize, const N: usize> {
+    pub(super) columns: [[Lanes<L>; N]; COLUMNS],
+    /// `rest[i][j]`, both of the branches, j <= i; zero elsewhere.
+    pub(super) rest: [[Lanes<L>; N]; N],
+    pub(super) is_positive: Mask<L>,
+}
+
+impl<const L: usize, const N: usize> Factor<L, N> {
+    #[inline(always)]
+    pub(super) fn new<const T: usize>(covariance: &[Lanes<L>; T]) -> Self {
+        let first = Column::new::<T, 0>(covariance, []);
+        let second = Column::new::<T, 1>(covariance, [&first]);
+        let third = Column::new::<T, 2>(covariance, [&first, &second]);
+        let columns = [first.scaled, second.scaled, third.scaled];
+        let mut rest = [[Lanes::splat(0.0); N]; N];
+        for i in COLUMNS..N {
+            for j in COLUMNS..=i {
+                let mut left = covariance[at(i, j)];
+                for column in &columns {
+                    left = left - column[i] * column[j];
+                }
+                rest[i][j] = left;
+            }
+        }
+        Self { columns, is_positive: is_positive(&rest), rest }
+    }
+}
+
+/// A column of the factor.
+struct Column<const L: usize, const N: usize> {
+    /// What the columns before it leave of the covariance.
+    left: [Lanes<L>; N],
+    per_pivot: Lanes<L>,
+    /// The same over the root of the pivot: the factor's column.
+    scaled: [Lanes<L>; N],
+}
+
+impl<const L: usize, const N: usize> Column<L, N> {
+    /// Column K, from those before it: these are not waited for until their roots are known. NaN where there is none: it
+    /// goes on into every result.
+    #[inline(always)]
+    fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
+        let mut left = [Lanes::splat(0.0); N];
+        for i in K..N {
+            left[i] = covariance[at(i, K)];
+        }
+        for done in done {
+            let factor = done.left[K] * done.per_pivot;
+            for i in K..N {
+                left[i] = left[i] - done.left[i] * factor;
+            }
+        }
+        let root = left[K].sqrt();
+        let per_pivot = left[K].reciprocal();
+        let per_root = root * per_pivot;
+        let mut scaled = [Lanes::splat(0.0); N];
+        scaled[K] = root;
+        for i in K + 1..N {
+            scaled[i] = left[i] * per_root;
+        }
+        Self { left, per_pivot, scaled }
+    }
+}
+
+/// Whether what is left has a factor, too.
+#[inline(always)]
+fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mask<L> {
+    let mut left = *rest;
+    let mut positive = Mask::splat(true);
+    for k in COLUMNS..N {
+        positive = positive & left[k][k].above_number(0.0);
+        for i in k + 1..N {
+            let factor = left[i][k] / left[k][k];
+            for j in k + 1..=i {
+                left[i][j] = left[i][j] - factor * left[j][k];
+            }
+        }
+    }
+    positive
+}
+
+/// The resistance ratios of the sigma points over that at the centre: those of the first two pairs differ from it.
+pub(super) struct Ratios<const L: usize> {
+    /// Factor of the first pair's plus and minus point.
+    pub(super) first: [Lanes<L>; 2],
+    /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s.
+    pub(super) second: [Lanes<L>; 2],
+}
+
+impl<const L: usize> Ratios<L> {
+    #[inline(always)]
+    pub(super) fn new<const N: usize>(c: &Constants, columns: &[[Lanes<L>; N]; COLUMNS]) -> Self {
+        let (up, down) = (columns[0][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
+        let (grown, shrunk) = (columns[1][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
+        let per_scale = 1.0 / c.scale;
+        Self {
+            first: [up, down],
+            second: [(grown - shrunk) * (0.5 * per_scale), ((grown + shrunk) * 0.5 - Lanes::splat(1.0)) * per_scale],
+        }
+    }
+}
+
+/// Odd and even parts of something over the pairs of the first columns.
+#[derive(Clone, Copy)]
+pub(super) struct Parts<const L: usize> {
+    pub(super) odd: [Lanes<L>; COLUMNS],
+    pub(super) even: [Lanes<L>; COLUMNS],
+}
+
+impl<const L: usize> Parts<L> {
+    pub(super) const NONE: Self = Self { odd: [Lanes([0.0; L]); COLUMNS], even: [Lanes([0.0; L]); COLUMNS] };
+
+    /// Of pair `k`, from what its plus and minus point and the centre became.
+    #[inline(always)]
+    pub(super) fn put(&mut self, c: &Constants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
+        self.odd[k] = (plus - minus) * (0.5 / c.scale);
+        self.even[k] = ((plus + minus) * 0.5 - centre) * (1.0 / c.scale);
+    }
+
+    /// Mean of what the pairs are moved by beside the centre.
+    #[inline(always)]
+    pub(super) fn shift(&self, c: &Constants) -> Lanes<L> {
+        (self.even[0] + self.even[1] + self.even[2]) * (1.0 / c.scale)
+    }
+}
+
+/// Sum of products over the columns.
+#[inline(always)]
+pub(super) fn sum<const L: usize>(a: [Lanes<L>; COLUMNS], b: [Lanes<L>; COLUMNS]) -> Lanes<L> {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}

@@ -1,0 +1,259 @@
+//! The kernel against the readable filter, and a cell in company against the same cell alone.
+
+use super::*;
+use crate::cell::Table;
+use crate::cell::circuit::{self, BranchAt};
+use crate::cell::config::{CapacityState, Discretisation};
+use crate::cell::estimator::tests::config;
+use crate::cell::model::tests::small_model;
+
+/// A generator of numbers in [0, 1) that needs no seed from outside.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> f64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
+
+/// Cells that drift apart, and what is measured of them: with noise, outliers, gaps, and currents that are not known.
+struct Pack {
+    model: CellModel,
+    dice: Dice,
+    cells: Vec<Truth>,
+    current_a: f64,
+    temperature_c: f64,
+}
+
+struct Truth {
+    soc: f64,
+    branch_v: [f64; MAX_BRANCHES],
+    capacity_ah: f64,
+    ratio: f64,
+}
+
+impl Pack {
+    fn new(model: &CellModel, cells: usize) -> Self {
+        let cell = |i: usize| Truth {
+            soc: 0.7 + 0.02 * (i as f64).sin(),
+            branch_v: [0.0; MAX_BRANCHES],
+            capacity_ah: 1.7 + 0.1 * (i as f64).cos(),
+            ratio: 1.0 + 0.1 * i as f64,
+        };
+        let cells = (0..cells).map(cell).collect();
+        Self { model: model.clone(), dice: Dice(0x2545_F491_4F6C_DD1D), cells, current_a: 1.0, temperature_c: 20.0 }
+    }
+
+    /// The steps of one round; a few cells are missing from some.
+    fn round(&mut self, time: u32) -> Vec<(usize, CellStep)> {
+        let dt_s = if time.is_multiple_of(7) { 0.25 } else { 1.0 };
+        let low = self.cells.iter().any(|cell| cell.soc < 0.1);
+        let high = self.cells.iter().any(|cell| cell.soc > 0.9);
+        self.current_a = match time % 5000 {
+            0..600 => 0.0,
+            _ if low => -1.0,
+            _ if high => 1.0,
+            _ if self.current_a == 0.0 => 0.7,
+            _ => self.current_a,
+        };
+        self.temperature_c += 0.2 * (self.dice.roll() - 0.5);
+        self.temperature_c = self.temperature_c.clamp(-5.0, 45.0);
+        (0..self.cells.len()).filter_map(|cell| self.measure(cell, time, dt_s)).collect()
+    }
+
+    fn measure(&mut self, index: usize, time: u32, dt_s: f64) -> Option<(usize, CellStep)> {
+        let (current_a, dice) = (self.current_a, &mut self.dice);
+        // Neighbours do not always report in one rhythm, and now and then twice at one time.
+        let dt_s = match dice.roll() {
+            roll if roll < 0.01 => 0.0,
+            roll if roll < 0.02 => 0.5 * dt_s,
+            _ => dt_s,
+        };
+        let is_missing = index % 5 == 3 && dice.roll() < 0.01;
+        let gap_s = if dice.roll() < 2e-4 { 40.0 } else { 0.0 };
+        let temperature_c = self.temperature_c + 0.1 * (index as f64).sin();
+        let cell = &mut self.cells[index];
+        let place = self.model.place(cell.soc, temperature_c);
+        for i in 0..self.model.branches.len() {
+            let branch = BranchAt::new(&self.model, i, &place, cell.ratio);
+            let moved = branch.voltage_after(Discretisation::Exact, cell.branch_v[i], current_a, dt_s);
+            cell.branch_v[i] = branch.voltage_after(Discretisation::Exact, moved, 0.0, gap_s);
+        }
+        cell.soc = circuit::soc_after(cell.soc, current_a * dt_s, cell.capacity_ah);
+        let state = (cell.soc, cell.ratio, cell.capacity_ah);
+        let branches_v = cell.branch_v.iter().sum();
+        let row = self.model.row(temperature_c);
+        let truth_v = circuit::aged_terminal_v(&self.model, state, &row, branches_v, current_a);
+        let outlier_v = if dice.roll() < 1e-3 { 0.8 } else { 0.0 };
+        let lost = time % 4000 > 3900 && index == 1;
+        let step = CellStep {
+            measured_s: dt_s,
+            charge_as: current_a * dt_s,
+            unmeasured_s: gap_s,
+            current_a: (dice.roll() > 1e-3).then_some(current_a),
+            temperature_c: (index != 2).then_some(temperature_c),
+            ambient_c: 22.0,
+            voltage_v: truth_v + 0.01 * (dice.roll() - 0.5) + outlier_v + if lost { -1.0 } else { 0.0 },
+        };
+        (!is_missing).then_some((index, step))
+    }
+}
+
+/// One batch.
+fn step(bank: &mut EstimatorBank, steps: &[(usize, CellStep)]) {
+    steps.iter().for_each(|(cell, step)| bank.add(*cell, step));
+    bank.step();
+}
+
+/// The small model with so many branches.
+fn model(branches: usize) -> CellModel {
+    let mut model = small_model();
+    let slower = |by: f64| {
+        let mut branch = model.branches[0].clone();
+        branch.c_farad.values.iter_mut().flatten().for_each(|c_farad| *c_farad *= by);
+        branch
+    };
+    model.branches = [1.0, 7.0, 40.0].into_iter().take(branches).map(slower).collect();
+    model
+}
+
+/// Largest difference of SOC, and of everything else there is, between the bank and readable estimators.
+fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64, f64) {
+    const CELLS: usize = 11;
+    let mut bank = EstimatorBank::new(model, config, CELLS);
+    let mut readable = vec![CellEstimator::new(config); CELLS];
+    let mut pack = Pack::new(model, CELLS);
+    let (mut soc, mut learned, mut accepted, mut resets) = (0.0_f64, 0.0_f64, 0, 0);
+    for time in 0..rounds {
+        let steps = pack.round(time);
+        step(&mut bank, &steps);
+        for (cell, step) in &steps {
+            let estimator = &mut readable[*cell];
+            let result = estimator.step(model, config, step);
+            let ours = bank.result(*cell);
+            assert_eq!(ours.reset, result.reset, "{time} {cell}");
+            assert_eq!(ours.update.map(|u| u.accepted), result.update.map(|u| u.accepted), "{time} {cell}");
+            accepted += usize::from(result.update.is_some_and(|update| update.accepted));
+            resets += usize::from(result.reset);
+            let (a, b) = (bank.soc(*cell).expect("started"), estimator.soc().expect("started"));
+            soc = soc.max((a.mean - b.mean).abs()).max((a.std() - b.std()).abs());
+            let near = |a: ScalarGaussian, b: ScalarGaussian| (a.mean - b.mean).abs().max((a.std() - b.std()).abs());
+            learned = learned
+                .max(near(bank.capacity(*cell), estimator.capacity()))
+                .max(near(bank.log_resistance(*cell), estimator.log_resistance()))
+                .max((bank.mean_nis(*cell) - estimator.mean_nis()).abs());
+            for (ours, theirs) in bank.branch_v(*cell).into_iter().zip(estimator.branch_v()) {
+                learned = learned.max(if ours.is_nan() && theirs.is_nan() { 0.0 } else { (ours - theirs).abs() });
+            }
+            if let (Some(ours), Some(theirs)) = (ours.update, result.update) {
+                learned = learned
+                    .max((ours.innovation - theirs.innovation).abs())
+                    .max((ours.innovation_variance - theirs.innovation_variance).abs())
+                    .max((ours.test_ratio - theirs.test_ratio).abs());
+            }
+        }
+        let worst_nis = (0..CELLS).map(|cell| bank.mean_nis(cell)).fold(0.0, f64::max);
+        assert_eq!(bank.worst_nis(), worst_nis, "{time}");
+    }
+    assert!(accepted > rounds as usize * 10 && resets > 0, "{accepted} {resets}");
+    (soc, learned)
+}
+
+#[test]
+fn soc_is_the_readable_filters_within_1e_9_over_100_000_steps() {
+    for branches in 1..=3 {
+        let (soc, learned) = differences(&model(branches), &config(), 100_000);
+        assert!(soc < 1e-9 && learned < 1e-8, "{branches} branches: {soc} {learned}");
+    }
+}
+
+#[test]
+fn every_setting_that_changes_the_filter_changes_the_kernel() {
+    let plain = model(2);
+    let aged = CellModel { ocv_ageing_shift: 0.6, ..plain.clone() };
+    let own_error =
+        CellModel { voltage_error_v: Some(Table { values: vec![vec![0.01, 0.004, 0.02]; 2] }), ..plain.clone() };
+    let one_temperature = {
+        let mut model = model(1);
+        let one = |table: &mut Table| table.values.truncate(1);
+        model.temperature_c.truncate(1);
+        [&mut model.ocv_v, &mut model.r0_ohm].into_iter().for_each(one);
+        model.branches.iter_mut().flat_map(|b| [&mut b.r_ohm, &mut b.c_farad]).for_each(one);
+        model
+    };
+    let held = EstimatorConfig { capacity_state: CapacityState::Held, ..config() };
+    let euler = EstimatorConfig { discretisation: Discretisation::Euler, ..config() };
+    let spread = EstimatorConfig { alpha: 0.3, beta: 1.0, kappa: 2.0, ..config() };
+    let cases = [
+        (&aged, config()),
+        (&own_error, config()),
+        (&one_temperature, config()),
+        (&plain, held),
+        (&plain, euler),
+        (&plain, spread),
+    ];
+    for (case, (model, config)) in cases.into_iter().enumerate() {
+        let (soc, learned) = differences(model, &config, 6000);
+        assert!(soc < 1e-9 && learned < 1e-8, "case {case}: {soc} {learned}");
+    }
+}
+
+#[test]
+fn a_cell_does_not_know_its_company() {
+    let (model, config) = (model(1), config());
+    let mut together = EstimatorBank::new(&model, &config, 11);
+    let mut alone: Vec<_> = (0..11).map(|_| EstimatorBank::new(&model, &config, 1)).collect();
+    let mut pack = Pack::new(&model, 11);
+    for time in 0..3000 {
+        let steps = pack.round(time);
+        // In two parts, the second backwards.
+        let (first, second) = steps.split_at(steps.len() / 3);
+        step(&mut together, first);
+        step(&mut together, &second.iter().rev().copied().collect::<Vec<_>>());
+        for (cell, own) in steps {
+            step(&mut alone[cell], &[(0, own)]);
+            assert_eq!(together.cell(cell).snapshot(), alone[cell].cell(0).snapshot(), "{time} {cell}");
+            assert_eq!(together.result(cell), alone[cell].result(0));
+        }
+    }
+}
+
+#[test]
+fn a_cell_in_another_interval_finds_its_temperature_though_others_had_its_room() {
+    let (model, config) = (model(1), config());
+    let mut together = EstimatorBank::new(&model, &config, 2);
+    let mut alone = EstimatorBank::new(&model, &config, 1);
+    let mut pack = Pack::new(&model, 2);
+    let mut socs = Vec::new();
+    for time in 0..4500 {
+        // One cell keeps its temperature, the other has more of them than are kept.
+        let at = |cell: usize| if cell == 0 { 20.0 } else { 0.01 * f64::from(time) };
+        let mut steps = pack.round(time);
+        steps.iter_mut().for_each(|(cell, step)| step.temperature_c = Some(at(*cell)));
+        step(&mut together, &steps);
+        step(&mut alone, &steps[..1]);
+        assert_eq!(together.cell(0).snapshot(), alone.cell(0).snapshot(), "{time}");
+        socs.push(alone.soc(0).expect("started").mean);
+    }
+    assert!(socs.iter().any(|soc| *soc > 0.55) && socs.iter().any(|soc| *soc < 0.45));
+}
+
+#[test]
+fn what_is_put_in_is_what_comes_out() {
+    let (model, config) = (model(3), config());
+    let mut bank = EstimatorBank::new(&model, &config, 9);
+    let mut pack = Pack::new(&model, 9);
+    (0..50).for_each(|time| step(&mut bank, &pack.round(time)));
+    let before = bank.cell(4).snapshot();
+    let other = bank.cell(7);
+    bank.put(4, &other);
+    assert_eq!(bank.cell(4).snapshot(), other.snapshot());
+    assert_ne!(bank.cell(4).snapshot(), before);
+    bank.change(4, |estimator| estimator.hold_capacity(1.23));
+    assert_eq!((bank.capacity(4).mean, bank.capacity(7)), (1.23, other.capacity()));
+    bank.put(4, &CellEstimator::new(&config));
+    assert_eq!((bank.soc(4), bank.capacity(4).mean), (None, config.initial_capacity_ah));
+}

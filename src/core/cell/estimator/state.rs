@@ -1,0 +1,169 @@
+//! The estimator's state as a document, to be stored and taken up again.
+
+use nalgebra::{SMatrix, SVector};
+use serde::{Deserialize, Serialize};
+
+use super::{BRANCHES, CAPACITY, CellEstimator, Filter, LOG_RESISTANCE, Memory};
+use crate::filter::Gaussian;
+use crate::quantity::InvalidState;
+
+/// The estimator's state as a document.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellState {
+    /// Mean of the filter's state in the order [SOC, U_1 .. U_n, ln rho, C]; empty before the first voltage.
+    mean: Vec<f64>,
+    /// Its covariance in that order, row by row.
+    covariance: Vec<f64>,
+    memory: Memory,
+}
+
+/// Where in the filter's state the `i`-th of `n` numbers of the document is.
+const fn place_of(i: usize, n: usize) -> usize {
+    match i {
+        0 => 0,
+        i if i + 2 < n => BRANCHES + i - 1,
+        i if i + 2 == n => LOG_RESISTANCE,
+        _ => CAPACITY,
+    }
+}
+
+impl CellEstimator {
+    /// The state, to be stored.
+    pub fn snapshot(&self) -> CellState {
+        let (mean, covariance) =
+            self.filter.as_ref().map_or_else(Default::default, |filter| each!(filter, x => document(x)));
+        CellState { mean, covariance, memory: self.memory }
+    }
+
+    /// A stored state taken up again; `None` when it is for another number of branches.
+    ///
+    /// Variances whose correlations do not go together any more (they were stored rounded) are kept without them.
+    pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
+        let filter = match (state.mean.len(), branches) {
+            (0, _) => None,
+            (4, 1) => Some(Filter::One(gaussian(state)?)),
+            (5, 2) => Some(Filter::Two(gaussian(state)?)),
+            (6, 3) => Some(Filter::Three(gaussian(state)?)),
+            _ => return None,
+        };
+        Some(Self { filter, memory: state.memory })
+    }
+}
+
+impl CellState {
+    /// Whether a filter can go on from its numbers.
+    ///
+    /// # Errors
+    /// The first from which none can.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        self.memory.check()?;
+        self.mean.iter().try_for_each(|&x| InvalidState::unless_number("a mean of a cell's filter", x))?;
+        self.covariance.iter().try_for_each(|&x| InvalidState::unless_number("a covariance of a cell's filter", x))?;
+        let size = self.mean.len();
+        let variances = self.covariance.iter().step_by(size + 1);
+        variances.copied().try_for_each(|x| InvalidState::unless_positive("a variance of a cell's filter", x))?;
+        let [.., log_resistance, capacity_ah] = self.mean[..] else { return Ok(()) };
+        check_log_resistance(log_resistance)?;
+        InvalidState::unless_capacity("the capacity of a cell's filter", capacity_ah)
+    }
+}
+
+impl Memory {
+    fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
+        check_log_resistance(self.log_resistance.mean)?;
+        for variance in [self.capacity.variance, self.log_resistance.variance] {
+            InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
+        }
+        for signed in [self.temperature_c.unwrap_or(0.0), self.last_current_a] {
+            InvalidState::unless_number("a cell's last temperature or current", signed)?;
+        }
+        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.away_std, self.rejected_s];
+        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("a cell's load, consistency or a time", x))
+    }
+}
+
+/// A thousand times the resistance of new, or a thousandth, is no cell.
+fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
+    InvalidState::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
+}
+
+fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>) {
+    let place = |i| place_of(i, N);
+    let mean = (0..N).map(|i| x.mean[place(i)]).collect();
+    let covariance = (0..N * N).map(|i| x.covariance[(place(i / N), place(i % N))]).collect();
+    (mean, covariance)
+}
+
+fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
+    if state.mean.len() != N || state.covariance.len() != N * N {
+        return None;
+    }
+    let mut mean = SVector::<f64, N>::zeros();
+    let mut covariance = SMatrix::<f64, N, N>::zeros();
+    for i in 0..N {
+        mean[place_of(i, N)] = state.mean[i];
+        for j in 0..N {
+            covariance[(place_of(i, N), place_of(j, N))] = state.covariance[i * N + j];
+        }
+    }
+    let is_symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
+    let goes_together = is_symmetric && covariance.cholesky().is_some();
+    let covariance = if goes_together { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
+    Some(Gaussian { mean, covariance })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::CellStep;
+    use crate::cell::estimator::tests::config;
+    use crate::cell::model::tests::small_model;
+
+    /// The cell rests at 3.7 V for so many seconds; how often the filter was reset.
+    fn resets(estimator: &mut CellEstimator, seconds: u32) -> usize {
+        let step = CellStep {
+            measured_s: 1.0,
+            charge_as: 0.0,
+            unmeasured_s: 0.0,
+            current_a: Some(0.0),
+            temperature_c: Some(25.0),
+            ambient_c: 25.0,
+            voltage_v: 3.7,
+        };
+        (0..seconds).filter(|_| estimator.step(&small_model(), &config(), &step).reset).count()
+    }
+
+    fn settled() -> CellState {
+        let mut estimator = CellEstimator::new(&config());
+        resets(&mut estimator, 100);
+        estimator.snapshot()
+    }
+
+    #[test]
+    fn variances_whose_correlations_do_not_go_together_are_kept_without_them() {
+        let mut state = settled();
+        let last = state.covariance.len() - 1;
+        let both = (state.covariance[0] * state.covariance[last]).sqrt() * 1.01;
+        (state.covariance[3], state.covariance[last - 3]) = (both, both);
+        assert_eq!(state.check(), Ok(()));
+        let mut estimator = CellEstimator::restore(&state, 1).expect("one branch");
+        let restored = estimator.snapshot();
+        assert_eq!((restored.covariance[0], restored.covariance[3]), (state.covariance[0], 0.0));
+        assert_eq!(resets(&mut estimator, 10), 0);
+    }
+
+    #[test]
+    fn a_capacity_no_filter_can_go_on_from_is_reset_once_and_not_for_ever() {
+        for (mean, variance) in [(2.0, -0.04), (2.0, f64::NAN), (0.0, 0.04)] {
+            let mut state = settled();
+            let last = state.covariance.len() - 1;
+            (state.mean[3], state.covariance[last]) = (mean, variance);
+            assert!(state.check().is_err(), "a stored state with it is refused");
+            let mut estimator = CellEstimator::restore(&state, 1).expect("one branch");
+            assert!(resets(&mut estimator, 20) <= 1, "{mean} {variance}");
+            assert!(estimator.capacity().mean > 0.5 && estimator.capacity().variance > 0.0, "{mean} {variance}");
+        }
+    }
+}

@@ -1,0 +1,255 @@
+//! The estimator against its own model, driven by a small simulation without noise.
+
+mod robust;
+
+use super::*;
+use crate::cell::Discretisation;
+use crate::cell::model::tests::small_model;
+
+pub(crate) fn config() -> EstimatorConfig {
+    EstimatorConfig {
+        alpha: 1.0,
+        beta: 2.0,
+        kappa: 0.0,
+        discretisation: Discretisation::Exact,
+        capacity_state: CapacityState::Joint,
+        initial_soc: None,
+        initial_soc_std: 0.3,
+        initial_branch_std_v: 0.05,
+        initial_capacity_ah: 2.0,
+        initial_capacity_std_ah: 0.2,
+        initial_log_resistance_std: 0.2,
+        soc_noise_per_sqrt_s: 3e-5,
+        charge_noise_per_sqrt_soc: 3e-3,
+        branch_noise_v_per_sqrt_s: 1e-3,
+        log_resistance_noise_per_sqrt_s: 3e-4,
+        gap_noise_per_sqrt_s: 1.5e-5,
+        self_discharge_per_s: 1e-8,
+        away_use_per_s: 0.0,
+        rest_current_a: 0.04,
+        voltage_noise_v: 0.005,
+        model_error_v_sqrt_s: 0.15,
+        drop_error_sqrt_s: 0.3,
+        load_error_sqrt_s: 0.5,
+        load_memory_s: 1200.0,
+        max_information_s: 100.0,
+        gate_sigma: 5.0,
+        gate_model_error_v: 0.06,
+        gate_soc_error: 0.02,
+        lost_after_s: 30.0,
+        consistency_window_s: 600.0,
+        consistency_limit: 4.0,
+    }
+}
+
+/// A cell that really has `capacity_ah` and `ratio` times the resistance, stepped beside the estimator.
+struct Truth {
+    soc: f64,
+    branch_v: f64,
+    capacity_ah: f64,
+    ratio: f64,
+}
+
+impl Truth {
+    fn step(&mut self, model: &CellModel, current_a: f64, dt_s: f64) -> CellStep {
+        let place = model.place(self.soc, 25.0);
+        let branch = BranchAt::new(model, 0, &place, self.ratio);
+        self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, dt_s);
+        self.soc = circuit::soc_after(self.soc, current_a * dt_s, self.capacity_ah);
+        let place = model.place(self.soc, 25.0);
+        CellStep {
+            measured_s: dt_s,
+            charge_as: current_a * dt_s,
+            unmeasured_s: 0.0,
+            current_a: Some(current_a),
+            temperature_c: Some(25.0),
+            ambient_c: 25.0,
+            voltage_v: circuit::terminal_v(model, &place, self.ratio, self.branch_v, current_a),
+        }
+    }
+}
+
+/// Discharges and charges between 0.9 and 0.1 with `dt_s`, for `hours`.
+fn cycle(estimator: &mut CellEstimator, config: &EstimatorConfig, truth: &mut Truth, dt_s: f64, hours: f64) {
+    let model = small_model();
+    let mut current_a = 1.0;
+    for _ in 0..(hours * 3600.0 / dt_s) as u32 {
+        if truth.soc < 0.1 {
+            current_a = -1.0;
+        } else if truth.soc > 0.9 {
+            current_a = 1.0;
+        }
+        let step = truth.step(&model, current_a, dt_s);
+        assert!(!estimator.step(&model, config, &step).reset);
+    }
+}
+
+fn truth() -> Truth {
+    Truth { soc: 0.9, branch_v: 0.0, capacity_ah: 1.7, ratio: 1.3 }
+}
+
+fn soc(estimator: &CellEstimator) -> ScalarGaussian {
+    estimator.soc().expect("started")
+}
+
+#[test]
+fn capacity_and_resistance_come_right_from_a_wrong_start_and_the_intervals_cover() {
+    let (config, mut truth) = (config(), truth());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 12.0);
+    let (capacity, log_r) = (estimator.capacity(), estimator.log_resistance());
+    assert!((capacity.mean - 1.7).abs() < 2.0 * capacity.std(), "{capacity:?}");
+    assert!(capacity.std() < 0.05, "{capacity:?}");
+    assert!((log_r.mean - libm::log(1.3)).abs() < 2.0 * log_r.std() + 0.02, "{log_r:?}");
+    assert!((soc(&estimator).mean - truth.soc).abs() < 0.01);
+}
+
+#[test]
+fn the_sample_rate_does_not_change_the_result() {
+    let config = config();
+    let run = |dt_s| {
+        let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
+        cycle(&mut estimator, &config, &mut truth, dt_s, 6.0);
+        (estimator.capacity(), soc(&estimator))
+    };
+    let (slow, fast) = (run(2.0), run(0.2));
+    assert!((slow.0.mean - fast.0.mean).abs() < 0.1 * slow.0.std(), "{slow:?} {fast:?}");
+    assert!((slow.0.std() / fast.0.std() - 1.0).abs() < 0.05, "{slow:?} {fast:?}");
+    assert!((slow.1.std() / fast.1.std() - 1.0).abs() < 0.05, "{slow:?} {fast:?}");
+}
+
+#[test]
+fn a_start_thirty_points_wrong_recovers() {
+    let config = EstimatorConfig { initial_soc: Some(0.6), ..config() };
+    let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
+    cycle(&mut estimator, &config, &mut truth, 1.0, 0.5);
+    assert!((soc(&estimator).mean - truth.soc).abs() < 0.02, "{:?} {}", soc(&estimator), truth.soc);
+}
+
+#[test]
+fn a_glitch_moves_nothing_and_the_time_it_took_is_still_counted() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
+    let before = soc(&estimator).mean;
+    let mut step = truth.step(&model, 1.0, 1.0);
+    step.voltage_v += 1.0;
+    let result = estimator.step(&model, &config, &step);
+    assert!(result.update.is_some_and(|update| !update.accepted) && !result.reset);
+    let moved = before - soc(&estimator).mean;
+    assert!((moved - 1.0 / (3600.0 * estimator.capacity().mean)).abs() < 1e-6, "{moved}");
+}
+
+#[test]
+fn a_lost_cell_starts_again_from_its_voltage_and_keeps_what_it_learned() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 6.0);
+    let capacity = estimator.capacity();
+    truth.soc = if truth.soc > 0.5 { 0.05 } else { 0.95 }; // somebody moved charge behind our back
+    let resets = (0..120).filter(|_| {
+        let step = truth.step(&model, 0.0, 1.0);
+        estimator.step(&model, &config, &step).reset
+    });
+    assert_eq!(resets.count(), 1);
+    assert!((soc(&estimator).mean - truth.soc).abs() < 0.05);
+    assert!((estimator.capacity().mean - capacity.mean).abs() < 3.0 * capacity.std());
+}
+
+#[test]
+fn an_unmeasured_load_may_have_gone_on_and_the_deviation_says_so() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
+    let before = soc(&estimator);
+    let step = CellStep { unmeasured_s: 1800.0, current_a: None, ..truth.step(&model, 1.0, 1.0) };
+    let result = estimator.step(&model, &config, &step);
+    assert_eq!(result.update, None);
+    // 1 A for half an hour out of 1.7 Ah is 0.29 of SOC.
+    assert!(soc(&estimator).std() > before.std() + 0.1, "{:?}", soc(&estimator));
+}
+
+#[test]
+fn nothing_known_stays_nothing_known_however_long_the_gap() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
+    for _ in 0..50 {
+        let step = CellStep { unmeasured_s: 1e6, current_a: None, ..truth.step(&model, 1.0, 1.0) };
+        estimator.step(&model, &config, &step);
+    }
+    assert!(soc(&estimator).variance < 0.1);
+    estimator.handle_unknown_gap();
+    assert!((soc(&estimator).variance - UNKNOWN_SOC_VARIANCE).abs() < 0.02);
+}
+
+#[test]
+fn without_a_sensor_the_thermal_model_warms_the_cell() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    estimator.step(&model, &config, &truth.step(&model, 2.0, 1.0));
+    for _ in 0..600 {
+        let step = CellStep { temperature_c: None, ..truth.step(&model, 2.0, 1.0) };
+        estimator.step(&model, &config, &step);
+    }
+    let warmed_c = estimator.temperature_c().expect("known") - 25.0;
+    assert!((0.2..5.0).contains(&warmed_c), "{warmed_c}");
+}
+
+#[test]
+fn a_restored_estimator_goes_on_bit_for_bit() {
+    let (config, mut truth, model) = (config(), truth(), small_model());
+    let mut estimator = CellEstimator::new(&config);
+    cycle(&mut estimator, &config, &mut truth, 1.0, 0.3);
+    let mut restored = CellEstimator::restore(&estimator.snapshot(), 1).expect("fits");
+    for _ in 0..100 {
+        let step = truth.step(&model, 1.0, 1.0);
+        assert_eq!(estimator.step(&model, &config, &step), restored.step(&model, &config, &step));
+    }
+    assert_eq!(estimator.snapshot(), restored.snapshot());
+    assert!(CellEstimator::restore(&estimator.snapshot(), 2).is_none());
+}
+
+#[test]
+fn held_capacity_is_the_papers_filter() {
+    let config = EstimatorConfig { capacity_state: CapacityState::Held, ..config() };
+    let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
+    cycle(&mut estimator, &config, &mut truth, 1.0, 2.0);
+    assert!((estimator.capacity().mean - 2.0).abs() < 1e-6);
+    estimator.hold_capacity(1.9);
+    assert_eq!(estimator.capacity().mean, 1.9);
+}
+
+#[test]
+fn two_and_three_branches_estimate_too() {
+    for branches in [2, 3] {
+        let mut model = small_model();
+        for _ in 1..branches {
+            model.branches.push(model.branches[0].clone());
+        }
+        let config = config();
+        let mut estimator = CellEstimator::new(&config);
+        let mut truth = truth();
+        for _ in 0..600 {
+            let mut step = truth.step(&model, 1.0, 1.0);
+            step.voltage_v -= truth.branch_v * f64::from(branches - 1); // equal branches in the cell too
+            estimator.step(&model, &config, &step);
+        }
+        assert!((soc(&estimator).mean - truth.soc).abs() < 0.02, "{branches} branches");
+        assert_eq!(estimator.branch_v().iter().filter(|v| v.is_finite()).count(), branches as usize);
+    }
+}
+
+#[test]
+fn a_restated_capacity_moves_the_mean_and_never_makes_the_filter_surer() {
+    let (config, mut truth) = (config(), truth());
+    let mut estimator = CellEstimator::new(&config);
+    estimator.restate_capacity(ScalarGaussian::from_std(1.9, 0.1));
+    assert_eq!(estimator.capacity(), ScalarGaussian::from_std(1.9, 0.1)); // before the first voltage it is simply so
+    cycle(&mut estimator, &config, &mut truth, 1.0, 2.0);
+    let before = estimator.capacity();
+    estimator.restate_capacity(ScalarGaussian { mean: 1.5, variance: 0.1 * before.variance });
+    assert_eq!(estimator.capacity(), ScalarGaussian { mean: 1.5, variance: before.variance });
+    estimator.restate_capacity(ScalarGaussian { mean: 1.6, variance: 9.0 * before.variance });
+    assert_eq!(estimator.capacity(), ScalarGaussian { mean: 1.6, variance: 9.0 * before.variance });
+}

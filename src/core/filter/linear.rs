@@ -1,0 +1,100 @@
+//! The scalar linear Kalman filter with A = C = 1: a random walk measured directly, step by step.
+//!
+//! State x (any unit), variance P. Predict: P += Q. Update with z, R: K = P / (P + R),
+//! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), where x is the
+//! capacity in Ah and a step is a charge/discharge transition.
+
+use serde::{Deserialize, Serialize};
+
+/// A scalar estimate and its variance.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct ScalarGaussian {
+    /// Estimate.
+    pub mean: f64,
+    /// Variance, not negative.
+    pub variance: f64,
+}
+
+/// A scalar measurement and its variance.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Measurement {
+    /// Measured value.
+    pub value: f64,
+    /// Variance, positive.
+    pub variance: f64,
+}
+
+impl ScalarGaussian {
+    /// From an estimate and its standard deviation.
+    pub fn from_std(mean: f64, std: f64) -> Self {
+        Self { mean, variance: std * std }
+    }
+
+    /// Standard deviation.
+    pub fn std(&self) -> f64 {
+        self.variance.sqrt()
+    }
+
+    /// One step of the random walk: the variance grows by `process_variance`.
+    pub fn predict(&mut self, process_variance: f64) {
+        self.variance += process_variance;
+    }
+
+    /// Takes a measurement in.
+    pub fn update(&mut self, z: Measurement) {
+        let gain = self.variance / (self.variance + z.variance);
+        self.mean += gain * (z.value - self.mean);
+        self.variance *= 1.0 - gain;
+    }
+
+    /// What somebody must have measured to get from the belief `self` to `after`: 1/R = 1/P1 - 1/P0,
+    /// z = R (x1/P1 - x0/P0). It is independent of what was believed before, so it does not feed an
+    /// assumption back as if it were evidence. `None` when nothing was learned (P1 >= P0).
+    pub fn information_until(&self, after: &Self) -> Option<Measurement> {
+        let information = 1.0 / after.variance - 1.0 / self.variance;
+        // Below a millionth of what was known the difference is rounding, not evidence.
+        if !information.is_finite() || information <= 1e-6 / self.variance {
+            return None;
+        }
+        let value = (after.mean / after.variance - self.mean / self.variance) / information;
+        Some(Measurement { value, variance: 1.0 / information })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn information_between_two_beliefs_is_the_measurement_that_was_taken() {
+        let before = ScalarGaussian::from_std(2.0, 0.2);
+        let taken = Measurement { value: 1.7, variance: 0.01 };
+        let mut after = before;
+        after.update(taken);
+        let found = before.information_until(&after).expect("something was learned");
+        assert!((found.value - taken.value).abs() < 1e-12);
+        assert!((found.variance - taken.variance).abs() < 1e-12);
+    }
+
+    #[test]
+    fn no_information_is_no_measurement() {
+        let before = ScalarGaussian::from_std(2.0, 0.2);
+        assert_eq!(before.information_until(&before), None);
+        let wider = ScalarGaussian::from_std(2.1, 0.3);
+        assert_eq!(before.information_until(&wider), None);
+    }
+
+    #[test]
+    fn steady_state_variance_is_the_closed_form() {
+        let (q, r) = (1.0, 0.1);
+        let mut belief = ScalarGaussian { mean: 30.0, variance: 1.0 };
+        for _ in 0..100 {
+            belief.predict(q);
+            belief.update(Measurement { value: 29.0, variance: r });
+        }
+        // Positive root of P^2 + Q P - Q R = 0 (variance after the update).
+        let expected = (-q + (q * q + 4.0 * q * r).sqrt()) / 2.0;
+        assert!((belief.variance - expected).abs() < 1e-12);
+        assert!((belief.mean - 29.0).abs() < 1e-9);
+    }
+}

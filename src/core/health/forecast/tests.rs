@@ -1,0 +1,266 @@
+//! Histories made up, and what must be told of them.
+
+use super::*;
+
+/// Feeds a fade: `capacity(efc)` at every `step` cycles, one cycle a quarter of a day.
+fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
+    let mut forecast = Forecast::new(Axis::Cycles, 2.0);
+    let mut efc = 0.0;
+    while efc <= until {
+        let passed = if efc == 0.0 { Usage::default() } else { passed(step) };
+        let reading = Reading { capacity_ah: capacity(efc), variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
+        forecast.update(passed, Some(reading));
+        efc += step;
+    }
+    forecast
+}
+
+fn passed(cycles: f64) -> Usage {
+    Usage { cycles, days: 0.25 * cycles, rest_days: 0.0 }
+}
+
+#[test]
+fn a_straight_fade_is_continued() {
+    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let life = forecast.remaining(1.5).expect("enough is known");
+    let cycles = life.cycles.expect("cycles are counted");
+    // 1.8 Ah left, 0.3 Ah to go.
+    assert!((cycles.median - 150.0).abs() < 10.0, "{cycles:?}");
+    assert!(cycles.low < 150.0 && cycles.high > 150.0 && cycles.high < 6.0 * cycles.low, "{cycles:?}");
+    let days = life.days.expect("the rate of use is known");
+    assert!((days.median / cycles.median - 0.25).abs() < 1e-9, "{days:?}");
+}
+
+#[test]
+fn the_same_fade_ten_times_slower_lasts_ten_times_longer() {
+    let fast = fed(|efc| 2.0 - 0.002 * efc, 10.0, 150.0);
+    let slow = fed(|efc| 2.0 - 0.0002 * efc, 100.0, 1500.0);
+    let median = |forecast: &Forecast| forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
+    assert!((median(&slow) / median(&fast) - 10.0).abs() < 1.0, "{} {}", median(&slow), median(&fast));
+}
+
+#[test]
+fn readings_in_one_cycle_are_not_as_many_readings() {
+    let noisy = |efc: f64| 2.0 - 0.002 * efc;
+    let (few, many) = (fed(noisy, 1.0, 60.0), fed(noisy, 0.05, 60.0));
+    let (few_std, many_std) = (few.rate_ah().1, many.rate_ah().1);
+    assert!(many_std > 0.6 * few_std, "{many_std} {few_std}");
+}
+
+#[test]
+fn a_bump_after_rest_is_not_taken_for_the_end_of_fade() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 99.0);
+    let before = forecast.rate_ah().0;
+    let rested = Usage { cycles: 1.0, days: 5.0, rest_days: 4.8 };
+    let reading = Reading { capacity_ah: 1.88, variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
+    forecast.update(rested, Some(reading));
+    assert!((forecast.rate_ah().0 / before - 1.0).abs() < 0.2, "{:?} {before}", forecast.rate_ah());
+    assert!(forecast.level_ah().0 < 1.84, "{:?}", forecast.level_ah());
+}
+
+#[test]
+fn nothing_is_told_of_few_readings_or_of_no_fade() {
+    assert_eq!(Forecast::new(Axis::Cycles, 2.0).remaining(1.5), Err(InsufficientData::Readings { found: 0 }));
+    assert_eq!(fed(|efc| 2.0 - 0.01 * efc, 1.0, 3.0).remaining(1.5), Err(InsufficientData::Readings { found: 4 }));
+    let flat = fed(|_| 2.0, 1.0, 300.0).remaining(1.5);
+    assert!(matches!(flat, Err(InsufficientData::Fade { .. })), "{flat:?}");
+    let rising = fed(|efc| 2.0 + 0.001 * efc, 1.0, 100.0).remaining(1.5);
+    assert!(matches!(rising, Err(InsufficientData::Fade { .. })), "{rising:?}");
+}
+
+#[test]
+fn below_the_threshold_nothing_remains() {
+    let life = fed(|efc| 2.0 - 0.004 * efc, 1.0, 150.0).remaining(1.6).expect("enough is known");
+    assert_eq!(life.cycles.map(|cycles| (cycles.low, cycles.median, cycles.high)), Some((0.0, 0.0, 0.0)));
+}
+
+#[test]
+fn what_all_readings_share_widens_the_interval() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let width = |forecast: &Forecast| {
+        let cycles = forecast.remaining(1.7).expect("enough").cycles.expect("cycles");
+        cycles.high - cycles.low
+    };
+    let before = width(&forecast);
+    let reading = Reading { capacity_ah: 1.798, variance_ah2: 1e-5, shared_variance_ah2: 0.0016 };
+    forecast.update(passed(1.0), Some(reading));
+    assert!(width(&forecast) > 1.1 * before, "{} {before}", width(&forecast));
+}
+
+#[test]
+fn the_axis_of_days_tells_days_alone() {
+    let mut forecast = Forecast::new(Axis::Days, 2.0);
+    for day in 0..12 {
+        let days = if day == 0 { 0.0 } else { 5.0 };
+        let reading = Reading { capacity_ah: 2.0 - 0.05 * f64::from(day), variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        forecast.update(Usage { days, ..Usage::default() }, Some(reading));
+    }
+    let life = forecast.remaining(1.2).expect("enough is known");
+    assert_eq!(life.cycles, None);
+    // 1.45 Ah left, 0.25 Ah to go at 0.01 Ah a day.
+    assert!(life.days.is_some_and(|days| (days.median - 25.0).abs() < 5.0), "{life:?}");
+}
+
+#[test]
+fn use_without_a_reading_is_use_all_the_same() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let before = forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
+    (0..50).for_each(|_| forecast.update(passed(1.0), None));
+    let after = forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
+    assert!((before - after - 50.0).abs() < 8.0, "{before} {after}");
+}
+
+#[test]
+fn the_fan_passes_the_threshold_when_the_forecast_says() {
+    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let cycles = forecast.remaining(1.6).expect("enough").cycles.expect("cycles");
+    let fan = forecast.fan(2.0 * cycles.median, 3).expect("enough is known");
+    assert!((fan[1].median_ah - 1.6).abs() < 1e-6, "{fan:?}");
+    assert!(fan[2].low_ah < fan[2].median_ah && fan[2].median_ah < fan[2].high_ah);
+    assert!(fan[0].high_ah - fan[0].low_ah < fan[2].high_ah - fan[2].low_ah);
+}
+
+#[test]
+fn it_is_the_same_after_being_stored() {
+    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 37.0);
+    let stored = serde_json::to_string(&forecast).expect("writes");
+    assert_eq!(serde_json::from_str::<Forecast>(&stored).expect("reads"), forecast);
+    assert!(stored.len() < 600, "{}", stored.len());
+}
+
+#[test]
+fn any_readings_leave_a_usable_covariance() {
+    let mut forecast = Forecast::new(Axis::Cycles, 2.0);
+    for k in 0..2000_u32 {
+        let capacity_ah = [2.0, 0.01, 3.9, f64::NAN, 1.0][(k % 5) as usize];
+        let passed = Usage { cycles: f64::from(k % 7) * 3.0, days: f64::from(k % 3) * 100.0, rest_days: 50.0 };
+        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 }));
+        assert!((0..N).all(|i| forecast.p[i][i] > 0.0 && forecast.x[i].is_finite()), "{k} {forecast:?}");
+        let _ = forecast.remaining(1.0);
+    }
+}
+
+#[test]
+fn a_first_reading_that_says_nothing_delays_the_forecast_by_that_reading() {
+    let told_after = |first_variance_ah2: f64| {
+        let mut forecast = Forecast::new(Axis::Cycles, 2.0);
+        let told = (0..200).find(|&efc| {
+            let variance_ah2 = if efc == 0 { first_variance_ah2 } else { 1e-5 };
+            let capacity_ah = 2.0 - 0.002 * f64::from(efc) + if efc == 0 { -0.3 } else { 0.0 };
+            let passed = if efc == 0 { Usage::default() } else { passed(1.0) };
+            forecast.update(passed, Some(Reading { capacity_ah, variance_ah2, shared_variance_ah2: 0.0 }));
+            forecast.remaining(1.5).is_ok()
+        });
+        told.expect("told before 200 cycles")
+    };
+    let (good, weak) = (told_after(1e-5), told_after(4.0));
+    assert!(weak <= good + 5, "{good} {weak}");
+}
+
+#[test]
+fn a_rest_each_night_does_not_drown_the_fade() {
+    let mut forecast = Forecast::new(Axis::Cycles, 2.0);
+    for day in 0..400 {
+        let passed = Usage { cycles: 0.25, days: 1.0, rest_days: 0.9 };
+        let capacity_ah = 2.0 - 0.001 * f64::from(day);
+        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+    }
+    let recovery_std = forecast.p[RECOVERY][RECOVERY].sqrt();
+    assert!(recovery_std < 1.1 * RECOVERY_IN_REST.hypot(RECOVERY_IN_USE), "{recovery_std}");
+    // 1.6 Ah left, 0.1 Ah to go at 0.004 Ah a cycle.
+    let cycles = forecast.remaining(1.5).expect("enough is known").cycles.expect("cycles");
+    assert!(cycles.low < 25.0 && cycles.high > 25.0 && cycles.median > 15.0 && cycles.median < 35.0, "{cycles:?}");
+}
+
+#[test]
+fn up_to_the_threshold_and_beyond_it_something_is_told_without_a_jump() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let mut before: Option<Remaining> = None;
+    for efc in 101..300 {
+        let capacity_ah = 2.0 - 0.002 * f64::from(efc);
+        forecast.update(passed(1.0), Some(Reading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+        let now = forecast.remaining(1.6).unwrap_or_else(|why| panic!("after {efc} cycles: {why}"));
+        let now = now.cycles.expect("cycles");
+        if let Some(before) = before {
+            let fell = |before: f64, now: f64| (before - now - 1.0).abs() < 0.12 * before + 4.0;
+            assert!(fell(before.low, now.low) && fell(before.median, now.median), "{efc}: {before:?} {now:?}");
+        }
+        before = Some(now);
+    }
+    assert_eq!(before, Some(Remaining::default()));
+}
+
+#[test]
+fn a_cell_that_came_worn_is_at_its_end_without_fade() {
+    let forecast = fed(|_| 1.4, 1.0, 30.0);
+    let life = forecast.remaining(1.6).expect("known without a fade");
+    assert_eq!(life.cycles, Some(Remaining::default()));
+    assert!(matches!(forecast.remaining(1.2), Err(InsufficientData::Fade { .. })));
+}
+
+#[test]
+fn the_fan_begins_with_the_levels_own_interval() {
+    let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let (level, std) = forecast.level_ah();
+    let now = forecast.fan(100.0, 2).expect("enough is known")[0];
+    assert!((now.low_ah - (level - 1.645 * std)).abs() < 0.02 * std, "{now:?} {level} {std}");
+    assert!((now.high_ah - (level + 1.645 * std)).abs() < 0.02 * std, "{now:?} {level} {std}");
+}
+
+#[test]
+fn a_long_rest_is_not_the_use_of_late() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let rested = Usage { cycles: 0.5, days: 300.0, rest_days: 299.9 };
+    forecast.update(rested, Some(Reading { capacity_ah: 1.8, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+    (0..20).for_each(|_| forecast.update(passed(1.0), None));
+    let life = forecast.remaining(1.5).expect("enough is known");
+    let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
+    // 5 days for 20 cycles, and the 25 days a window of 30 still holds of the rest: far from the 300.
+    assert!((0.25..2.0).contains(&days_per_cycle), "{days_per_cycle}");
+}
+
+#[test]
+fn one_wild_reading_moves_little() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
+    let before = forecast.rate_ah().0;
+    forecast.update(passed(1.0), Some(Reading { capacity_ah: 0.9, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+    assert!((1.7..1.85).contains(&forecast.level_ah().0), "{:?}", forecast.level_ah());
+    assert!((forecast.rate_ah().0 / before - 1.0).abs() < 0.5, "{:?} {before}", forecast.rate_ah());
+}
+
+#[test]
+fn readings_of_one_moment_tell_nothing() {
+    let mut forecast = Forecast::new(Axis::Cycles, 2.0);
+    for n in 0..8 {
+        let capacity_ah = 2.0 - 0.05 * f64::from(n);
+        let reading = Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 };
+        forecast.update(Usage::default(), Some(reading));
+    }
+    assert_eq!(forecast.remaining(1.5), Err(InsufficientData::Use));
+}
+
+#[test]
+fn what_is_not_a_number_changes_nothing_and_a_state_of_such_is_refused() {
+    let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 50.0);
+    let before = forecast.clone();
+    let wild = Usage { cycles: f64::INFINITY, days: f64::NAN, rest_days: f64::NAN };
+    let reading = Reading { capacity_ah: 1.9, variance_ah2: 1e-5, shared_variance_ah2: f64::NAN };
+    forecast.update(wild, Some(reading));
+    assert_eq!((forecast.x, forecast.readings), (before.x, before.readings));
+    assert_eq!(before.check(Axis::Cycles), Ok(()));
+    assert!(before.check(Axis::Days).is_err());
+    type Damage = fn(&mut Forecast);
+    let damages: [Damage; 6] = [
+        |forecast| forecast.reference_ah = 0.0,
+        |forecast| forecast.x[RATE] = f64::NAN,
+        |forecast| forecast.p[LEVEL][LEVEL] = -1e-9,
+        |forecast| forecast.p[LEVEL][RATE] = 1.0,
+        |forecast| forecast.used = -1.0,
+        |forecast| forecast.recent[1] = f64::INFINITY,
+    ];
+    for (number, damage) in damages.into_iter().enumerate() {
+        let mut damaged = before.clone();
+        damage(&mut damaged);
+        assert!(damaged.check(Axis::Cycles).is_err(), "damage {number}");
+    }
+}

@@ -1,0 +1,467 @@
+//! What each completed half-cycle teaches about each cell: charge moved, SOC swing, capacity.
+//!
+//! A half-cycle runs from where charge or discharge began to where it ended (both dated by the transition
+//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; by `Swing` with fade and offset beside it, [`super::drift`]) gets
+//! its measurement by one of two rules:
+//! * `Swing`: the information which the voltages since the last half-cycle have given about the capacity. The
+//!   sample-by-sample filter carries the capacity with its correlation to the SOC; the measurement is what leads
+//!   from its belief then to its belief now, `ScalarGaussian::information_until`. Charge / swing with the SOC of that same
+//!   filter would return the capacity it assumed; this does not.
+//! * `Nominal`: the paper's, charge / nominal swing with a fixed variance.
+
+use serde::{Deserialize, Serialize};
+
+use super::drift::Drift;
+use super::{CapacityConfig, CapacityMethod, TransitionConfig};
+use crate::cell::{CellEstimator, CellModel};
+use crate::filter::{ScalarGaussian, Measurement};
+use crate::quantity::{Mode, Timestamp, InvalidState};
+
+/// A half-cycle's ends are weighed over no less than this swing: below it the variance is beyond use anyway.
+const MIN_WEIGHED_SWING: f64 = 0.02;
+
+/// One completed half-cycle of one cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HalfCycle {
+    /// Charge or discharge.
+    pub mode: Mode,
+    /// Charge moved, Ah, positive.
+    pub charge_ah: f64,
+    /// SOC swing, fraction, positive when it goes with the charge, and its standard deviation (the errors of both
+    /// ends taken as independent); `None` when its beginning was not estimated.
+    pub swing: Option<ScalarGaussian>,
+    /// SOC at its end, fraction.
+    pub end_soc: Option<f64>,
+    /// Where its charge was weighed: both ends on the voltage curve; `None` when nothing was estimated.
+    pub ends: Option<[End; 2]>,
+    /// Duration, s.
+    pub duration_s: f64,
+    /// Mean current, A, positive = discharge.
+    pub mean_current_a: f64,
+    /// Mean temperature, degrees C; `None` when there was none.
+    pub mean_temperature_c: Option<f64>,
+}
+
+/// One end of a half-cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct End {
+    /// State of charge, fraction.
+    pub soc: f64,
+    /// Voltage which the load of the minutes before dropped in the cell, V.
+    pub load_v: f64,
+}
+
+/// Where a cell is: at the end of a half-cycle, when it begins or ends now.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellEnd {
+    /// State of charge; `None` before the first estimate.
+    pub soc: Option<ScalarGaussian>,
+    /// Voltage which the load of the last minutes drops in the cell, V.
+    pub load_v: f64,
+}
+
+/// What the capacity filter made of a half-cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CapacityUpdate {
+    /// What the half-cycle alone says; `None` = nothing.
+    pub measurement: Option<Measurement>,
+    /// The published capacity, gain error of the current sensor included.
+    pub capacity: ScalarGaussian,
+}
+
+/// The state of one cell's totals at a moment.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+struct CellMark {
+    soc: Option<ScalarGaussian>,
+    #[serde(default)]
+    load_v: f64,
+    temperature_integral: f64,
+    temperature_s: f64,
+}
+
+impl CellMark {
+    fn put(&mut self, end: CellEnd) {
+        (self.soc, self.load_v) = (end.soc, end.load_v);
+    }
+
+    fn check(&self) -> Result<(), InvalidState> {
+        for number in [self.load_v, self.temperature_integral, self.temperature_s] {
+            InvalidState::unless_number("a load or temperature at a half-cycle's end", number)?;
+        }
+        let Some(soc) = self.soc else { return Ok(()) };
+        InvalidState::unless_number("the SOC at a half-cycle's end", soc.mean)?;
+        InvalidState::unless_natural("its variance", soc.variance)
+    }
+}
+
+/// The state of all totals at a moment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct Mark {
+    time: Timestamp,
+    /// Cumulative charge per cell, A s, positive = discharge.
+    charge_as: f64,
+    cells: Vec<CellMark>,
+}
+
+/// Totals, marks and capacity filters of all cells.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Learner {
+    totals: Vec<CellMark>,
+    /// Where the present half-cycle began.
+    start: Option<Mark>,
+    /// Where the mode that may follow began.
+    candidate: Option<Mark>,
+    /// Capacity belief of each sample filter right after the last half-cycle's step.
+    prior: Vec<ScalarGaussian>,
+    /// Event filter's belief.
+    capacity: Vec<ScalarGaussian>,
+    /// Time without current since the last half-cycle, s.
+    rest_s: f64,
+    /// When the present mode began.
+    mode_since: Option<Timestamp>,
+    /// Whether `start` is kept because too little was moved since.
+    joining: bool,
+    /// Whether a half-cycle has taught something about each cell.
+    learned: Vec<bool>,
+    /// Capacity with what drifts beside it (`Swing`).
+    drift: Vec<Drift>,
+}
+
+impl Learner {
+    /// For cells that start from these beliefs.
+    pub fn new(config: &CapacityConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
+        Self {
+            totals: vec![CellMark::default(); cells],
+            start: None,
+            candidate: None,
+            prior: vec![initial_capacity; cells],
+            capacity: vec![initial_capacity; cells],
+            rest_s: 0.0,
+            mode_since: None,
+            joining: false,
+            learned: vec![false; cells],
+            drift: vec![Drift::new(config, initial_capacity); cells],
+        }
+    }
+
+    /// Takes a cell's sample into its totals: when, its temperature (degrees C), the time since the sample before in which
+    /// the current was measured, and that in which it was not (infinite before the first and after an unknown gap), s.
+    /// Whether what may begin next was marked in that gap: then it begins where the cell is after it ([`Self::move_mark`]).
+    #[inline]
+    pub fn observe(
+        &mut self,
+        cell: usize,
+        time: Timestamp,
+        temperature_c: Option<f64>,
+        measured_s: f64,
+        gap_s: f64,
+    ) -> bool {
+        if let Some(temperature_c) = temperature_c {
+            let totals = &mut self.totals[cell];
+            totals.temperature_integral += temperature_c * measured_s;
+            totals.temperature_s += measured_s;
+        }
+        gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
+    }
+
+    /// What begins next begins for a cell where it is now, not where it was when that was marked.
+    pub fn move_mark(&mut self, cell: usize, end: CellEnd) {
+        if let Some(mark) = &mut self.candidate {
+            mark.cells[cell].put(end);
+        }
+    }
+
+    /// All cells have learned from the half-cycle at hand.
+    pub fn finish(&mut self) {
+        self.rest_s = 0.0;
+    }
+
+    /// A mode that may follow the present one begins here; `end` tells where each cell is.
+    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, end: impl Fn(usize) -> CellEnd) {
+        let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
+        cells.clone_from(&self.totals);
+        cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.put(end(cell)));
+        self.candidate = Some(Mark { time, charge_as, cells });
+    }
+
+    /// Completes the mode `from`: the one that may follow is confirmed. When the charge moved since the last half-cycle
+    /// comes to the configured swing, appends each cell's half-cycle to `half_cycles` in cell order; a charge or
+    /// discharge of less is joined to what follows it.
+    pub fn complete(
+        &mut self,
+        config: &TransitionConfig,
+        rated_capacity_ah: f64,
+        from: Mode,
+        half_cycles: &mut Vec<HalfCycle>,
+    ) {
+        let Some(end) = self.candidate.take() else { return };
+        let since = self.mode_since.replace(end.time);
+        let Some(start) = &self.start else {
+            self.start = Some(end);
+            return;
+        };
+        if matches!(from, Mode::Rest | Mode::Unknown) {
+            self.rest_s += since.map_or(0.0, |since| end.time.since(since).max(0.0));
+            if !self.joining {
+                self.start = Some(end);
+            }
+            return;
+        }
+        let moved_ah = (end.charge_as - start.charge_as) / 3600.0;
+        self.joining = moved_ah == 0.0 || moved_ah.abs() < config.min_swing * rated_capacity_ah;
+        if !self.joining {
+            half_cycles.extend(
+                start.cells.iter().zip(&end.cells).map(|(a, b)| half_cycle(moved_ah, end.time.since(start.time), a, b)),
+            );
+            self.start = Some(end);
+        }
+    }
+
+    /// Runs the capacity filter of one cell over its completed half-cycle.
+    pub fn learn(
+        &mut self,
+        model: &CellModel,
+        config: &CapacityConfig,
+        cell: usize,
+        estimator: &mut CellEstimator,
+        half_cycle: &HalfCycle,
+    ) -> CapacityUpdate {
+        let measurement = match config.method {
+            CapacityMethod::Swing => self.learn_swing(model, config, cell, estimator, half_cycle),
+            CapacityMethod::Nominal { swing, variance_ah2 } => {
+                let measurement = Measurement { value: half_cycle.charge_ah / swing, variance: variance_ah2 };
+                let belief = &mut self.capacity[cell];
+                belief.predict(config.noise_ah_per_cycle * config.noise_ah_per_cycle);
+                belief.update(measurement);
+                estimator.hold_capacity(belief.mean);
+                Some(measurement)
+            }
+        };
+        self.learned[cell] |= measurement.is_some();
+        CapacityUpdate { measurement, capacity: self.capacity(config, cell) }
+    }
+
+    /// Whether a cell's capacity is more than what it was configured to start from.
+    pub fn has_learned(&self, cell: usize) -> bool {
+        self.learned.get(cell).copied().unwrap_or(false)
+    }
+
+    /// Whether every cell's capacity is more than what it was configured to start from.
+    pub fn has_learned_all(&self) -> bool {
+        self.learned.iter().all(|&learned| learned)
+    }
+
+    fn learn_swing(
+        &mut self,
+        model: &CellModel,
+        config: &CapacityConfig,
+        cell: usize,
+        estimator: &mut CellEstimator,
+        half_cycle: &HalfCycle,
+    ) -> Option<Measurement> {
+        let after = estimator.capacity();
+        let measurement = self.prior[cell].information_until(&after).map(|z| Measurement {
+            value: z.value,
+            variance: z.variance + end_variance_ah2(model, config, half_cycle, after.mean),
+        });
+        let drift = &mut self.drift[cell];
+        if let Some(z) = measurement {
+            drift.update(z, half_cycle.mean_current_a);
+        }
+        self.capacity[cell] = drift.capacity();
+        let cycles = half_cycle.charge_ah / (2.0 * after.mean);
+        let rest_days = (self.rest_s / 86_400.0).min(1.0);
+        let walk = config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
+            + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days;
+        let charged = if half_cycle.mode == Mode::Charge { 2.0 * cycles } else { 0.0 };
+        drift.pass(config, cycles, charged, walk);
+        // The sample filter goes on from what is known now.
+        estimator.restate_capacity(drift.capacity());
+        self.prior[cell] = estimator.capacity();
+        measurement
+    }
+
+    /// The published capacity of a cell: the filter's, its variance widened by the gain error of the current
+    /// sensor, which no number of half-cycles averages out.
+    pub fn capacity(&self, config: &CapacityConfig, cell: usize) -> ScalarGaussian {
+        let belief = self.capacity[cell];
+        let gain_ah = config.current_gain_std * belief.mean;
+        ScalarGaussian { mean: belief.mean, variance: belief.variance + gain_ah * gain_ah }
+    }
+
+    /// Offset of the current as a cell's half-cycles tell it, per cell, A: measured less true.
+    #[inline]
+    pub fn current_offset_a(&self, cell: usize) -> f64 {
+        self.drift[cell].offset_a()
+    }
+
+    /// Whether the totals are for this many cells.
+    pub fn fits(&self, cells: usize) -> bool {
+        [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
+            && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
+    }
+
+    /// Whether the numbers of a stored one can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        for belief in self.prior.iter().chain(&self.capacity) {
+            InvalidState::unless_capacity("a learned capacity", belief.mean)?;
+            InvalidState::unless_positive("the variance of a learned capacity", belief.variance)?;
+        }
+        self.drift.iter().try_for_each(Drift::check)?;
+        InvalidState::unless_natural("the time at rest", self.rest_s)?;
+        let marks = [&self.start, &self.candidate].into_iter().flatten();
+        marks
+            .clone()
+            .try_for_each(|mark| InvalidState::unless_number("the charge at a half-cycle's end", mark.charge_as))?;
+        marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
+    }
+
+    /// Moves stored stamps onto another clock.
+    pub fn rebase(&mut self, by_nanos: i64) {
+        for mark in [&mut self.start, &mut self.candidate].into_iter().flatten() {
+            mark.time = mark.time.plus_nanos(by_nanos);
+        }
+        self.mode_since = self.mode_since.map(|since| since.plus_nanos(by_nanos));
+    }
+}
+
+/// Variance which the voltage model's repeating error at both ends puts under a half-cycle's capacity, Ah^2:
+/// (C / swing)^2 times the variance of both ends' SOC.
+fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &HalfCycle, capacity_ah: f64) -> f64 {
+    let Some(ends) = &half_cycle.ends else { return 0.0 };
+    let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
+    let lost = 1.0 - capacity_ah / model.capacity_ah;
+    let soc_variance = ends.iter().fold(0.0, |sum, end| {
+        let slope_v = model.ocv_slope_v(&model.place(end.soc, temperature_c));
+        let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
+        let shape = config.ageing_shift_error * lost * end.soc * (1.0 - end.soc);
+        sum + volts * volts + shape * shape
+    });
+    let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);
+    (capacity_ah / swing) * (capacity_ah / swing) * soc_variance
+}
+
+/// One cell's half-cycle between two marks in which `moved_ah` left it.
+fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> HalfCycle {
+    let (mode, sign) = if moved_ah > 0.0 { (Mode::Discharge, 1.0) } else { (Mode::Charge, -1.0) };
+    let temperature_s = b.temperature_s - a.temperature_s;
+    HalfCycle {
+        mode,
+        charge_ah: moved_ah.abs(),
+        swing: a
+            .soc
+            .zip(b.soc)
+            .map(|(a, b)| ScalarGaussian { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
+        end_soc: b.soc.map(|soc| soc.mean),
+        ends: b.soc.map(|soc| {
+            let end = End { soc: soc.mean, load_v: b.load_v };
+            // A beginning that nobody saw is no better than the end.
+            [a.soc.map_or(end, |soc| End { soc: soc.mean, load_v: a.load_v }), end]
+        }),
+        duration_s,
+        mean_current_a: moved_ah * 3600.0 / duration_s,
+        mean_temperature_c: (temperature_s > 0.0)
+            .then(|| (b.temperature_integral - a.temperature_integral) / temperature_s),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::CellStep;
+    use crate::cell::estimator::tests::config as estimator_config;
+    use crate::cell::model::tests::small_model;
+
+    fn config() -> CapacityConfig {
+        CapacityConfig {
+            method: CapacityMethod::Swing,
+            noise_ah_per_cycle: 0.01,
+            noise_ah_per_rest_day: 0.0,
+            end_error_v: 0.0,
+            end_load_error: 0.0,
+            ageing_shift_error: 0.0,
+            current_gain_std: 0.0,
+            current_offset_std_a: 0.0,
+            fade_std_ah_per_cycle: 0.0,
+            fade_noise_ah_per_cycle: 0.0,
+        }
+    }
+
+    /// An hour's discharge at 1 A whose voltages fall from 4.1 V to 3.5 V.
+    fn discharge(estimator: &mut CellEstimator) {
+        for k in 0..360 {
+            let step = CellStep {
+                measured_s: 10.0,
+                charge_as: 10.0,
+                unmeasured_s: 0.0,
+                current_a: Some(1.0),
+                temperature_c: Some(20.0),
+                ambient_c: 20.0,
+                voltage_v: 4.1 - 0.6 * f64::from(k) / 360.0,
+            };
+            estimator.step(&small_model(), &estimator_config(), &step);
+        }
+    }
+
+    #[test]
+    fn what_begins_behind_a_gap_begins_at_the_soc_after_it() {
+        let transition =
+            TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
+        let mut learner = Learner::new(&config(), 1, ScalarGaussian::from_std(2.0, 0.1));
+        let at = |soc: f64| CellEnd { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v: 0.0 };
+        let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
+        assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
+        learner.mark_candidate(start, 0.0, |_| at(0.1));
+        assert!(learner.observe(0, Timestamp::from_secs(5000.1), None, 10.0, 4000.0));
+        learner.move_mark(0, at(0.9));
+        let mut found = Vec::new();
+        learner.complete(&transition, 2.0, Mode::Unknown, &mut found);
+        assert!(!learner.observe(0, end, None, 10.0, 0.0));
+        learner.mark_candidate(end, 3600.0, |_| at(0.4));
+        learner.complete(&transition, 2.0, Mode::Discharge, &mut found);
+        assert!((found[0].swing.expect("both ends seen").mean - 0.5).abs() < 1e-12, "{found:?}");
+    }
+
+    #[test]
+    fn a_half_cycle_is_measured_by_what_it_alone_has_told() {
+        let config = config();
+        let mut estimator = CellEstimator::new(&estimator_config());
+        let mut learner = Learner::new(&config, 1, estimator.capacity());
+        let at = |soc| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), ..CellMark::default() };
+        let moved = half_cycle(1.0, 3600.0, &at(0.9), &at(0.4));
+        discharge(&mut estimator);
+        assert!(!learner.has_learned_all());
+        let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
+        assert!(first.measurement.is_some() && learner.has_learned_all());
+        // Nothing was measured since: the same voltages must not be counted a second time.
+        let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
+        assert_eq!(second.measurement, None);
+        assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
+    }
+
+    #[test]
+    fn the_repeating_error_of_both_ends_weighs_by_slope_load_ageing_and_swing() {
+        let mut config = config();
+        (config.end_error_v, config.end_load_error, config.ageing_shift_error) = (0.004, 0.1, 0.5);
+        let model = small_model();
+        let mark = |soc, load_v| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v, ..CellMark::default() };
+        let moved = half_cycle(1.0, 3600.0, &mark(0.9, 0.03), &mark(0.4, 0.0));
+        // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. A tenth of 2 Ah is lost.
+        let (start_v2, end_v2) = (0.004 * 0.004 + 0.003 * 0.003, 0.004 * 0.004);
+        let shape = |soc: f64| 0.5 * 0.1 * soc * (1.0 - soc);
+        let soc_variance =
+            start_v2 / (1.075 * 1.075) + end_v2 / (1.325 * 1.325) + shape(0.9) * shape(0.9) + shape(0.4) * shape(0.4);
+        let swing: f64 = 1.0 / 1.8;
+        let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
+        let found = end_variance_ah2(&model, &config, &moved, 1.8);
+        assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
+        // A tiny swing weighs no worse than the least one; one whose beginning nobody estimated has no ends.
+        let tiny = HalfCycle { charge_ah: 0.001, ..moved };
+        let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;
+        assert!((end_variance_ah2(&model, &config, &tiny, 1.8) / least - 1.0).abs() < 1e-9);
+        assert_eq!(end_variance_ah2(&model, &config, &HalfCycle { ends: None, ..moved }, 1.8), 0.0);
+    }
+}

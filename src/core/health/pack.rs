@@ -1,0 +1,101 @@
+//! The pack's values from its cells, by a stated rule and never by a mean.
+//!
+//! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest is full:
+//! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum;
+//! pack SOC = dischargeable / pack capacity. For one cell these are its own values.
+
+use serde::{Deserialize, Serialize};
+
+use crate::filter::ScalarGaussian;
+use crate::quantity::{CellIndex, InvalidState};
+
+/// One cell's part in the pack.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellShare {
+    /// Which cell.
+    pub cell: CellIndex,
+    /// State of charge, fraction.
+    pub soc: ScalarGaussian,
+    /// Capacity, Ah.
+    pub capacity: ScalarGaussian,
+}
+
+/// The pack as its limiting cells make it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PackState {
+    /// State of charge, fraction.
+    pub soc: f64,
+    /// Standard deviation of the limiting cell's SOC.
+    pub soc_std: f64,
+    /// Charge the pack takes from where the fullest cell is full to where the weakest is empty, Ah.
+    pub capacity_ah: f64,
+    /// Standard deviation of the limiting cell's capacity, Ah.
+    pub capacity_std_ah: f64,
+    /// The cell that ends a discharge.
+    pub limiting_cell: CellIndex,
+}
+
+/// Combines the cells; `None` for no cell, and when they leave no capacity (one above full, one below empty).
+pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
+    let mut weakest: Option<(f64, CellShare)> = None;
+    let mut chargeable_ah = f64::INFINITY;
+    for share in cells {
+        let dischargeable_ah = share.soc.mean * share.capacity.mean;
+        chargeable_ah = chargeable_ah.min((1.0 - share.soc.mean) * share.capacity.mean);
+        if weakest.is_none_or(|(least, _)| dischargeable_ah < least) {
+            weakest = Some((dischargeable_ah, share));
+        }
+    }
+    let (dischargeable_ah, limiting) = weakest?;
+    let capacity_ah = dischargeable_ah + chargeable_ah;
+    (capacity_ah > 0.0).then_some(PackState {
+        soc: dischargeable_ah / capacity_ah,
+        soc_std: limiting.soc.std(),
+        capacity_ah,
+        capacity_std_ah: limiting.capacity.std(),
+        limiting_cell: limiting.cell,
+    })
+}
+
+impl PackState {
+    /// Whether the numbers of a stored one can be shown.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless_number("the pack's SOC", self.soc)?;
+        let natural = [self.soc_std, self.capacity_ah, self.capacity_std_ah];
+        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("the pack's capacity or a deviation", x))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn share(cell: u16, soc: f64, capacity_ah: f64) -> CellShare {
+        let (soc, capacity) = (ScalarGaussian::from_std(soc, 0.01), ScalarGaussian::from_std(capacity_ah, 0.05));
+        CellShare { cell: CellIndex(cell), soc, capacity }
+    }
+
+    #[test]
+    fn one_cell_is_its_own_pack() {
+        let pack = combine([share(0, 0.4, 2.5)].into_iter()).expect("one cell");
+        assert!((pack.soc - 0.4).abs() < 1e-15);
+        assert!((pack.capacity_ah - 2.5).abs() < 1e-15);
+    }
+
+    #[test]
+    fn the_weakest_cell_limits_discharge_and_the_fullest_charge() {
+        // 1.0 Ah left in cell 1; cell 0 takes only 0.5 Ah more: an unbalanced pack of 1.5 Ah, 2/3 full.
+        let pack = combine([share(0, 0.8, 2.5), share(1, 0.4, 2.5)].into_iter()).expect("two cells");
+        assert!((pack.capacity_ah - 1.5).abs() < 1e-12);
+        assert!((pack.soc - 1.0 / 1.5).abs() < 1e-12);
+        assert_eq!(pack.limiting_cell, CellIndex(1));
+    }
+
+    #[test]
+    fn no_cell_is_no_pack() {
+        assert_eq!(combine(std::iter::empty()), None);
+    }
+}

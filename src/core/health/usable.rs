@@ -1,0 +1,108 @@
+//! Usable capacity: what a full cell delivers at a stated current and temperature down to a cut-off voltage
+//! under load. It follows from the capacity and from how far the resistance has grown.
+//!
+//! The discharge is simulated with the circuit's own equations at constant current, from the SOC the charger
+//! leaves with relaxed branches, until the voltage falls to the cut-off. Standard deviation by first-order
+//! propagation of (capacity, ln rho) with their covariance.
+
+use super::UsableConfig;
+use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
+use crate::cell::{CellEstimator, CellModel, Discretisation, MAX_BRANCHES};
+use crate::filter::ScalarGaussian;
+
+/// Steps a full capacity is cut into.
+const STEPS: f64 = 400.0;
+
+/// Steps after which a discharge that never reaches its cut-off is given up: five capacities.
+const MAX_STEPS: u32 = 2000;
+
+/// Steps of the numerical forward derivatives over ln rho and over ln capacity.
+const LOG_STEP: f64 = 0.01;
+
+/// Charge, Ah, that a cell of `capacity_ah` and `resistance_ratio` delivers from `full_soc` down to the cut-off.
+pub fn usable_ah(
+    model: &CellModel,
+    config: &UsableConfig,
+    full_soc: f64,
+    capacity_ah: f64,
+    resistance_ratio: f64,
+) -> f64 {
+    let step_ah = capacity_ah / STEPS;
+    let step_s = 3600.0 * step_ah / config.current_a;
+    let mut branch_v = [0.0; MAX_BRANCHES];
+    let mut soc = full_soc;
+    let row = model.row(config.temperature_c);
+    let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
+        let state = (soc, resistance_ratio, capacity_ah);
+        aged_terminal_v(model, state, &row, branch_v.iter().sum(), config.current_a)
+    };
+    let mut before_v = voltage(soc, &branch_v);
+    if before_v <= config.cutoff_v {
+        return 0.0;
+    }
+    for k in 0..MAX_STEPS {
+        let next = soc_after(soc, 3600.0 * step_ah, capacity_ah);
+        let place = model.place_in(&row, 0.5 * (soc + next));
+        for (i, v) in branch_v.iter_mut().enumerate().take(model.branches.len()) {
+            let branch = BranchAt::new(model, i, &place, resistance_ratio);
+            *v = branch.voltage_after(Discretisation::Exact, *v, config.current_a, step_s);
+        }
+        let after_v = voltage(next, &branch_v);
+        if after_v <= config.cutoff_v {
+            let part = (before_v - config.cutoff_v) / (before_v - after_v);
+            return step_ah * (f64::from(k) + part);
+        }
+        (soc, before_v) = (next, after_v);
+    }
+    step_ah * f64::from(MAX_STEPS)
+}
+
+/// Usable capacity and its variance, Ah. `capacity` is the published belief (its variance may hold more than
+/// the filter's own).
+pub fn usable_capacity(
+    model: &CellModel,
+    config: &UsableConfig,
+    cell: &CellEstimator,
+    capacity: ScalarGaussian,
+    full_soc: f64,
+) -> ScalarGaussian {
+    let log_r = cell.log_resistance();
+    let at = |log_capacity: f64, log_ratio: f64| {
+        usable_ah(model, config, full_soc, capacity.mean * libm::exp(log_capacity), libm::exp(log_r.mean + log_ratio))
+    };
+    let mean = at(0.0, 0.0);
+    let by_capacity = (at(LOG_STEP, 0.0) - mean) / (LOG_STEP * capacity.mean);
+    let by_log_r = (at(0.0, LOG_STEP) - mean) / LOG_STEP;
+    let variance = by_capacity * by_capacity * capacity.variance
+        + by_log_r * by_log_r * log_r.variance
+        + 2.0 * by_capacity * by_log_r * cell.capacity_resistance_covariance();
+    ScalarGaussian { mean, variance: variance.max(0.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cell::model::tests::small_model;
+
+    const CONFIG: UsableConfig =
+        UsableConfig { current_a: 0.2, temperature_c: 0.0, cutoff_v: 3.3, taper_current_a: 0.05 };
+
+    #[test]
+    fn without_resistance_the_cutoff_is_on_the_open_circuit_curve() {
+        // OCV 3.0 + 1.2 s up to s = 0.5: 3.3 V at s = 0.25, so 75 % of 2 Ah.
+        let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, 1e-12);
+        assert!((usable - 1.5).abs() < 1e-6, "{usable}");
+        assert!((usable_ah(&small_model(), &CONFIG, 0.9, 2.0, 1e-12) - 1.3).abs() < 1e-6);
+    }
+
+    #[test]
+    fn resistance_takes_its_share() {
+        // At 0.2 A every branch (20 to 40 s) has settled: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
+        for ratio in [1.0, 3.0] {
+            let end = (0.3 + 0.2 * ratio * 0.12) / (1.2 + 0.2 * ratio * 0.08);
+            let usable = usable_ah(&small_model(), &CONFIG, 1.0, 2.0, ratio);
+            assert!((usable - 2.0 * (1.0 - end)).abs() < 1e-3, "ratio {ratio}: {usable}");
+        }
+        assert_eq!(usable_ah(&small_model(), &CONFIG, 1.0, 2.0, 1000.0), 0.0);
+    }
+}

@@ -1,0 +1,225 @@
+//! Time, cell numbers, quality of a reading, and the conventions every module keeps.
+//!
+//! Conventions inside the program (wire units and wire signs end in `can` and `config`):
+//! * current in A, **positive = discharge** (the paper's sign, dSOC/dt = -I / (3600 C));
+//! * voltage in V, temperature in degrees C, charge in Ah, resistance in ohm, time in s or [`Timestamp`];
+//! * SOC and SOH are fractions 0..1.
+
+use serde::{Deserialize, Serialize};
+
+/// A point on a clock that never steps, in integer nanoseconds.
+///
+/// Its origin is the driver's choice (the daemon starts it at the wall time of its start, a log at the
+/// log's own stamps); only differences mean anything to the core.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct Timestamp(i64);
+
+impl Timestamp {
+    /// The clock's origin.
+    pub const ZERO: Self = Self(0);
+
+    /// From nanoseconds since the clock's origin.
+    pub const fn from_nanos(nanos: i64) -> Self {
+        Self(nanos)
+    }
+
+    /// From seconds since the clock's origin, rounded to the nearest nanosecond; saturates at the ends
+    /// of the range (292 years), NaN gives the origin.
+    pub fn from_secs(seconds: f64) -> Self {
+        // Whole seconds apart: their product with 1e9 would not fit a float's 53 bits.
+        let whole = seconds.floor();
+        Self((whole as i64).saturating_mul(1_000_000_000).saturating_add(((seconds - whole) * 1e9).round() as i64))
+    }
+
+    /// Nanoseconds since the clock's origin.
+    pub const fn nanos(self) -> i64 {
+        self.0
+    }
+
+    /// Seconds since the clock's origin (a float: about 0.2 us resolution at today's Unix time).
+    pub fn secs(self) -> f64 {
+        self.0 as f64 * 1e-9
+    }
+
+    /// Seconds from `earlier` to `self`; negative when `earlier` is later.
+    #[inline]
+    pub fn since(self, earlier: Self) -> f64 {
+        // A branch that is never taken is cheaper than to saturate every time.
+        let nanos = self.0.checked_sub(earlier.0).unwrap_or_else(|| self.0.saturating_sub(earlier.0));
+        nanos as f64 * 1e-9
+    }
+
+    /// This point moved by `seconds` (may be negative).
+    pub fn plus_secs(self, seconds: f64) -> Self {
+        self.plus_nanos((seconds * 1e9).round() as i64)
+    }
+
+    /// This point moved by `nanos` (may be negative).
+    pub const fn plus_nanos(self, nanos: i64) -> Self {
+        Self(self.0.saturating_add(nanos))
+    }
+}
+
+/// A number of a stored state that cannot be: what, found, allowed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InvalidState {
+    /// Which number.
+    pub what: &'static str,
+    /// What it is.
+    pub found: f64,
+    /// What it may be.
+    pub allowed: &'static str,
+}
+
+impl InvalidState {
+    /// The number, unless `is_sound`.
+    pub fn unless(is_sound: bool, what: &'static str, found: f64, allowed: &'static str) -> Result<(), Self> {
+        if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
+    }
+
+    /// Finite, and so small that its square and its cube are. Nothing measured comes near the bound.
+    pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless(found.abs() <= 1e20, what, found, "at most 1e20 in size")
+    }
+
+    /// The same, and not below 0.
+    pub fn unless_natural(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
+    }
+
+    /// The same, and so much above 0 that one can divide by its square.
+    pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((1e-40..=1e20).contains(&found), what, found, "1e-40 to 1e20")
+    }
+
+    /// A capacity a cell can have, Ah.
+    pub fn unless_capacity(what: &'static str, found: f64) -> Result<(), Self> {
+        Self::unless((1e-6..=1e9).contains(&found), what, found, "1e-6 to 1e9 Ah")
+    }
+}
+
+/// Largest number of cells (series elements) one daemon watches: 1,024, so that a cell number and
+/// "the pack as a whole" fit the 11-bit field of the alarm frame.
+pub const MAX_CELLS: usize = 1024;
+
+/// Which cell of the pack, counted from 0 inside; people and DBC patterns may count from 1.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct CellIndex(pub u16);
+
+impl CellIndex {
+    /// As an index into per-cell arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Which CAN interface, in the order of the configuration's `interfaces`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct BusIndex(pub u8);
+
+impl BusIndex {
+    /// As an index into per-interface arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// Which temperature sensor, in the order of the configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(transparent)]
+pub struct SensorIndex(pub u16);
+
+impl SensorIndex {
+    /// As an index into per-sensor arrays.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
+
+/// What a configured signal feeds. The order is the order in which the readings of one frame are
+/// handed on: a voltage triggers the estimator, so current and temperature of the same frame come first.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Channel {
+    /// Pack current, A, positive = discharge after the configured sign.
+    Current,
+    /// A temperature sensor, degrees C.
+    Temperature(SensorIndex),
+    /// Total pack voltage, V.
+    PackVoltage,
+    /// One cell's voltage, V.
+    CellVoltage(CellIndex),
+    /// SOC as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoc,
+    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with ours, never believed.
+    ReportedSoh,
+    /// A number that is another one for another pack (serial number).
+    PackIdentity,
+}
+
+/// Why a reading cannot be used. A bad reading is data, not an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Fault {
+    /// The frame carries fewer bytes than the signal needs.
+    ShortFrame,
+    /// Its frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
+    EndToEnd,
+    /// The sender said "signal not available".
+    NotAvailable,
+    /// NaN or infinite on the wire (IEEE float signals).
+    NotFinite,
+    /// Outside the range the DBC or the configuration gives.
+    OutOfRange,
+    /// Moved faster than the configured rate allows.
+    RateTooHigh,
+    /// Did not move for longer than the configured time although it should have.
+    Stuck,
+    /// No value for longer than the configured age.
+    Stale,
+}
+
+/// One value taken from a frame, in the program's units and sign, or why there is none.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Reading {
+    /// What it feeds.
+    pub channel: Channel,
+    /// The value, or the fault that makes it unusable.
+    pub value: Result<f64, Fault>,
+}
+
+/// What the cells do, by the sign of the current after dead band, hysteresis and minimum duration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Mode {
+    /// No current reading yet, or it is stale.
+    Unknown,
+    /// Current negative beyond the dead band.
+    Charge,
+    /// Current inside the dead band.
+    Rest,
+    /// Current positive beyond the dead band.
+    Discharge,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_round_trip_at_unix_scale() {
+        let t = Timestamp::from_secs(1_700_000_000.25);
+        assert_eq!(t.nanos(), 1_700_000_000_250_000_000);
+        assert_eq!(t.plus_secs(-0.25).since(t), -0.25);
+    }
+
+    #[test]
+    fn differences_saturate_instead_of_wrapping() {
+        let far = Timestamp::from_nanos(i64::MAX);
+        assert!(far.since(Timestamp::from_nanos(i64::MIN)) > 9.0e9);
+        assert_eq!(far.plus_secs(1.0), far);
+    }
+}

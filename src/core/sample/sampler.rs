@@ -1,0 +1,592 @@
+//! One signal per configured channel, the charge counter, and the samples made of them.
+//!
+//! A sample is made when a good voltage arrives: with the current and temperature that are fresh at that
+//! moment, and the charge and unmeasured time counted up to it. A bad voltage makes none. What comes for a
+//! channel that feeds nothing is counted ([`Sampler::unused_readings`]).
+//!
+//! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records
+//! lie together and not field by field. Nothing is allocated per reading.
+
+use std::ops::Range;
+
+use serde::{Deserialize, Serialize};
+
+use super::charge::{ChargeCounter, Totals};
+use super::config::{Limits, SampleConfig, VoltageSource};
+use super::counts::ReadingCounts;
+use super::signal::Signal;
+use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp, InvalidState};
+
+/// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
+/// sensor at rest, below any load under which a voltage or temperature has to move.
+pub const FLOW_SHARE: f64 = 0.01;
+
+/// Everything a cell's update needs, at the time of its voltage.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellSample {
+    /// Time of the voltage reading.
+    pub time: Timestamp,
+    /// Which cell.
+    pub cell: CellIndex,
+    /// Cell voltage, V.
+    pub voltage_v: f64,
+    /// Cell current, A, positive = discharge; `None` = the last good one is too old.
+    pub current_a: Option<f64>,
+    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it by
+    /// what the current did between its last reading and `time`.
+    pub charge_as: f64,
+    /// Time so far without a usable current, s: charge of unknown size went by in it.
+    pub unmeasured_s: f64,
+    /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
+    pub temperature_c: Option<f64>,
+}
+
+impl CellSample {
+    /// Whether the numbers of a stored one can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        let known = [self.current_a, self.temperature_c].into_iter().flatten();
+        let mut numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
+        numbers.try_for_each(|found| InvalidState::unless_number("a sample that waits for its step", found))
+    }
+}
+
+/// A signal turned bad (`Err`: why) or good again (`Ok`: after so many bad readings).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SignalChange {
+    /// Which signal.
+    pub channel: Channel,
+    /// What it is now.
+    pub state: Result<u64, Fault>,
+}
+
+/// State of a [`Sampler`], to be stored.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SamplerState {
+    signals: Vec<Signal>,
+    charge: ChargeCounter,
+    began: Option<Timestamp>,
+    latest: Timestamp,
+    unused_readings: u64,
+    #[serde(default)]
+    counts: ReadingCounts,
+}
+
+impl SamplerState {
+    /// Whether its numbers can be gone on with.
+    ///
+    /// # Errors
+    /// The first that cannot.
+    pub fn check(&self) -> Result<(), InvalidState> {
+        self.charge.check()?;
+        self.signals.iter().try_for_each(Signal::check)
+    }
+
+    /// Moves every stamp by `by_nanos`, onto another clock.
+    pub fn rebase(&mut self, by_nanos: i64) {
+        self.signals.iter_mut().for_each(|signal| signal.rebase(by_nanos));
+        self.charge.rebase(by_nanos);
+        self.began = self.began.map(|stamp| stamp.plus_nanos(by_nanos));
+        self.latest = self.latest.plus_nanos(by_nanos);
+    }
+}
+
+/// A stored state has another number of signals than the configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("sample state has {found} signals, the configuration has {allowed}")]
+pub struct SamplerShape {
+    /// Stored.
+    pub found: usize,
+    /// Configured.
+    pub allowed: usize,
+}
+
+/// The sample stage.
+#[derive(Debug, Clone)]
+pub struct Sampler {
+    config: SampleConfig,
+    /// Channels in the order of their signals: current, sensors, voltages, what the pack reports.
+    channels: Vec<Channel>,
+    /// Temperature sensors that serve a cell.
+    sensors: usize,
+    /// Channels with a voltage.
+    voltages: usize,
+    /// The signals of the cells' own voltages; none where the pack's total is measured.
+    cell_voltages: Range<usize>,
+    flow_a: f64,
+    state: SamplerState,
+    /// Before this no signal can become stale; `None` = not known.
+    next_stale: Option<Timestamp>,
+    /// How many signals are known to be bad.
+    bad_signals: usize,
+    /// What the latest readings had in common.
+    moment: Moment,
+}
+
+/// What is the same for every reading of one time, as long as no current comes (and no temperature, for what was asked of
+/// its sensor).
+#[derive(Debug, Clone, Copy, Default)]
+struct Moment {
+    /// Whether the rest holds (still).
+    is_known: bool,
+    time: Timestamp,
+    totals: Totals,
+    cell_current_a: Option<f64>,
+    cell_charge_as: f64,
+    /// The sensor that was asked last, and its value: neighbouring cells mostly share one.
+    sensor: Option<(SensorIndex, Option<f64>)>,
+}
+
+impl Sampler {
+    /// A sampler that has heard nothing yet.
+    pub fn new(config: SampleConfig) -> Self {
+        let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
+        let voltages = match config.voltage_source {
+            VoltageSource::Cells => usize::from(config.cells),
+            VoltageSource::PackTotal { .. } => 1,
+        };
+        let channels = channels(&config, sensors);
+        let state = SamplerState {
+            signals: vec![Signal::default(); channels.len()],
+            charge: ChargeCounter::default(),
+            began: None,
+            latest: Timestamp::ZERO,
+            unused_readings: 0,
+            counts: ReadingCounts::default(),
+        };
+        let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
+        let first = 1 + sensors;
+        let cell_voltages = match config.voltage_source {
+            VoltageSource::Cells => first..first + voltages,
+            VoltageSource::PackTotal { .. } => first..first,
+        };
+        Self {
+            config,
+            channels,
+            sensors,
+            voltages,
+            cell_voltages,
+            flow_a,
+            state,
+            next_stale: None,
+            bad_signals: 0,
+            moment: Moment::default(),
+        }
+    }
+
+    /// Other limits for the same signals.
+    ///
+    /// # Panics
+    /// When the signals are others: the caller has checked.
+    pub fn reconfigure(&mut self, config: &SampleConfig) {
+        let state = std::mem::replace(self, Self::new(config.clone())).state;
+        assert!(self.restore(&state).is_ok(), "the same signals");
+    }
+
+    /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
+    pub fn handle_reading(
+        &mut self,
+        time: Timestamp,
+        reading: Reading,
+        changes: &mut Vec<SignalChange>,
+    ) -> Option<CellSample> {
+        let time = self.pass(time);
+        let channel = reading.channel;
+        let Some(slot) = self.slot(channel) else {
+            self.state.unused_readings += 1;
+            return None;
+        };
+        self.renew_moment(time);
+        let limits = limits(&self.config, channel);
+        let value = reading.value.map(|value| value / self.divisor(channel));
+        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &self.moment.totals));
+        self.state.counts.note(judged.value.err());
+        self.state.counts.levels_believed += u64::from(judged.is_new_level);
+        if let Some(state) = judged.change {
+            changes.push(SignalChange { channel, state });
+            // Only a good signal turns bad, and only a bad one good: the count never passes below 0.
+            self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
+            self.next_stale = None;
+        }
+        let value = judged.value.ok()?;
+        match channel {
+            Channel::Current => {
+                let max_age_s = self.config.current.max_age_s;
+                self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
+                self.moment.is_known = false;
+                None
+            }
+            Channel::Temperature(_) => {
+                self.moment.sensor = None;
+                None
+            }
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
+            Channel::PackVoltage => Some(self.sample(CellIndex(0), value)),
+            Channel::CellVoltage(cell) => Some(self.sample(cell, value)),
+        }
+    }
+
+    /// Takes the most frequent reading, as [`handle_reading`](Self::handle_reading) would, by the shortest way: a cell's
+    /// good voltage after many others. `None` when it may be anything else: then it has still to be taken.
+    #[inline]
+    pub fn take_ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
+        let time = self.pass(time);
+        self.renew_moment(time);
+        let Self { config, state, cell_voltages, moment, .. } = self;
+        let signal = state.signals[cell_voltages.clone()].get_mut(cell.index())?;
+        let clock_s = should_move_s(Channel::CellVoltage(cell), &moment.totals);
+        if !signal.take_ordinary(time, voltage_v, &config.voltage, clock_s) {
+            return None;
+        }
+        state.counts.accepted += 1;
+        Some(self.sample(cell, voltage_v))
+    }
+
+    /// Judges the ages at `now`; signals that have become stale go to `changes`.
+    pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<SignalChange>) {
+        let now = self.pass(now);
+        if self.next_stale.is_some_and(|next| now <= next) {
+            return;
+        }
+        let began = self.state.began.unwrap_or(now);
+        let mut next = Timestamp::from_nanos(i64::MAX);
+        for (signal, &channel) in self.state.signals.iter_mut().zip(&self.channels) {
+            if signal.is_bad() {
+                continue;
+            }
+            let stale_from = signal.stale_from(began, limits(&self.config, channel));
+            if now <= stale_from {
+                next = next.min(stale_from);
+                continue;
+            }
+            self.state.counts.note(Some(Fault::Stale));
+            self.bad_signals += 1;
+            changes.push(SignalChange { channel, state: Err(signal.turn_stale()) });
+        }
+        self.next_stale = Some(next);
+    }
+
+    /// The record goes on at `time` after a gap of unknown length: no value is fresh, no charge is counted
+    /// over it, ages start anew.
+    pub fn handle_gap(&mut self, time: Timestamp) {
+        self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
+        self.state.signals.iter_mut().for_each(Signal::handle_gap);
+        self.state.began = Some(time);
+        self.state.latest = time;
+        (self.next_stale, self.moment.is_known) = (None, false);
+    }
+
+    /// The computer was asleep until `time`: values are as old as they are, but nothing is called silent or stale
+    /// for the time in which nobody listened.
+    pub fn wake(&mut self, time: Timestamp) {
+        self.state.began = Some(time);
+        self.next_stale = None;
+    }
+
+    /// Pack current, A, positive = discharge, when its last good reading is fresh.
+    #[inline]
+    pub fn pack_current_a(&self, now: Timestamp) -> Option<f64> {
+        self.state.signals[0].fresh(now, &self.config.current)
+    }
+
+    /// Current of one cell, A: the pack's shared equally by the strings.
+    pub fn cell_current_a(&self, now: Timestamp) -> Option<f64> {
+        self.pack_current_a(now).map(|current| current / self.strings())
+    }
+
+    /// Charge (As, per cell) and unmeasured time (s) up to `now`, as in [`CellSample`].
+    pub fn counted(&self, now: Timestamp) -> (f64, f64) {
+        let totals = self.state.charge.totals_at(now, self.config.current.max_age_s);
+        (totals.charge_as / self.strings(), totals.unmeasured_s)
+    }
+
+    /// Temperature of a cell, degrees C, when its sensor's last good reading is fresh.
+    pub fn temperature_c(&self, cell: CellIndex, now: Timestamp) -> Option<f64> {
+        self.sensor_c(self.sensor_of(cell)?, now)
+    }
+
+    /// Age of the last good value, s; from the start or the last waking when there is none since. `None` = the channel feeds nothing.
+    pub fn age_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        self.slot(channel).map(|slot| self.since(self.state.signals[slot].good_at(), now))
+    }
+
+    /// Time since anything came on the channel, good or bad, s (the value of the rule `input_missing`).
+    pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        self.slot(channel).map(|slot| self.since(self.state.signals[slot].heard_at(), now))
+    }
+
+    /// Share of bad readings on a channel, fraction, forgotten over about
+    /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = nothing came yet.
+    pub fn bad_share(&self, channel: Channel) -> Option<f64> {
+        self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
+    }
+
+    /// The channels that feed something: current, sensors, voltages, what the pack reports.
+    pub fn channels(&self) -> &[Channel] {
+        &self.channels
+    }
+
+    /// The highest temperature of the sensors whose last good reading is fresh, degrees C, and whether that is all of
+    /// them; `None` = no sensor is.
+    pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
+        let sensors = &self.state.signals[1..=self.sensors];
+        let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
+        let hottest = fresh.clone().flatten().reduce(f64::max)?;
+        Some((hottest, fresh.clone().all(|value| value.is_some())))
+    }
+
+    /// The last good value of a channel, when it is young enough.
+    pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
+        self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, limits(&self.config, channel)))
+    }
+
+    /// Whether a channel is lost: its latest reading is bad or too old, and so is its last good one. A single bad reading
+    /// loses nothing, and one from which nothing came yet is not lost as long as it may come.
+    pub fn is_lost(&self, channel: Channel, now: Timestamp) -> bool {
+        let is_bad = self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad());
+        is_bad && self.reported(channel, now).is_none()
+    }
+
+    /// Whether a good value that is young enough has come since the start or the last waking.
+    pub fn is_fresh(&self, channel: Channel, now: Timestamp) -> bool {
+        self.heard_since_waking(channel) && self.reported(channel, now).is_some()
+    }
+
+    /// Whether nothing, good or bad, came for longer than a value may be old.
+    pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
+        self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
+    }
+
+    /// The longest silence of a channel, s, and the largest share of bad readings, while something has come on every
+    /// channel and none is silent; `None` otherwise.
+    pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
+        let began = self.state.began?;
+        let (mut longest_s, mut share) = (0.0_f64, 0.0_f64);
+        let config = &self.config;
+        let voltages = 1 + self.sensors;
+        let reported = voltages + self.voltages;
+        let parts =
+            [(0..1, &config.current), (1..voltages, &config.temperature), (voltages..reported, &config.voltage)];
+        for (slots, limits) in parts {
+            let mut oldest = now;
+            for signal in &self.state.signals[slots] {
+                let (heard, bad_share) = signal.latest_since(began)?;
+                oldest = oldest.min(heard);
+                share = if bad_share > share { bad_share } else { share };
+            }
+            let silence_s = now.since(oldest);
+            if silence_s > limits.max_age_s {
+                return None;
+            }
+            longest_s = longest_s.max(silence_s);
+        }
+        for &channel in &self.channels[reported..] {
+            let heard = self.heard_since_waking(channel) && !self.is_silent(channel, now);
+            longest_s = longest_s.max(self.silence_s(channel, now).filter(|_| heard)?);
+            share = share.max(self.bad_share(channel).unwrap_or(0.0));
+        }
+        Some((longest_s, share))
+    }
+
+    /// Whether anything has come on the channel since the start or the last waking.
+    pub fn heard_since_waking(&self, channel: Channel) -> bool {
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].heard_at() >= self.state.began)
+    }
+
+    /// Whether every voltage has a good reading that is young enough.
+    pub fn voltages_fresh(&self, now: Timestamp) -> bool {
+        let first = 1 + self.sensors;
+        let voltages = &self.state.signals[first..first + self.voltages];
+        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good_at()?)));
+        oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
+    }
+
+    /// Whether any signal the estimates are made of is bad or stale.
+    pub fn any_bad(&self) -> bool {
+        self.any_lost() && self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
+    }
+
+    /// Whether any signal at all is bad or stale.
+    pub fn any_lost(&self) -> bool {
+        self.bad_signals > 0
+    }
+
+    /// Whether a stored state is of this many signals.
+    pub fn fits(&self, state: &SamplerState) -> bool {
+        state.signals.len() == self.state.signals.len()
+    }
+
+    /// Readings that came for channels that feed nothing.
+    pub fn unused_readings(&self) -> u64 {
+        self.state.unused_readings
+    }
+
+    /// Readings by what became of them.
+    pub fn reading_counts(&self) -> ReadingCounts {
+        ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
+    }
+
+    /// What is to be stored.
+    pub fn snapshot(&self) -> SamplerState {
+        self.state.clone()
+    }
+
+    /// Takes up a stored state (rebased by the caller): the time away is unmeasured like any other hole.
+    ///
+    /// # Errors
+    /// When it has another number of signals; the present state is kept.
+    pub fn restore(&mut self, state: &SamplerState) -> Result<(), SamplerShape> {
+        let (found, allowed) = (state.signals.len(), self.state.signals.len());
+        if found != allowed {
+            return Err(SamplerShape { found, allowed });
+        }
+        self.state.clone_from(state);
+        self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
+        (self.next_stale, self.moment.is_known) = (None, false);
+        Ok(())
+    }
+
+    #[inline]
+    fn renew_moment(&mut self, time: Timestamp) {
+        if self.moment.is_known && self.moment.time == time {
+            return;
+        }
+        let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
+        let cell_charge_as = totals.charge_as / self.strings();
+        let cell_current_a = self.cell_current_a(time);
+        self.moment = Moment { is_known: true, time, totals, cell_current_a, cell_charge_as, sensor: None };
+    }
+
+    /// The sample of a good voltage at the moment.
+    #[inline]
+    fn sample(&mut self, cell: CellIndex, voltage_v: f64) -> CellSample {
+        let time = self.moment.time;
+        let temperature_c = self.sensor_of(cell).and_then(|sensor| match self.moment.sensor {
+            Some((asked, value)) if asked == sensor => value,
+            _ => {
+                let value = self.sensor_c(sensor, time);
+                self.moment.sensor = Some((sensor, value));
+                value
+            }
+        });
+        CellSample {
+            time,
+            cell,
+            voltage_v,
+            current_a: self.moment.cell_current_a,
+            charge_as: self.moment.cell_charge_as,
+            unmeasured_s: self.moment.totals.unmeasured_s,
+            temperature_c,
+        }
+    }
+
+    fn sensor_of(&self, cell: CellIndex) -> Option<SensorIndex> {
+        *self.config.sensor_of_cell.get(cell.index())?
+    }
+
+    fn sensor_c(&self, sensor: SensorIndex, now: Timestamp) -> Option<f64> {
+        self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
+    }
+
+    /// Notes that time has come to `time`; the latest time, should it have gone back.
+    #[inline]
+    fn pass(&mut self, time: Timestamp) -> Timestamp {
+        if self.state.began.is_none() {
+            self.state.began = Some(time);
+            self.state.latest = time;
+            self.state.charge.begin(time);
+        }
+        self.state.latest = self.state.latest.max(time);
+        self.state.latest
+    }
+
+    fn since(&self, stamp: Option<Timestamp>, now: Timestamp) -> f64 {
+        // `None` < `Some`: what came before the start or the last sleep counts from there.
+        stamp.max(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
+    }
+
+    fn strings(&self) -> f64 {
+        f64::from(self.config.strings.max(1))
+    }
+
+    /// What a reading is divided by to become a cell's: a total voltage is shared by the cells in series.
+    #[inline]
+    fn divisor(&self, channel: Channel) -> f64 {
+        match (channel, self.config.voltage_source) {
+            (Channel::PackVoltage, VoltageSource::PackTotal { series }) => f64::from(series.max(1)),
+            (Channel::PackVoltage, VoltageSource::Cells)
+            | (
+                Channel::Current
+                | Channel::Temperature(_)
+                | Channel::CellVoltage(_)
+                | Channel::ReportedSoc
+                | Channel::ReportedSoh
+                | Channel::PackIdentity,
+                _,
+            ) => 1.0,
+        }
+    }
+
+    #[inline]
+    fn slot(&self, channel: Channel) -> Option<usize> {
+        let voltage = 1 + self.sensors;
+        match (channel, self.config.voltage_source) {
+            (Channel::Current, _) => Some(0),
+            (Channel::Temperature(sensor), _) => (sensor.index() < self.sensors).then(|| 1 + sensor.index()),
+            (Channel::PackVoltage, VoltageSource::PackTotal { .. }) => Some(voltage),
+            (Channel::CellVoltage(cell), VoltageSource::Cells) => {
+                (cell.0 < self.config.cells).then(|| voltage + cell.index())
+            }
+            (Channel::PackVoltage, VoltageSource::Cells)
+            | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
+            // Known by the monitor, not sampled.
+            | (Channel::PackIdentity, _) => None,
+            (Channel::ReportedSoc | Channel::ReportedSoh, _) => {
+                let first = voltage + self.voltages;
+                let found = self.channels[first..].iter().position(|reported| *reported == channel)?;
+                Some(first + found)
+            }
+        }
+    }
+}
+
+fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
+    match channel {
+        Channel::Current => &config.current,
+        Channel::Temperature(_) => &config.temperature,
+        Channel::PackVoltage | Channel::CellVoltage(_) | Channel::PackIdentity => &config.voltage,
+        Channel::ReportedSoc => config.reported_soc.as_ref().unwrap_or(&config.voltage),
+        Channel::ReportedSoh => config.reported_soh.as_ref().unwrap_or(&config.voltage),
+    }
+}
+
+/// Every channel that feeds something, in the order of the signals.
+fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
+    let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
+    let mut channels = vec![Channel::Current];
+    channels.extend((0..sensors).map(|sensor| Channel::Temperature(SensorIndex(narrow(sensor)))));
+    match config.voltage_source {
+        VoltageSource::Cells => channels.extend((0..config.cells).map(|cell| Channel::CellVoltage(CellIndex(cell)))),
+        VoltageSource::PackTotal { .. } => channels.push(Channel::PackVoltage),
+    }
+    channels.extend(config.reported_soc.map(|_| Channel::ReportedSoc));
+    channels.extend(config.reported_soh.map(|_| Channel::ReportedSoh));
+    channels
+}
+
+/// The clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
+/// on purpose, so only discharging counts for it; temperature and current should move while current flows.
+fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
+    match channel {
+        Channel::Current | Channel::Temperature(_) => totals.flowing_s,
+        Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
+        // Nothing is known of how they should move.
+        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => 0.0,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,255 @@
+//! Judges the readings of one signal: range, rate, stuck, stale.
+//!
+//! * **Range**: outside the limits is bad.
+//! * **Rate**: further from the last good value than the fastest plausible change allows is bad, unless
+//!   [`ACCEPT_AFTER`] readings in a row agree with each other: then the step was real (or the last good value was
+//!   wrong), and refusing it for ever would lock a healthy sensor out.
+//! * **Stuck**: exactly the same value for too long while it should move is bad until it moves. The caller passes
+//!   the clock that counts only the time in which it should.
+//! * **Stale**: no good value for too long.
+//!
+//! A fault found by the decoder passes through. A bad reading never becomes the value.
+
+use serde::{Deserialize, Serialize};
+
+use super::config::Limits;
+use crate::quantity::{Fault, Timestamp, InvalidState};
+
+/// Readings in a row that must agree on a new level: two could be one disturbance seen twice.
+pub const ACCEPT_AFTER: u32 = 3;
+
+/// Shortest time the rate is judged over, s: stamps of neighbouring frames jitter by about this much, and
+/// a change divided by no time would be infinitely fast.
+pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
+
+/// Readings after which an old one has lost most of its weight in the share of bad readings.
+pub const BAD_SHARE_READINGS: u32 = 100;
+
+/// A value and when it was measured.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+struct Stamped {
+    value: f64,
+    time: Timestamp,
+}
+
+/// What is known about one signal.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct Signal {
+    good: Option<Stamped>,
+    /// Latest reading refused for its rate, and how many in a row agree with it.
+    refused: Option<Stamped>,
+    refused_count: u32,
+    /// Value the signal rests at, and the stuck clock when it came to rest there.
+    rests_at: Option<f64>,
+    rests_since_s: f64,
+    /// When anything came, good or bad.
+    heard: Option<Timestamp>,
+    /// Why the signal is bad at present.
+    fault: Option<Fault>,
+    /// Bad readings since it turned bad.
+    bad_readings: u64,
+    /// Readings taken, up to [`BAD_SHARE_READINGS`].
+    readings: u32,
+    bad_share: f64,
+}
+
+/// Outcome of a reading: the judged value, and the state to tell when it changed (`Ok` = good again after so
+/// many bad readings).
+pub(super) struct Judged {
+    pub(super) value: Result<f64, Fault>,
+    pub(super) change: Option<Result<u64, Fault>>,
+    /// A step to another level that was refused before is believed now.
+    pub(super) is_new_level: bool,
+}
+
+impl Signal {
+    /// Takes a reading. `should_move_s` is the clock for the stuck check.
+    #[inline]
+    pub(super) fn handle(
+        &mut self,
+        time: Timestamp,
+        value: Result<f64, Fault>,
+        limits: &Limits,
+        should_move_s: f64,
+    ) -> Judged {
+        self.heard = Some(time);
+        let value = self.judge(time, value, limits, should_move_s);
+        self.count(value.is_err());
+        let is_new_level = value.is_ok() && self.refused_count >= ACCEPT_AFTER;
+        if let Ok(value) = value {
+            self.good = Some(Stamped { value, time });
+            self.refused_count = 0;
+        }
+        Judged { value, change: self.turn(value.err(), 1), is_new_level }
+    }
+
+    /// Takes a good reading of a signal that has been good for long, as [`handle`](Self::handle) would, with less to look
+    /// at; `false` and nothing changed when it may be anything else.
+    #[inline]
+    pub(super) fn take_ordinary(&mut self, time: Timestamp, value: f64, limits: &Limits, should_move_s: f64) -> bool {
+        let (Some(good), None, 0) = (self.good, self.fault, self.refused_count) else { return false };
+        // Also false for NaN.
+        let is_plausible = value >= limits.min && value <= limits.max;
+        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, Stamped { value, time }, rate)) {
+            return false;
+        }
+        if self.rests_at != Some(value) {
+            (self.rests_at, self.rests_since_s) = (Some(value), should_move_s);
+        } else if limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s) {
+            return false;
+        }
+        self.good = Some(Stamped { value, time });
+        self.heard = Some(time);
+        self.count(false);
+        true
+    }
+
+    /// Nothing good came for too long, on a signal that was good; says so.
+    pub(super) fn turn_stale(&mut self) -> Fault {
+        self.turn(Some(Fault::Stale), 0);
+        Fault::Stale
+    }
+
+    /// From when on the signal is called stale if nothing good comes: its age counts from when somebody began to listen.
+    pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
+        self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
+    }
+
+    /// Whether the signal is known to be bad.
+    pub(super) fn is_bad(&self) -> bool {
+        self.fault.is_some()
+    }
+
+    /// The last good value when it is young enough.
+    #[inline]
+    pub(super) fn fresh(&self, now: Timestamp, limits: &Limits) -> Option<f64> {
+        self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
+    }
+
+    /// When the last good value came.
+    pub(super) fn good_at(&self) -> Option<Timestamp> {
+        self.good.map(|good| good.time)
+    }
+
+    /// When anything came, good or bad.
+    pub(super) fn heard_at(&self) -> Option<Timestamp> {
+        self.heard
+    }
+
+    /// When anything came, and the share of bad readings; `None` = nothing since `began`.
+    #[inline]
+    pub(super) fn latest_since(&self, began: Timestamp) -> Option<(Timestamp, f64)> {
+        Some((self.heard.filter(|&heard| heard >= began)?, self.bad_share))
+    }
+
+    /// Share of bad readings, the recent ones weighing most; `None` before the first reading.
+    pub(super) fn bad_share(&self) -> Option<f64> {
+        (self.readings > 0).then_some(self.bad_share)
+    }
+
+    /// How old anything is has become unknown: start afresh, keep only whether the signal was bad.
+    pub(super) fn handle_gap(&mut self) {
+        *self = Self {
+            fault: self.fault,
+            bad_readings: self.bad_readings,
+            readings: self.readings,
+            bad_share: self.bad_share,
+            ..Self::default()
+        };
+    }
+
+    /// Whether a stored signal can be gone on with.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
+        let others = [self.rests_since_s, self.rests_at.unwrap_or(0.0), self.bad_share];
+        values.chain(others).try_for_each(|found| InvalidState::unless_number("a signal", found))
+    }
+
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        for stamped in [&mut self.good, &mut self.refused].into_iter().flatten() {
+            stamped.time = stamped.time.plus_nanos(by_nanos);
+        }
+        self.heard = self.heard.map(|stamp| stamp.plus_nanos(by_nanos));
+    }
+
+    #[inline]
+    fn judge(
+        &mut self,
+        time: Timestamp,
+        value: Result<f64, Fault>,
+        limits: &Limits,
+        should_move_s: f64,
+    ) -> Result<f64, Fault> {
+        let value = value?;
+        if !value.is_finite() {
+            return Err(Fault::NotFinite);
+        }
+        if value < limits.min || value > limits.max {
+            return Err(Fault::OutOfRange);
+        }
+        if self.is_stuck(value, limits, should_move_s) {
+            return Err(Fault::Stuck);
+        }
+        if self.is_too_fast(Stamped { value, time }, limits) {
+            return Err(Fault::RateTooHigh);
+        }
+        Ok(value)
+    }
+
+    #[inline]
+    fn is_stuck(&mut self, value: f64, limits: &Limits, should_move_s: f64) -> bool {
+        if self.rests_at != Some(value) {
+            self.rests_at = Some(value);
+            self.rests_since_s = should_move_s;
+        }
+        limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s)
+    }
+
+    #[inline]
+    fn is_too_fast(&mut self, reading: Stamped, limits: &Limits) -> bool {
+        let (Some(rate), Some(good)) = (limits.max_rate_per_s, self.good) else { return false };
+        if agree(good, reading, rate) {
+            return false;
+        }
+        let agrees = self.refused_count > 0 && self.refused.is_some_and(|last| agree(last, reading, rate));
+        self.refused_count = if agrees { self.refused_count + 1 } else { 1 };
+        self.refused = Some(reading);
+        self.refused_count < ACCEPT_AFTER
+    }
+
+    #[inline]
+    fn count(&mut self, bad: bool) {
+        self.readings = (self.readings + 1).min(BAD_SHARE_READINGS);
+        if !bad && self.bad_share == 0.0 {
+            return;
+        }
+        let now = if bad { 1.0 } else { 0.0 };
+        self.bad_share += (now - self.bad_share) / f64::from(self.readings);
+    }
+
+    #[inline]
+    fn turn(&mut self, fault: Option<Fault>, readings: u64) -> Option<Result<u64, Fault>> {
+        match (self.fault, fault) {
+            (None, None) => None,
+            (None, Some(fault)) => {
+                self.fault = Some(fault);
+                self.bad_readings = readings;
+                Some(Err(fault))
+            }
+            (Some(_), Some(_)) => {
+                self.bad_readings += readings;
+                None
+            }
+            (Some(_), None) => {
+                self.fault = None;
+                Some(Ok(self.bad_readings))
+            }
+        }
+    }
+}
+
+#[inline]
+fn agree(earlier: Stamped, later: Stamped, max_rate_per_s: f64) -> bool {
+    let dt_s = later.time.since(earlier.time).max(MIN_RATE_INTERVAL_S);
+    (later.value - earlier.value).abs() <= max_rate_per_s * dt_s
+}

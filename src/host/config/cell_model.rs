@@ -1,0 +1,206 @@
+//! Cell model files: TOML to a checked [`CellModel`], with every fault at once.
+//!
+//! A model is refused unless breakpoints rise strictly, SOC runs from 0 to 1, the open-circuit voltage rises
+//! strictly with SOC at every temperature, tables have no hole, and resistances, capacitances and capacities
+//! are positive.
+
+use std::path::Path;
+
+use super::document::{Document, Faults, Place};
+use super::schema::Presence::{Default, Optional, Required};
+use super::schema::{Section as _, SectionInfo, Walk, section};
+use super::setting::Allowed::{Above, Between, NotEmpty};
+use super::{ConfigFaults, ReadFile, read_text};
+use crate::cell::{Branch, CellModel, MAX_BRANCHES, Table, Thermal};
+
+const INF: f64 = f64::INFINITY;
+
+section! {
+    /// A cell type.
+    Head at "" {
+        /// Version of this layout.
+        format: u16, "", Between(1.0, 1.0), Required;
+        /// What people call the cell.
+        name: String, "", NotEmpty, Required;
+        /// Chemistry, for people.
+        chemistry: Option<String>, "", NotEmpty, Optional;
+        /// Capacity on the label, which SOH is relative to.
+        rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        /// Charge of a new cell from full to empty open-circuit voltage.
+        capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
+        /// How far the open-circuit curve shifts as the cell loses capacity: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
+        ocv_ageing_shift: f64, "", Between(0.0, 1.0), Default("0.0");
+        /// Lowest voltage under load.
+        voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
+        /// Highest voltage under charge.
+        voltage_max_v: f64, "V", Above(0.0, 100.0), Required;
+    }
+}
+
+section! {
+    /// The circuit over SOC and temperature. Two-dimensional tables have one row per temperature and one column per SOC.
+    Tables at "tables" {
+        /// SOC breakpoints, strictly rising from 0 to 1.
+        soc: Vec<f64>, "fraction", Between(0.0, 1.0), Required;
+        /// Temperature breakpoints, strictly rising.
+        temperature_c: Vec<f64>, "degrees C", Between(-100.0, 200.0), Required;
+        /// Open-circuit voltage, strictly rising along each row.
+        ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
+        /// Series resistance of a new cell.
+        r0_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` finds it. Without it the estimator's `model_error_v_sqrt_s` holds.
+        voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
+    }
+}
+
+section! {
+    /// A branch of a resistor and a capacitor in parallel, 1 to 3 of them.
+    BranchTables at "tables.branches" {
+        /// Resistance of a new cell.
+        r_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        /// Capacitance.
+        c_farad: Vec<Vec<f64>>, "F", Above(0.0, INF), Required;
+    }
+}
+
+section! {
+    /// The thermal model of one cell; without it there is no fallback for a stale temperature.
+    ThermalKeys at "thermal" {
+        /// Heat capacity.
+        heat_capacity_j_per_k: f64, "J/K", Above(0.0, 1e9), Required;
+        /// Thermal resistance to the surroundings.
+        resistance_k_per_w: f64, "K/W", Above(0.0, 1e9), Required;
+    }
+}
+
+/// Every table of a cell model file, in the order of the reference page.
+pub const SECTIONS: &[SectionInfo] = &[
+    SectionInfo::one::<Head>(),
+    SectionInfo::notes(
+        "provenance",
+        "Where the numbers come from: source, method, data, residuals. For people; any keys.",
+    ),
+    SectionInfo::one::<Tables>(),
+    SectionInfo::many::<BranchTables>(),
+    SectionInfo::one::<ThermalKeys>(),
+];
+
+/// Reads and checks a cell model file.
+///
+/// # Errors
+/// Every fault found, one line each.
+pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
+    let mut faults = Faults::default();
+    let model = load_with(path, &super::read_file, &mut faults);
+    model.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
+}
+
+/// As [`load`], through `read`; faults are noted beside those of other files.
+pub fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
+    let text = read_text(path, read, faults)?;
+    let document = Document::parse(&path.display().to_string(), &text, faults);
+    let mut walk = Walk::new(&document, SECTIONS, faults);
+    let head = walk.one::<Head>();
+    let tables = walk.one::<Tables>();
+    let branches = walk.many::<BranchTables>();
+    let thermal = walk.optional::<ThermalKeys>();
+    let written = walk.count(BranchTables::PATH);
+    if let Some(head) = &head {
+        check_head(head, faults);
+    }
+    let tables = tables?;
+    check_tables(&tables, faults);
+    if let Some(written) = written {
+        check_branch_count(&tables.place, written, faults);
+    }
+    check_branches(&tables, &branches, faults);
+    Some(model(head?, tables, branches, thermal))
+}
+
+fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Option<ThermalKeys>) -> CellModel {
+    let branch = |b: BranchTables| Branch { r_ohm: Table { values: b.r_ohm }, c_farad: Table { values: b.c_farad } };
+    CellModel {
+        name: head.name,
+        rated_capacity_ah: head.rated_capacity_ah,
+        capacity_ah: head.capacity_ah,
+        voltage_min_v: head.voltage_min_v,
+        voltage_max_v: head.voltage_max_v,
+        soc: tables.soc,
+        temperature_c: tables.temperature_c,
+        ocv_ageing_shift: head.ocv_ageing_shift,
+        ocv_v: Table { values: tables.ocv_v },
+        r0_ohm: Table { values: tables.r0_ohm },
+        branches: branches.into_iter().map(branch).collect(),
+        voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
+        thermal: thermal.map(|t| Thermal {
+            heat_capacity_j_per_k: t.heat_capacity_j_per_k,
+            resistance_k_per_w: t.resistance_k_per_w,
+        }),
+    }
+}
+
+fn check_head(head: &Head, faults: &mut Faults) {
+    if head.voltage_max_v <= head.voltage_min_v {
+        let what = format!("must be above voltage_min_v = {}", head.voltage_min_v);
+        head.place.fault(faults, "voltage_max_v", &what);
+    }
+}
+
+fn check_tables(tables: &Tables, faults: &mut Faults) {
+    let place = &tables.place;
+    if tables.soc.len() < 2 || tables.soc.first() != Some(&0.0) || tables.soc.last() != Some(&1.0) {
+        place.fault(faults, "soc", "must begin with 0 and end with 1");
+    }
+    if tables.temperature_c.is_empty() {
+        place.fault(faults, "temperature_c", "must have at least one temperature");
+    }
+    for (key, values) in [("soc", &tables.soc), ("temperature_c", &tables.temperature_c)] {
+        if let Some((a, b)) = first_not_rising(values) {
+            place.note(faults, key, &format!("{b} follows {a}, must rise strictly"));
+        }
+    }
+    check_shape(place, "ocv_v", &tables.ocv_v, tables, faults);
+    check_shape(place, "r0_ohm", &tables.r0_ohm, tables, faults);
+    if let Some(voltage_error_v) = &tables.voltage_error_v {
+        check_shape(place, "voltage_error_v", voltage_error_v, tables, faults);
+    }
+    for (row, t) in tables.ocv_v.iter().zip(&tables.temperature_c) {
+        if let Some((a, b)) = first_not_rising(row) {
+            place.note(faults, "ocv_v", &format!("{b} follows {a} at {t} degrees C, must rise strictly with soc"));
+        }
+    }
+}
+
+fn check_branch_count(place: &Place, written: usize, faults: &mut Faults) {
+    if written == 0 || written > MAX_BRANCHES {
+        let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
+        place.note(faults, "branches", &what);
+    }
+}
+
+fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Faults) {
+    for branch in branches {
+        check_shape(&branch.place, "r_ohm", &branch.r_ohm, tables, faults);
+        check_shape(&branch.place, "c_farad", &branch.c_farad, tables, faults);
+    }
+}
+
+/// No hole: as many rows as temperatures, as many columns as SOC breakpoints.
+fn check_shape(place: &Place, key: &str, rows: &[Vec<f64>], tables: &Tables, faults: &mut Faults) {
+    let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
+    if rows.len() != temperatures {
+        let what = format!("{} rows, must be {temperatures}, one per temperature_c", rows.len());
+        place.note(faults, key, &what);
+    }
+    for (number, row) in (1..).zip(rows) {
+        if row.len() != socs {
+            let what = format!("row {number} has {} values, must be {socs}, one per soc", row.len());
+            place.note(faults, key, &what);
+        }
+    }
+}
+
+/// The first neighbours that do not rise.
+fn first_not_rising(values: &[f64]) -> Option<(f64, f64)> {
+    values.windows(2).find(|pair| pair[1] <= pair[0]).map(|pair| (pair[0], pair[1]))
+}

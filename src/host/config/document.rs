@@ -1,0 +1,186 @@
+//! One TOML text with the lines its values stand on, and the list of everything found wrong.
+//!
+//! A fault reads `FILE:LINE: KEY = FOUND, must be ALLOWED`; nothing here stops at the first one.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+/// Longest piece of the file quoted in a fault, characters: enough to recognise it, short enough for one line.
+const MAX_QUOTE: usize = 48;
+/// Faults of syntax told one by one; more than these mean a file of another kind.
+const MAX_SYNTAX_FAULTS: usize = 10;
+
+/// Everything found wrong, in files of any kind.
+#[derive(Debug, Default)]
+pub struct Faults {
+    list: Vec<(String, usize, String)>,
+}
+
+impl Faults {
+    /// Notes `text` about line `line` of `file`; line 0 = the file as a whole.
+    pub fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
+        let fault = (file.to_owned(), line, text.into());
+        if !self.list.contains(&fault) {
+            self.list.push(fault);
+        }
+    }
+
+    /// How many faults there are.
+    pub fn len(&self) -> usize {
+        self.list.len()
+    }
+
+    /// Whether nothing was found.
+    pub fn is_empty(&self) -> bool {
+        self.list.is_empty()
+    }
+
+    /// One line each: the files in the order in which they first failed, each by line.
+    pub fn into_lines(self) -> Vec<String> {
+        let mut files: Vec<&str> = Vec::new();
+        for (file, _, _) in &self.list {
+            if !files.contains(&file.as_str()) {
+                files.push(file);
+            }
+        }
+        let mut sorted: Vec<_> = self.list.iter().collect();
+        sorted.sort_by_key(|(file, line, _)| (files.iter().position(|f| f == file), *line));
+        let show = |(file, line, text): &&(String, usize, String)| match line {
+            0 => format!("{file}: {text}"),
+            _ => format!("{file}:{line}: {text}"),
+        };
+        // A name in the file may hold a line break; a fault is one line all the same.
+        sorted.iter().map(|fault| show(fault).replace('\n', "\\n")).collect()
+    }
+}
+
+/// A TOML text and its name.
+#[derive(Debug)]
+pub struct Document<'t> {
+    /// As people named it.
+    pub file: String,
+    /// Whether the syntax is broken somewhere: what is missing may then stand in the broken part.
+    pub broken: bool,
+    text: &'t str,
+    root: DeTable<'t>,
+}
+
+impl<'t> Document<'t> {
+    /// Parses `text`. Syntax faults go to `faults`; what could be understood is kept, so that the rest of
+    /// the file is still checked.
+    pub fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
+        let (root, errors) = DeTable::parse_recoverable(text);
+        let document = Self { file: file.to_owned(), broken: !errors.is_empty(), text, root: root.into_inner() };
+        for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
+            let line = error.span().map_or(0, |span| document.line(&span));
+            faults.add(file, line, error.message().trim().replace('\n', ", "));
+        }
+        if let Some(error) = errors.get(MAX_SYNTAX_FAULTS) {
+            let line = error.span().map_or(0, |span| document.line(&span));
+            faults.add(file, line, format!("and {} more faults of syntax from here", errors.len() - MAX_SYNTAX_FAULTS));
+        }
+        document
+    }
+
+    /// The whole file as a table.
+    pub fn root(&self) -> &DeTable<'t> {
+        &self.root
+    }
+
+    /// Line, from 1, on which `span` begins.
+    pub fn line(&self, span: &Range<usize>) -> usize {
+        let before = self.text.as_bytes().get(..span.start).unwrap_or(self.text.as_bytes());
+        1 + before.iter().filter(|&&b| b == b'\n').count()
+    }
+
+    /// What stands at `span`, cut to one short line.
+    pub fn quote(&self, span: &Range<usize>) -> String {
+        let words: Vec<&str> = self.text.get(span.clone()).unwrap_or("").split_whitespace().collect();
+        shorten(&words.join(" "))
+    }
+
+    /// Whether the table at `span` is written `{ ... }`.
+    pub fn is_inline(&self, span: &Range<usize>) -> bool {
+        self.text.get(span.clone()).is_some_and(|text| text.starts_with('{'))
+    }
+
+    /// The place of a table: its path for people, its line, and where its keys stand.
+    pub fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> Place {
+        let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
+            let key: &Spanned<std::borrow::Cow<'_, str>> = key;
+            let found = match value.get_ref() {
+                DeValue::Table(_) if !self.is_inline(&value.span()) => "a table".to_owned(),
+                _ => self.quote(&value.span()),
+            };
+            (key.get_ref().to_string(), Spot { line: self.line(&key.span()), found })
+        };
+        Place { file: self.file.clone(), path: path.to_owned(), line, spots: table.iter().map(spot).collect() }
+    }
+}
+
+/// `text` cut to the length of a quotation.
+pub fn shorten(text: &str) -> String {
+    match text.char_indices().nth(MAX_QUOTE) {
+        Some((end, _)) => format!("{}...", &text[..end]),
+        None => text.to_owned(),
+    }
+}
+
+/// Where one key stands and what it says.
+#[derive(Debug, Clone, PartialEq)]
+struct Spot {
+    line: usize,
+    found: String,
+}
+
+/// Where a table stands, so that a later check can still name file, line, key and found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Place {
+    /// File as people named it.
+    pub file: String,
+    /// `input.current`, `alarm[2]`; empty for the top of the file.
+    pub path: String,
+    /// Line of the table's header.
+    pub line: usize,
+    spots: BTreeMap<String, Spot>,
+}
+
+impl Place {
+    /// Full name of a key of this table.
+    pub fn key(&self, key: &str) -> String {
+        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+    }
+
+    /// Whether the key is written in the file.
+    pub fn has(&self, key: &str) -> bool {
+        self.spots.contains_key(key)
+    }
+
+    /// What is written at a key, cut to one short line.
+    pub fn found(&self, key: &str) -> Option<&str> {
+        self.spots.get(key).map(|spot| spot.found.as_str())
+    }
+
+    /// Line of a key; of the table when the key is not written.
+    pub fn line_of(&self, key: &str) -> usize {
+        self.spots.get(key).map_or(self.line, |spot| spot.line)
+    }
+
+    /// Notes `KEY = FOUND, WHAT`.
+    pub fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
+        let name = self.key(key);
+        let text = match self.spots.get(key) {
+            Some(spot) => format!("{name} = {}, {what}", spot.found),
+            None => format!("{name} is not set, {what}"),
+        };
+        faults.add(&self.file, self.line_of(key), text);
+    }
+
+    /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.
+    pub fn note(&self, faults: &mut Faults, key: &str, what: &str) {
+        faults.add(&self.file, self.line_of(key), format!("{}: {what}", self.key(key)));
+    }
+}

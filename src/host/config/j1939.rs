@@ -1,0 +1,198 @@
+//! `[j1939]` and the `spn` of each alarm to a node's settings: its NAME, and each alarm as a trouble code.
+//!
+//! Nothing the node sends may be taken for an input or for a frame of `[output]`, and no two rules may share a code.
+
+use super::Config;
+use super::convert::Raw;
+use super::document::Faults;
+use super::keys::{Alarm, J1939};
+use super::resolve::Resolved;
+use crate::alarm::{Direction, Rule, Severity};
+use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
+use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
+use crate::quantity::BusIndex;
+
+/// First suspect parameter number left to makers (unverified: from memory of J1939-73); rules follow it by their numbers.
+const FIRST_MAKER_SPN: u32 = 520_192;
+
+/// Failure mode of a test: condition exists.
+const TEST_FMI: u8 = 31;
+
+/// The node; `None` = there is none (not configured, silenced, or faults noted).
+pub fn node(
+    raw: &Raw,
+    found: &[Resolved<'_>],
+    output: Option<&OutputConfig>,
+    faults: &mut Faults,
+) -> Option<J1939Config> {
+    let Some(keys) = &raw.j1939 else {
+        if !raw.broken && !raw.j1939_written {
+            for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
+                let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
+                alarm.place.fault(faults, key, "must have a table [j1939], without it nothing is told on J1939");
+            }
+        }
+        return None;
+    };
+    let alarms = codes(&raw.alarms, faults);
+    let bus = bus(raw, keys, faults);
+    let node = NodeConfig { name: name(keys, faults)?, address: address(keys, faults)? };
+    check_ids(keys, &node, bus?, found, output, faults);
+    let is_silenced = raw.output_written && raw.output.as_ref().is_some_and(|output| !output.enabled);
+    let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
+    let test_code = test_code.map_err(|error| keys.place.fault(faults, "test_spn", &error.to_string())).ok()?;
+    Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !is_silenced)
+}
+
+fn address(keys: &J1939, faults: &mut Faults) -> Option<u8> {
+    let address = u8::try_from(keys.address).ok().filter(|address| *address <= MAX_ADDRESS);
+    if address.is_none() {
+        keys.place.fault(faults, "address", &format!("must be 0 to {MAX_ADDRESS}"));
+    }
+    address
+}
+
+fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
+    // The keys' ranges are those of the fields; what does not fit a byte would be refused by the NAME as well.
+    let small = |number: u16| u8::try_from(number).unwrap_or(u8::MAX);
+    let fields = NameFields {
+        arbitrary_address_capable: false,
+        industry_group: small(keys.industry_group),
+        vehicle_system_instance: small(keys.vehicle_system_instance),
+        vehicle_system: small(keys.vehicle_system),
+        function: small(keys.function),
+        function_instance: small(keys.function_instance),
+        ecu_instance: small(keys.ecu_instance),
+        manufacturer_code: keys.manufacturer_code,
+        identity_number: keys.identity_number,
+    };
+    Name::new(&fields).map_err(|error| keys.place.fault(faults, error.field, &error.to_string())).ok()
+}
+
+fn bus(raw: &Raw, keys: &J1939, faults: &mut Faults) -> Option<BusIndex> {
+    let names = || raw.interfaces.iter().map(|i| i.name.as_str()).collect::<Vec<_>>().join(" or ");
+    let index = match &keys.interface {
+        Some(name) => raw.interfaces.iter().position(|interface| interface.name == *name),
+        None => (raw.interfaces.len() == 1).then_some(0),
+    };
+    if index.is_none() && raw.interfaces_whole && !raw.interfaces.is_empty() {
+        keys.place.fault(faults, "interface", &format!("must be {}", names()));
+    }
+    index.and_then(|index| u8::try_from(index).ok()).map(BusIndex)
+}
+
+/// The code of every threshold; `None` when one is faulty (noted).
+fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
+    let mut codes: Vec<(&Alarm, AlarmCode)> = Vec::new();
+    let mut is_good = true;
+    for alarm in alarms {
+        for (key, severity, _) in alarm.thresholds() {
+            let Some(own) = code(alarm, severity, faults) else {
+                is_good = false;
+                continue;
+            };
+            let same = |(other, of): &&(&Alarm, AlarmCode)| other.rule != alarm.rule && of.code == own.code;
+            if let Some((twin, _)) = codes.iter().find(same) {
+                let (line, path, fmi) = (twin.place.line, &twin.place.path, own.code.fmi());
+                let what =
+                    format!("must not give two rules one code, {path} in line {line} has it with FMI {fmi} ({key})");
+                alarm.place.fault(faults, "spn", &what);
+                is_good = false;
+            }
+            codes.push((alarm, own));
+        }
+    }
+    is_good.then(|| codes.into_iter().map(|(_, code)| code).collect())
+}
+
+fn code(alarm: &Alarm, severity: Severity, faults: &mut Faults) -> Option<AlarmCode> {
+    // The rule's number as in alarm frames.
+    let spn = alarm.spn.unwrap_or(FIRST_MAKER_SPN + u32::from(alarm.rule as u8));
+    let configured = alarm.fmi.and_then(|fmi| u8::try_from(fmi).ok());
+    let fmi = configured.unwrap_or_else(|| failure_mode(alarm.rule, severity));
+    match TroubleCode::new(spn, fmi, 0) {
+        Ok(code) => Some(AlarmCode { rule: alarm.rule, severity, code, lamp: lamp(severity) }),
+        Err(error) => {
+            alarm.place.fault(faults, "spn", &error.to_string());
+            None
+        }
+    }
+}
+
+/// Failure mode identifiers of J1939-73, appendix A.
+fn failure_mode(rule: Rule, severity: Severity) -> u8 {
+    match rule {
+        // Abnormal update rate; received network data in error; data erratic, intermittent or incorrect; condition exists.
+        Rule::InputMissing => 9,
+        Rule::BusFault => 19,
+        Rule::InputImplausible | Rule::BmsDisagrees => 2,
+        Rule::EstimateUntrusted | Rule::StoreFailed => 31,
+        Rule::CapacityLow
+        | Rule::UsableCapacityLow
+        | Rule::RechargePeriodLow
+        | Rule::ResistanceHigh
+        | Rule::SocLow
+        | Rule::TemperatureHigh
+        | Rule::CellImbalance
+        | Rule::RemainingLifeLow => match (rule.row().direction, severity) {
+            // Data valid, but beyond normal: least, moderately, most severe.
+            (Direction::Below, Severity::Info) => 17,
+            (Direction::Below, Severity::Warning) => 18,
+            (Direction::Below, Severity::Severe) => 1,
+            (Direction::Above, Severity::Info) => 15,
+            (Direction::Above, Severity::Warning) => 16,
+            (Direction::Above, Severity::Severe) => 0,
+        },
+    }
+}
+
+/// Never the malfunction lamp: that one is about emissions.
+fn lamp(severity: Severity) -> Lamp {
+    match severity {
+        Severity::Info => Lamp::Protect,
+        Severity::Warning => Lamp::Amber,
+        Severity::Severe => Lamp::Red,
+    }
+}
+
+/// No identifier of the node is one of an input or of a frame of `[output]` on its interface.
+fn check_ids(
+    keys: &J1939,
+    node: &NodeConfig,
+    bus: BusIndex,
+    found: &[Resolved<'_>],
+    output: Option<&OutputConfig>,
+    faults: &mut Faults,
+) {
+    let sent = node.sent_ids();
+    if let Some(input) = found.iter().find(|f| f.bus == bus && sent.contains(&f.message.id)) {
+        let (name, id) = (&input.message.name, input.message.id);
+        keys.place.fault(faults, "address", &format!("must not be the address of an input, {name} has {id}"));
+    }
+    let output = output.filter(|output| output.buses.contains(&bus));
+    if let Some(id) = output.and_then(|output| output.plan.ids().into_iter().find(|id| sent.contains(id))) {
+        let what = format!("must not be the address in the identifier of a frame of [output], {id}");
+        keys.place.fault(faults, "address", &what);
+    }
+}
+
+/// What the node is and tells, for people.
+pub fn words(config: &Config) -> Vec<String> {
+    let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
+    let interface = config.interfaces.get(j1939.bus.index()).map_or("", |interface| interface.name.as_str());
+    let [dm1, dm2, ..] = j1939.node.sent_ids();
+    let node = format!(
+        "address {} ({0:02X}) on {interface}, NAME {}; DM1 {dm1} every second and on change, DM2 {dm2} when asked for",
+        j1939.node.address, j1939.node.name
+    );
+    let alarms = j1939.alarms.iter().map(|AlarmCode { rule, severity, code, lamp }| {
+        let lamp = match lamp {
+            Lamp::None => "no lamp",
+            Lamp::Protect => "protect lamp",
+            Lamp::Amber => "amber lamp",
+            Lamp::Red => "red lamp",
+        };
+        format!("{} {}: SPN {}, FMI {}, {lamp}", rule.name(), severity.name(), code.spn(), code.fmi())
+    });
+    std::iter::once(node).chain(alarms).collect()
+}

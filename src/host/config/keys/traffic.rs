@@ -1,0 +1,163 @@
+//! The tables of what goes out, and of the commands that come in: frames, J1939, commands.
+
+use super::E2e;
+use crate::config::schema::Presence::{Default, Optional, Required};
+use crate::config::schema::section;
+use crate::config::setting::Allowed::{Any, Between, NotEmpty};
+
+section! {
+    /// A J1939 node beside the frames of `[output]`: it claims an address and tells alarms as trouble codes, in DM1 once a second and on every change, in DM2 when asked for.
+    /// Of a rule's alarms that share a parameter number the gravest is told. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
+    /// The NAME says who the node is: in a contest for the address the smaller one wins, and a node that loses falls silent.
+    J1939 at "j1939" {
+        /// Interface the node is on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// Address it claims, and keeps or loses: it never takes another one.
+        address: u16, "", Between(0.0, 253.0), Required;
+        /// Serial number in the NAME, unique among the maker's nodes.
+        identity_number: u32, "", Between(0.0, 2_097_151.0), Required;
+        /// The maker's number in the NAME, which SAE assigns.
+        manufacturer_code: u16, "", Between(0.0, 2047.0), Required;
+        /// What the node does, as SAE numbers it; 255 = not available.
+        function: u16, "", Between(0.0, 255.0), Default("255");
+        /// Which one of several nodes of this function.
+        function_instance: u16, "", Between(0.0, 31.0), Default("0");
+        /// Which one of several computers that share the function.
+        ecu_instance: u16, "", Between(0.0, 7.0), Default("0");
+        /// Vehicle system within the industry group; 127 = not available.
+        vehicle_system: u16, "", Between(0.0, 127.0), Default("127");
+        /// Which one of several equal vehicle systems.
+        vehicle_system_instance: u16, "", Between(0.0, 15.0), Default("0");
+        /// 0 global, 1 on-highway, 2 agriculture and forestry, 3 construction, 4 marine, 5 industrial.
+        industry_group: u16, "", Between(0.0, 7.0), Default("0");
+        /// Suspect parameter number that is told, with FMI 31 and no lamp, while `packwatch test-alarm` runs: a trouble code has no mark of a test of its own.
+        test_spn: u32, "", Between(1.0, 524_287.0), Default("524286");
+    }
+}
+
+section! {
+    /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent. `packwatch dbc` writes the DBC of the frames as they are configured.
+    Output at "output" {
+        /// Whether anything is sent.
+        enabled: bool, "", Any, Default("true");
+        /// Interfaces to send on. Without it: all.
+        interfaces: Option<Vec<String>>, "", NotEmpty, Optional;
+        /// DBC that lays the frames out, relative to this file. Without it: the built-in `packwatch.dbc`, with steps of Ah that fit the cell.
+        dbc: Option<String>, "", NotEmpty, Optional;
+    }
+}
+
+/// What the table of a frame says.
+#[derive(Debug, Clone, Copy)]
+pub struct FrameKeys<'a> {
+    /// Where it stands.
+    pub place: &'a crate::config::document::Place,
+    /// Identifier.
+    pub id: Option<u32>,
+    /// Whether it has 29 bits.
+    pub extended: bool,
+    /// Classic or FD.
+    pub fd: Option<bool>,
+    /// Bit rate switch.
+    pub brs: Option<bool>,
+    /// Period.
+    pub period_ms: Option<u32>,
+    /// Protection.
+    pub e2e: Option<E2e>,
+    /// Its data id.
+    pub data_id: Option<u16>,
+}
+
+/// Declares the table of a frame; every such table has these keys.
+macro_rules! frame_section {
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal) => {
+        section! {
+            $(#[doc = $about])+
+            $name at $path {
+                /// Identifier. Without it: the DBC's.
+                id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+                /// Whether `id` has 29 bits.
+                extended: bool, "", Any, Default("false");
+                /// Whether CAN FD frames carry it (the interface must have `fd = true` too). Without it: as the DBC says; the built-in one: classic frames.
+                fd: Option<bool>, "", Any, Optional;
+                /// Whether FD frames switch to the higher bit rate. Without it: as the DBC says; the built-in one: no.
+                brs: Option<bool>, "", Any, Optional;
+                /// Period. Without it: the DBC's cycle time, or else 1000 ms.
+                period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
+                /// AUTOSAR end-to-end protection: a checksum and a counter in the first bytes, profile 1 variant A or C (2 bytes) or profile 5 (3 bytes; the built-in layout then has 12 bytes and needs `fd = true`). Without it: as the DBC says; the built-in one: off.
+                e2e: Option<E2e>, "", Any, Optional;
+                /// Data id of the protection, which sender and receivers know; each protected frame has its own, with "1C" up to 0xFFF. Needed with `e2e`.
+                data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
+            }
+        }
+
+        impl $name {
+            /// What all tables of frames have in common.
+            pub fn frame(&self) -> FrameKeys<'_> {
+                FrameKeys {
+                    place: &self.place,
+                    id: self.id,
+                    extended: self.extended,
+                    fd: self.fd,
+                    brs: self.brs,
+                    period_ms: self.period_ms,
+                    e2e: self.e2e,
+                    data_id: self.data_id,
+                }
+            }
+        }
+    };
+}
+
+frame_section! {
+    /// The status frame: estimates.
+    OutputStatus at "output.status"
+}
+
+frame_section! {
+    /// The health frame: what was learned, all pages at once.
+    OutputHealth at "output.health"
+}
+
+frame_section! {
+    /// The alarm frame: at once on change, and one of the active alarms in each period.
+    OutputAlarm at "output.alarm"
+}
+
+section! {
+    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off unless switched on here, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not obeyed.
+    Commands at "commands" {
+        /// Whether commands from the bus are obeyed.
+        enabled: bool, "", Any, Default("false");
+        /// Interface the frame comes on. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// Identifier. Without it: the DBC's.
+        id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
+        /// Whether `id` has 29 bits.
+        extended: bool, "", Any, Default("false");
+        /// Whether CAN FD frames carry it. Without it: as the DBC says; the built-in one: classic frames.
+        fd: Option<bool>, "", Any, Optional;
+        /// Profile of the protection. Needed when commands are obeyed; "off" is refused then.
+        e2e: Option<E2e>, "", Any, Optional;
+        /// Data id of the protection. Needed with `e2e`.
+        data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
+        /// Frames that may be lost between two.
+        max_delta_counter: u16, "frames", Between(1.0, 14.0), Default("1");
+    }
+}
+
+impl Commands {
+    /// What all tables of frames have in common.
+    pub fn frame(&self) -> FrameKeys<'_> {
+        FrameKeys {
+            place: &self.place,
+            id: self.id,
+            extended: self.extended,
+            fd: self.fd,
+            brs: None,
+            period_ms: None,
+            e2e: self.e2e,
+            data_id: self.data_id,
+        }
+    }
+}

@@ -1,0 +1,165 @@
+//! End-to-end protection of inputs: `[[input.protected]]` to the guards of the core, and in words.
+
+use super::Config;
+use super::convert::Raw;
+use super::document::Faults;
+use super::keys::ProtectedInput;
+use super::resolve::{Resolved, bus_of};
+use super::schema::did_you_mean;
+use crate::can::MAX_DATA;
+use crate::can::dbc::{Message, Signal};
+use crate::can::e2e::{CheckConfig, Protection};
+use crate::can::guard::GuardConfig;
+
+/// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
+/// is not there is the fault of its name and not of another key.
+pub fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faults: &mut Faults) -> Vec<GuardConfig> {
+    let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
+    for keys in &raw.protected {
+        check_profile(keys, faults);
+        let Some(bus) = bus_of(raw, keys.interface.as_deref()) else { continue };
+        let inputs = found.iter().filter(|input| input.bus == bus && input.message.name == keys.message);
+        let inputs: Vec<_> = inputs.collect();
+        let Some(first) = inputs.first() else {
+            if inputs_whole {
+                let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
+                not_an_input(keys, there, faults);
+            }
+            continue;
+        };
+        if let Some(other) = inputs.iter().find(|input| input.message.id != first.message.id) {
+            let what = format!(
+                "must be one message, is {} in {} and {} in {}",
+                first.message.id, first.file, other.message.id, other.file
+            );
+            keys.place.fault(faults, "message", &what);
+        }
+        check_layout(keys, &inputs, faults);
+        let guard = guard(keys, first, bus);
+        if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
+            let what = format!("must be protected once, is also in line {}", twin.place.line_of("message"));
+            keys.place.fault(faults, "message", &what);
+        }
+        guards.push((guard, keys));
+    }
+    guards.into_iter().map(|(guard, _)| guard).collect()
+}
+
+fn guard(keys: &ProtectedInput, input: &Resolved<'_>, bus: crate::quantity::BusIndex) -> GuardConfig {
+    // The keys' ranges end at 255.
+    let byte = |key: u16| u8::try_from(key).unwrap_or(u8::MAX);
+    GuardConfig {
+        bus,
+        id: input.message.id,
+        check: CheckConfig {
+            protection: Protection { profile: keys.profile, data_id: keys.data_id },
+            max_delta_counter_init: byte(keys.max_delta_counter),
+            max_no_new_or_repeated_data: byte(keys.max_repeated),
+            sync_counter_init: byte(keys.sync_counter),
+        },
+        cycle_time_s: input.message.cycle_time_ms.map(|period_ms| f64::from(period_ms) / 1000.0),
+    }
+}
+
+/// What the keys say among themselves.
+fn check_profile(keys: &ProtectedInput, faults: &mut Faults) {
+    let profile = keys.profile;
+    if keys.data_id > profile.max_data_id() {
+        let what = format!("must be 0 to {:#X} with profile \"{}\"", profile.max_data_id(), profile.name());
+        keys.place.fault(faults, "data_id", &what);
+    }
+    if keys.max_delta_counter > u16::from(profile.max_counter()) {
+        let what = format!("must be 0 to {} with profile \"{}\"", profile.max_counter(), profile.name());
+        keys.place.fault(faults, "max_delta_counter", &what);
+    }
+}
+
+fn not_an_input<'n>(keys: &ProtectedInput, there: impl Iterator<Item = &'n str>, faults: &mut Faults) {
+    let what = "must be the message of a configured input on its interface";
+    let hint = did_you_mean(&keys.message, there);
+    keys.place.fault(faults, "message", &format!("{what}{hint}"));
+}
+
+/// The header must fit into the message, and no input, nor what decides whether an input is there, may lie in it.
+fn check_layout(keys: &ProtectedInput, inputs: &[&Resolved<'_>], faults: &mut Faults) {
+    let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
+    let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());
+    let length = usize::from(first.message.len_bytes);
+    if !(shortest..=longest).contains(&length) {
+        let what = format!(
+            "must have {shortest} to {longest} bytes with profile \"{}\", has {length} in {}",
+            profile.name(),
+            first.file
+        );
+        keys.place.fault(faults, "message", &what);
+    }
+    let mut told: Vec<&str> = Vec::new();
+    for input in inputs {
+        for signal in read_with(input.message, input.signal) {
+            if lies_in(signal, profile.header_mask()) && !told.contains(&signal.name.as_str()) {
+                told.push(&signal.name);
+                let what = format!(
+                    "must not lie in {}, which profile \"{}\" writes: {}.{} does",
+                    header_words(profile.header_mask()),
+                    profile.name(),
+                    input.message.name,
+                    signal.name
+                );
+                keys.place.fault(faults, "profile", &format!("inputs {what}"));
+            }
+        }
+    }
+}
+
+/// A signal and the multiplexors it depends on.
+fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
+    let selectors = signal.multiplex.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
+    selectors.chain([signal])
+}
+
+/// Whether a signal has a bit in these of the first bytes: then it does not read 0 there.
+fn lies_in(signal: &Signal, mask: [u8; 3]) -> bool {
+    let mut payload = [0; MAX_DATA];
+    payload[..mask.len()].copy_from_slice(&mask);
+    signal.layout.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
+}
+
+fn header_words(mask: [u8; 3]) -> &'static str {
+    match mask {
+        [0xFF, 0x0F, 0] => "byte 0 and the low half of byte 1",
+        [0xFF, 0xFF, 0] => "bytes 0 and 1",
+        _ => "bytes 0 to 2",
+    }
+}
+
+/// What is taken in, for people.
+pub fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
+    let monitor = &config.monitor;
+    let rate = monitor.flood.max_frames_per_s;
+    let mut words = vec![format!("at most {rate} frames a second of one identifier, a tenth of them at once")];
+    if monitor.guards.is_empty() {
+        words.push(
+            "no end-to-end protection: a damaged, repeated or old frame cannot be told from a good one".to_owned(),
+        );
+    }
+    if monitor.commands.is_none() {
+        words.push("commands of other ECUs are not taken".to_owned());
+    }
+    for guard in &monitor.guards {
+        let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));
+        let name = input.map_or("commands", |input| input.message.name.as_str());
+        let interface = config.interfaces.get(guard.bus.index()).map_or("", |interface| interface.name.as_str());
+        let Protection { profile, data_id } = guard.check.protection;
+        let missed = match guard.cycle_time_s {
+            Some(period_s) => format!("one missing is counted each {} ms", period_s * 1000.0),
+            None => "without a cycle time in the DBC missing ones are not counted".to_owned(),
+        };
+        words.push(format!(
+            "{name} ({} on {interface}): end-to-end protected, profile {}, data id {data_id:#06X}, {} lost in a row allowed, {missed}",
+            guard.id,
+            profile.name(),
+            guard.check.max_delta_counter_init,
+        ));
+    }
+    words
+}

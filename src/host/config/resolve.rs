@@ -1,0 +1,305 @@
+//! Configured signal names to signals of the DBC files.
+//!
+//! Every name must be found in exactly one of the files, every cell exactly once, and a signal longer than a
+//! classic frame only on an interface with `fd = true`. All faults are noted, none ends the search.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use super::convert::{Ranges, Raw, UNLIMITED};
+use super::document::Faults;
+use super::keys::{CellVoltageInput, Positive, SignalSource};
+use super::pattern::Pattern;
+use super::schema::did_you_mean;
+use super::{ReadFile, beside};
+use crate::can::dbc::{Database, Message, Signal};
+use crate::can::decode::{Binding, InputMap};
+use crate::can::signal::LayoutFault;
+use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+
+/// Most cell numbers named in one fault.
+const MAX_NAMED_CELLS: usize = 8;
+
+/// Longest identity, bits: what a reading tells apart.
+const MAX_IDENTITY_BITS: u16 = 53;
+
+/// The DBC files of a configuration.
+#[derive(Debug)]
+pub struct Databases {
+    files: Vec<(String, Database)>,
+}
+
+/// A configured signal, found.
+#[derive(Debug, Clone)]
+pub struct Resolved<'d> {
+    /// What it feeds.
+    pub channel: Channel,
+    /// Interface it comes on.
+    pub bus: BusIndex,
+    /// DBC it was found in.
+    pub file: &'d str,
+    /// Its message.
+    pub message: &'d Message,
+    /// The signal.
+    pub signal: &'d Signal,
+    /// Factor from the DBC's unit and sign to ours; negative when the bus counts charge positive.
+    pub scale: f64,
+    /// Added after it, in our unit and sign.
+    pub offset: f64,
+    /// Raw codes that mean "not available", the configuration's and the DBC's.
+    pub not_available: Vec<u64>,
+}
+
+impl Databases {
+    /// Reads the files; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
+    pub fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+        let mut files = Vec::new();
+        for name in names {
+            let path = beside(config, name);
+            files.push(read_dbc(&path, read, faults).map(|database| (name.clone(), database)));
+        }
+        let files = files.into_iter().collect::<Option<Vec<_>>>()?;
+        (!files.is_empty()).then_some(Self { files })
+    }
+
+    /// Every signal with its file and message.
+    pub fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
+        let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
+        messages.flat_map(|(file, message)| message.signals.iter().map(move |signal| (file, message, signal)))
+    }
+
+    fn file_names(&self) -> String {
+        let names: Vec<&str> = self.files.iter().map(|(file, _)| file.as_str()).collect();
+        names.join(" or ")
+    }
+}
+
+/// Reads one DBC, or notes why not.
+pub fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Database> {
+    let file = path.display().to_string();
+    let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
+    Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()
+}
+
+/// Finds every configured signal.
+pub fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faults) -> Vec<Resolved<'d>> {
+    let mut search = Search { raw, databases, faults, found: Vec::new() };
+    if let Some(current) = &raw.current {
+        let sign = match current.positive {
+            Positive::Charge => -1.0,
+            Positive::Discharge => 1.0,
+        };
+        search.one(Channel::Current, &current.source(), sign);
+    }
+    for (index, temperature) in (0..).zip(&raw.temperatures) {
+        search.one(Channel::Temperature(SensorIndex(index)), &temperature.source(), 1.0);
+    }
+    if let Some(voltage) = &raw.pack_voltage {
+        search.one(Channel::PackVoltage, &voltage.source(), 1.0);
+    }
+    if let Some(soc) = &raw.reported_soc {
+        search.one(Channel::ReportedSoc, &soc.source(), 1.0);
+    }
+    if let Some(soh) = &raw.reported_soh {
+        search.one(Channel::ReportedSoh, &soh.source(), 1.0);
+    }
+    if let Some(identity) = &raw.pack_identity {
+        search.one(Channel::PackIdentity, &identity.source(), 1.0);
+    }
+    if let (Some(voltage), Some(pack)) = (&raw.cell_voltage, &raw.pack) {
+        search.cells(voltage, pack.cells);
+    }
+    search.found
+}
+
+struct Search<'s, 'd> {
+    raw: &'s Raw,
+    databases: &'d Databases,
+    faults: &'s mut Faults,
+    found: Vec<Resolved<'d>>,
+}
+
+/// Where a name was found.
+type Hit<'d> = (&'d str, &'d Message, &'d Signal);
+
+impl<'d> Search<'_, 'd> {
+    /// A signal with a name of its own.
+    fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
+        let name = source.signal;
+        let hits: Vec<Hit<'d>> = self.databases.signals().filter(|(_, m, s)| is_named(name, m, s)).collect();
+        match hits[..] {
+            [] => self.not_found(source),
+            [hit] => self.add(channel, source, sign, hit),
+            [(first, ..), .., (last, ..)] => {
+                let what = format!("must be in one DBC file, is in {first} and {last}");
+                source.place.fault(self.faults, "signal", &what);
+            }
+        }
+    }
+
+    fn not_found(&mut self, source: &SignalSource<'_>) {
+        let what = format!("must be a signal (Message.Signal) of {}", self.databases.file_names());
+        let names: Vec<String> = self.databases.signals().map(|(_, m, s)| format!("{}.{}", m.name, s.name)).collect();
+        let hint = did_you_mean(source.signal, names.iter().map(String::as_str));
+        source.place.fault(self.faults, "signal", &(what + &hint));
+    }
+
+    /// The signals of all cells, by their pattern.
+    fn cells(&mut self, keys: &CellVoltageInput, cells: u16) {
+        let source = keys.source();
+        let pattern = match Pattern::parse(source.signal) {
+            Ok(pattern) => pattern,
+            Err(what) => return source.place.fault(self.faults, "signal", &what),
+        };
+        if !pattern.has_cell() && cells > 1 {
+            return source.place.fault(self.faults, "signal", "must have {n} in place of the cell's number");
+        }
+        let mut hits: BTreeMap<u32, Vec<Hit<'d>>> = BTreeMap::new();
+        for hit in self.databases.signals() {
+            if let Some(number) = pattern.fits(&format!("{}.{}", hit.1.name, hit.2.name)) {
+                hits.entry(number.unwrap_or(u32::from(keys.first))).or_default().push(hit);
+            }
+        }
+        if hits.is_empty() {
+            return self.not_found(&source);
+        }
+        let mut missing = Vec::new();
+        for (index, number) in (0..cells).zip(u32::from(keys.first)..) {
+            match hits.get(&number).map(Vec::as_slice) {
+                None | Some([]) => missing.push(number),
+                Some([hit]) => self.add(Channel::CellVoltage(CellIndex(index)), &source, 1.0, *hit),
+                Some([a, .., b]) => {
+                    let what = format!(
+                        "must give each cell one signal, {number} is {}.{} and {}.{}",
+                        a.1.name, a.2.name, b.1.name, b.2.name
+                    );
+                    source.place.fault(self.faults, "signal", &what);
+                }
+            }
+        }
+        if !missing.is_empty() {
+            let what = format!("must give every cell a signal, none for number {}", list(&missing));
+            source.place.fault(self.faults, "signal", &what);
+        }
+    }
+
+    fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, (file, message, signal): Hit<'d>) {
+        let Some(bus) = bus_of(self.raw, source.interface) else {
+            return; // an interface that is not there was noted by the cross checks
+        };
+        let full_name = format!("{}.{}", message.name, signal.name);
+        if let Err(error) = Binding::new(bus, message, signal, channel) {
+            source.place.fault(self.faults, "signal", &format!("{full_name} in {file} cannot be read: {error}"));
+        }
+        let fd = self.raw.interfaces.get(bus.index()).is_some_and(|interface| interface.fd);
+        if message.len_bytes > 8 && !fd {
+            let what = format!(
+                "message {} has {} bytes, must have fd = true on its interface",
+                message.name, message.len_bytes
+            );
+            source.place.fault(self.faults, "signal", &what);
+        }
+        if let Some(other) = self.found.iter().find(|f| f.bus == bus && std::ptr::eq(f.signal, signal)) {
+            let what = format!("must not be used twice, is also {}", channel_words(other.channel));
+            source.place.fault(self.faults, "signal", &what);
+        }
+        if channel == Channel::PackIdentity && signal.layout.length_bits > MAX_IDENTITY_BITS {
+            let what =
+                format!("{full_name} has {} bits, must have at most {MAX_IDENTITY_BITS}", signal.layout.length_bits);
+            source.place.fault(self.faults, "signal", &what);
+        }
+        let largest = u64::MAX >> (64 - u32::from(signal.layout.length_bits.clamp(1, 64)));
+        if source.not_available.iter().any(|&code| code > largest) {
+            let what = format!("must be 0 to {largest:#X}, the codes of {full_name}");
+            source.place.fault(self.faults, "not_available", &what);
+        }
+        let mut not_available = signal.not_available_codes();
+        not_available.extend(source.not_available.iter().filter(|code| **code <= largest));
+        not_available.sort_unstable();
+        not_available.dedup();
+        let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
+        let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
+        let (scale, offset) = (sign * usual_scale, sign * source.offset);
+        self.found.push(Resolved { channel, bus, file, message, signal, scale, offset, not_available });
+    }
+}
+
+/// The interface a table names, the first when it names none; `None` = not there (noted by the cross checks).
+pub fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
+    let index = match interface {
+        Some(name) => raw.interfaces.iter().position(|interface| interface.name == name)?,
+        None => 0,
+    };
+    u8::try_from(index).ok().map(BusIndex)
+}
+
+fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
+    full_name.strip_prefix(message.name.as_str()).and_then(|rest| rest.strip_prefix('.')) == Some(signal.name.as_str())
+}
+
+/// What a channel is, for people (cells and sensors from 1).
+pub fn channel_words(channel: Channel) -> String {
+    match channel {
+        Channel::Current => "pack current".to_owned(),
+        Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
+        Channel::PackVoltage => "pack voltage".to_owned(),
+        Channel::CellVoltage(cell) => format!("cell {} voltage", cell.0 + 1),
+        Channel::ReportedSoc => "reported SOC".to_owned(),
+        Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
+    }
+}
+
+fn list(numbers: &[u32]) -> String {
+    let mut words: Vec<String> = numbers.iter().take(MAX_NAMED_CELLS).map(u32::to_string).collect();
+    if numbers.len() > MAX_NAMED_CELLS {
+        words.push(format!("... ({} in all)", numbers.len()));
+    }
+    words.join(", ")
+}
+
+impl Resolved<'_> {
+    /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
+    pub fn binding(&self) -> Result<Binding, LayoutFault> {
+        let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
+        binding.scale = self.scale;
+        binding.offset = self.offset;
+        binding.not_available.clone_from(&self.not_available);
+        Ok(binding)
+    }
+
+    /// The DBC's range in our unit and sign; infinite when it gives none.
+    pub fn range(&self) -> (f64, f64) {
+        let layout = &self.signal.layout;
+        if !layout.has_range() {
+            return UNLIMITED;
+        }
+        let (a, b) = (layout.minimum * self.scale + self.offset, layout.maximum * self.scale + self.offset);
+        (a.min(b), a.max(b))
+    }
+}
+
+/// The decoder's map; `None` when a layout cannot be read (noted when it was found).
+pub fn input_map(found: &[Resolved<'_>]) -> Option<InputMap> {
+    let bindings: Result<Vec<_>, _> = found.iter().map(Resolved::binding).collect();
+    bindings.ok().map(InputMap::new)
+}
+
+/// The widest range the DBC gives each kind of value; a total voltage counts per cell.
+pub fn ranges(found: &[Resolved<'_>], series: u16) -> Ranges {
+    let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
+        let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(Resolved::range);
+        let widest = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))).unwrap_or(UNLIMITED);
+        (widest.0 / divisor, widest.1 / divisor)
+    };
+    let voltage_v = if found.iter().any(|resolved| resolved.channel == Channel::PackVoltage) {
+        widest(|channel| channel == Channel::PackVoltage, f64::from(series))
+    } else {
+        widest(|channel| matches!(channel, Channel::CellVoltage(_)), 1.0)
+    };
+    Ranges {
+        current_a: widest(|channel| channel == Channel::Current, 1.0),
+        voltage_v,
+        temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),
+    }
+}

@@ -1,0 +1,384 @@
+//! What a key is: meaning, unit, type, range and default in one line; reading, faults and the reference
+//! page all come from that line.
+//!
+//! A table of the file is declared with [`section!`]; [`Walk`] reads declared tables from a document and
+//! notes everything wrong: missing, unknown, of the wrong type, out of range.
+
+use std::collections::BTreeSet;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::document::{Document, Faults, Place};
+use super::setting::{Allowed, Setting, Wrong};
+
+/// What happens when a key is not written.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Presence {
+    /// It is a fault.
+    Required,
+    /// The program goes without; the key's text says what then holds.
+    Optional,
+    /// This TOML text stands in.
+    Default(&'static str),
+}
+
+/// One key.
+#[derive(Debug)]
+pub struct Key {
+    /// As written.
+    pub name: &'static str,
+    /// What it means.
+    pub about: &'static str,
+    /// Unit, or empty.
+    pub unit: &'static str,
+    /// Its type in words.
+    pub kind: &'static str,
+    /// Words it may be, when it is a choice.
+    pub choices: &'static [&'static str],
+    /// Its range.
+    pub allowed: Allowed,
+    /// What happens without it.
+    pub presence: Presence,
+}
+
+impl Key {
+    /// The range for people; empty when anything of the type goes.
+    pub fn range(&self) -> String {
+        if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
+    }
+
+    /// What must be written, type included.
+    pub fn must_be(&self) -> String {
+        let range = self.range();
+        if self.allowed == Allowed::NotEmpty {
+            return format!("must be {} that is not empty", self.kind);
+        }
+        let unit = if self.unit.is_empty() { String::new() } else { format!(" ({})", self.unit) };
+        match (self.choices.is_empty(), range.is_empty()) {
+            (false, _) => format!("must be {range}"),
+            (true, true) => format!("must be {}{unit}", self.kind),
+            (true, false) => format!("must be {}, {range}{unit}", self.kind),
+        }
+    }
+
+    /// What must be written, for a value of the right type.
+    fn must_be_in_range(&self) -> String {
+        match self.range() {
+            range if range.is_empty() || self.allowed == Allowed::NotEmpty => self.must_be(),
+            range => format!("must be {range}"),
+        }
+    }
+}
+
+/// A declared table of a file.
+pub trait Section: Sized {
+    /// Dotted path; empty for the top of the file.
+    const PATH: &'static str;
+    /// What the table is for.
+    const ABOUT: &'static str;
+    /// Its keys.
+    const KEYS: &'static [Key];
+    /// Reads it; `None` when a key is bad (noted in the faults).
+    fn read(table: &mut TableReader<'_>) -> Option<Self>;
+}
+
+/// What the unknown-key check and the reference page know of a table.
+#[derive(Debug)]
+pub struct SectionInfo {
+    /// Dotted path.
+    pub path: &'static str,
+    /// Whether it is written `[[path]]`, any number of times.
+    pub many: bool,
+    /// What the table is for.
+    pub about: &'static str,
+    /// Its keys; `None` = anything goes (notes for people).
+    pub keys: Option<&'static [Key]>,
+}
+
+impl SectionInfo {
+    /// A table written once.
+    pub const fn one<S: Section>() -> Self {
+        Self { path: S::PATH, many: false, about: S::ABOUT, keys: Some(S::KEYS) }
+    }
+
+    /// A table written any number of times.
+    pub const fn many<S: Section>() -> Self {
+        Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
+    }
+
+    /// A table for people, never read.
+    pub const fn notes(path: &'static str, about: &'static str) -> Self {
+        Self { path, many: false, about, keys: None }
+    }
+}
+
+/// Declares a table of a file: the struct, its keys and how it is read.
+///
+/// ```text
+/// section! {
+///     /// What the table is for.
+///     Pack at "pack" {
+///         /// What the key means.
+///         cells: u16, "", Allowed::Between(1.0, 1024.0), Required;
+///     }
+/// }
+/// ```
+macro_rules! section {
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal {
+        $( $(#[doc = $doc:literal])+ $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr; )*
+    }) => {
+        $(#[doc = $about])+
+        #[derive(Debug, Clone)]
+        #[allow(dead_code, reason = "some keys are for people only, and not every table is checked again at its place")]
+        pub struct $name {
+            /// Where it stands in the file.
+            pub place: $crate::config::document::Place,
+            $( $(#[doc = $doc])+ pub $key: $type, )*
+        }
+
+        impl $crate::config::schema::Section for $name {
+            const PATH: &'static str = $path;
+            const ABOUT: &'static str = concat!($($about),+);
+            const KEYS: &'static [$crate::config::schema::Key] = &[$(
+                $crate::config::schema::Key {
+                    name: stringify!($key),
+                    about: concat!($($doc),+),
+                    unit: $unit,
+                    kind: <$type as $crate::config::setting::Setting>::KIND,
+                    choices: <$type as $crate::config::setting::Setting>::CHOICES,
+                    allowed: $allowed,
+                    presence: $presence,
+                },
+            )*];
+
+            fn read(table: &mut $crate::config::schema::TableReader<'_>) -> Option<Self> {
+                let mut keys = Self::KEYS.iter();
+                $( let $key: Option<$type> = keys.next().and_then(|key| table.setting(key)); )*
+                Some(Self { place: table.place.clone(), $( $key: $key?, )* })
+            }
+        }
+    };
+}
+pub(crate) use section;
+
+/// Reads the keys of one table.
+pub struct TableReader<'a> {
+    document: &'a Document<'a>,
+    broken: bool,
+    table: Option<&'a DeTable<'a>>,
+    /// Where the table stands.
+    pub place: Place,
+    faults: &'a mut Faults,
+}
+
+impl TableReader<'_> {
+    /// The value of `key`, its default, or `None` with a fault noted.
+    pub fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
+        let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
+            return self.absent(key);
+        };
+        match T::read(value, &key.allowed) {
+            Ok(setting) => Some(setting),
+            Err(wrong) => {
+                let what = match &wrong {
+                    Wrong::Type(_) => key.must_be(),
+                    Wrong::Range(_) => key.must_be_in_range(),
+                };
+                let (Wrong::Type(span) | Wrong::Range(span)) = wrong;
+                let found = match value.get_ref() {
+                    DeValue::Table(_) if !self.document.is_inline(&value.span()) => "a table".to_owned(),
+                    _ => self.document.quote(&span),
+                };
+                let text = format!("{} = {found}, {what}", self.place.key(key.name));
+                self.faults.add(&self.document.file, self.document.line(&span), text);
+                None
+            }
+        }
+    }
+
+    fn absent<T: Setting>(&mut self, key: &Key) -> Option<T> {
+        match key.presence {
+            Presence::Optional => T::absent(),
+            Presence::Default(text) => {
+                let value = DeValue::parse(text).ok()?;
+                T::read(&value, &key.allowed).ok()
+            }
+            Presence::Required if self.broken => None,
+            Presence::Required => {
+                let text = format!("{} is missing, {}", self.place.key(key.name), key.must_be());
+                self.faults.add(&self.document.file, self.place.line, text);
+                None
+            }
+        }
+    }
+}
+
+/// Reads the declared tables of one document.
+pub struct Walk<'a> {
+    document: &'a Document<'a>,
+    /// Whether syntax or tables are broken somewhere, so that what is not found may still be there: then nothing
+    /// is called missing.
+    pub broken: bool,
+    faults: &'a mut Faults,
+}
+
+impl<'a> Walk<'a> {
+    /// A walk that has checked the document for unknown keys.
+    pub fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
+        let mut walk = Self { document, broken: document.broken, faults };
+        walk.refuse_unknown("", "", document.root(), known);
+        walk
+    }
+
+    /// A table that is always read: without it in the file its required keys are missing.
+    pub fn one<S: Section>(&mut self) -> Option<S> {
+        if S::PATH.is_empty() {
+            let root = self.document.root();
+            return self.read(S::PATH, 1, Some(root));
+        }
+        match self.find(S::PATH) {
+            None => self.read(S::PATH, self.line_above(S::PATH), None),
+            Some(value) => match value.get_ref() {
+                DeValue::Table(table) => self.read(S::PATH, self.document.line(&value.span()), Some(table)),
+                _ => None, // noted by the check for unknown keys
+            },
+        }
+    }
+
+    /// A table that may be left out.
+    pub fn optional<S: Section>(&mut self) -> Option<S> {
+        if self.has::<S>() { self.one() } else { None }
+    }
+
+    /// A table that may be written any number of times; faulty ones are left out (and noted).
+    pub fn many<S: Section>(&mut self) -> Vec<S> {
+        let Some(DeValue::Array(items)) = self.find(S::PATH).map(Spanned::get_ref) else {
+            return Vec::new();
+        };
+        let mut sections = Vec::new();
+        for (index, item) in items.iter().enumerate() {
+            if let DeValue::Table(table) = item.get_ref() {
+                let path = format!("{}[{}]", S::PATH, index + 1);
+                sections.extend(self.read(&path, self.document.line(&item.span()), Some(table)));
+            }
+        }
+        sections
+    }
+
+    /// Whether the table is in the file.
+    pub fn has<S: Section>(&self) -> bool {
+        self.find(S::PATH).is_some()
+    }
+
+    /// How many tables `[[path]]` are written; `None` when something else stands there.
+    pub fn count(&self, path: &str) -> Option<usize> {
+        match self.find(path).map(Spanned::get_ref) {
+            None => Some(0),
+            Some(DeValue::Array(items)) => Some(items.len()),
+            Some(_) => None,
+        }
+    }
+
+    /// The text at a full path, whatever else its table says.
+    pub fn text(&self, path: &str) -> Option<String> {
+        self.find(path)?.get_ref().as_str().map(str::to_owned)
+    }
+
+    /// Line of the table that the table at `path`, which is not written, would be in.
+    fn line_above(&self, path: &str) -> usize {
+        let above = path.rsplit_once('.').and_then(|(above, _)| self.find(above));
+        above.map_or(1, |value| self.document.line(&value.span()))
+    }
+
+    fn find(&self, path: &str) -> Option<&'a Spanned<DeValue<'a>>> {
+        let mut parts = path.split('.');
+        let mut value = self.document.root().get(parts.next()?)?;
+        for part in parts {
+            let DeValue::Table(table) = value.get_ref() else { return None };
+            value = table.get(part)?;
+        }
+        Some(value)
+    }
+
+    fn read<S: Section>(&mut self, path: &str, line: usize, table: Option<&'a DeTable<'a>>) -> Option<S> {
+        let nothing = DeTable::new();
+        let place = self.document.place(path, line, table.unwrap_or(&nothing));
+        S::read(&mut TableReader { document: self.document, broken: self.broken, table, place, faults: self.faults })
+    }
+
+    /// Notes every key of `table` that `known` does not have. `schema` is the table's path in the schema,
+    /// `shown` the one for people (with the number of a repeated table).
+    fn refuse_unknown(&mut self, schema: &str, shown: &str, table: &'a DeTable<'a>, known: &[SectionInfo]) {
+        let here = known.iter().find(|info| info.path == schema);
+        if here.is_some_and(|info| info.keys.is_none()) {
+            return;
+        }
+        let keys = here.and_then(|info| info.keys).unwrap_or(&[]);
+        let tables = tables_below(schema, known);
+        for (name, value) in table.iter() {
+            let (key, line) = (name.get_ref().as_ref(), self.document.line(&name.span()));
+            let shown_key = join(shown, key);
+            if tables.contains(key) {
+                self.table_below(&join(schema, key), &shown_key, value, known);
+            } else if !keys.iter().any(|k| k.name == key) {
+                let hint = did_you_mean(key, keys.iter().map(|k| k.name).chain(tables.iter().copied()));
+                self.faults.add(&self.document.file, line, format!("{shown_key} is not a known key{hint}"));
+            }
+        }
+    }
+
+    /// The value where the schema has a table.
+    fn table_below(&mut self, schema: &str, shown: &str, value: &'a Spanned<DeValue<'a>>, known: &[SectionInfo]) {
+        let line = self.document.line(&value.span());
+        let many = known.iter().any(|info| info.path == schema && info.many);
+        match value.get_ref() {
+            DeValue::Table(table) if !many => self.refuse_unknown(schema, shown, table, known),
+            DeValue::Array(items) if many && items.iter().all(|item| item.get_ref().is_table()) => {
+                for (index, item) in items.iter().enumerate() {
+                    if let DeValue::Table(table) = item.get_ref() {
+                        self.refuse_unknown(schema, &format!("{shown}[{}]", index + 1), table, known);
+                    }
+                }
+            }
+            other => {
+                self.broken = true;
+                let found = match other {
+                    DeValue::Table(_) => format!("[{schema}]"),
+                    DeValue::Array(items) if items.iter().any(|item| item.get_ref().is_table()) => {
+                        format!("[[{schema}]]")
+                    }
+                    _ => self.document.quote(&value.span()),
+                };
+                let must_be = if many { format!("tables [[{schema}]]") } else { format!("one table [{schema}]") };
+                self.faults.add(&self.document.file, line, format!("{shown} = {found}, must be {must_be}"));
+            }
+        }
+    }
+}
+
+/// The names that continue `path` towards a known table.
+fn tables_below<'k>(path: &str, known: &'k [SectionInfo]) -> BTreeSet<&'k str> {
+    let below = |info: &'k SectionInfo| match path {
+        "" => Some(info.path),
+        _ => info.path.strip_prefix(path)?.strip_prefix('.'),
+    };
+    let first = |rest: &'k str| rest.split('.').next().filter(|name| !name.is_empty());
+    known.iter().filter_map(below).filter_map(first).collect()
+}
+
+fn join(path: &str, key: &str) -> String {
+    if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") }
+}
+
+/// `, did you mean X` for the nearest of `names`, or nothing when none is near.
+pub fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
+    /// Jaro-Winkler similarity below which a hint confuses more than it helps.
+    const NEAR: f64 = 0.8;
+    let near = |name: &'n str| (strsim::jaro_winkler(&found.to_lowercase(), &name.to_lowercase()), name);
+    let best = names.map(near).max_by(|a, b| a.0.total_cmp(&b.0));
+    match best {
+        Some((similarity, name)) if similarity >= NEAR => format!(", did you mean {name}"),
+        _ => String::new(),
+    }
+}

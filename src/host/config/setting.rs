@@ -1,0 +1,219 @@
+//! The types a key may have: how each is read from TOML and what range it may be given.
+
+use std::fmt;
+use std::ops::{Range, RangeInclusive};
+
+use toml::Spanned;
+use toml::de::{DeInteger, DeValue};
+
+/// The range of a key's value; of each element when the value is a list.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Allowed {
+    /// Anything of the type (numbers must still be finite).
+    Any,
+    /// A number from the first to the second, both included.
+    Between(f64, f64),
+    /// A number above the first, up to and including the second.
+    Above(f64, f64),
+    /// A text or list that is not empty.
+    NotEmpty,
+}
+
+impl Allowed {
+    fn has(&self, number: f64) -> bool {
+        number.is_finite()
+            && match *self {
+                Self::Any | Self::NotEmpty => true,
+                Self::Between(low, high) => low <= number && number <= high,
+                Self::Above(low, high) => low < number && number <= high,
+            }
+    }
+}
+
+impl fmt::Display for Allowed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Any => Ok(()),
+            Self::Between(low, high) if low == high => write!(f, "{low}"),
+            Self::Between(low, f64::INFINITY) => write!(f, "{low} or more"),
+            Self::Between(low, high) => write!(f, "{low} to {high}"),
+            Self::Above(low, f64::INFINITY) => write!(f, "above {low}"),
+            Self::Above(low, high) => write!(f, "above {low} and at most {high}"),
+            Self::NotEmpty => write!(f, "not empty"),
+        }
+    }
+}
+
+/// Why a value is refused, and where exactly.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Wrong {
+    /// Not the key's type.
+    Type(Range<usize>),
+    /// The type, but not in the range.
+    Range(Range<usize>),
+}
+
+/// A type a key may have.
+pub trait Setting: Sized {
+    /// The type in words.
+    const KIND: &'static str;
+    /// The words it may be, when it is a choice.
+    const CHOICES: &'static [&'static str] = &[];
+    /// Reads and checks a value.
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong>;
+    /// What stands for a key that is not written and has no default.
+    fn absent() -> Option<Self> {
+        None
+    }
+}
+
+impl<T: Setting> Setting for Option<T> {
+    const KIND: &'static str = T::KIND;
+    const CHOICES: &'static [&'static str] = T::CHOICES;
+
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+        T::read(value, allowed).map(Some)
+    }
+
+    fn absent() -> Option<Self> {
+        Some(None)
+    }
+}
+
+impl Setting for bool {
+    const KIND: &'static str = "true or false";
+
+    fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
+        match value.get_ref() {
+            DeValue::Boolean(value) => Ok(*value),
+            _ => Err(Wrong::Type(value.span())),
+        }
+    }
+}
+
+impl Setting for f64 {
+    const KIND: &'static str = "a number";
+
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+        let number = match value.get_ref() {
+            DeValue::Float(float) => float.as_str().parse::<f64>().map_err(|_| Wrong::Type(value.span()))?,
+            DeValue::Integer(integer) => whole(integer).ok_or_else(|| Wrong::Range(value.span()))? as f64,
+            _ => return Err(Wrong::Type(value.span())),
+        };
+        if allowed.has(number) { Ok(number) } else { Err(Wrong::Range(value.span())) }
+    }
+}
+
+/// The number an integer in any of TOML's bases stands for; `None` when it does not fit.
+fn whole(integer: &DeInteger<'_>) -> Option<i128> {
+    i128::from_str_radix(integer.as_str(), integer.radix()).ok()
+}
+
+fn read_whole<T: TryFrom<i128>>(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<T, Wrong> {
+    let DeValue::Integer(integer) = value.get_ref() else {
+        return Err(Wrong::Type(value.span()));
+    };
+    let number = whole(integer).filter(|&number| allowed.has(number as f64));
+    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| Wrong::Range(value.span()))
+}
+
+macro_rules! whole_numbers {
+    ($($type:ty),+) => {$(
+        impl Setting for $type {
+            const KIND: &'static str = "a whole number";
+
+            fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+                read_whole(value, allowed)
+            }
+        }
+    )+};
+}
+whole_numbers!(u16, u32, u64);
+
+impl Setting for String {
+    const KIND: &'static str = "a text";
+
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+        match value.get_ref() {
+            DeValue::String(text) if *allowed == Allowed::NotEmpty && text.trim().is_empty() => {
+                Err(Wrong::Range(value.span()))
+            }
+            DeValue::String(text) => Ok(text.to_string()),
+            _ => Err(Wrong::Type(value.span())),
+        }
+    }
+}
+
+macro_rules! lists {
+    ($($type:ty, $kind:literal;)+) => {$(
+        impl Setting for Vec<$type> {
+            const KIND: &'static str = $kind;
+
+            fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+                match value.get_ref() {
+                    DeValue::Array(items) if *allowed == Allowed::NotEmpty && items.is_empty() => {
+                        Err(Wrong::Range(value.span()))
+                    }
+                    DeValue::Array(items) => items.iter().map(|item| <$type>::read(item, allowed)).collect(),
+                    _ => Err(Wrong::Type(value.span())),
+                }
+            }
+        }
+    )+};
+}
+lists! {
+    String, "a list of texts";
+    u64, "a list of whole numbers";
+    f64, "a list of numbers";
+    Vec<f64>, "a list of lists of numbers";
+}
+
+/// Cell numbers as people write them: `"1-12, 15"`, counted from 1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CellRanges(pub Vec<RangeInclusive<u16>>);
+
+impl CellRanges {
+    fn parse(text: &str) -> Option<Self> {
+        let range = |part: &str| {
+            let (first, last) = part.split_once('-').unwrap_or((part, part));
+            let (first, last) = (first.trim().parse::<u16>().ok()?, last.trim().parse::<u16>().ok()?);
+            (1 <= first && first <= last).then_some(first..=last)
+        };
+        text.split(',').map(range).collect::<Option<Vec<_>>>().map(Self)
+    }
+}
+
+impl Setting for CellRanges {
+    const KIND: &'static str = "cell numbers from 1, like \"1-12, 15\"";
+
+    fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
+        match value.get_ref() {
+            DeValue::String(text) => Self::parse(text).ok_or_else(|| Wrong::Type(value.span())),
+            _ => Err(Wrong::Type(value.span())),
+        }
+    }
+}
+
+/// Makes an enum a choice between words.
+macro_rules! choice {
+    ($type:ty { $($word:literal => $value:expr),+ $(,)? }) => {
+        impl $crate::config::setting::Setting for $type {
+            const KIND: &'static str = "one of";
+            const CHOICES: &'static [&'static str] = &[$($word),+];
+
+            fn read(
+                value: &toml::Spanned<toml::de::DeValue<'_>>,
+                _: &$crate::config::setting::Allowed,
+            ) -> Result<Self, $crate::config::setting::Wrong> {
+                match value.get_ref() {
+                    toml::de::DeValue::String(text) => match text.as_ref() {
+                        $($word => Ok($value),)+
+                        _ => Err($crate::config::setting::Wrong::Range(value.span())),
+                    },
+                    _ => Err($crate::config::setting::Wrong::Type(value.span())),
+                }
+            }
+        }
+    };
+}
+pub(crate) use choice;

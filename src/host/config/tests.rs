@@ -1,0 +1,557 @@
+//! Files good and bad: the faults are part of the program's face, so they are compared word for word.
+
+#![allow(clippy::unwrap_used, reason = "in a test a panic is the message")]
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use proptest::prelude::*;
+
+mod alarms;
+mod cell_model;
+mod j1939;
+mod protect;
+
+use super::*;
+use crate::can::dbc::FrameFormat;
+use crate::can::e2e::{Profile, Protection};
+use crate::can::encode::OutputPlan;
+use crate::can::{CanId, Frame};
+use crate::health::{CapacityMethod, RechargeAlarm};
+use crate::quantity::{BusIndex, CellIndex, Channel, Fault, SensorIndex};
+use crate::sample::VoltageSource;
+
+const DBC: &str = r#"VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 256 Status: 8 A
+ SG_ Current : 0|16@1- (0.1,0) [-300|500] "A" A
+ SG_ Total : 16|16@1+ (0.1,0) [0|100] "V" A
+ SG_ Temperature : 32|8@1+ (1,-40) [-40|100] "degC" A
+BO_ 272 Cells: 8 A
+ SG_ Page M : 0|8@1+ (1,0) [0|1] "" A
+ SG_ CellVoltage1 m0 : 8|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage2 m0 : 24|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage3 m1 : 8|16@1+ (0.001,0) [0|0] "mV" A
+ SG_ CellVoltage4 m1 : 24|16@1+ (0.001,0) [0|0] "mV" A
+BO_ 288 Long: 12 A
+ SG_ Current : 0|16@1- (0.1,0) [0|0] "A" A
+VAL_ 256 Current -32768 "not available" ;
+"#;
+
+const CELL: &str = r#"format = 1
+name = "test"
+rated_capacity_ah = 2.0
+capacity_ah = 1.9
+voltage_min_v = 2.5
+voltage_max_v = 4.2
+[provenance]
+anything = ["goes", 1]
+[tables]
+soc = [0, 0.5, 1]
+temperature_c = [10, 30]
+ocv_v = [[3.0, 3.6, 4.1], [3.0, 3.6, 4.2]]
+r0_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+[[tables.branches]]
+r_ohm = [[0.1, 0.1, 0.1], [0.05, 0.05, 0.05]]
+c_farad = [[100, 100, 100], [100, 100, 100]]
+"#;
+
+/// Line 1 is `[pack]`.
+const PACK: &str = r#"[pack]
+cells = 4
+cell_model = "cell.toml"
+[[interface]]
+name = "can0"
+[input]
+dbc = ["pack.dbc"]
+[input.current]
+signal = "Status.Current"
+positive = "charge"
+[input.cell_voltage]
+signal = "Cells.CellVoltage{n}"
+[[input.temperature]]
+signal = "Status.Temperature"
+"#;
+
+fn read_texts(pack: &str, cell: &str, dbc: &str) -> Result<(Config, Description), Vec<String>> {
+    let own = include_str!("../../../config/packwatch.dbc");
+    let files = [("pack.toml", pack), ("cell.toml", cell), ("pack.dbc", dbc), ("twin.dbc", DBC), ("own.dbc", own)];
+    let files = HashMap::from(files);
+    let read = |path: &Path| match path.to_str().and_then(|name| files.get(name)) {
+        Some(text) => Ok(text.as_bytes().to_vec()),
+        None => Err(std::io::ErrorKind::NotFound.into()),
+    };
+    read_all(Path::new("pack.toml"), &read).map_err(|faults| faults.0)
+}
+
+fn good(pack: &str) -> Config {
+    read_texts(pack, CELL, DBC).unwrap().0
+}
+
+fn faults(pack: &str) -> Vec<String> {
+    read_texts(pack, CELL, DBC).unwrap_err()
+}
+
+/// The test configuration with `from` replaced, which must be there.
+fn pack_with(from: &str, to: &str) -> String {
+    assert!(PACK.contains(from), "{from}");
+    PACK.replacen(from, to, 1)
+}
+
+#[test]
+fn a_good_file_becomes_settings_with_defaults() {
+    let config = good(PACK);
+    let monitor = &config.monitor;
+    assert_eq!(config.interfaces, [InterfaceConfig { name: "can0".to_owned(), fd: false }]);
+    assert_eq!((monitor.sample.cells, monitor.sample.voltage_source), (4, VoltageSource::Cells));
+    assert_eq!(monitor.sample.sensor_of_cell, [Some(SensorIndex(0)); 4]);
+    assert_eq!((monitor.estimator.initial_capacity_ah, monitor.estimator.initial_capacity_std_ah), (1.9, 0.19));
+    let recharge = monitor.health.recharge;
+    assert_eq!((recharge.from_soc, recharge.to_soc, recharge.reference_current_a), (0.3, 0.9, 1.0), "C/2 of 2 Ah");
+    assert_eq!((recharge.min_coverage, recharge.alarm_on), (0.5, RechargeAlarm::Raw));
+    assert_eq!(monitor.health.transition.dead_band_a, 0.04, "C/50 of the label's 2 Ah");
+    assert_eq!(monitor.health.capacity.method, CapacityMethod::Swing);
+    assert_eq!((monitor.health.usable, monitor.rules.len()), (None, 0));
+}
+
+#[test]
+fn limits_come_from_the_dbc_in_our_sign_and_the_cell_model() {
+    let sample = good(PACK).monitor.sample;
+    assert_eq!((sample.current.min, sample.current.max), (-500.0, 300.0), "the bus counts charge positive");
+    assert_eq!((sample.voltage.min, sample.voltage.max), (1.25, 4.7), "[0|0] in the DBC gives no range");
+    assert_eq!((sample.temperature.min, sample.temperature.max), (-40.0, 100.0));
+    let sample = good(&format!("{PACK}[limits.current]\nmax_charge_a = 20\n")).monitor.sample;
+    assert_eq!((sample.current.min, sample.current.max), (-20.0, 300.0));
+}
+
+#[test]
+fn a_total_voltage_means_one_cell_of_a_series() {
+    let pack = pack_with(
+        "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"",
+        "[input.pack_voltage]\nsignal = \"Status.Total\"",
+    );
+    let sample = good(&pack).monitor.sample;
+    assert_eq!((sample.cells, sample.voltage_source), (1, VoltageSource::PackTotal { series: 4 }));
+    assert_eq!(sample.voltage.max, 4.7, "100 V by four cells is more than the cell model allows");
+    assert_eq!(sample.sensor_of_cell, [Some(SensorIndex(0))]);
+}
+
+fn decoded(config: &Config, id: u16, payload: &[u8]) -> Vec<(Channel, Result<f64, Fault>)> {
+    let frame = Frame::classic(CanId::Standard(id), payload).unwrap();
+    let mut readings = Vec::new();
+    config.monitor.input.decode(BusIndex(0), &frame, |reading| readings.push((reading.channel, reading.value)));
+    readings
+}
+
+#[test]
+fn readings_have_our_sign_scale_and_cells() {
+    let pack = pack_with("\"charge\"", "\"charge\"\nscale = 0.5\nnot_available = [0x7FFF]")
+        .replace("Status.Temperature\"", "Status.Temperature\"\noffset = -1");
+    let config = good(&pack);
+    let temperature = Channel::Temperature(SensorIndex(0));
+    let status = decoded(&config, 0x100, &[100, 0, 0, 0, 65, 0, 0, 0]);
+    assert_eq!(status, [(Channel::Current, Ok(-5.0)), (temperature, Ok(24.0))]);
+    for code in [[0xFF, 0x7F], [0x00, 0x80]] {
+        let status = decoded(&config, 0x100, &[code[0], code[1], 0, 0, 65, 0, 0, 0]);
+        assert_eq!(status[0], (Channel::Current, Err(Fault::NotAvailable)), "configured, or in the DBC's value table");
+    }
+    let second_page = decoded(&config, 0x110, &[1, 0xE8, 0x03, 0xD0, 0x07, 0, 0, 0]);
+    let (cell_3, cell_4) = (Channel::CellVoltage(CellIndex(2)), Channel::CellVoltage(CellIndex(3)));
+    assert_eq!(second_page, [(cell_3, Ok(1.0)), (cell_4, Ok(2.0))]);
+    assert!(decoded(&config, 0x120, &[0; 8]).is_empty(), "a message nobody configured");
+}
+
+#[test]
+fn nothing_is_sent_unless_configured() {
+    assert!(good(PACK).monitor.output.is_none());
+    assert!(good(&format!("{PACK}[output]\nenabled = false\n[output.status]\nid = 5\n")).monitor.output.is_none());
+}
+
+#[test]
+fn identifiers_and_periods_come_from_the_configuration_or_the_dbc() {
+    let output = good(&format!("{PACK}[output]\n")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids(), [0x6B0, 0x6B1, 0x6B2].map(CanId::Standard));
+    assert_eq!((output.buses, output.status_period_s), (vec![BusIndex(0)], 0.1));
+    let text = "[output.status]\nextended = true\nid = 0x18FF_0001\nperiod_ms = 200\n";
+    let output = good(&format!("{PACK}{text}")).monitor.output.unwrap();
+    assert_eq!(output.plan.ids()[..2], [CanId::Extended(0x18FF_0001), CanId::Standard(0x6B1)]);
+    assert_eq!((output.status_period_s, output.alarm_period_s), (0.2, 1.0));
+}
+
+#[test]
+fn frame_kinds_and_protection_come_from_the_configuration_and_the_layout_says_so() {
+    let text = "[output.status]\nfd = true\nbrs = true\ne2e = \"5\"\ndata_id = 0x1234\n[output.alarm]\ne2e = \"1C\"\n\
+                data_id = 7\n";
+    let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
+    let config = good(&format!("{pack}{text}"));
+    let plan = config.monitor.output.unwrap().plan;
+    assert_eq!(plan.formats(), [FrameFormat::Fd { brs: true }, FrameFormat::Classic, FrameFormat::Classic]);
+    let wanted = |profile, data_id| Some(Protection { profile, data_id });
+    assert_eq!(plan.protections(), [wanted(Profile::P05, 0x1234), None, wanted(Profile::P01C, 7)]);
+    let layout = config.output_layout.unwrap();
+    assert_eq!(layout.messages.len(), 3, "no command is taken");
+    assert_eq!(OutputPlan::new(&Database::parse(&layout.to_dbc()).unwrap()).unwrap(), plan);
+}
+
+#[test]
+fn an_own_output_dbc_is_not_moved_for_a_longer_header() {
+    let pack = pack_with("\"can0\"", "\"can0\"\nfd = true");
+    let text = "[output]\ndbc = \"own.dbc\"\n[output.status]\nfd = true\ne2e = \"5\"\ndata_id = 1\n";
+    let fault = "pack.toml:20: output.status.e2e = \"5\", signal PACKWATCH_Status.Soc begins at bit 16, must leave the 24 \
+                 bits of the header of profile 5 free";
+    assert_eq!(faults(&format!("{pack}{text}")), [fault]);
+}
+
+#[test]
+fn steps_in_ah_are_those_of_the_configured_cell() {
+    let pack = pack_with("cells = 4", "cells = 4\nrated_capacity_ah = 100");
+    let layout = good(&format!("{pack}[output]\n")).output_layout.unwrap();
+    assert_eq!(layout.signal("PACKWATCH_Alarm.Value_CapacityLow").unwrap().1.layout.factor, 0.05);
+}
+
+#[test]
+fn an_output_dbc_must_have_the_daemons_messages() {
+    let all = faults(&format!("{PACK}[output]\ndbc = \"twin.dbc\"\n"));
+    assert_eq!(all[0], "pack.toml:16: output.dbc = \"twin.dbc\", message PACKWATCH_Status is missing");
+    assert_eq!(all.len(), 3);
+}
+
+#[test]
+fn numbers_may_be_hex_or_have_underscores() {
+    let output =
+        "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
+    let config = good(&format!("{PACK}{output}"));
+    assert_eq!(config.monitor.estimator.consistency_window_s, 1000.0);
+    assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
+}
+
+/// Each edit of the good file (from, to) and the whole of what is said about it.
+fn each_edit_gives(table: &[(&str, &str, &str)]) {
+    for (from, to, fault) in table {
+        assert_eq!(faults(&pack_with(from, to)), [*fault], "{from} -> {to}");
+    }
+}
+
+#[test]
+fn single_faults_name_file_line_key_found_and_allowed() {
+    let table: &[(&str, &str, &str)] = &[
+        ("cells = 4", "cells = 0", "pack.toml:2: pack.cells = 0, must be 1 to 1024"),
+        ("cells = 4", "cells = -1", "pack.toml:2: pack.cells = -1, must be 1 to 1024"),
+        (
+            "cells = 4",
+            "cells = 99999999999999999999",
+            "pack.toml:2: pack.cells = 99999999999999999999, must be 1 to 1024",
+        ),
+        ("cells = 4", "cells = 4.0", "pack.toml:2: pack.cells = 4.0, must be a whole number, 1 to 1024"),
+        ("cells = 4", "cells = \"four\"", "pack.toml:2: pack.cells = \"four\", must be a whole number, 1 to 1024"),
+        ("cells = 4\n", "", "pack.toml:1: pack.cells is missing, must be a whole number, 1 to 1024"),
+        ("cells = 4", "cells = 4\nstring = 1", "pack.toml:3: pack.string is not a known key, did you mean strings"),
+        ("cells = 4", "cells = 4\nambient_c = nan", "pack.toml:3: pack.ambient_c = nan, must be -100 to 200"),
+        ("cells = 4", "cells = 4\nambient_c = inf", "pack.toml:3: pack.ambient_c = inf, must be -100 to 200"),
+        ("cells = 4", "cells = 4\ncells = 5", "pack.toml:3: duplicate key"),
+        (
+            "cells = 4",
+            "cells = 4\nrated_capacity_ah = 0",
+            "pack.toml:3: pack.rated_capacity_ah = 0, must be above 0 and at most 100000",
+        ),
+        ("\"cell.toml\"", "\"no.toml\"", "no.toml: cannot be read: entity not found"),
+        ("\"cell.toml\"", "\"no\\ntoml\"", "no\\ntoml: cannot be read: entity not found"),
+        ("[[interface]]", "[interface]", "pack.toml:4: interface = [interface], must be tables [[interface]]"),
+        ("[input]", "[[input]]", "pack.toml:6: input = [[input]], must be one table [input]"),
+        (
+            "\"can0\"",
+            "\"a name too long to be one\"",
+            "pack.toml:5: interface[1].name = \"a name too long to be one\", must be at most 15 characters without blank or /",
+        ),
+        ("dbc = [\"pack.dbc\"]", "dbc = [\"no.dbc\"]", "no.dbc: cannot be read: entity not found"),
+        ("dbc = [\"pack.dbc\"]", "dbc = []", "pack.toml:7: input.dbc = [], must be a list of texts that is not empty"),
+        (
+            "dbc = [\"pack.dbc\"]",
+            "dbc = [\"pack.dbc\", 7]",
+            "pack.toml:7: input.dbc = 7, must be a list of texts that is not empty",
+        ),
+    ];
+    each_edit_gives(table);
+}
+
+#[test]
+fn single_faults_of_signals_name_what_the_dbc_has() {
+    let table: &[(&str, &str, &str)] = &[
+        ("positive = \"charge\"\n", "", "pack.toml:8: input.current.positive is missing, must be charge or discharge"),
+        ("\"charge\"", "\"in\"", "pack.toml:10: input.current.positive = \"in\", must be charge or discharge"),
+        (
+            "\"charge\"",
+            "\"charge\"\ninterface = \"can1\"",
+            "pack.toml:11: input.current.interface = \"can1\", must be can0",
+        ),
+        (
+            "\"charge\"",
+            "\"charge\"\nscale = 0",
+            "pack.toml:11: input.current.scale = 0, must be above 0 and at most 1000000000",
+        ),
+        (
+            "\"charge\"",
+            "\"charge\"\nnot_available = [0x1_0000]",
+            "pack.toml:11: input.current.not_available = [0x1_0000], must be 0 to 0xFFFF, the codes of Status.Current",
+        ),
+        (
+            "Status.Current",
+            "Status.Curent",
+            "pack.toml:9: input.current.signal = \"Status.Curent\", must be a signal (Message.Signal) of pack.dbc, did you mean Status.Current",
+        ),
+        (
+            "Status.Current",
+            "Long.Current",
+            "pack.toml:9: input.current.signal = \"Long.Current\", message Long has 12 bytes, must have fd = true on its interface",
+        ),
+        (
+            "Status.Current",
+            "Status.Temperature",
+            "pack.toml:14: input.temperature[1].signal = \"Status.Temperature\", must not be used twice, is also pack current",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage1",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage1\", must have {n} in place of the cell's number",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage{x}",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{x}\", must have {n} (cell's number) and {m} (any number) as its only braces",
+        ),
+        (
+            "CellVoltage{n}",
+            "CellVoltage{n}\"\nfirst = 3\ninterface = \"can0",
+            "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give every cell a signal, none for number 5, 6",
+        ),
+        (
+            "[input.cell_voltage]\nsignal = \"Cells.CellVoltage{n}\"\n",
+            "",
+            "pack.toml:6: input has no voltage, must have [input.cell_voltage] or [input.pack_voltage]",
+        ),
+        (
+            "Status.Temperature\"",
+            "Status.Temperature\"\ncells = \"3-5\"",
+            "pack.toml:15: input.temperature[1].cells = \"3-5\", must be within 1 to 4 (pack.cells)",
+        ),
+        (
+            "Status.Temperature\"",
+            "Status.Temperature\"\ncells = \"4-3\"",
+            "pack.toml:15: input.temperature[1].cells = \"4-3\", must be cell numbers from 1, like \"1-12, 15\"",
+        ),
+    ];
+    each_edit_gives(table);
+}
+
+#[test]
+fn single_faults_of_appended_tables() {
+    let table: &[(&str, &str)] = &[
+        ("[pak]\n", "pack.toml:15: pak is not a known key, did you mean pack"),
+        ("[recharge]\nto_soc = 0.3\n", "pack.toml:16: recharge.to_soc = 0.3, must be above recharge.from_soc = 0.3"),
+        (
+            "[recharge]\nfrom_soc = 0.95\n",
+            "pack.toml:16: recharge.from_soc = 0.95, must be below recharge.to_soc = 0.9",
+        ),
+        (
+            "[limits.voltage]\nmin_v = 4\nmax_v = 3\n",
+            "pack.toml:17: limits.voltage.max_v = 3, must be above 4, the smallest",
+        ),
+        ("[limits.amps]\n", "pack.toml:15: limits.amps is not a known key"),
+        (
+            "[usable]\ncurrent_a = 2\ntemperature_c = 24\ncutoff_v = 4.2\n",
+            "pack.toml:18: usable.cutoff_v = 4.2, must be below the cell model's voltage_max_v = 4.2",
+        ),
+        (
+            "[output.status]\nid = 0x800\n",
+            "pack.toml:16: output.status.id = 0x800, must be 0 to 0x7FF, or extended = true",
+        ),
+        (
+            "[output.status]\nid = 1\n[output.alarm]\nid = 1\n",
+            "pack.toml:18: output.alarm.id = 1, alarm and status frame would both be 001, must differ",
+        ),
+        (
+            "[output]\n[output.alarm]\nid = 0x6B0\n",
+            "pack.toml:17: output.alarm.id = 0x6B0, alarm and status frame would both be 6B0, must differ",
+        ),
+        ("[output.alarm]\nextended = true\n", "pack.toml:16: output.alarm.extended = true, must have an id beside it"),
+        ("[output.alarm]\nperiod_ms = 9\n", "pack.toml:16: output.alarm.period_ms = 9, must be 10 to 3600000"),
+        ("[output.alarm]\ne2e = \"2\"\n", "pack.toml:16: output.alarm.e2e = \"2\", must be off or 1A or 1C or 5"),
+        (
+            "[output.alarm]\ne2e = \"1A\"\n",
+            "pack.toml:15: output.alarm.data_id is not set, must be given, 0 to 0xFFFF, with e2e = \"1A\"",
+        ),
+        ("[output.alarm]\ndata_id = 1\n", "pack.toml:16: output.alarm.data_id = 1, must have e2e beside it"),
+        (
+            "[output.alarm]\ne2e = \"1C\"\ndata_id = 0x1000\n",
+            "pack.toml:17: output.alarm.data_id = 0x1000, must be 0 to 0xFFF with profile 1C",
+        ),
+        (
+            "[output.status]\ne2e = \"1C\"\ndata_id = 7\n[output.alarm]\ne2e = \"1A\"\ndata_id = 7\n",
+            "pack.toml:20: output.alarm.data_id = 7, alarm and status frame would both have 0x7, must differ",
+        ),
+        (
+            "[output.health]\ne2e = \"5\"\ndata_id = 7\n",
+            "pack.toml:16: output.health.e2e = \"5\", must have fd = true here and on the interface: the header of \
+             profile 5 makes the message 12 bytes long; 1A and 1C fit classic frames",
+        ),
+        (
+            "[output.health]\nfd = true\n",
+            "pack.toml:16: output.health.fd = true, must have fd = true on interface can0 too",
+        ),
+        (
+            "[output.health]\nbrs = true\n",
+            "pack.toml:16: output.health.brs = true, must have fd = true: classic frames have one bit rate",
+        ),
+        ("[output]\nstatus_id = 1\n", "pack.toml:16: output.status_id is not a known key, did you mean status"),
+        (
+            "[output]\nenabled = true\ninterfaces = [\"can7\"]\n",
+            "pack.toml:17: output.interfaces = [\"can7\"], must be can0",
+        ),
+        (
+            "[output.health]\nid = 0x110\n",
+            "pack.toml:16: output.health.id = 0x110, must not be the identifier of an input, Cells has 110",
+        ),
+        (
+            "[[interface]]\nname = \"can0\"\n",
+            "pack.toml:16: interface[2].name = \"can0\", must be unique, is also the name in line 5",
+        ),
+    ];
+    for (text, fault) in table {
+        let all = faults(&format!("{PACK}{text}"));
+        assert!(all.contains(&(*fault).to_owned()), "{text}: {all:#?}");
+        assert!(all.len() == 1 || text.starts_with("[[interface]]"), "{text}: {all:#?}");
+    }
+}
+
+#[test]
+fn broken_syntax_hides_no_other_fault_and_invents_none() {
+    let pack = pack_with("cells = 4", "cells = = 4").replace("\"charge\"", "\"in\"").replace("[input]", "[inp");
+    let expected = [
+        "pack.toml:2: extra `=`, expected nothing",
+        "pack.toml:6: unclosed table, expected `]`",
+        "pack.toml:10: input.current.positive = \"in\", must be charge or discharge",
+    ];
+    let all = faults(&pack);
+    for fault in expected {
+        assert!(all.contains(&fault.to_owned()), "{all:#?}");
+    }
+    assert!(!all.iter().any(|fault| fault.contains("missing")), "{all:#?}");
+    let all = read_texts(PACK, DBC, DBC).unwrap_err();
+    assert_eq!((all.len(), all[10].as_str()), (11, "cell.toml:11: and 7 more faults of syntax from here"));
+}
+
+#[test]
+fn with_several_interfaces_each_signal_says_which() {
+    let all = faults(&format!("{PACK}[[interface]]\nname = \"can1\"\n"));
+    let expected = [
+        "pack.toml:8: input.current.interface is not set, must be can0 or can1",
+        "pack.toml:11: input.cell_voltage.interface is not set, must be can0 or can1",
+        "pack.toml:13: input.temperature[1].interface is not set, must be can0 or can1",
+    ];
+    assert_eq!(all, expected);
+}
+
+#[test]
+fn a_signal_in_two_dbc_files_is_ambiguous() {
+    let all = faults(&pack_with("[\"pack.dbc\"]", "[\"pack.dbc\", \"twin.dbc\"]"));
+    assert_eq!(
+        all[0],
+        "pack.toml:9: input.current.signal = \"Status.Current\", must be in one DBC file, is in pack.dbc and twin.dbc"
+    );
+    let cell = "pack.toml:12: input.cell_voltage.signal = \"Cells.CellVoltage{n}\", must give each cell one signal, \
+                1 is Cells.CellVoltage1 and Cells.CellVoltage1";
+    assert!(all.contains(&cell.to_owned()), "{all:#?}");
+}
+
+#[test]
+fn faults_of_all_files_are_told_at_once_in_the_order_of_lines() {
+    let pack =
+        pack_with("cells = 4", "cells = 0\nx = 1").replace("\"charge\"", "\"in\"") + "[recharge]\nto_soc = 0.1\n";
+    let cell = CELL.replace("capacity_ah = 1.9", "capacity_ah = 0").replace("[0, 0.5, 1]", "[0, 0.5, 0.5]");
+    let dbc = DBC.replace("BO_ 272 Cells: 8 A", "BO_ 4000 Cells: 8 A");
+    let all = read_texts(&pack, &cell, &dbc).unwrap_err();
+    let expected = [
+        "pack.toml:2: pack.cells = 0, must be 1 to 1024",
+        "pack.toml:3: pack.x is not a known key",
+        "pack.toml:11: input.current.positive = \"in\", must be charge or discharge",
+        "pack.toml:17: recharge.to_soc = 0.1, must be above recharge.from_soc = 0.3",
+        "cell.toml:4: capacity_ah = 0, must be above 0 and at most 100000",
+        "cell.toml:10: tables.soc = [0, 0.5, 0.5], must begin with 0 and end with 1",
+        "cell.toml:10: tables.soc: 0.5 follows 0.5, must rise strictly",
+        "pack.dbc:9: identifier 4000, must be 0 to 2047, or have bit 31 set for an extended one",
+    ];
+    assert_eq!(all, expected);
+}
+
+#[test]
+fn text_that_is_not_utf_8_is_refused_with_its_line() {
+    let read = |_: &Path| Ok(b"[pack]\ncells = \xFF".to_vec());
+    assert_eq!(load_with(Path::new("pack.toml"), &read).unwrap_err().0, ["pack.toml:2: is not UTF-8 text"]);
+}
+
+#[test]
+fn every_default_is_a_value_its_key_allows() {
+    use super::schema::Presence;
+    for info in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS) {
+        for key in info.keys.unwrap_or(&[]) {
+            assert!(!key.about.trim().is_empty() && key.about.trim().ends_with('.'), "{}.{}", info.path, key.name);
+            if key.presence == Presence::Optional {
+                assert!(
+                    key.about.contains("ithout it")
+                        || info.path.is_empty()
+                        || key.about.contains("Needed")
+                        || key.about.contains("At least one of"),
+                    "{}.{} says what holds without it",
+                    info.path,
+                    key.name
+                );
+            }
+        }
+    }
+    // The good file leaves every default in place: one that could not be read would have failed it.
+    good(PACK);
+}
+
+#[test]
+fn the_reference_page_is_the_one_in_the_repository() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/REFERENCE.md");
+    let page = std::fs::read_to_string(path).unwrap();
+    assert!(page == reference(), "write it anew: packwatch check --reference > config/REFERENCE.md");
+    for key in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
+        assert!(page.contains(&format!("| `{}` |", key.name)), "{}", key.name);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(2000))]
+
+    /// Pieces cut out, doubled, swapped or overwritten: faults or a configuration, never a panic, never an empty list.
+    #[test]
+    fn any_mutilated_file_gives_faults_or_a_configuration(
+        edits in prop::collection::vec((0..3_usize, any::<prop::sample::Index>(), 0..24_usize, any::<prop::sample::Index>()), 1..6),
+    ) {
+        const SCRAPS: [&str; 14] = [
+            "", "\n", "=", "[", "]", "\"", "{n}", "-1", "1e999", "[[alarm]]\n", "[input]\n", "nan", "0xFFFFFFFFFFFFFFFFFFF", "\u{e9}",
+        ];
+        let full = format!(
+            "{PACK}[[alarm]]\nrule = \"capacity_low\"\nwarning = 1\n[output.status]\nid = 1\n{}",
+            j1939::TABLE
+        );
+        let mut texts = [full.chars().collect::<Vec<_>>(), CELL.chars().collect(), DBC.chars().collect()];
+        for (file, place, length, scrap) in edits {
+            let text = &mut texts[file];
+            let from = place.index(text.len() + 1);
+            let to = (from + length).min(text.len());
+            text.splice(from..to, SCRAPS[scrap.index(SCRAPS.len())].chars());
+        }
+        let texts = texts.map(|chars| chars.into_iter().collect::<String>());
+        if let Err(faults) = read_texts(&texts[0], &texts[1], &texts[2]) {
+            prop_assert!(!faults.is_empty());
+            for fault in faults {
+                prop_assert!(!fault.contains('\n') && !fault.contains("not usable"), "{fault}");
+            }
+        }
+    }
+}

@@ -1,0 +1,280 @@
+//! The doctor's loops: logs replayed, or interfaces listened to, into the core's [`Doctor`] and, where the configuration
+//! is good, a [`Monitor`] beside it.
+//!
+//! Listening is passive: nothing is sent. Both loops end early when told to, with what was seen so far.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+
+use crate::can::encode::{InputEncoder, InputProtector};
+use crate::config::Survey;
+use crate::doctor::{Doctor, Report};
+use crate::io::clock::{MappedClock, Reading};
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
+use crate::io::socket::{Tap, Tapped};
+use crate::monitor::{BusEvent, Input, Monitor, Outputs};
+use crate::quantity::{BusIndex, Timestamp};
+
+/// How often the interfaces are read: a full bus brings 80 frames in that time, the kernel keeps thousands.
+const READ_PERIOD: Duration = Duration::from_millis(10);
+/// How often an interface that is not there is looked for.
+const LOOK_PERIOD: Duration = Duration::from_millis(500);
+/// Records between two looks at the clock.
+const REPORT_EVERY: u64 = 4096;
+
+/// How far it is.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress {
+    /// Bytes of the logs read.
+    pub bytes: u64,
+    /// Frames taken.
+    pub frames: u64,
+    /// Seconds listened, of the record or of real time.
+    pub seconds: f64,
+}
+
+/// Tells loops to end: set by SIGINT and SIGTERM.
+#[derive(Debug, Clone, Default)]
+pub struct Interrupt(Arc<AtomicBool>);
+
+impl Interrupt {
+    /// Watches for the signals from now on.
+    ///
+    /// # Errors
+    /// When no signal can be watched for.
+    pub fn watch() -> std::io::Result<Self> {
+        let interrupt = Self::default();
+        let flag = Arc::clone(&interrupt.0);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let mut stop = runtime.block_on(async { super::service::Stop::new(None) })?;
+        std::thread::spawn(move || {
+            runtime.block_on(stop.wait());
+            flag.store(true, Ordering::Relaxed);
+        });
+        Ok(interrupt)
+    }
+
+    fn is_set(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// The doctor and the monitor beside it.
+struct Session {
+    doctor: Doctor,
+    monitor: Option<Monitor>,
+    out: Outputs,
+    configured: usize,
+}
+
+impl Session {
+    fn new(survey: &Survey) -> Self {
+        Self {
+            doctor: Doctor::new(survey.plan.clone()),
+            monitor: survey.config.as_ref().map(|config| Monitor::new(config.monitor.clone())),
+            out: Outputs { want_estimates: true, ..Outputs::default() },
+            configured: survey.plan.interfaces.len(),
+        }
+    }
+
+    fn feed(&mut self, input: &Input<'_>) {
+        let bus = match *input {
+            Input::Frame { time, bus, frame } => {
+                self.doctor.handle_frame(time, bus, frame);
+                Some(bus)
+            }
+            Input::Bus { bus, event, .. } => {
+                self.doctor.handle_bus(bus, event);
+                Some(bus)
+            }
+            Input::UnknownGap { .. } => {
+                self.doctor.handle_gap();
+                None
+            }
+            _ => None,
+        };
+        if bus.is_some_and(|bus| bus.index() >= self.configured) {
+            return;
+        }
+        if let Some(monitor) = &mut self.monitor {
+            monitor.handle(*input, &mut self.out);
+            self.hand_on_estimates();
+        }
+    }
+
+    fn hand_on_estimates(&mut self) {
+        self.out.estimates.iter().for_each(|estimate| self.doctor.handle_estimate(estimate));
+        self.out.clear();
+    }
+
+    /// Nothing more comes.
+    fn finish(mut self) -> Report {
+        if let Some(monitor) = &mut self.monitor {
+            monitor.settle(&mut self.out);
+            self.hand_on_estimates();
+        }
+        self.doctor.finish()
+    }
+}
+
+/// Replays logs; at most `limit_s` of them.
+///
+/// # Errors
+/// When a log cannot be read.
+pub fn replay(
+    survey: &Survey,
+    logs: &[PathBuf],
+    csv: CsvOptions,
+    limit_s: Option<f64>,
+    interrupt: &Interrupt,
+    each: &mut dyn FnMut(Progress),
+) -> Result<(Report, LogCounts), LogError> {
+    let encoder = InputEncoder::new(&survey.input);
+    let mut protector = InputProtector::new(&survey.plan.guards);
+    let mut source = LogSource::new(
+        logs.to_vec(),
+        LogOptions {
+            interfaces: survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect(),
+            strict: false,
+            csv,
+            encode_row: Box::new(move |values, frames| {
+                let uncarried = encoder.encode(values, frames);
+                protector.protect(frames);
+                uncarried
+            }),
+        },
+    );
+    source.adopt_foreign();
+    let mut session = Session::new(survey);
+    let mut known = session.configured;
+    let mut records = 0_u64;
+    while let Some(record) = source.next_record()? {
+        for name in source.interfaces().iter().skip(known) {
+            session.doctor.add_interface(name);
+        }
+        known = source.interfaces().len();
+        if let Some(input) = record.input() {
+            session.feed(&input);
+        }
+        records += 1;
+        let is_over = limit_s.is_some_and(|limit_s| session.doctor.seconds() >= limit_s)
+            && !matches!(record, Record::UnknownGap { .. });
+        if is_over || interrupt.is_set() {
+            break;
+        }
+        if records.is_multiple_of(REPORT_EVERY) {
+            let bytes = source.read_bytes().load(Ordering::Relaxed);
+            each(Progress { bytes, frames: session.doctor.frames(), seconds: session.doctor.seconds() });
+        }
+    }
+    Ok((session.finish(), source.counts().clone()))
+}
+
+/// One interface listened to.
+struct BusListener {
+    bus: BusIndex,
+    name: String,
+    tap: Option<Tap>,
+    look_at: Instant,
+}
+
+/// Listens to the configured interfaces, and to every other CAN interface of this computer, for `duration`.
+///
+/// # Errors
+/// When this kernel has no SocketCAN.
+pub fn listen(
+    survey: &Survey,
+    duration: Duration,
+    interrupt: &Interrupt,
+    each: &mut dyn FnMut(Progress),
+) -> std::io::Result<Report> {
+    let clock = MappedClock::new(Reading::now());
+    let mut session = Session::new(survey);
+    let mut names: Vec<String> = survey.plan.interfaces.iter().map(|interface| interface.name.clone()).collect();
+    for name in can_interfaces(clock) {
+        if !names.contains(&name) && names.len() < usize::from(u8::MAX) {
+            session.doctor.add_interface(&name);
+            names.push(name);
+        }
+    }
+    let began = Instant::now();
+    let ear = |(bus, name)| BusListener { bus: BusIndex(bus), name, tap: None, look_at: began };
+    let mut ears: Vec<BusListener> = (0_u8..).zip(names).map(ear).collect();
+    let mut received = Vec::new();
+    while began.elapsed() < duration && !interrupt.is_set() {
+        for ear in &mut ears {
+            ear.look(clock, &mut session)?;
+            ear.read(&mut received, &mut session);
+        }
+        received.sort_by_key(|(time, ..)| *time);
+        for (time, bus, what) in received.drain(..) {
+            let input = match &what {
+                Tapped::Frame(frame) => Input::Frame { time, bus, frame },
+                Tapped::Error(class) => Input::Bus { time, bus, event: BusEvent::ErrorFrame { class: *class } },
+                Tapped::Dropped(frames) => Input::Bus { time, bus, event: BusEvent::Dropped { frames: *frames } },
+            };
+            session.feed(&input);
+        }
+        each(Progress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
+        std::thread::sleep(READ_PERIOD);
+    }
+    session.doctor.handle_listened(began.elapsed().as_secs_f64());
+    Ok(session.finish())
+}
+
+impl BusListener {
+    fn look(&mut self, clock: MappedClock, session: &mut Session) -> std::io::Result<()> {
+        if self.tap.is_some() || Instant::now() < self.look_at {
+            return Ok(());
+        }
+        self.look_at = Instant::now() + LOOK_PERIOD;
+        match Tap::open(&self.name, clock) {
+            Ok((tap, is_up)) => {
+                self.tap = Some(tap);
+                session.doctor.handle_bus(self.bus, if is_up { BusEvent::Up } else { BusEvent::Down });
+            }
+            Err(error) if error.raw_os_error() == Some(Errno::EAFNOSUPPORT as i32) => {
+                return Err(std::io::Error::other(format!("{}: this kernel has no SocketCAN: {error}", self.name)));
+            }
+            Err(_) => session.doctor.handle_bus(self.bus, BusEvent::Missing),
+        }
+        Ok(())
+    }
+
+    fn read(&mut self, received: &mut Vec<(Timestamp, BusIndex, Tapped)>, session: &mut Session) {
+        let Some(tap) = &mut self.tap else { return };
+        let mut came = Vec::new();
+        loop {
+            match tap.next(&mut came) {
+                Ok(true) => {}
+                Ok(false) => break,
+                Err(error) if error.raw_os_error() == Some(Errno::ENETDOWN as i32) => {
+                    session.doctor.handle_bus(self.bus, BusEvent::Down);
+                }
+                Err(_) => {
+                    session.doctor.handle_bus(self.bus, BusEvent::Missing);
+                    self.tap = None;
+                    break;
+                }
+            }
+        }
+        if !came.is_empty() {
+            session.doctor.handle_bus(self.bus, BusEvent::Up);
+        }
+        received.extend(came.into_iter().map(|(time, what)| (time, self.bus, what)));
+    }
+}
+
+/// CAN interfaces of this computer, by name: those a CAN socket can be bound to.
+fn can_interfaces(clock: MappedClock) -> Vec<String> {
+    let Ok(interfaces) = nix::net::if_::if_nameindex() else { return Vec::new() };
+    let names = interfaces.iter().filter_map(|interface| interface.name().to_str().ok());
+    let mut names: Vec<String> = names.filter(|name| Tap::open(name, clock).is_ok()).map(str::to_owned).collect();
+    names.sort_unstable();
+    names
+}

@@ -1,0 +1,245 @@
+//! The exporter: a process of its own that serves the status as metrics over HTTP, so that nothing that goes wrong here can
+//! hurt the estimation loop.
+//!
+//! * `/metrics`: each scrape asks the status socket anew, within [`ASK_LIMIT`]; without a fresh answer it is
+//!   `packwatch_up 0` and nothing else. OpenMetrics 1.0 for those who ask for it, else Prometheus' text 0.0.4.
+//! * `/`: a short page; `/-/healthy`: that this process lives.
+//! * At most [`MAX_CONNECTIONS`] at once, others are closed at once; requests of at most [`MAX_REQUEST_BYTES`], whose head must
+//!   come within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
+
+use std::cell::Cell;
+use std::convert::Infallible;
+use std::io;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::pin::pin;
+use std::rc::Rc;
+use std::time::Duration;
+
+use http_body_util::Full;
+use hyper::body::{Bytes, Incoming};
+use hyper::header::{ACCEPT, ALLOW, CONTENT_TYPE, HeaderMap, HeaderValue};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Method, Request, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use sd_notify::NotifyState;
+use tokio::io::AsyncReadExt;
+use tokio::net::{TcpListener, TcpStream, UnixStream};
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::task::{JoinSet, LocalSet};
+use tokio::time::{sleep, timeout};
+
+use super::status::client::{check_length, explain, parse};
+use super::status::document::Document;
+use super::status::metrics::{openmetrics, prometheus_text};
+
+/// Connections at once: two servers and somebody with a browser, several times over.
+const MAX_CONNECTIONS: usize = 16;
+/// Longest head of a request, bytes: hyper's least.
+const MAX_REQUEST_BYTES: usize = 8192;
+/// Headers of a request.
+const MAX_HEADERS: usize = 64;
+/// Time a request's head has to come; a connection that is silent for as long is closed.
+const HEAD_LIMIT: Duration = Duration::from_secs(30);
+/// Time a connection has in all, whatever it does: a slow reader must not hold its place for ever.
+const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
+/// Time the answer has that is under way then: as long as a scrape may take.
+const ANSWER_LIMIT: Duration = Duration::from_secs(10);
+/// Time the daemon has to tell its status: under the ten seconds a scrape may take.
+const ASK_LIMIT: Duration = Duration::from_secs(3);
+/// Time running answers have when the exporter stops.
+const DRAIN_LIMIT: Duration = Duration::from_secs(1);
+/// Pause after a connection could not be taken.
+const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
+
+const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+const PROMETHEUS_TEXT: &str = "text/plain; version=0.0.4; charset=utf-8";
+const HTML: &str = "text/html; charset=utf-8";
+const PLAIN: &str = "text/plain; charset=utf-8";
+const PAGE: &str = "<!DOCTYPE html><html lang=\"en\"><head><title>packwatch</title></head><body><h1>packwatch</h1>\
+    <p><a href=\"/metrics\">metrics</a></p></body></html>\n";
+
+/// Which socket it asks, and whether that answered last time.
+#[derive(Debug)]
+struct Asker {
+    path: PathBuf,
+    is_up: Cell<Option<bool>>,
+}
+
+/// Serves on `listen` what the daemon at `socket` tells, until told to stop.
+///
+/// # Errors
+/// When the address cannot be had.
+pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
+    let asker = Rc::new(Asker { path: socket, is_up: Cell::new(None) });
+    let served = LocalSet::new().block_on(&runtime, serve(listen, asker));
+    served.map_err(|error| format!("{listen}: {error}"))
+}
+
+async fn serve(listen: SocketAddr, asker: Rc<Asker>) -> io::Result<()> {
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let listener = TcpListener::bind(listen).await?;
+    let address = listener.local_addr()?;
+    tracing::info!(%address, socket = %asker.path.display(), "exporter listens");
+    let status = format!("listening on {address}");
+    notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
+    let mut connections = JoinSet::new();
+    loop {
+        let accepted = tokio::select! {
+            _ = terminate.recv() => break,
+            _ = interrupt.recv() => break,
+            Some(_) = connections.join_next() => continue,
+            accepted = listener.accept() => accepted,
+        };
+        match accepted {
+            // Closed at once: whoever is served keeps being served.
+            Ok(_) if connections.len() >= MAX_CONNECTIONS => tracing::debug!("connection closed: too many at once"),
+            Ok((stream, _)) => drop(connections.spawn_local(converse(stream, Rc::clone(&asker)))),
+            Err(error) => {
+                tracing::warn!(%error, "connection not taken");
+                sleep(ACCEPT_PAUSE).await;
+            }
+        }
+    }
+    notify(&[NotifyState::Stopping]);
+    drop(listener);
+    // An idle connection has nothing to finish: a short wait, then all are closed.
+    let drained = async { while connections.join_next().await.is_some() {} };
+    let _ = timeout(DRAIN_LIMIT, drained).await;
+    tracing::info!("exporter stopped");
+    Ok(())
+}
+
+/// Tells the service manager; without one nothing happens.
+fn notify(states: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(states) {
+        tracing::warn!(%error, "service manager not told");
+    }
+}
+
+/// One connection.
+async fn converse(stream: TcpStream, asker: Rc<Asker>) {
+    let answer = service_fn(move |request| {
+        let asker = Rc::clone(&asker);
+        async move { Ok::<_, Infallible>(answer(&request, &asker).await) }
+    });
+    let mut builder = http1::Builder::new();
+    builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);
+    builder.max_buf_size(MAX_REQUEST_BYTES).max_headers(MAX_HEADERS);
+    let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), answer));
+    let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
+        Ok(ended) => ended,
+        Err(_) => {
+            // An answer under way is finished, another request is not taken.
+            connection.as_mut().graceful_shutdown();
+            timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
+        }
+    };
+    if let Err(error) = ended {
+        tracing::debug!(%error, "connection ended");
+    }
+}
+
+type Answer = Response<Full<Bytes>>;
+
+async fn answer(request: &Request<Incoming>, asker: &Asker) -> Answer {
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        let mut refused = respond(StatusCode::METHOD_NOT_ALLOWED, PLAIN, "must be GET or HEAD\n");
+        refused.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
+        return refused;
+    }
+    match request.uri().path() {
+        "/metrics" => metrics(request.headers(), asker).await,
+        "/" => respond(StatusCode::OK, HTML, PAGE),
+        "/-/healthy" => respond(StatusCode::OK, PLAIN, "healthy\n"),
+        _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /metrics or /-/healthy\n"),
+    }
+}
+
+fn respond(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> Answer {
+    let mut response = Response::new(Full::new(text.into()));
+    *response.status_mut() = status;
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+    response
+}
+
+async fn metrics(headers: &HeaderMap, asker: &Asker) -> Answer {
+    let text = openmetrics(asker.ask().await);
+    if wants_openmetrics(headers) {
+        respond(StatusCode::OK, OPENMETRICS, text)
+    } else {
+        respond(StatusCode::OK, PROMETHEUS_TEXT, prometheus_text(&text))
+    }
+}
+
+/// Whether the client takes OpenMetrics 1.0, and does not weigh it at nothing.
+fn wants_openmetrics(headers: &HeaderMap) -> bool {
+    let values = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok());
+    values.flat_map(|value| value.split(',')).any(|range| {
+        let mut parts = range.split(';').map(str::trim);
+        let is_named = parts.next().is_some_and(|name| name.eq_ignore_ascii_case("application/openmetrics-text"));
+        let refuses = |part: &str| match part.split_once('=') {
+            Some(("version", version)) => version.trim_matches('"') != "1.0.0",
+            Some(("q", weight)) => weight.parse::<f64>().is_ok_and(|weight| weight <= 0.0),
+            _ => false,
+        };
+        is_named && !parts.any(refuses)
+    })
+}
+
+impl Asker {
+    /// The daemon's status; `None` = it does not tell it in time. The log is told on change.
+    async fn ask(&self) -> Option<Document> {
+        let asked = timeout(ASK_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
+        let document = asked.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
+        let was_up = self.is_up.replace(Some(document.is_ok()));
+        match &document {
+            Ok(_) if was_up != Some(true) => tracing::info!("the daemon tells its status"),
+            Err(error) if was_up != Some(false) => tracing::warn!(error, "no status of the daemon"),
+            Ok(_) | Err(_) => {}
+        }
+        document.ok()
+    }
+
+    async fn line(&self) -> io::Result<Vec<u8>> {
+        let mut stream = UnixStream::connect(&self.path).await?;
+        let mut line = Vec::new();
+        while line.last() != Some(&b'\n') {
+            if stream.read_buf(&mut line).await? == 0 {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+            check_length(line.len())?;
+        }
+        Ok(line)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn openmetrics_is_for_those_who_take_version_1() {
+        for (accept, wanted) in [
+            // What Prometheus 2.42 sends.
+            (
+                "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;q=0.75,\
+                 text/plain;version=0.0.4;q=0.5,*/*;q=0.1",
+                true,
+            ),
+            ("application/openmetrics-text; version=\"1.0.0\"; charset=utf-8", true),
+            ("text/plain;version=0.0.4", false),
+            ("application/openmetrics-text;version=0.0.1", false),
+            ("application/openmetrics-text;version=1.0.0;q=0", false),
+            ("*/*", false),
+        ] {
+            let mut headers = HeaderMap::new();
+            headers.insert(ACCEPT, HeaderValue::from_static(accept));
+            assert_eq!(wants_openmetrics(&headers), wanted, "{accept}");
+        }
+        assert!(!wants_openmetrics(&HeaderMap::new()));
+    }
+}

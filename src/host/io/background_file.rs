@@ -1,0 +1,153 @@
+//! A file written by a thread of its own, so that a slow disk never holds up the loop.
+//!
+//! Bytes are collected and handed over in pieces. When the disk is so far behind that the pieces in waiting reach
+//! their limit, or a write failed, every further write is an error: the caller gives the file up and goes on.
+
+use std::fs::File;
+use std::io::{self, Write};
+use std::path::Path;
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Bytes collected before they are handed over, unless flushed.
+const PIECE_BYTES: usize = 64 * 1024;
+/// Pieces waiting at most: 4 MB, ten seconds of a full 1 Mbit/s bus.
+const MAX_PIECES: usize = 64;
+
+/// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
+pub const MAX_FINISH: Duration = Duration::from_secs(5);
+/// How often the end is looked for.
+const FINISH_POLL: Duration = Duration::from_millis(5);
+
+/// See the module.
+#[derive(Debug)]
+pub struct BackgroundFile {
+    piece: Vec<u8>,
+    /// `None` once finished or failed.
+    pieces: Option<SyncSender<Vec<u8>>>,
+    writer: Option<JoinHandle<io::Result<()>>>,
+}
+
+impl BackgroundFile {
+    /// Creates the file and its thread.
+    ///
+    /// # Errors
+    /// When the file cannot be created.
+    pub fn create(path: &Path) -> io::Result<Self> {
+        keep_earlier(path)?;
+        let file = File::create(path)?;
+        let (pieces, queue) = sync_channel(MAX_PIECES);
+        let writer = std::thread::Builder::new().name("record".to_owned()).spawn(move || write_all(file, &queue))?;
+        Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
+    }
+
+    /// Writes what is left, makes it last on the disk, and waits for that.
+    ///
+    /// # Errors
+    /// The first error of any write.
+    pub fn finish(mut self) -> io::Result<()> {
+        let handed_over = self.hand_over();
+        self.join()?;
+        handed_over
+    }
+
+    fn hand_over(&mut self) -> io::Result<()> {
+        if self.piece.is_empty() {
+            return Ok(());
+        }
+        let piece = std::mem::replace(&mut self.piece, Vec::with_capacity(PIECE_BYTES));
+        let Some(pieces) = &self.pieces else { return Err(io::Error::other("file given up")) };
+        match pieces.try_send(piece) {
+            Ok(()) => Ok(()),
+            Err(TrySendError::Full(_)) => {
+                self.pieces = None;
+                Err(io::Error::new(io::ErrorKind::TimedOut, "disk more than 4 MB behind"))
+            }
+            Err(TrySendError::Disconnected(_)) => {
+                Err(self.join().err().unwrap_or_else(|| io::Error::other("writer gone")))
+            }
+        }
+    }
+
+    fn join(&mut self) -> io::Result<()> {
+        self.pieces = None;
+        let Some(writer) = self.writer.take() else { return Ok(()) };
+        if !ends_in_time(&writer) {
+            let why = "the disk does not answer, the file is not complete";
+            return Err(io::Error::new(io::ErrorKind::TimedOut, why));
+        }
+        writer.join().unwrap_or_else(|_| Err(io::Error::other("writer panicked")))
+    }
+}
+
+/// Waits for a thread that was told to end, up to [`MAX_FINISH`]; whether it has.
+pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
+    let asked = Instant::now();
+    while !thread.is_finished() {
+        if asked.elapsed() > MAX_FINISH {
+            return false;
+        }
+        std::thread::sleep(FINISH_POLL);
+    }
+    true
+}
+
+/// A record of an earlier run becomes `NAME.1`: what led to a crash is what somebody will want to read.
+fn keep_earlier(path: &Path) -> io::Result<()> {
+    let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
+    if !earlier.is_file() || earlier.len() == 0 {
+        return Ok(());
+    }
+    let mut kept = path.as_os_str().to_owned();
+    kept.push(".1");
+    std::fs::rename(path, kept)
+}
+
+impl Write for BackgroundFile {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.piece.extend_from_slice(bytes);
+        if self.piece.len() >= PIECE_BYTES {
+            self.hand_over()?;
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.hand_over()
+    }
+}
+
+fn write_all(mut file: File, queue: &Receiver<Vec<u8>>) -> io::Result<()> {
+    for piece in queue {
+        file.write_all(&piece)?;
+    }
+    // A pipe or a device cannot be synchronised, and need not be.
+    file.sync_all().or_else(|error| if error.raw_os_error() == Some(22) { Ok(()) } else { Err(error) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn everything_written_is_in_the_file_after_finish() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("record");
+        let mut file = BackgroundFile::create(&path).unwrap();
+        let line = [b'x'; 1000];
+        for _ in 0..1000 {
+            file.write_all(&line).unwrap();
+        }
+        file.finish().unwrap();
+        assert_eq!(std::fs::metadata(&path).unwrap().len(), 1_000_000);
+    }
+
+    #[test]
+    fn a_full_disk_is_told_at_the_latest_at_the_end() {
+        if let Ok(mut file) = BackgroundFile::create(Path::new("/dev/full")) {
+            let early = file.write_all(b"x");
+            assert!(early.is_err() || file.finish().is_err());
+        }
+    }
+}

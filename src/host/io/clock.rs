@@ -1,0 +1,322 @@
+//! The clock that never steps: wall time at the program's start plus CLOCK_BOOTTIME since then (which counts sleep).
+//!
+//! The kernel stamps received frames with CLOCK_REALTIME, which steps (NTP, a set clock), or with the adapter's own
+//! clock, whose origin is anything. [`MappedClock`] and [`HardwareClock`] move both onto ours:
+//!
+//! * a software stamp becomes `stamp - (realtime - boottime)` with that difference measured when the frame is read.
+//!   Around a step of the clock the difference of the previous reading is tried too and the later time taken; a
+//!   stamp that fits neither becomes the time of reading;
+//! * what "fits" means is known exactly: a frame that is read now came after the socket was last found empty. So
+//!   the error of any one stamp is bounded by the time since then, and a step bends no time difference by more;
+//! * a hardware stamp becomes `stamp + offset`, the offset being the least seen lately of (arrival - stamp): queueing
+//!   only ever adds, so the least is the truest, and forgetting old ones lets the adapter's quartz drift.
+//!
+//! Times of one interface never go backwards. All functions but [`Reading::now`] are pure: tests bring their own clock.
+
+use nix::time::{ClockId, clock_gettime};
+
+use crate::quantity::Timestamp;
+
+/// A stamp may be this much older than the moment the socket was last found empty, ns: between stamping and
+/// queueing lie a soft interrupt and, with USB adapters, a batch.
+const QUEUEING_SLACK_NS: i64 = 20_000_000;
+
+/// Half the memory of the least hardware offset, ns. A quartz 100 ppm off bends times by 1 ms over it.
+const HARDWARE_WINDOW_NS: i64 = 10_000_000_000;
+
+/// Both kernel clocks at one moment, ns since their origins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Reading {
+    /// CLOCK_REALTIME.
+    pub realtime_ns: i64,
+    /// CLOCK_BOOTTIME.
+    pub boottime_ns: i64,
+}
+
+impl Reading {
+    /// Reads both clocks. A kernel without CLOCK_BOOTTIME does not exist since 2.6.39; zero stands for it.
+    pub fn now() -> Self {
+        Self { realtime_ns: nanos_of(ClockId::CLOCK_REALTIME), boottime_ns: nanos_of(ClockId::CLOCK_BOOTTIME) }
+    }
+
+    fn offset_ns(self) -> i64 {
+        self.realtime_ns - self.boottime_ns
+    }
+}
+
+fn nanos_of(clock: ClockId) -> i64 {
+    clock_gettime(clock).map_or(0, |t| t.tv_sec().saturating_mul(1_000_000_000) + t.tv_nsec())
+}
+
+/// Stamps the kernel gave a frame, ns on their own clocks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct KernelStamps {
+    /// On CLOCK_REALTIME.
+    pub software_ns: Option<i64>,
+    /// On the adapter's clock.
+    pub hardware_ns: Option<i64>,
+}
+
+/// The program's clock.
+#[derive(Debug, Clone, Copy)]
+pub struct MappedClock {
+    /// Wall time minus boot time when the program started.
+    origin_ns: i64,
+}
+
+impl MappedClock {
+    /// The clock of a program that starts at `start`.
+    pub fn new(start: Reading) -> Self {
+        Self { origin_ns: start.offset_ns() }
+    }
+
+    /// The time at `reading`.
+    pub fn at(&self, reading: Reading) -> Timestamp {
+        Timestamp::from_nanos(self.origin_ns + reading.boottime_ns)
+    }
+
+    /// The time now.
+    pub fn now(&self) -> Timestamp {
+        Timestamp::from_nanos(self.origin_ns + nanos_of(ClockId::CLOCK_BOOTTIME))
+    }
+}
+
+/// Maps the stamps of one interface.
+#[derive(Debug, Clone)]
+pub struct StampMapper {
+    clock: MappedClock,
+    /// When the socket was last found empty, boot time.
+    emptied_ns: i64,
+    /// The realtime offset then.
+    emptied_offset_ns: i64,
+    hardware: HardwareClock,
+    latest: Timestamp,
+}
+
+impl StampMapper {
+    /// A mapper for a socket opened at `reading`: nothing can have arrived earlier.
+    pub fn new(clock: MappedClock, reading: Reading) -> Self {
+        Self {
+            clock,
+            emptied_ns: reading.boottime_ns,
+            emptied_offset_ns: reading.offset_ns(),
+            hardware: HardwareClock::default(),
+            latest: Timestamp::from_nanos(i64::MIN),
+        }
+    }
+
+    /// The socket was found empty at `reading`: what comes from now on is younger.
+    pub fn socket_empty(&mut self, reading: Reading) {
+        self.emptied_ns = reading.boottime_ns;
+        self.emptied_offset_ns = reading.offset_ns();
+    }
+
+    /// The socket was found empty by the very call that gave the frame answered last, read at `reading`: what comes from now
+    /// on is younger than that frame.
+    pub fn socket_emptied(&mut self, reading: Reading) {
+        self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);
+        self.emptied_offset_ns = reading.offset_ns();
+    }
+
+    /// When a frame read at `reading` arrived; never before an earlier answer.
+    pub fn arrival(&mut self, stamps: KernelStamps, reading: Reading) -> Timestamp {
+        let software = self.software(stamps.software_ns, reading);
+        let arrived_ns = match stamps.hardware_ns {
+            None => software,
+            Some(stamp) => {
+                let mapped = self.hardware.map(stamp, software);
+                if self.possible(mapped, reading) { mapped } else { self.hardware.restart(stamp, software) }
+            }
+        };
+        self.never_back(Timestamp::from_nanos(self.clock.origin_ns + arrived_ns))
+    }
+
+    /// The time of something the interface told us at `reading`, in order with its frames.
+    pub fn event(&mut self, reading: Reading) -> Timestamp {
+        self.never_back(self.clock.at(reading))
+    }
+
+    fn never_back(&mut self, time: Timestamp) -> Timestamp {
+        self.latest = self.latest.max(time);
+        self.latest
+    }
+
+    /// A realtime stamp on the boot clock.
+    fn software(&self, stamp: Option<i64>, reading: Reading) -> i64 {
+        let candidates =
+            [reading.offset_ns(), self.emptied_offset_ns].map(|offset| stamp.map(|s| s.saturating_sub(offset)));
+        // Both fit only around a step. Frames are read soon after they arrive: the later one.
+        candidates.into_iter().flatten().filter(|&t| self.possible(t, reading)).max().unwrap_or(reading.boottime_ns)
+    }
+
+    /// Whether a frame read at `reading` can have arrived at `arrived_ns`.
+    fn possible(&self, arrived_ns: i64, reading: Reading) -> bool {
+        (self.emptied_ns - QUEUEING_SLACK_NS..=reading.boottime_ns).contains(&arrived_ns)
+    }
+}
+
+/// The least of (arrival - stamp), remembered for one to two windows.
+#[derive(Debug, Clone, Default)]
+struct HardwareClock {
+    /// Least of this window and of the one before; `None` before the first stamp.
+    least_ns: Option<(i64, i64)>,
+    window_start_ns: i64,
+}
+
+impl HardwareClock {
+    /// An adapter's stamp on the boot clock; `arrived_ns` is when the frame came by the software stamp.
+    fn map(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
+        if arrived_ns.saturating_sub(self.window_start_ns) > 2 * HARDWARE_WINDOW_NS {
+            // After a silence the old offsets say nothing: the quartz has drifted on.
+            return self.restart(stamp_ns, arrived_ns);
+        }
+        let offset = arrived_ns.saturating_sub(stamp_ns);
+        let (mut current, mut previous) = self.least_ns.unwrap_or((offset, offset));
+        if arrived_ns - self.window_start_ns > HARDWARE_WINDOW_NS {
+            self.window_start_ns = arrived_ns;
+            (previous, current) = (current, offset);
+        }
+        current = current.min(offset);
+        self.least_ns = Some((current, previous));
+        stamp_ns.saturating_add(current.min(previous))
+    }
+
+    /// The adapter's clock jumped (it was reset, or slept): begins anew.
+    fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
+        let offset = arrived_ns.saturating_sub(stamp_ns);
+        *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };
+        arrived_ns
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: i64 = 1_000_000_000;
+    const MS: i64 = 1_000_000;
+    /// Wall time minus boot time in these tests.
+    const OFFSET: i64 = 1_700_000_000 * S;
+
+    fn at(boottime_ns: i64, step_ns: i64) -> Reading {
+        Reading { realtime_ns: OFFSET + boottime_ns + step_ns, boottime_ns }
+    }
+
+    fn mapper() -> StampMapper {
+        StampMapper::new(MappedClock::new(at(0, 0)), at(0, 0))
+    }
+
+    /// A frame arrives every 100 ms and is read 2 ms later; the wall clock steps by `step_ns` at `step_at_ns`.
+    fn arrivals(step_ns: i64, step_at_ns: i64, by_the_same_call: bool) -> Vec<i64> {
+        let mut mapper = mapper();
+        let wall_step = |t: i64| if t >= step_at_ns { step_ns } else { 0 };
+        (1..40)
+            .map(|k| {
+                let (arrived, read) = (k * 100 * MS, k * 100 * MS + 2 * MS);
+                let stamps =
+                    KernelStamps { software_ns: Some(OFFSET + arrived + wall_step(arrived)), hardware_ns: None };
+                let time = mapper.arrival(stamps, at(read, wall_step(read)));
+                // Found empty by the same call, or by another after it.
+                if by_the_same_call {
+                    mapper.socket_emptied(at(read, wall_step(read)));
+                } else {
+                    mapper.socket_empty(at(read, wall_step(read)));
+                }
+                time.nanos() - OFFSET
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_software_stamp_is_the_arrival_not_the_reading() {
+        assert_eq!(arrivals(0, 0, true)[0], 100 * MS);
+    }
+
+    #[test]
+    fn a_stepping_wall_clock_changes_no_time_difference() {
+        // Between two frames, and between stamp and reading of one frame.
+        for step_at in [1950 * MS, 2001 * MS] {
+            for step in [3600 * S, -3600 * S, S / 2, -S / 2, 50 * MS, -50 * MS] {
+                for times in [true, false].map(|by_the_same_call| arrivals(step, step_at, by_the_same_call)) {
+                    for pair in times.windows(2) {
+                        assert_eq!(pair[1] - pair[0], 100 * MS, "step {step} ns at {step_at} ns");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn frames_that_waited_long_in_the_kernel_keep_their_distance() {
+        let mut mapper = mapper();
+        mapper.socket_empty(at(S, 0));
+        let read = at(31 * S, 0);
+        let times: Vec<i64> = (2..30)
+            .map(|k| KernelStamps { software_ns: Some(OFFSET + k * S), hardware_ns: None })
+            .map(|stamps| mapper.arrival(stamps, read).nanos() - OFFSET)
+            .collect();
+        assert_eq!(times, (2..30).map(|k| k * S).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn a_stamp_from_the_future_or_from_before_the_socket_was_empty_becomes_the_reading() {
+        let mut mapper = mapper();
+        mapper.socket_empty(at(10 * S, 0));
+        for wrong in [OFFSET + 12 * S, OFFSET + 9 * S, 0, i64::MIN, i64::MAX] {
+            let stamps = KernelStamps { software_ns: Some(wrong), hardware_ns: None };
+            assert_eq!(mapper.arrival(stamps, at(11 * S, 0)).nanos(), OFFSET + 11 * S);
+        }
+    }
+
+    #[test]
+    fn times_of_one_interface_never_go_backwards() {
+        let mut mapper = mapper();
+        let late = mapper.event(at(5 * S, 0));
+        let stamps = KernelStamps { software_ns: Some(OFFSET + 4 * S), hardware_ns: None };
+        assert_eq!(mapper.arrival(stamps, at(6 * S, 0)), late);
+    }
+
+    #[test]
+    fn sleep_counts_as_time() {
+        let clock = MappedClock::new(at(0, 0));
+        assert_eq!(clock.at(at(8 * 3600 * S, 0)).since(clock.at(at(0, 0))), 28_800.0);
+    }
+
+    #[test]
+    fn hardware_stamps_lose_the_jitter_of_reading_and_follow_the_quartz() {
+        let mut mapper = mapper();
+        // The adapter's clock started at 7 s of ours and runs 100 ppm fast; stamping in software is up to 3 ms late.
+        for k in 1..600_i64 {
+            let arrived = 10 * S + k * 100 * MS;
+            let late = (k * 7 % 4) * MS;
+            let hardware = (arrived - 7 * S) + (arrived - 7 * S) / 10_000;
+            let stamps = KernelStamps { software_ns: Some(OFFSET + arrived + late), hardware_ns: Some(hardware) };
+            let read = at(arrived + late + MS, 0);
+            let error = mapper.arrival(stamps, read).nanos() - OFFSET - arrived;
+            mapper.socket_empty(at(arrived + late + MS, 0));
+            assert!(k < 5 || (-MS / 10..=3 * MS).contains(&error), "frame {k}: {error} ns");
+        }
+    }
+
+    #[test]
+    fn after_hours_of_silence_old_offsets_do_not_bend_the_stamps() {
+        let mut clock = HardwareClock::default();
+        // The adapter's quartz is 50 ppm slow: 1.44 s in eight silent hours.
+        let stamp = |t: i64| t - t / 20_000;
+        clock.map(stamp(S), S);
+        for arrived in (0..200).map(|k| 8 * 3600 * S + k * 100 * MS) {
+            let mapped = clock.map(stamp(arrived), arrived);
+            assert!((mapped - arrived).abs() <= 2 * MS, "{} ns", mapped - arrived);
+        }
+    }
+
+    #[test]
+    fn an_adapter_whose_clock_restarts_is_followed() {
+        let mut mapper = mapper();
+        for (k, hardware) in [(1, 500 * S), (2, 501 * S), (3, 0), (4, S), (5, 2 * S)] {
+            let stamps = KernelStamps { software_ns: Some(OFFSET + k * S), hardware_ns: Some(hardware) };
+            assert_eq!(mapper.arrival(stamps, at(k * S, 0)).nanos() - OFFSET, k * S);
+            mapper.socket_empty(at(k * S, 0));
+        }
+    }
+}

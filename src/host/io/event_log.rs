@@ -1,0 +1,259 @@
+//! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are told
+//! once, then as a count: a bus without a partner makes thousands a second, for as long as it has none. And as JSON lines, all of them.
+
+use std::io::{self, Write};
+
+use crate::alarm::{Change, Severity};
+use crate::can::CanId;
+use crate::can::e2e::Status;
+use crate::monitor::{BusEvent, Event, EventKind};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
+
+/// What one interface does again and again is told as a sum after this long, s; then after twice that, and so on.
+const SUMMARY_S: f64 = 10.0;
+/// At least this often, s.
+const LONGEST_SUMMARY_S: f64 = 3600.0;
+
+/// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
+pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    serde_json::to_writer(&mut *out, event)?;
+    out.write_all(b"\n")
+}
+
+/// Frames of one kind on one interface that are told of as a sum.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sum {
+    told: Option<Timestamp>,
+    untold: u64,
+    /// Until the next sum, s.
+    period_s: f64,
+}
+
+impl Sum {
+    /// Adds frames; gives how many there are to be told, when it is time to.
+    fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
+        self.untold += frames;
+        let since_s = self.told.map_or(f64::INFINITY, |told| time.since(told));
+        if since_s < self.period_s {
+            return None;
+        }
+        // After a pause it is news again.
+        let goes_on = since_s < 2.0 * self.period_s;
+        self.period_s = if goes_on { (2.0 * self.period_s).min(LONGEST_SUMMARY_S) } else { SUMMARY_S };
+        self.told = Some(time);
+        Some(std::mem::take(&mut self.untold))
+    }
+}
+
+/// The sums of one interface.
+#[derive(Debug, Clone, Copy, Default)]
+struct Sums {
+    errors: Sum,
+    dropped: Sum,
+    unsent: Sum,
+}
+
+/// Logs events.
+#[derive(Debug)]
+pub struct EventLog {
+    interfaces: Vec<String>,
+    sums: Vec<Sums>,
+}
+
+impl EventLog {
+    /// For these interfaces, in the order of the configuration.
+    pub fn new(interfaces: Vec<String>) -> Self {
+        let sums = vec![Sums::default(); interfaces.len()];
+        Self { interfaces, sums }
+    }
+
+    /// Logs one event.
+    pub fn log(&mut self, event: &Event) {
+        match event.kind {
+            EventKind::Bus { bus, what } => self.log_bus(event.time, bus.index(), what),
+            EventKind::Alarm { .. } => log_alarm(&event.kind),
+            EventKind::HalfCycle { .. }
+            | EventKind::Capacity { .. }
+            | EventKind::RemainingLife { .. }
+            | EventKind::RechargePeriod { .. } => {
+                log_learned(&event.kind);
+            }
+            EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
+            EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
+            EventKind::Protection { bus, id, status, usable, count } => {
+                self.log_protection(bus, id, status, usable, count);
+            }
+            EventKind::Flood { bus, id, active: true, .. } => {
+                tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
+            }
+            EventKind::Flood { bus, id, active: false, dropped } => {
+                tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
+            }
+            EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
+            EventKind::TimeBackwards { seconds } => tracing::warn!(seconds, "time went backwards"),
+            EventKind::Trust { cell, trusted: false, mean_nis } => {
+                tracing::warn!(cell = number(cell), mean_nis, "estimate not to be trusted");
+            }
+            EventKind::Trust { cell, trusted: true, mean_nis } => {
+                tracing::info!(cell = number(cell), mean_nis, "estimate trusted again");
+            }
+            EventKind::J1939 { what } => tracing::info!(?what, "J1939"),
+            EventKind::Mode { from, to } => tracing::info!(?from, ?to, "mode"),
+            EventKind::Command { source, command, changed, refused } => {
+                tracing::info!(?source, ?command, changed, refused, "command");
+            }
+            EventKind::BadCommand { bus, intact } => {
+                let interface = self.interfaces.get(bus.index()).map_or("?", String::as_str);
+                tracing::warn!(interface, intact, "command frame not obeyed");
+            }
+            EventKind::Test { rule, running } => {
+                tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
+            }
+            EventKind::PackReplaced { capacity_ah, capacity_std_ah } => {
+                tracing::warn!(
+                    capacity_ah,
+                    capacity_std_ah,
+                    "another pack: what was learned of the old one is forgotten"
+                );
+            }
+            EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),
+            EventKind::Reconfigured { alarms_ended } => tracing::info!(alarms_ended, "another configuration"),
+            EventKind::AlarmDropped { rule, severity, cell, active, occurrences } => {
+                let cell = cell.map(number);
+                tracing::warn!(
+                    ?rule,
+                    ?severity,
+                    cell,
+                    active,
+                    occurrences,
+                    "stored alarm dropped, nothing watches it now"
+                );
+            }
+            EventKind::Store { works: true } => tracing::info!("files can be written"),
+            EventKind::Store { works: false } => tracing::error!("a file cannot be written"),
+            EventKind::Gap { seconds } => tracing::info!(seconds, "gap"),
+        }
+    }
+
+    fn name(&self, bus: BusIndex) -> &str {
+        self.interfaces.get(bus.index()).map_or("?", String::as_str)
+    }
+
+    fn log_protection(&self, bus: BusIndex, id: CanId, status: Status, usable: bool, count: u64) {
+        let (interface, status) = (self.name(bus), status.name());
+        if usable {
+            tracing::info!(interface, %id, status, failed = count, "protected message usable again");
+        } else {
+            tracing::warn!(interface, %id, status, failed = count, "protected message fails its check");
+        }
+    }
+
+    fn log_bus(&mut self, time: Timestamp, bus: usize, what: BusEvent) {
+        let interface = self.interfaces.get(bus).map_or("?", String::as_str);
+        let Some(sums) = self.sums.get_mut(bus) else { return };
+        match what {
+            BusEvent::Up => tracing::info!(interface, "interface up"),
+            BusEvent::Down => tracing::warn!(interface, "interface down"),
+            BusEvent::Missing => tracing::warn!(interface, "interface missing"),
+            BusEvent::Dropped { frames } => {
+                if let Some(frames) = sums.dropped.add(time, frames) {
+                    tracing::warn!(interface, frames, "frames lost on receiving");
+                }
+            }
+            BusEvent::SendFailed { frames } => {
+                if let Some(frames) = sums.unsent.add(time, frames) {
+                    tracing::warn!(interface, frames, "frames not sent");
+                }
+            }
+            BusEvent::ErrorFrame { class } => {
+                if let Some(frames) = sums.errors.add(time, 1) {
+                    tracing::warn!(interface, frames, class = format_args!("{class:#x}"), "error frames");
+                }
+            }
+        }
+    }
+}
+
+/// A cell's number as people count, from 1.
+fn number(cell: CellIndex) -> u32 {
+    u32::from(cell.0) + 1
+}
+
+fn log_alarm(kind: &EventKind) {
+    let EventKind::Alarm { rule, cell, change, severity, value, probability, threshold, occurrences, .. } = *kind
+    else {
+        return;
+    };
+    let cell = cell.map(number);
+    let what = match change {
+        Change::Raised => "alarm raised",
+        Change::Suppressed => "alarm raised earlier, its value is not known now",
+        Change::Resumed => "alarm raised earlier, its value is known again",
+        Change::Latched => "alarm latched",
+        Change::Cleared => "alarm cleared",
+        Change::Acknowledged => "alarm acknowledged",
+        Change::Forgotten => "alarm forgotten",
+    };
+    if change == Change::Raised && severity != Severity::Info {
+        tracing::warn!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
+    } else {
+        tracing::info!(?rule, cell, ?severity, value, probability, threshold, occurrences, "{what}");
+    }
+}
+
+fn log_learned(kind: &EventKind) {
+    match *kind {
+        EventKind::HalfCycle { cell, mode, charge_ah, swing, swing_std, duration_s, .. } => {
+            tracing::info!(cell = number(cell), ?mode, charge_ah, swing, swing_std, duration_s, "half-cycle");
+        }
+        EventKind::Capacity {
+            cell,
+            measured_ah,
+            capacity_ah,
+            capacity_std_ah,
+            usable_capacity_ah,
+            resistance_ratio,
+            ..
+        } => {
+            tracing::info!(
+                cell = number(cell),
+                measured_ah,
+                capacity_ah,
+                capacity_std_ah,
+                usable_capacity_ah,
+                resistance_ratio,
+                "capacity"
+            );
+        }
+        EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, .. } => {
+            tracing::info!(cell = cell.map(number), cycles, cycles_low, cycles_high, days, "remaining life");
+        }
+        EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
+            tracing::info!(seconds, normalised_s, normalised_std_s, "recharge period");
+        }
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
+        let mut sum = Sum::default();
+        let told: Vec<u64> =
+            (0..86_400 * 4).filter_map(|n| sum.add(Timestamp::from_secs(f64::from(n) * 0.25), 2)).collect();
+        assert!((20..=45).contains(&told.len()), "{} lines", told.len());
+        assert_eq!(told[0], 2, "the first is told at once");
+        assert_eq!(told.iter().sum::<u64>() + sum.untold, 86_400 * 4 * 2);
+    }
+
+    #[test]
+    fn after_a_pause_it_is_told_at_once_again() {
+        let mut sum = Sum::default();
+        let mut add = |at_s: f64| sum.add(Timestamp::from_secs(at_s), 1);
+        assert_eq!([add(0.0), add(1.0), add(10.0), add(11.0)], [Some(1), None, Some(2), None]);
+        assert_eq!([add(1000.0), add(1001.0), add(1010.0)], [Some(2), None, Some(2)]);
+    }
+}

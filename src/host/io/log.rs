@@ -1,0 +1,474 @@
+//! One stream of the core's inputs from logs of any form: journals, candump logs, CSV; plain, gzip or zstd.
+//!
+//! The form is told by the first line (CSV also by the name). Several logs are read one after another on one clock:
+//! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
+//! after it, and an unknown gap is put before it. Everything that is not handed on is counted in [`LogCounts`].
+
+mod record;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU64;
+
+use serde::Serialize;
+
+use super::candump::{self, Line, fast_line};
+use super::csv_log::{CsvLog, CsvOptions, RowResult};
+use super::journal::{self, Mark};
+use super::lines::{self, Lines, RawLine};
+use crate::can::Frame;
+use crate::can::decode::Channel;
+use crate::monitor::BusEvent;
+use crate::quantity::{BusIndex, Timestamp};
+
+pub use record::{Batch, Record};
+
+/// Where a part with an unknown gap before it is put: this long after the record so far.
+const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
+/// Names of unconfigured interfaces counted apart; more are counted together under "...".
+const MAX_FOREIGN_NAMES: usize = 64;
+
+/// Most interfaces, configured and adopted: a log has a handful.
+pub const MAX_ADOPTED: usize = 64;
+
+/// Why reading cannot go on, with file and line.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct LogError(pub String);
+
+/// Turns one CSV row's values into the frames that would have carried them; gives how many values no frame could carry.
+pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
+
+/// How logs are to be read.
+pub struct LogOptions {
+    /// Configured interface names, in the order of their numbers.
+    pub interfaces: Vec<String>,
+    /// A bad line ends the reading.
+    pub strict: bool,
+    /// For CSV logs.
+    pub csv: CsvOptions,
+    /// For CSV logs.
+    pub encode_row: RowEncoder,
+}
+
+impl std::fmt::Debug for LogOptions {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("LogOptions").field("interfaces", &self.interfaces).finish_non_exhaustive()
+    }
+}
+
+/// What was read, and what of it was not handed on.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct LogCounts {
+    /// Lines and CSV rows read, bad ones included.
+    pub lines: u64,
+    /// Frames handed on.
+    pub frames: u64,
+    /// Lines that break their grammar, and files that end damaged.
+    pub bad_lines: u64,
+    /// The first of them: file, line, found and expected.
+    pub first_bad_line: Option<String>,
+    /// Lines that are no record: headers, comments, blank ones.
+    pub ignored_lines: u64,
+    /// CAN XL frames, not supported.
+    pub xl_frames: u64,
+    /// Error frames.
+    pub error_frames: u64,
+    /// Frames the recorder says it lost.
+    pub dropped_frames: u64,
+    /// Frames and events of interfaces that are not configured, by name.
+    pub foreign: BTreeMap<String, u64>,
+    /// Records with a stamp before the one before them.
+    pub time_backwards: u64,
+    /// Parts with an unknown gap before them.
+    pub unknown_gaps: u64,
+    /// CSV values that no input frame could carry (out of the signal's range, or no such signal).
+    pub uncarried_values: u64,
+}
+
+/// Reads logs one after another.
+pub struct LogSource {
+    files: VecDeque<PathBuf>,
+    current: Option<Open>,
+    queue: VecDeque<Record>,
+    frames: Vec<(BusIndex, Frame)>,
+    encode_row: RowEncoder,
+    csv: CsvOptions,
+    state: State,
+    read_bytes: Arc<AtomicU64>,
+}
+
+impl std::fmt::Debug for LogSource {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("LogSource").field("files", &self.files).finish_non_exhaustive()
+    }
+}
+
+struct Open {
+    name: String,
+    form: Form,
+}
+
+enum Form {
+    Text { lines: Lines, journal: bool },
+    Csv(Box<CsvLog>),
+}
+
+/// What the parsers share: counts, names, the clock.
+struct State {
+    counts: LogCounts,
+    strict: bool,
+    interfaces: Vec<String>,
+    /// Knows the interfaces.
+    fast_line: fast_line::FastLineParser,
+    /// Interfaces that are not configured get a number too.
+    adopt: bool,
+    shift_ns: i64,
+    latest: Option<Timestamp>,
+    /// The next record begins a file or a section.
+    fresh: bool,
+    /// ... and how long after the record so far is unknown.
+    unknown: bool,
+}
+
+impl LogSource {
+    /// Logs to be read in this order.
+    pub fn new(files: impl IntoIterator<Item = PathBuf>, options: LogOptions) -> Self {
+        Self {
+            files: files.into_iter().collect(),
+            current: None,
+            queue: VecDeque::new(),
+            frames: Vec::new(),
+            encode_row: options.encode_row,
+            csv: options.csv,
+            state: State {
+                counts: LogCounts::default(),
+                strict: options.strict,
+                fast_line: fast_line::FastLineParser::new(&options.interfaces),
+                interfaces: options.interfaces,
+                adopt: false,
+                shift_ns: 0,
+                latest: None,
+                fresh: true,
+                unknown: false,
+            },
+            read_bytes: Arc::default(),
+        }
+    }
+
+    /// From here on interfaces that are not configured are handed on too: each gets the next number, up to
+    /// [`MAX_ADOPTED`] of them.
+    pub fn adopt_foreign(&mut self) {
+        self.state.adopt = true;
+    }
+
+    /// Names of the interfaces by their numbers, adopted ones last.
+    pub fn interfaces(&self) -> &[String] {
+        &self.state.interfaces
+    }
+
+    /// What was read so far.
+    pub fn counts(&self) -> &LogCounts {
+        &self.state.counts
+    }
+
+    /// Bytes taken from the files so far, compressed as they are.
+    pub fn read_bytes(&self) -> &Arc<AtomicU64> {
+        &self.read_bytes
+    }
+
+    /// Whether the log being read carries its own ticks.
+    pub fn carries_ticks(&self) -> bool {
+        matches!(self.current, Some(Open { form: Form::Text { journal: true, .. }, .. }))
+    }
+
+    /// The next record; `None` at the end of the last log.
+    ///
+    /// # Errors
+    /// When a log cannot be opened, a CSV's header does not fit, or, if strict, at the first bad line.
+    pub fn next_record(&mut self) -> Result<Option<Record>, LogError> {
+        loop {
+            if let Some(record) = self.queue.pop_front() {
+                return Ok(Some(record));
+            }
+            if let Some(Open { form: Form::Text { lines, .. }, .. }) = &mut self.current
+                && let mut slot = [record::NOTHING]
+                && self.state.usual_records(lines, &mut slot) > 0
+            {
+                return Ok(Some(slot[0]));
+            }
+            let Some(open) = &mut self.current else {
+                let Some(path) = self.files.pop_front() else { return Ok(None) };
+                self.current = Some(self.open(&path)?);
+                continue;
+            };
+            let more = match &mut open.form {
+                Form::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
+                    Some(record) => {
+                        let (gap, time) = self.state.place(record.time());
+                        let record = record.at(time);
+                        let Some(gap) = gap else { return Ok(Some(record)) };
+                        self.queue.push_back(record);
+                        return Ok(Some(gap));
+                    }
+                    None => false,
+                },
+                Form::Csv(log) => self.state.next_row(log, &open.name)?.is_some_and(|raw| {
+                    let (gap, time) = self.state.place(raw);
+                    self.queue.extend(gap);
+                    let uncarried = (self.encode_row)(&log.values, &mut self.frames);
+                    self.state.counts.uncarried_values += uncarried as u64;
+                    self.state.counts.frames += self.frames.len() as u64;
+                    self.queue.extend(self.frames.drain(..).map(|(bus, frame)| Record::Frame { time, bus, frame }));
+                    true
+                }),
+            };
+            if !more {
+                self.current = None;
+            }
+        }
+    }
+
+    /// The next records, at least one: what can be had without waiting for more of the file. `false` at the end of the last
+    /// log.
+    ///
+    /// # Errors
+    /// As [`next_record`](Self::next_record), and only once every record before has been given.
+    pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
+        batch.len = 0;
+        if let Some(open) = &mut self.current
+            && let Form::Text { lines, journal } = &mut open.form
+            && self.queue.is_empty()
+        {
+            batch.carries_ticks = *journal;
+            batch.len = self.state.usual_records(lines, &mut batch.slots);
+            if batch.len > 0 {
+                return Ok(true);
+            }
+        }
+        let Some(record) = self.next_record()? else { return Ok(false) };
+        (batch.slots[0], batch.len, batch.carries_ticks) = (record, 1, self.carries_ticks());
+        Ok(true)
+    }
+
+    fn open(&mut self, path: &Path) -> Result<Open, LogError> {
+        let name = path.display().to_string();
+        let failed = |e: std::io::Error| LogError(format!("{name}: cannot be read: {e}"));
+        let mut lines = Lines::new(lines::open(path, &self.read_bytes).map_err(failed)?);
+        let first = lines.peek().map_err(failed)?.trim_ascii_end();
+        let journal = first == journal::HEADER.as_bytes();
+        if first.starts_with(b"PACKWATCH-JOURNAL") && !journal {
+            let found = String::from_utf8_lossy(first);
+            return Err(LogError(format!("{name}:1: found {found:?}, this program reads {:?}", journal::HEADER)));
+        }
+        let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
+        (self.state.fresh, self.state.unknown) = (true, false);
+        let form = if csv {
+            Form::Csv(Box::new(CsvLog::open(Box::new(lines.into_reader()), &name, &self.csv)?))
+        } else {
+            Form::Text { lines, journal }
+        };
+        Ok(Open { name, form })
+    }
+}
+
+/// `.csv`, `.csv.gz`, `.csv.zst`.
+fn named_csv(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
+}
+
+impl State {
+    /// The next records of a text log into these slots, as long as they are frames in usual lines of known interfaces and
+    /// not the first of their file; how many. Exactly what the long way ([`next_text`](Self::next_text),
+    /// [`place`](Self::place)) gives for them.
+    fn usual_records(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
+        let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
+        let all = lines.unread();
+        let (mut text, mut count, mut backwards) = (all, 0, 0);
+        for slot in slots {
+            let Some(line) = self.fast_line.parse(text) else { break };
+            *slot = Record::Frame { time: line.time, bus: line.bus, frame: line.frame() };
+            text = &text[line.line_len..];
+            count += 1;
+            if line.time < latest {
+                std::hint::cold_path();
+                backwards += 1;
+            } else {
+                latest = line.time;
+            }
+        }
+        let len = all.len() - text.len();
+        lines.take_lines(len, count);
+        self.counts.lines += count;
+        self.counts.frames += count;
+        self.counts.time_backwards += backwards;
+        self.latest = Some(latest);
+        count as usize
+    }
+
+    fn bad(&mut self, what: impl FnOnce() -> String) -> Result<(), LogError> {
+        self.counts.bad_lines += 1;
+        if self.strict {
+            return Err(LogError(what()));
+        }
+        self.counts.first_bad_line.get_or_insert_with(what);
+        Ok(())
+    }
+
+    /// The next record of a text log on its own clock.
+    fn next_text(&mut self, lines: &mut Lines, journal: bool, name: &str) -> Result<Option<Record>, LogError> {
+        loop {
+            let number = lines.number() + 1;
+            let bytes = match lines.next_line() {
+                Ok(Some(RawLine::Whole(bytes))) => bytes,
+                Ok(Some(RawLine::Last(bytes))) if !journal => bytes,
+                Ok(Some(RawLine::Last(_))) => {
+                    self.counts.lines += 1;
+                    self.bad(|| format!("{name}:{number}: the last line is torn (no line feed)"))?;
+                    continue;
+                }
+                Ok(Some(RawLine::TooLong)) => {
+                    self.counts.lines += 1;
+                    self.bad(|| format!("{name}:{number}: longer than 256 KiB"))?;
+                    continue;
+                }
+                Ok(None) => return Ok(None),
+                Err(error) => {
+                    self.bad(|| format!("{name}: damaged after line {}: {error}", number - 1))?;
+                    return Ok(None);
+                }
+            };
+            self.counts.lines += 1;
+            let record = match candump::parse_line(bytes) {
+                Ok(Line::Other) if journal => match journal::parse_mark(bytes) {
+                    Ok(mark) => self.mark_record(mark),
+                    Err(error) => {
+                        self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
+                        None
+                    }
+                },
+                Ok(line) => self.line_record(&line),
+                Err(error) => {
+                    self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
+                    None
+                }
+            };
+            if record.is_some() {
+                return Ok(record);
+            }
+        }
+    }
+
+    fn line_record(&mut self, line: &Line<'_>) -> Option<Record> {
+        match *line {
+            Line::Frame { time, interface, frame, .. } => {
+                let bus = self.bus(interface)?;
+                self.counts.frames += 1;
+                Some(Record::Frame { time, bus, frame })
+            }
+            Line::ErrorFrame { time, interface, class } => {
+                self.counts.error_frames += 1;
+                let bus = self.bus(interface)?;
+                Some(Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } })
+            }
+            Line::Dropped { interface, frames } => {
+                self.counts.dropped_frames += frames;
+                let bus = self.bus(interface)?;
+                // The line has no stamp: it belongs to the frame before it, if there was one.
+                let time = self.latest?.plus_nanos(-self.shift_ns);
+                (!self.fresh).then_some(Record::Bus { time, bus, event: BusEvent::Dropped { frames } })
+            }
+            Line::Xl { .. } => {
+                self.counts.xl_frames += 1;
+                None
+            }
+            Line::Other => {
+                self.counts.ignored_lines += 1;
+                None
+            }
+        }
+    }
+
+    fn mark_record(&mut self, mark: Option<Mark<'_>>) -> Option<Record> {
+        match mark {
+            Some(Mark::Tick { time }) => Some(Record::Tick { time }),
+            Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
+            Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
+            Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
+            Some(Mark::Reload { time }) => Some(Record::Reload { time }),
+            Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
+            Some(Mark::Bus { time, interface, event }) => {
+                let bus = self.bus(interface)?;
+                Some(Record::Bus { time, bus, event })
+            }
+            None => {
+                self.counts.ignored_lines += 1;
+                None
+            }
+        }
+    }
+
+    /// The interface's number; one that is not configured is counted.
+    fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
+        let name = String::from_utf8_lossy(interface);
+        if let Some(index) = self.interfaces.iter().position(|known| *known == name) {
+            return u8::try_from(index).ok().map(BusIndex);
+        }
+        if self.adopt && self.interfaces.len() < MAX_ADOPTED {
+            self.interfaces.push(name.into_owned());
+            self.fast_line.know(&self.interfaces);
+            return u8::try_from(self.interfaces.len() - 1).ok().map(BusIndex);
+        }
+        let foreign = &mut self.counts.foreign;
+        let full = foreign.len() >= MAX_FOREIGN_NAMES && !foreign.contains_key(name.as_ref());
+        *foreign.entry(if full { "...".to_owned() } else { name.into_owned() }).or_default() += 1;
+        None
+    }
+
+    /// The next good row's time on the file's own clock.
+    fn next_row(&mut self, log: &mut CsvLog, name: &str) -> Result<Option<Timestamp>, LogError> {
+        loop {
+            match log.next() {
+                Ok(RowResult::Row(row)) => {
+                    self.counts.lines += 1;
+                    if row.after_unknown_gap {
+                        (self.fresh, self.unknown) = (true, true);
+                    }
+                    return Ok(Some(row.time));
+                }
+                Ok(RowResult::Bad { line, what }) => {
+                    self.counts.lines += 1;
+                    self.bad(|| format!("{name}:{line}: {what}"))?;
+                }
+                Ok(RowResult::End) => return Ok(None),
+                Err(error) => {
+                    self.bad(|| format!("{name}: damaged: {error}"))?;
+                    return Ok(None);
+                }
+            }
+        }
+    }
+
+    /// A file's own stamp on the common clock; a gap to go before it, where one is needed.
+    fn place(&mut self, raw: Timestamp) -> (Option<Record>, Timestamp) {
+        let mut gap = false;
+        if std::mem::take(&mut self.fresh) {
+            self.shift_ns = 0;
+            gap = std::mem::take(&mut self.unknown);
+            if let Some(latest) = self.latest.filter(|&latest| raw < latest) {
+                self.shift_ns = latest.plus_nanos(UNKNOWN_GAP_NS).nanos().saturating_sub(raw.nanos());
+                gap = true;
+            }
+            self.fast_line.shift(self.shift_ns);
+        }
+        let time = raw.plus_nanos(self.shift_ns);
+        if self.latest.is_some_and(|latest| time < latest) {
+            self.counts.time_backwards += 1;
+        }
+        self.latest = Some(self.latest.map_or(time, |latest| latest.max(time)));
+        self.counts.unknown_gaps += u64::from(gap);
+        (gap.then_some(Record::UnknownGap { time }), time)
+    }
+}

@@ -1,0 +1,16 @@
+//! Files and sockets: logs in every form, journals, result files, CAN interfaces.
+
+pub mod background_file;
+pub mod candump;
+pub mod clock;
+pub mod csv_log;
+pub mod event_log;
+pub mod journal;
+pub mod lines;
+pub mod log;
+pub mod result_file;
+pub mod snapshot_file;
+pub mod socket;
+pub mod stamp;
+pub mod ticks;
+pub mod unix_socket;

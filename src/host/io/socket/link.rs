@@ -1,0 +1,500 @@
+//! One interface for as long as the daemon lives: receives, sends, and survives the interface going down, away and
+//! coming back. Every change is a [`BusEvent`]; nothing here ends the program.
+//!
+//! A socket that went down is kept: it is still bound, so the first frame after the interface comes up is not lost.
+//! A socket whose interface was removed is dead, whatever comes back under its name: a new one is opened. One task
+//! owns the socket for both directions, because the kernel keeps our frames from us only on the socket that sent them.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use nix::errno::Errno;
+use tokio::io::unix::AsyncFd;
+use tokio::io::{Interest, Ready};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
+
+use super::counters::{LinkCounters, LinkState};
+use super::raw::{CALL_BATCH, RawConfig, RawReceived, RawSocket, index_of};
+use super::wire::Wire;
+use crate::can::{CanId, Frame};
+use crate::io::clock::{MappedClock, Reading, StampMapper};
+use crate::monitor::BusEvent;
+use crate::quantity::{BusIndex, Timestamp};
+
+/// First pause before an interface that is down or missing is looked at again.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+/// Longest such pause: a look costs a few system calls, a frame missed cannot be had again.
+const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+/// Frames read before other tasks get their turn: 8 ms of a full 1 Mbit/s bus, under one tick.
+const READ_BATCH: usize = 64;
+/// Frames waiting to be sent: the status, health and alarm frames of a second, many times over.
+const SEND_QUEUE: usize = 256;
+/// A frame not sent after this long says something that is no longer true, and is dropped.
+const SEND_MAX_AGE: Duration = Duration::from_millis(500);
+/// How often losses are reported: a stalled bus must not fill the journal.
+const REPORT_PERIOD: Duration = Duration::from_millis(250);
+
+/// What a link needs to know.
+#[derive(Debug, Clone)]
+pub struct LinkConfig {
+    /// Its number.
+    pub bus: BusIndex,
+    /// Kernel name.
+    pub interface: String,
+    /// FD frames too.
+    pub fd: bool,
+    /// Identifiers wanted, ascending.
+    pub ids: Vec<CanId>,
+    /// Extended identifiers wanted besides, as identifier and mask.
+    pub patterns: Vec<(u32, u32)>,
+    /// Receive buffer to ask for, bytes.
+    pub receive_buffer_bytes: usize,
+}
+
+/// One thing an interface delivered, on the program's clock.
+#[derive(Debug, Clone, Copy)]
+pub struct Received {
+    /// When.
+    pub time: Timestamp,
+    /// Where.
+    pub bus: BusIndex,
+    /// What.
+    pub what: LinkEvent,
+}
+
+/// Frame or event.
+#[derive(Debug, Clone, Copy)]
+pub enum LinkEvent {
+    /// A frame.
+    Frame(Frame),
+    /// Anything else.
+    Event(BusEvent),
+}
+
+/// The sending end of a link. Dropped, it ends the link once what is queued has been sent.
+#[derive(Debug)]
+pub struct LinkOutput {
+    queue: mpsc::Sender<Outgoing>,
+    unsent: Arc<AtomicU64>,
+    counters: Arc<LinkCounters>,
+}
+
+#[derive(Debug)]
+struct Outgoing {
+    since: Instant,
+    frame: Frame,
+}
+
+impl LinkOutput {
+    /// Queues a frame; one that finds the queue full is dropped and counted.
+    pub fn send(&self, frame: Frame) {
+        if self.queue.try_send(Outgoing { since: Instant::now(), frame }).is_err() {
+            self.unsent.fetch_add(1, Ordering::Relaxed);
+            LinkCounters::add(&self.counters.send_queue_full, 1);
+        }
+    }
+
+    /// What the link has counted.
+    pub fn counters(&self) -> &LinkCounters {
+        &self.counters
+    }
+}
+
+/// What is known of the interface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    Up,
+    Down,
+    Missing,
+}
+
+/// Why a socket is no longer served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum End {
+    /// The daemon stops.
+    Stopped,
+    /// The socket is of no more use.
+    Dead,
+}
+
+/// One interface.
+#[derive(Debug)]
+pub struct Link {
+    config: LinkConfig,
+    clock: MappedClock,
+    inbox: mpsc::Sender<Received>,
+    outgoing: mpsc::Receiver<Outgoing>,
+    unsent: Arc<AtomicU64>,
+    counters: Arc<LinkCounters>,
+    state: Option<State>,
+    /// When that was noted.
+    state_since: Timestamp,
+    /// Frames lost since the last report: by the kernel, and by our full inbox.
+    lost: u64,
+    report: Interval,
+    pause: Duration,
+    last_problem: Option<String>,
+}
+
+/// An open socket and what belongs to it alone.
+struct Open {
+    socket: AsyncFd<RawSocket>,
+    mapper: StampMapper,
+    /// What one call brought; kept for its room.
+    received: Vec<RawReceived>,
+    dropped_total: u32,
+    /// The next frame to send, waiting for room.
+    pending: Option<Outgoing>,
+}
+
+/// Registers a socket with the runtime. Errors too: a removed interface makes the socket neither readable nor writable.
+#[expect(
+    deprecated,
+    reason = "its successor needs unsafe, which this crate forbids; RawSocket keeps its one descriptor open while it lives"
+)]
+fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
+    AsyncFd::with_interest(socket, Interest::READABLE | Interest::WRITABLE | Interest::ERROR)
+}
+
+impl Link {
+    /// A link, not yet running, and its sending end. Must be called inside the runtime.
+    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Received>) -> (Self, LinkOutput) {
+        let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
+        let unsent = Arc::new(AtomicU64::new(0));
+        let mut report = interval(REPORT_PERIOD);
+        report.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let counters = Arc::new(LinkCounters::default());
+        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), counters: Arc::clone(&counters) };
+        let link = Self {
+            config,
+            clock,
+            inbox,
+            outgoing,
+            unsent,
+            counters,
+            state: None,
+            state_since: clock.now(),
+            lost: 0,
+            report,
+            pause: FIRST_PAUSE,
+            last_problem: None,
+        };
+        (link, output)
+    }
+
+    /// Serves the interface until the sending end is dropped.
+    pub async fn run(mut self) {
+        loop {
+            let end = match self.open().await {
+                Some(open) => self.serve(open).await,
+                None => self.wait().await,
+            };
+            if end == End::Stopped {
+                return;
+            }
+        }
+    }
+
+    /// Opens the interface and says what it found; `None` when there is nothing to serve.
+    async fn open(&mut self) -> Option<Open> {
+        let raw = RawConfig {
+            interface: &self.config.interface,
+            fd: self.config.fd,
+            ids: &self.config.ids,
+            patterns: &self.config.patterns,
+            receive_buffer_bytes: self.config.receive_buffer_bytes,
+        };
+        let opened = RawSocket::open(&raw).and_then(|socket| {
+            let error = socket.take_error()?;
+            Ok((watch(socket)?, error))
+        });
+        let (socket, error) = match opened {
+            Ok(opened) => opened,
+            Err(error) => {
+                self.problem(&error);
+                self.enter(State::Missing).await;
+                return None;
+            }
+        };
+        self.last_problem = None;
+        self.note_buffer(socket.get_ref());
+        let state = if error.is_none() { State::Up } else { State::Down };
+        let mapper = StampMapper::new(self.clock, Reading::now());
+        self.enter(state).await;
+        let received = Vec::with_capacity(CALL_BATCH);
+        Some(Open { socket, mapper, received, dropped_total: 0, pending: None })
+    }
+
+    /// Receives and sends until the socket is dead or the daemon stops.
+    async fn serve(&mut self, mut open: Open) -> End {
+        let end = self.serve_open(&mut open).await;
+        self.note_dropped(&mut open);
+        end
+    }
+
+    async fn serve_open(&mut self, open: &mut Open) -> End {
+        let mut look_at = Instant::now() + self.pause;
+        loop {
+            let interest = match open.pending {
+                Some(_) => Interest::READABLE | Interest::ERROR | Interest::WRITABLE,
+                None => Interest::READABLE | Interest::ERROR,
+            };
+            let step = tokio::select! {
+                ready = open.socket.ready(interest) => match ready {
+                    Ok(mut guard) => {
+                        let ready = guard.ready();
+                        // Cleared before the work: an edge that comes during it sets it again. What the work leaves
+                        // behind is taken in the loop, which reads until the socket is empty.
+                        guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
+                        guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
+                        Ok(())
+                    }
+                    Err(error) => { self.problem(&error); return End::Dead; }
+                },
+                next = self.outgoing.recv(), if open.pending.is_none() => Err(next),
+                _ = self.report.tick() => {
+                    self.note_dropped(open);
+                    self.report_losses(open.mapper.event(Reading::now())).await;
+                    continue;
+                }
+                () = sleep_until(look_at), if self.state != Some(State::Up) => {
+                    look_at = Instant::now() + self.lengthen_pause();
+                    if self.look(open).await { continue } else { return End::Dead }
+                }
+            };
+            match step {
+                Err(None) => return End::Stopped,
+                Err(Some(outgoing)) => open.pending = Some(outgoing),
+                Ok(()) => {
+                    if self.receive_all(open).await == Some(End::Dead) {
+                        return End::Dead;
+                    }
+                }
+            }
+            if self.send_pending(open).await == Some(End::Dead) {
+                return End::Dead;
+            }
+        }
+    }
+
+    /// Reads until the socket is empty, with pauses for the other tasks.
+    async fn receive_all(&mut self, open: &mut Open) -> Option<End> {
+        loop {
+            for _ in 0..READ_BATCH / CALL_BATCH {
+                open.received.clear();
+                match open.socket.get_ref().receive(&mut open.received) {
+                    Ok(()) => {
+                        // Once for all of them: what came with one call was read at one moment.
+                        let reading = Reading::now();
+                        for received in &open.received {
+                            self.take(&mut open.mapper, received, reading).await;
+                        }
+                        if open.received.len() < CALL_BATCH {
+                            open.mapper.socket_emptied(reading);
+                            return None;
+                        }
+                    }
+                    Err(Errno::EAGAIN) => return None,
+                    Err(Errno::EINTR) => {}
+                    Err(error) => {
+                        if let Some(end) = self.failed(error).await {
+                            return Some(end);
+                        }
+                    }
+                }
+            }
+            tokio::task::yield_now().await;
+        }
+    }
+
+    fn is_wanted(&self, id: CanId) -> bool {
+        let fits = |&(wanted, mask): &(u32, u32)| matches!(id, CanId::Extended(raw) if raw & mask == wanted);
+        self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
+    }
+
+    /// Hands on one thing read.
+    async fn take(&mut self, mapper: &mut StampMapper, received: &RawReceived, reading: Reading) {
+        let time = mapper.arrival(received.stamps, reading);
+        // Frames that were still in the socket when the interface went down do not say that it is up again.
+        if self.state != Some(State::Up) && time > self.state_since {
+            self.enter_at(State::Up, time).await;
+        }
+        let what = match received.what {
+            Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
+            Wire::Frame(frame) => LinkEvent::Frame(frame),
+            Wire::Error(class) => LinkEvent::Event(BusEvent::ErrorFrame { class }),
+            Wire::Malformed => {
+                self.lost += 1;
+                LinkCounters::add(&self.counters.malformed, 1);
+                return;
+            }
+        };
+        if self.inbox.try_send(Received { time, bus: self.config.bus, what }).is_err() {
+            self.lost += 1;
+            LinkCounters::add(&self.counters.inbox_full, 1);
+        }
+    }
+
+    /// Takes over what the kernel had no room for since this was asked last.
+    fn note_dropped(&mut self, open: &mut Open) {
+        let total = open.socket.get_ref().dropped_total();
+        let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
+        self.lost += dropped;
+        LinkCounters::add(&self.counters.kernel_dropped, dropped);
+    }
+
+    /// Sends what waits, if there is room.
+    async fn send_pending(&mut self, open: &mut Open) -> Option<End> {
+        let outgoing = open.pending.take()?;
+        let useless = self.state != Some(State::Up) || outgoing.since.elapsed() > SEND_MAX_AGE;
+        let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
+        match result {
+            Ok(()) => {
+                LinkCounters::add(&self.counters.sent, 1);
+                None
+            }
+            Err(Errno::EAGAIN | Errno::EINTR) => {
+                open.pending = Some(outgoing);
+                None
+            }
+            Err(error) => {
+                self.count_unsent();
+                if useless || error == Errno::ENOBUFS { None } else { self.failed(error).await }
+            }
+        }
+    }
+
+    /// An error of the socket: what it says about the interface, and whether the socket is dead.
+    async fn failed(&mut self, error: Errno) -> Option<End> {
+        match error {
+            Errno::ENETDOWN => {
+                self.enter(State::Down).await;
+                None
+            }
+            Errno::ENODEV | Errno::ENXIO => {
+                self.enter(State::Missing).await;
+                Some(End::Dead)
+            }
+            // A frame this interface cannot carry; counted by the caller.
+            Errno::EINVAL | Errno::EMSGSIZE => {
+                self.problem(&error.into());
+                None
+            }
+            other => {
+                self.problem(&other.into());
+                self.enter(State::Down).await;
+                Some(End::Dead)
+            }
+        }
+    }
+
+    /// Looks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
+    async fn look(&mut self, open: &Open) -> bool {
+        let raw = RawConfig {
+            interface: &self.config.interface,
+            fd: false,
+            ids: &[],
+            patterns: &[],
+            receive_buffer_bytes: 0,
+        };
+        if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
+            return false;
+        }
+        if let Ok(None) = RawSocket::open(&raw).and_then(|probe| probe.take_error()) {
+            self.enter(State::Up).await;
+        }
+        true
+    }
+
+    /// Without a socket: waits, and drops what should be sent.
+    async fn wait(&mut self) -> End {
+        let until = Instant::now() + self.lengthen_pause();
+        loop {
+            tokio::select! {
+                () = sleep_until(until) => return End::Dead,
+                next = self.outgoing.recv() => match next {
+                    Some(_) => self.count_unsent(),
+                    None => return End::Stopped,
+                },
+                _ = self.report.tick() => self.report_losses(self.clock.now()).await,
+            }
+        }
+    }
+
+    fn count_unsent(&self) {
+        self.unsent.fetch_add(1, Ordering::Relaxed);
+        LinkCounters::add(&self.counters.send_failed, 1);
+    }
+
+    fn lengthen_pause(&mut self) -> Duration {
+        let pause = self.pause;
+        self.pause = (pause * 2).min(LONGEST_PAUSE);
+        pause
+    }
+
+    /// Notes the interface's state; tells it when it is new.
+    async fn enter(&mut self, state: State) {
+        self.enter_at(state, self.clock.now()).await;
+    }
+
+    /// The same, found out from something of that time.
+    async fn enter_at(&mut self, state: State, time: Timestamp) {
+        if self.state == Some(state) {
+            return;
+        }
+        self.state = Some(state);
+        self.state_since = time;
+        if state == State::Up {
+            self.pause = FIRST_PAUSE;
+        }
+        let (event, told) = match state {
+            State::Up => (BusEvent::Up, LinkState::Up),
+            State::Down => (BusEvent::Down, LinkState::Down),
+            State::Missing => (BusEvent::Missing, LinkState::Missing),
+        };
+        self.counters.enter(told);
+        self.tell(time, event).await;
+    }
+
+    /// Tells what was lost since the last report.
+    async fn report_losses(&mut self, time: Timestamp) {
+        let frames = std::mem::take(&mut self.lost);
+        if frames > 0 {
+            self.tell(time, BusEvent::Dropped { frames }).await;
+        }
+        let frames = self.unsent.swap(0, Ordering::Relaxed);
+        if frames > 0 {
+            self.tell(time, BusEvent::SendFailed { frames }).await;
+        }
+    }
+
+    /// Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
+    async fn tell(&self, time: Timestamp, event: BusEvent) {
+        // An error means that the daemon is stopping: nobody is left to be told.
+        let _ = self.inbox.send(Received { time, bus: self.config.bus, what: LinkEvent::Event(event) }).await;
+    }
+
+    /// Logs a problem once, until it is another one.
+    fn problem(&mut self, error: &io::Error) {
+        let text = error.to_string();
+        if self.last_problem.as_ref() != Some(&text) {
+            tracing::warn!(interface = self.config.interface, error = text, "interface cannot be used");
+            self.last_problem = Some(text);
+        }
+    }
+
+    fn note_buffer(&self, socket: &RawSocket) {
+        let granted_bytes = socket.receive_buffer_bytes().unwrap_or(0);
+        tracing::debug!(
+            interface = self.config.interface,
+            index = socket.index,
+            identifiers = self.config.ids.len(),
+            asked_bytes = self.config.receive_buffer_bytes,
+            granted_bytes,
+            "socket open"
+        );
+    }
+}

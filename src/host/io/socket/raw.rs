@@ -1,0 +1,315 @@
+//! One SocketCAN raw socket: opened so that nothing but the wanted identifiers ever reaches it, read several frames in
+//! one system call with their stamps, written without blocking.
+//!
+//! The kernel's drop counter is asked for by itself, not taken with each frame: a frame's control message tells it only once a
+//! frame has got in again, and changes its size when the first is dropped (see [`Slots`]).
+
+use std::cell::RefCell;
+use std::io::{self, IoSliceMut};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, RawFd};
+
+use nix::cmsg_space;
+use nix::errno::Errno;
+use nix::libc;
+use nix::sys::socket::{
+    AddressFamily, ControlMessageOwned, MsgFlags, MultiHeaders, SockFlag, SockProtocol, SockType, TimestampingFlag,
+    Timestamps, recvmmsg, send, setsockopt, socket, sockopt,
+};
+use nix::sys::time::TimeSpec;
+use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
+
+use super::wire::{self, FD_BYTES, Wire};
+use crate::can::{CanId, Frame};
+use crate::io::clock::KernelStamps;
+
+/// Receive buffer asked for, bytes: about 2,700 frames of 768 bytes (the kernel counts a frame with its
+/// bookkeeping), a third of a second of a full 1 Mbit/s bus. The kernel caps it at net.core.rmem_max.
+pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
+
+/// Most frames taken in one system call: with 16 the call itself is no longer what a frame costs, and laying out room for
+/// them costs little when only one comes.
+pub(super) const CALL_BATCH: usize = 16;
+
+/// Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
+const MEMINFO_NUMBERS: usize = 9;
+const MEMINFO_DROPS: usize = 8;
+
+/// Most filters the kernel takes (CAN_RAW_FILTER_MAX).
+const MAX_KERNEL_FILTERS: usize = 512;
+
+/// How a socket is to be opened.
+#[derive(Debug, Clone)]
+pub(super) struct RawConfig<'a> {
+    /// Kernel name of the interface.
+    pub(super) interface: &'a str,
+    /// FD frames too.
+    pub(super) fd: bool,
+    /// Identifiers wanted.
+    pub(super) ids: &'a [CanId],
+    /// Extended identifiers wanted besides, as identifier and mask.
+    pub(super) patterns: &'a [(u32, u32)],
+    /// Receive buffer to ask for, bytes.
+    pub(super) receive_buffer_bytes: usize,
+}
+
+/// One thing read, and its stamps.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct RawReceived {
+    pub(super) what: Wire,
+    pub(super) stamps: KernelStamps,
+}
+
+/// Where the kernel puts what one call takes. It is used again and again, and the kernel writes into each header how much of the
+/// room for control messages it has used, which is all the room the next frame there has: enough as long as each carries its stamp.
+/// After one that did not, the headers are made anew.
+struct Slots {
+    headers: MultiHeaders<()>,
+    bytes: [[u8; FD_BYTES]; CALL_BATCH],
+}
+
+impl Slots {
+    fn new() -> Self {
+        Self { headers: Self::headers(), bytes: [[0; FD_BYTES]; CALL_BATCH] }
+    }
+
+    fn headers() -> MultiHeaders<()> {
+        MultiHeaders::preallocate(CALL_BATCH, Some(cmsg_space!(Timestamps, TimeSpec)))
+    }
+
+    fn receive(&mut self, fd: RawFd, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+        let mut lengths = [0; CALL_BATCH];
+        let begin = into.len();
+        {
+            let mut slices = self.bytes.each_mut().map(|bytes| [IoSliceMut::new(bytes)]);
+            let messages = recvmmsg(fd, &mut self.headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None)?;
+            for (message, length) in messages.zip(&mut lengths) {
+                *length = message.bytes.min(FD_BYTES);
+                // An error says that a control message was cut off: as good as none.
+                let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
+                into.push(RawReceived { what: Wire::Malformed, stamps });
+            }
+        }
+        for ((received, length), bytes) in into[begin..].iter_mut().zip(lengths).zip(&self.bytes) {
+            received.what = wire::decode(&bytes[..length]);
+        }
+        if into[begin..].iter().any(|received| received.stamps.software_ns.is_none()) {
+            self.headers = Self::headers();
+        }
+        Ok(())
+    }
+}
+
+thread_local! {
+    /// Of all sockets of a thread: headers hold pointers, so they cannot go from thread to thread as a socket may.
+    static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
+}
+
+/// A bound, nonblocking raw socket.
+#[derive(Debug)]
+pub(super) struct RawSocket {
+    socket: CanFdSocket,
+    /// The kernel's number of the interface it is bound to.
+    pub(super) index: u32,
+}
+
+impl RawSocket {
+    /// Opens and binds. Filters are set before the bind, so that not one unwanted frame is queued.
+    ///
+    /// # Errors
+    /// `ENODEV` when there is no such interface; an interface that is down opens, and says so in
+    /// [`RawSocket::take_error`].
+    pub(super) fn open(config: &RawConfig<'_>) -> io::Result<Self> {
+        Self::open_filtered(config, &filters(config.ids, config.patterns))
+    }
+
+    /// As [`RawSocket::open`], for every identifier there is.
+    ///
+    /// # Errors
+    /// As there.
+    pub(super) fn open_all(interface: &str) -> io::Result<Self> {
+        let receive_buffer_bytes = DEFAULT_RECEIVE_BUFFER_BYTES;
+        let config = RawConfig { interface, fd: true, ids: &[], patterns: &[], receive_buffer_bytes };
+        Self::open_filtered(&config, &[CanFilter::new(0, 0)])
+    }
+
+    fn open_filtered(config: &RawConfig<'_>, filters: &[CanFilter]) -> io::Result<Self> {
+        let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
+        let fd = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
+        set_stamping(&fd)?;
+        let socket = CanFdSocket::from(fd);
+        socket.set_recv_own_msgs(false)?;
+        socket.set_socket_option_int(
+            socketcan::socket::SOL_CAN_RAW,
+            socketcan::socket::CAN_RAW_FD_FRAMES,
+            i32::from(config.fd),
+        )?;
+        socket.set_filters(filters)?;
+        socket.set_error_filter_accept_all()?;
+        socket.as_raw_socket().set_recv_buffer_size(config.receive_buffer_bytes)?;
+        let index = index_of(config.interface)?;
+        socket.as_raw_socket().bind(&CanAddr::new(index).into_sock_addr())?;
+        Ok(Self { socket, index })
+    }
+
+    /// The pending error of the socket: `ENETDOWN` right after opening on an interface that is down.
+    pub(super) fn take_error(&self) -> io::Result<Option<io::Error>> {
+        self.socket.as_raw_socket().take_error()
+    }
+
+    /// The receive buffer the kernel granted, bytes (it doubles what it was asked for).
+    pub(super) fn receive_buffer_bytes(&self) -> io::Result<usize> {
+        self.socket.as_raw_socket().recv_buffer_size()
+    }
+
+    /// Takes up to [`CALL_BATCH`] frames from the socket and appends them; fewer say that it was empty then.
+    ///
+    /// # Errors
+    /// `EAGAIN` when there is none; `ENETDOWN`, `ENODEV` once when the interface went down or away.
+    pub(super) fn receive(&self, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+        SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
+    }
+
+    /// Frames this socket has lost since it was opened because its receive buffer was full, modulo 2^32; 0 where the kernel cannot
+    /// say.
+    pub(super) fn dropped_total(&self) -> u32 {
+        let mut bytes = [0; MEMINFO_NUMBERS * size_of::<u32>()];
+        let told = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
+        let (numbers, _) = bytes.as_chunks();
+        // A shorter answer leaves it zero.
+        told.map_or(0, |_| u32::from_ne_bytes(numbers[MEMINFO_DROPS]))
+    }
+
+    /// Hands one frame to the kernel.
+    ///
+    /// # Errors
+    /// `EAGAIN` and `ENOBUFS` when there is no room, `ENETDOWN`, `ENODEV`, `ENXIO` when the interface is down or
+    /// gone, `EINVAL` for an FD frame on a classic interface.
+    pub(super) fn send(&self, frame: &Frame) -> Result<(), Errno> {
+        let mut buffer = [0; FD_BYTES];
+        send(self.socket.as_raw_fd(), wire::encode(frame, &mut buffer), MsgFlags::MSG_DONTWAIT).map(drop)
+    }
+}
+
+impl AsRawFd for RawSocket {
+    fn as_raw_fd(&self) -> RawFd {
+        self.socket.as_raw_fd()
+    }
+}
+
+impl AsFd for RawSocket {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+}
+
+/// The kernel's number of an interface.
+///
+/// # Errors
+/// `ENODEV` when there is none of this name.
+pub(super) fn index_of(interface: &str) -> io::Result<u32> {
+    Ok(nix::net::if_::if_nametoindex(interface)?)
+}
+
+/// Hardware and software stamps, or where the kernel cannot say which, its plain ones.
+fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
+    let flags = TimestampingFlag::SOF_TIMESTAMPING_RX_SOFTWARE
+        | TimestampingFlag::SOF_TIMESTAMPING_SOFTWARE
+        | TimestampingFlag::SOF_TIMESTAMPING_RX_HARDWARE
+        | TimestampingFlag::SOF_TIMESTAMPING_RAW_HARDWARE;
+    if setsockopt(fd, sockopt::Timestamping, &flags).is_err() {
+        setsockopt(fd, sockopt::ReceiveTimestampns, &true)?;
+    }
+    Ok(())
+}
+
+/// Filters for exactly these identifiers, data frames only. More than the kernel takes: everything comes in,
+/// and the reader passes over what it does not know.
+fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
+    if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
+        return vec![CanFilter::new(0, 0)];
+    }
+    let exact = ids.iter().map(|&id| CanFilter::new(wire::id_word(id), filter_mask(id)));
+    let flags = wire::EXTENDED_FLAG | wire::REMOTE_FLAG;
+    let patterns = patterns.iter().map(|&(id, mask)| CanFilter::new(id | wire::EXTENDED_FLAG, mask | flags));
+    exact.chain(patterns).collect()
+}
+
+fn filter_mask(id: CanId) -> u32 {
+    let bits = match id {
+        CanId::Standard(_) => wire::STANDARD_MASK,
+        CanId::Extended(_) => wire::EXTENDED_MASK,
+    };
+    bits | wire::EXTENDED_FLAG | wire::REMOTE_FLAG
+}
+
+fn read_control(messages: impl Iterator<Item = ControlMessageOwned>) -> KernelStamps {
+    let mut stamps = KernelStamps::default();
+    for message in messages {
+        match message {
+            ControlMessageOwned::ScmTimestampsns(all) => {
+                stamps.software_ns = nanos(all.system).or(stamps.software_ns);
+                stamps.hardware_ns = nanos(all.hw_raw);
+            }
+            ControlMessageOwned::ScmTimestampns(stamp) => stamps.software_ns = nanos(stamp),
+            _ => {}
+        }
+    }
+    stamps
+}
+
+/// Zero means "no such stamp".
+fn nanos(time: TimeSpec) -> Option<i64> {
+    let nanos = time.tv_sec().saturating_mul(1_000_000_000).saturating_add(time.tv_nsec());
+    (nanos != 0).then_some(nanos)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::UdpSocket;
+
+    use super::*;
+
+    #[test]
+    fn a_filter_tells_standard_from_extended_and_keeps_remote_requests_out() {
+        assert_eq!(filter_mask(CanId::Standard(0x123)), 0xC000_07FF);
+        assert_eq!(filter_mask(CanId::Extended(0x123)), 0xDFFF_FFFF);
+        assert_eq!(wire::id_word(CanId::Extended(0x123)), 0x8000_0123);
+    }
+
+    #[test]
+    fn more_identifiers_than_the_kernel_takes_open_the_filter() {
+        let ids: Vec<CanId> = (0..=MAX_KERNEL_FILTERS as u16).map(CanId::Standard).collect();
+        assert_eq!(filters(&ids, &[]).len(), 1);
+        assert_eq!(filters(&ids[1..], &[]).len(), MAX_KERNEL_FILTERS);
+    }
+
+    #[test]
+    fn a_zero_stamp_is_none() {
+        assert_eq!(nanos(TimeSpec::new(0, 0)), None);
+        assert_eq!(nanos(TimeSpec::new(1, 5)), Some(1_000_000_005));
+    }
+
+    #[test]
+    fn one_call_takes_what_waits_in_order_and_frames_without_stamps_spoil_no_later_ones() {
+        // Any datagrams do: the kernel's headers are the same.
+        let (tx, rx) = (UdpSocket::bind("127.0.0.1:0").unwrap(), UdpSocket::bind("127.0.0.1:0").unwrap());
+        tx.connect(rx.local_addr().unwrap()).unwrap();
+        let frames = [1, 2, 3].map(|id| Frame::classic(CanId::Standard(id), &[7, 8]).unwrap());
+        let mut slots = Slots::new();
+        for stamped in [true, false, true, true] {
+            setsockopt(&rx, sockopt::ReceiveTimestampns, &stamped).unwrap();
+            for frame in &frames {
+                tx.send(wire::encode(frame, &mut [0; FD_BYTES])).unwrap();
+            }
+            let mut received = Vec::new();
+            while received.len() < frames.len() {
+                if let Err(error) = slots.receive(rx.as_raw_fd(), &mut received) {
+                    assert_eq!(error, Errno::EAGAIN);
+                }
+            }
+            assert!(received.iter().map(|received| received.what).eq(frames.map(Wire::Frame)));
+            assert!(received.iter().all(|received| received.stamps.software_ns.is_some() == stamped), "{received:?}");
+        }
+        assert_eq!(slots.receive(rx.as_raw_fd(), &mut Vec::new()), Err(Errno::EAGAIN));
+    }
+}

@@ -1,0 +1,130 @@
+//! A Unix socket's file: made so that a dead daemon's is replaced and a live daemon's is not.
+
+use std::fs::Permissions;
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tokio::net::{UnixListener, UnixStream};
+use tokio::time::timeout;
+
+/// How long a look at an earlier daemon's socket may take; one that is stopped has a full queue and lets us wait.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// The folder of a daemon that systemd did not start.
+const STANDARD_FOLDER: &str = "/run/packwatch";
+
+/// Where the sockets are when nobody says where: the folder systemd made, else `/run/packwatch`.
+pub fn runtime_folder() -> PathBuf {
+    let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
+    // systemd puts a colon between several; the first is the unit's own.
+    let folder = folders.and_then(|folders| std::env::split_paths(&folders).next());
+    folder.unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
+}
+
+/// Where a socket of the daemon is to be.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum SocketSetting {
+    /// In `$RUNTIME_DIRECTORY` under systemd, else in `/run/packwatch`; where that cannot be made, the daemon goes
+    /// without.
+    Standard,
+    /// There is none.
+    Off,
+    /// There, or the daemon does not start.
+    At(PathBuf),
+}
+
+impl SocketSetting {
+    /// As written on the command line: a path, or `none`.
+    pub fn from_path(path: Option<PathBuf>) -> Self {
+        match path {
+            None => Self::Standard,
+            Some(path) if path.as_os_str() == "none" => Self::Off,
+            Some(path) => Self::At(path),
+        }
+    }
+}
+
+/// A bound socket and its file, which goes when this is dropped.
+#[derive(Debug)]
+pub struct Bound {
+    pub listener: UnixListener,
+    pub file: SocketFile,
+}
+
+/// The file of a bound socket.
+#[derive(Debug)]
+pub struct SocketFile {
+    pub path: PathBuf,
+    inode: (u64, u64),
+}
+
+/// Why there is no socket.
+#[derive(Debug)]
+pub enum BindError {
+    /// Another daemon has it.
+    Taken(String),
+    /// It cannot be made.
+    Io(io::Error),
+}
+
+impl From<io::Error> for BindError {
+    fn from(error: io::Error) -> Self {
+        Self::Io(error)
+    }
+}
+
+/// Binds a socket there; `mode` says who may connect.
+pub async fn bind(path: &Path, mode: u32) -> Result<Bound, BindError> {
+    remove_stale(path).await?;
+    let listener = UnixListener::bind(path)?;
+    std::fs::set_permissions(path, Permissions::from_mode(mode))?;
+    let file = SocketFile { path: path.to_owned(), inode: inode(path)? };
+    Ok(Bound { listener, file })
+}
+
+/// Removes the socket of a daemon that is no more.
+async fn remove_stale(path: &Path) -> Result<(), BindError> {
+    match std::fs::symlink_metadata(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
+        Err(error) => return Err(error.into()),
+        Ok(found) if !found.file_type().is_socket() => {
+            return Err(io::Error::new(ErrorKind::AlreadyExists, "is there and no socket").into());
+        }
+        Ok(_) => {}
+    }
+    match timeout(LOOK, UnixStream::connect(path)).await {
+        Ok(Err(error)) if error.kind() == ErrorKind::ConnectionRefused => Ok(std::fs::remove_file(path)?),
+        Ok(Err(error)) if error.kind() == ErrorKind::NotFound => Ok(()),
+        Ok(Err(error)) => Err(error.into()),
+        Ok(Ok(stream)) => Err(BindError::Taken(owner(&stream))),
+        Err(_) => Err(BindError::Taken("a process that does not answer".to_owned())),
+    }
+}
+
+/// Who listens, as the kernel knows it.
+fn owner(stream: &UnixStream) -> String {
+    match stream.peer_cred() {
+        Ok(who) => {
+            let process = who.pid().map_or_else(|| "a process".to_owned(), |pid| format!("process {pid}"));
+            format!("{process} of user {}", who.uid())
+        }
+        Err(_) => "another process".to_owned(),
+    }
+}
+
+fn inode(path: &Path) -> io::Result<(u64, u64)> {
+    std::fs::symlink_metadata(path).map(|found| (found.dev(), found.ino()))
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        // Unless somebody has put another one there meanwhile.
+        if inode(&self.path).is_ok_and(|found| found == self.inode)
+            && let Err(error) = std::fs::remove_file(&self.path)
+        {
+            tracing::warn!(path = %self.path.display(), %error, "socket not removed");
+        }
+    }
+}

@@ -1,0 +1,467 @@
+//! The replay loop: records in, the core stepped, results written, a summary at the end.
+//!
+//! Promise: the same logs and configuration give the same result files, byte for byte; a journal gives what the run
+//! that wrote it gave. Plain logs and CSV get the ticks of [`Ticks`]; journals carry their own. Wall time is read
+//! only to pace (`speed`) and to report.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::sync::atomic::Ordering;
+
+mod cells;
+mod clock;
+mod in_order;
+mod intake;
+mod rows;
+mod summary;
+
+use crate::io::event_log;
+use super::store::Recorder;
+use crate::can::Frame;
+use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
+use crate::io::result_file::ResultFile;
+use crate::io::ticks::Ticks;
+use crate::monitor::{Downtime, Input, Monitor, Outputs, RestoreError, Snapshot, TICK_PERIOD_MS};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
+
+pub use cells::CellSummary;
+pub use clock::When;
+use clock::{Pace, Place, Span, Window};
+pub use in_order::in_order;
+pub use intake::{DroppedSummary, ProtectedSummary};
+use rows::{write_estimate, write_estimates_header, write_frame};
+pub use summary::Summary;
+use summary::{note_event, peak_memory_kib};
+
+/// Records between two looks at the clock for the progress report.
+const REPORT_EVERY: usize = 4096;
+
+/// How to replay.
+#[derive(Debug)]
+pub struct Settings {
+    /// Times real time; `None` = as fast as possible.
+    pub speed: Option<f64>,
+    /// Records before this are left out.
+    pub from: Option<When>,
+    /// Records after this are left out.
+    pub until: Option<When>,
+    /// A hole longer than this means that the recorder was asleep, s.
+    pub sleep_gap_s: f64,
+    /// Whether a snapshot is wanted.
+    pub snapshot: bool,
+    /// When it is taken; `None` = at the end.
+    pub snapshot_at: Option<When>,
+    /// State to start from.
+    pub restore: Option<Snapshot>,
+    /// How old it is; `None` = as the journal says, or else its stamp.
+    pub away: Option<Downtime>,
+    /// Where state and history are kept, as the daemon keeps them.
+    pub store: Option<Recorder>,
+    /// Names of the interfaces, for the frames that would be sent.
+    pub interfaces: Vec<String>,
+}
+
+impl Settings {
+    /// From the start to the end, as fast as possible, with nothing kept.
+    pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
+        Self {
+            speed: None,
+            from: None,
+            until: None,
+            sleep_gap_s,
+            snapshot: false,
+            snapshot_at: None,
+            restore: None,
+            away: None,
+            store: None,
+            interfaces,
+        }
+    }
+
+    /// Every record is taken, as fast as possible, and neither it nor the state after it is kept.
+    fn is_simple(&self) -> bool {
+        // Every field, so that a new one is not overlooked.
+        let Self {
+            speed,
+            from,
+            until,
+            snapshot_at,
+            store,
+            sleep_gap_s: _,
+            snapshot: _,
+            restore: _,
+            away: _,
+            interfaces: _,
+        } = self;
+        speed.is_none() && from.is_none() && until.is_none() && snapshot_at.is_none() && store.is_none()
+    }
+}
+
+/// Files that results go to.
+#[derive(Debug, Default)]
+pub struct Sinks {
+    /// CSV, a row per estimate.
+    pub estimates: Option<ResultFile>,
+    /// A JSON document per line and event.
+    pub events: Option<ResultFile>,
+    /// candump lines of what would be sent.
+    pub frames: Option<ResultFile>,
+    /// Somebody who looks at everything that comes out.
+    pub watch: Option<Watch>,
+}
+
+/// Is shown what came out of each input.
+pub struct Watch(pub Box<dyn FnMut(&Outputs)>);
+
+impl std::fmt::Debug for Watch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Watch")
+    }
+}
+
+/// Why a replay ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// A log cannot be read on.
+    #[error(transparent)]
+    Log(#[from] LogError),
+    /// A result cannot be written.
+    #[error(transparent)]
+    Write(#[from] io::Error),
+    /// The snapshot does not fit.
+    #[error(transparent)]
+    Restore(#[from] RestoreError),
+    /// State or history cannot be written.
+    #[error("{0}")]
+    Store(String),
+    /// The moment of the snapshot lies beyond the log.
+    #[error("no snapshot taken: the log ends at {end_s} s, before the moment asked for")]
+    SnapshotNotReached {
+        /// The log's last stamp.
+        end_s: f64,
+    },
+}
+
+/// For the progress bar.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress {
+    /// Bytes of the logs read.
+    pub bytes: u64,
+    /// Frames handed to the core.
+    pub frames: u64,
+    /// Times real time so far.
+    pub times_real_time: f64,
+}
+
+/// Replays `source` through a monitor that has had no input; gives the summary and the snapshot, if one was wanted.
+///
+/// # Errors
+/// When a log cannot be read, a result cannot be written, or a snapshot does not fit or was not reached.
+pub fn run(
+    source: &mut LogSource,
+    monitor: Monitor,
+    sinks: Sinks,
+    settings: Settings,
+    report: &mut dyn FnMut(Progress),
+) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+    let mut replay = Replay::new(monitor, sinks, settings)?;
+    // Where the log is not read to its end, or may be waited for, nothing is read beyond the record in hand.
+    let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
+    let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
+    let mut unreported: usize = 0;
+    while source.next_batch(&mut batch)? {
+        if !replay.take_batch(&batch)? {
+            break;
+        }
+        unreported += batch.records().len();
+        if unreported >= REPORT_EVERY || replay.pace.speed.is_some() {
+            unreported = 0;
+            report(progress(source, source.counts().frames, &replay.span));
+        }
+    }
+    replay.finish(source.counts())
+}
+
+fn progress(source: &LogSource, frames: u64, span: &Span) -> Progress {
+    let bytes = source.read_bytes().load(Ordering::Relaxed);
+    Progress { bytes, frames, times_real_time: span.times_real_time() }
+}
+
+/// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
+///
+/// # Errors
+/// When a log cannot be read or `send` fails.
+pub fn play(
+    source: &mut LogSource,
+    settings: &Settings,
+    send: &mut dyn FnMut(BusIndex, &Frame) -> io::Result<()>,
+    report: &mut dyn FnMut(Progress),
+) -> Result<u64, ReplayError> {
+    let (mut span, mut pace, mut window) =
+        (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
+    let mut sent = 0;
+    while let Some(record) = source.next_record()? {
+        match window.judge(record.time()) {
+            Place::Before => continue,
+            Place::After => break,
+            Place::Inside => {}
+        }
+        if span.advance(record.time()) || matches!(record, Record::UnknownGap { .. }) {
+            pace.rebase();
+        }
+        if let Record::Frame { time, bus, frame } = &record {
+            pace.wait(*time);
+            send(*bus, frame)?;
+            sent += 1;
+            report(progress(source, sent, &span));
+        }
+    }
+    Ok(sent)
+}
+
+/// The loop's state.
+struct Replay {
+    monitor: Monitor,
+    out: Outputs,
+    ticks: Ticks,
+    pace: Pace,
+    span: Span,
+    window: Window,
+    sinks: Sinks,
+    settings: Settings,
+    /// Every record is wanted, at once, and nobody looks at more than what comes of it.
+    is_simple: bool,
+    /// When the snapshot is due, once the first stamp is known.
+    snapshot_at: Option<Timestamp>,
+    snapshot: Option<Snapshot>,
+    summary: Summary,
+    /// A reload of the recorded run was noted.
+    reloaded: bool,
+    usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
+    /// Cell-steps of a stored state that was taken up; `None` until the first input has taken it up.
+    steps_before: Option<u64>,
+}
+
+impl Replay {
+    fn new(monitor: Monitor, mut sinks: Sinks, settings: Settings) -> io::Result<Self> {
+        if let Some(file) = &mut sinks.estimates {
+            write_estimates_header(file)?;
+        }
+        let want_estimates = sinks.estimates.is_some() || sinks.watch.is_some();
+        let out = Outputs { want_estimates, ..Outputs::default() };
+        Ok(Self {
+            monitor,
+            out,
+            ticks: Ticks::new(TICK_PERIOD_MS, settings.sleep_gap_s),
+            pace: Pace::new(settings.speed),
+            span: Span::new(settings.sleep_gap_s),
+            window: Window::new(&settings),
+            is_simple: settings.is_simple() && sinks.watch.is_none(),
+            sinks,
+            settings,
+            snapshot_at: None,
+            snapshot: None,
+            summary: Summary::default(),
+            reloaded: false,
+            usable: BTreeMap::new(),
+            steps_before: Some(0),
+        })
+    }
+
+    /// Records in a row; `false` when the rest of the log is not wanted.
+    fn take_batch(&mut self, batch: &Batch) -> Result<bool, ReplayError> {
+        for record in batch.records() {
+            if let Record::Frame { time, bus, frame } = record
+                && self.is_simple
+                && !batch.carries_ticks()
+                && self.ticks.advance_within(*time, self.monitor.next_due())
+            {
+                self.span.advance(*time);
+                self.monitor.handle(Input::Frame { time: *time, bus: *bus, frame }, &mut self.out);
+                if !self.out.is_empty() {
+                    self.write_out()?;
+                }
+            } else if !self.take(record, batch.carries_ticks())? {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// One record; `false` when the rest of the log is not wanted.
+    fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
+        let time = record.time();
+        match self.window.judge(time) {
+            Place::Before => {
+                self.summary.skipped_records += 1;
+                return Ok(true);
+            }
+            Place::After => return Ok(false),
+            Place::Inside => {}
+        }
+        if self.span.first.is_none() {
+            self.begin(record)?;
+        }
+        let unknown_gap = matches!(record, Record::UnknownGap { .. });
+        if self.span.advance(time) || unknown_gap {
+            self.pace.rebase();
+        }
+        if unknown_gap || carries_ticks {
+            self.ticks.sleep();
+        } else {
+            self.ticks.advance(time);
+        }
+        self.make_ticks()?;
+        if let Record::Reload { time } = record {
+            self.note_reload(*time);
+        }
+        if let Some(input) = record.input() {
+            self.feed(input)?;
+        }
+        Ok(true)
+    }
+
+    /// The first of the recorded run's reloads is noted: from there this replay may differ from it.
+    fn note_reload(&mut self, time: Timestamp) {
+        if !std::mem::replace(&mut self.reloaded, true) {
+            let at_s = time.secs();
+            self.summary.notes.push(format!(
+                "the recorded run took another configuration over at {at_s:.3} s: from there its results may differ"
+            ));
+        }
+    }
+
+    /// The first record of all.
+    fn begin(&mut self, record: &Record) -> Result<(), ReplayError> {
+        let first = self.window.first.unwrap_or(record.time());
+        self.snapshot_at = self.settings.snapshot_at.filter(|_| self.settings.snapshot).map(|at| at.resolve(first));
+        let recorded = match record {
+            Record::Restore { away, .. } => Some(*away),
+            _ => None,
+        };
+        match (self.settings.restore.take(), recorded) {
+            (Some(snapshot), recorded) => {
+                self.steps_before = None;
+                self.monitor.restore(snapshot, self.settings.away.or(recorded).unwrap_or_default())?;
+            }
+            (None, Some(_)) => self
+                .summary
+                .notes
+                .push("the recorded run began from a stored state: without --restore its results differ".to_owned()),
+            (None, None) => {}
+        }
+        Ok(())
+    }
+
+    fn make_ticks(&mut self) -> Result<(), ReplayError> {
+        while self.ticks.is_pending() {
+            if let Some(time) = self.ticks.pop(self.monitor.next_due()) {
+                self.feed(Input::Tick { time })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn feed(&mut self, input: Input<'_>) -> Result<(), ReplayError> {
+        if self.snapshot_at.is_some_and(|at| input.time() > at) {
+            self.snapshot_at = None;
+            self.snapshot = Some(self.monitor.snapshot());
+        }
+        self.pace.wait(input.time());
+        self.summary.ticks += u64::from(matches!(input, Input::Tick { .. }));
+        self.monitor.handle(input, &mut self.out);
+        self.steps_before.get_or_insert_with(|| cell_steps(&self.monitor));
+        if let Some(store) = &mut self.settings.store {
+            store.record(&self.out.events, &self.monitor, input.time()).map_err(ReplayError::Store)?;
+        }
+        self.write_out()?;
+        Ok(())
+    }
+
+    fn write_out(&mut self) -> io::Result<()> {
+        let out = &mut self.out;
+        if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
+            return Ok(());
+        }
+        if let Some(Watch(watch)) = &mut self.sinks.watch {
+            watch(out);
+        }
+        if let Some(file) = &mut self.sinks.estimates {
+            self.summary.estimates += out.estimates.len() as u64;
+            out.estimates.iter().try_for_each(|estimate| write_estimate(file, estimate))?;
+        }
+        for event in &out.events {
+            note_event(&mut self.summary, &mut self.usable, event);
+            if let Some(file) = &mut self.sinks.events {
+                event_log::write_line(file, event)?;
+            }
+        }
+        self.summary.frames_out += out.frames.len() as u64;
+        if let Some(file) = &mut self.sinks.frames {
+            let interfaces = &self.settings.interfaces;
+            out.frames.iter().try_for_each(|transmit| write_frame(file, interfaces, transmit))?;
+        }
+        out.clear();
+        if self.pace.speed.is_some() {
+            self.sinks.flush()?;
+        }
+        Ok(())
+    }
+
+    fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+        self.ticks.sleep();
+        self.make_ticks()?;
+        self.monitor.settle(&mut self.out);
+        if let (Some(store), Some(end)) = (&mut self.settings.store, self.span.latest) {
+            store.record(&self.out.events, &self.monitor, end).map_err(ReplayError::Store)?;
+        }
+        self.write_out()?;
+        if let (Some(store), Some(end)) = (self.settings.store.take(), self.span.latest) {
+            store.finish(&self.monitor, end).map_err(ReplayError::Store)?;
+        }
+        if self.settings.snapshot && self.snapshot.is_none() {
+            // A moment within the last record's tick period was reached as well.
+            let reached = self.settings.snapshot_at.is_none() || self.snapshot_at == self.span.latest;
+            let end_s = self.span.latest.map_or(f64::NAN, Timestamp::secs);
+            if !reached {
+                return Err(ReplayError::SnapshotNotReached { end_s });
+            }
+            self.snapshot = Some(self.monitor.snapshot());
+        }
+        for file in [self.sinks.estimates, self.sinks.events, self.sinks.frames].into_iter().flatten() {
+            file.finish()?;
+        }
+        let (span, mut summary) = (self.span, self.summary);
+        summary.log = counts.clone();
+        summary.cells = cells::summaries(&self.monitor, &self.usable);
+        (summary.protected, summary.dropped) = intake::summaries(&self.monitor, &self.settings.interfaces);
+        summary.first_s = span.first.map(Timestamp::secs);
+        summary.last_s = span.latest.map(Timestamp::secs);
+        summary.awake_s = span.awake_s();
+        summary.wall_s = span.started.elapsed().as_secs_f64();
+        summary.frames_per_s = counts.frames as f64 / summary.wall_s.max(1e-9);
+        let steps = cell_steps(&self.monitor).saturating_sub(self.steps_before.unwrap_or(0));
+        summary.cell_steps_per_s = steps as f64 / summary.wall_s.max(1e-9);
+        summary.times_real_time = span.times_real_time();
+        summary.peak_memory_kib = peak_memory_kib();
+        if counts.frames == 0 && !counts.foreign.is_empty() {
+            let names: Vec<_> = counts.foreign.keys().map(String::as_str).collect();
+            let configured = self.settings.interfaces.join(", ");
+            summary.notes.push(format!("no frame used: the log has {}, configured is {configured}", names.join(", ")));
+        }
+        Ok((summary, self.snapshot))
+    }
+}
+
+/// Voltage readings that came to an estimator, since the monitor's first start.
+fn cell_steps(monitor: &Monitor) -> u64 {
+    let counts = monitor.statistics();
+    counts.voltages_used + counts.voltages_gated + counts.voltages_without_current
+}
+
+impl Sinks {
+    /// At a pace somebody may be watching: nothing stays in a buffer.
+    fn flush(&mut self) -> io::Result<()> {
+        [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
+    }
+}

@@ -1,0 +1,260 @@
+//! What the service manager is told: when the service is ready, and in one line how it is.
+//!
+//! Ready means: the configuration is good, and the first usable reading came, or the wait for it is over. The line
+//! names what is not as it should be, and is told anew when it has changed, at most every [`STATUS_PERIOD`]. Times are
+//! the caller's; what is to be told is returned, so that this file needs no service manager.
+
+use std::time::Duration;
+
+use tokio::time::Instant;
+
+use crate::monitor::{BusEvent, Event, EventKind, Monitor};
+use crate::quantity::Channel;
+
+/// Longest wait for the first reading, s; the unit's `TimeoutStartSec` is longer.
+pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
+/// Usual wait, s: ten times what a bus needs to wake, short enough that nobody takes the start for hung.
+pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
+/// The line is told at most this often.
+const STATUS_PERIOD: Duration = Duration::from_secs(1);
+/// Signals named in the line; of the rest, how many.
+const MAX_NAMED: usize = 3;
+/// Longest line, bytes: a datagram to the service manager carries more, a terminal does not show more.
+const MAX_LINE: usize = 1500;
+
+/// An interface, as last heard of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Interface {
+    /// Nothing was heard yet.
+    Unknown,
+    Up,
+    Down,
+    Missing,
+}
+
+/// What the service manager is to be told now.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct ManagerUpdate {
+    /// The service is ready.
+    pub(super) ready: bool,
+    /// Its line.
+    pub(super) status: Option<String>,
+}
+
+/// See the module.
+#[derive(Debug)]
+pub(super) struct Readiness {
+    interfaces: Vec<(String, Interface)>,
+    began: Instant,
+    timeout: Duration,
+    /// How long after the start the first usable reading came.
+    first_after: Option<Duration>,
+    is_ready: bool,
+    lost: Vec<Channel>,
+    inputs: usize,
+    store_works: bool,
+    /// Why the last reload was refused.
+    refused: Option<String>,
+    /// What is told of the state that was taken up.
+    restored: Option<String>,
+    told: String,
+    told_at: Option<Instant>,
+    /// Something the line speaks of has changed since it was last made: most ticks make none.
+    is_changed: bool,
+}
+
+impl Readiness {
+    /// Of a service that starts now with these interfaces and waits this long for its first reading.
+    pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
+        Self {
+            interfaces: names.iter().map(|name| (name.clone(), Interface::Unknown)).collect(),
+            began: now,
+            timeout,
+            first_after: None,
+            is_ready: false,
+            lost: Vec::new(),
+            inputs: 0,
+            store_works: true,
+            refused: None,
+            restored,
+            told: String::new(),
+            told_at: None,
+            is_changed: true,
+        }
+    }
+
+    /// Takes what the core tells.
+    pub(super) fn note(&mut self, event: &Event) {
+        match event.kind {
+            EventKind::Bus { bus, what } => {
+                let state = match what {
+                    BusEvent::Up => Interface::Up,
+                    BusEvent::Down => Interface::Down,
+                    BusEvent::Missing => Interface::Missing,
+                    BusEvent::Dropped { .. } | BusEvent::ErrorFrame { .. } | BusEvent::SendFailed { .. } => return,
+                };
+                if let Some(interface) = self.interfaces.get_mut(bus.index()) {
+                    interface.1 = state;
+                }
+            }
+            EventKind::Store { works } => self.store_works = works,
+            _ => return,
+        }
+        self.is_changed = true;
+    }
+
+    /// Takes how a reload went: `None` = well, else why not.
+    pub(super) fn note_reload(&mut self, refused: Option<String>) {
+        self.refused = refused;
+        self.is_changed = true;
+    }
+
+    /// Looks at the core; gives what is to be told.
+    pub(super) fn poll(&mut self, monitor: &Monitor, now: Instant) -> ManagerUpdate {
+        let waited = now.duration_since(self.began);
+        if self.first_after.is_none() && monitor.has_heard() {
+            self.first_after = Some(waited);
+            self.is_changed = true;
+        }
+        let is_due = self.told_at.is_none_or(|told_at| now.duration_since(told_at) >= STATUS_PERIOD);
+        let ready = !self.is_ready && (self.first_after.is_some() || waited >= self.timeout);
+        if !is_due && !ready {
+            return ManagerUpdate::default();
+        }
+        self.is_ready |= ready;
+        self.is_changed |= ready;
+        self.look(monitor);
+        ManagerUpdate { ready, status: self.new_line(now) }
+    }
+
+    /// What changed just now is told at once: the line, when it is another than was told.
+    pub(super) fn tell_now(&mut self, monitor: &Monitor, now: Instant) -> Option<String> {
+        self.look(monitor);
+        self.new_line(now)
+    }
+
+    /// Whether the service manager was told that the service is ready.
+    pub(super) fn is_ready(&self) -> bool {
+        self.is_ready
+    }
+
+    fn look(&mut self, monitor: &Monitor) {
+        if self.inputs == monitor.inputs() && monitor.lost_inputs().eq(self.lost.iter().copied()) {
+            return;
+        }
+        self.lost.clear();
+        self.lost.extend(monitor.lost_inputs());
+        self.inputs = monitor.inputs();
+        self.is_changed = true;
+    }
+
+    /// The line, when it is another than was told.
+    fn new_line(&mut self, now: Instant) -> Option<String> {
+        if !std::mem::take(&mut self.is_changed) {
+            return None;
+        }
+        let line = self.line();
+        if line == self.told {
+            return None;
+        }
+        self.told.clone_from(&line);
+        self.told_at = Some(now);
+        Some(line)
+    }
+
+    fn line(&self) -> String {
+        let mut line = self.state();
+        for problem in self.problems() {
+            line.push_str("; ");
+            line.push_str(&problem);
+        }
+        one_line(&line, MAX_LINE)
+    }
+
+    /// The line's head: whether there is input.
+    fn state(&self) -> String {
+        let count = self.interfaces.len();
+        let mut line = match self.first_after {
+            None if !self.is_ready => "waiting for the first frame".to_owned(),
+            None => format!("running without input: no frame in {} s", self.timeout.as_secs_f64()),
+            Some(_) if !self.lost.is_empty() && self.lost.len() == self.inputs => "running without input".to_owned(),
+            Some(after) => {
+                let plural = if count == 1 { "" } else { "s" };
+                format!("running: {count} interface{plural}, first frame after {:.1} s", after.as_secs_f64())
+            }
+        };
+        if let Some(restored) = &self.restored {
+            line.push_str(", ");
+            line.push_str(restored);
+        }
+        line
+    }
+
+    fn problems(&self) -> Vec<String> {
+        let mut problems = Vec::new();
+        for (name, interface) in &self.interfaces {
+            match interface {
+                Interface::Missing => problems.push(format!("{name} is missing")),
+                Interface::Down => problems.push(format!("{name} is down")),
+                Interface::Up | Interface::Unknown => {}
+            }
+        }
+        if !self.lost.is_empty() && self.first_after.is_some() {
+            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| words(channel)).collect();
+            if self.lost.len() > MAX_NAMED {
+                names.push("...".to_owned());
+            }
+            problems.push(format!("{} of {} signals lost ({})", self.lost.len(), self.inputs, names.join(", ")));
+        }
+        if !self.store_works {
+            problems.push("a file cannot be written".to_owned());
+        }
+        problems.extend(self.refused.as_ref().map(|why| format!("reload refused: {why}")));
+        problems
+    }
+}
+
+/// What is told of a state of that age, s.
+pub(super) fn restored_words(age_s: Option<f64>) -> String {
+    match age_s {
+        Some(age_s) => format!("restored state {} old", words_s(age_s)),
+        None => "restored state of unknown age".to_owned(),
+    }
+}
+
+/// A time as people say it.
+fn words_s(seconds: f64) -> String {
+    const DAY_S: f64 = 86_400.0;
+    match seconds {
+        s if s < 120.0 => format!("{s:.0} s"),
+        s if s < 7200.0 => format!("{:.0} min", s / 60.0),
+        s if s < 2.0 * DAY_S => format!("{:.0} h", s / 3600.0),
+        s => format!("{:.0} days", s / DAY_S),
+    }
+}
+
+/// A signal as people say it; cells and sensors count from 1.
+fn words(channel: Channel) -> String {
+    match channel {
+        Channel::Current => "current".to_owned(),
+        Channel::Temperature(sensor) => format!("temperature {}", sensor.index() + 1),
+        Channel::PackVoltage => "pack voltage".to_owned(),
+        Channel::CellVoltage(cell) => format!("voltage of cell {}", cell.index() + 1),
+        Channel::ReportedSoc => "reported SOC".to_owned(),
+        Channel::ReportedSoh => "reported SOH".to_owned(),
+        Channel::PackIdentity => "pack identity".to_owned(),
+    }
+}
+
+/// Without control characters (a line feed would begin another assignment), and no longer than `limit` bytes.
+pub(super) fn one_line(text: &str, limit: usize) -> String {
+    let line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
+    if line.len() <= limit {
+        return line;
+    }
+    let end = (0..=limit - 3).rev().find(|&end| line.is_char_boundary(end)).unwrap_or(0);
+    format!("{}...", &line[..end])
+}
+
+#[cfg(test)]
+mod tests;

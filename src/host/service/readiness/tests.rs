@@ -1,0 +1,142 @@
+//! When the service is said to be ready, and what the status line says of interfaces, lost signals and reloads.
+
+use super::*;
+use crate::can::{CanId, Frame};
+use crate::config;
+use crate::monitor::{Input, Outputs};
+use crate::quantity::{BusIndex, Timestamp};
+use std::path::Path;
+
+/// A core, its readiness, and the time of both.
+struct Scene {
+    monitor: Monitor,
+    readiness: Readiness,
+    began: Instant,
+    at_s: f64,
+}
+
+impl Scene {
+    fn new(restored: Option<String>) -> Self {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml");
+        let config = config::load(&path).expect("the example is good");
+        let names: Vec<_> = ["can0", "can1"].map(str::to_owned).to_vec();
+        let began = Instant::now();
+        let readiness = Readiness::new(&names, Duration::from_secs(10), restored, began);
+        Self { monitor: Monitor::new(config.monitor), readiness, began, at_s: 0.0 }
+    }
+
+    /// Hands one input over, `after_s` later.
+    fn feed(&mut self, after_s: f64, input: impl Fn(Timestamp) -> Input<'static>) -> ManagerUpdate {
+        self.at_s += after_s;
+        let mut out = Outputs::default();
+        self.monitor.handle(input(Timestamp::from_secs(1e9 + self.at_s)), &mut out);
+        out.events.iter().for_each(|event| self.readiness.note(event));
+        self.readiness.poll(&self.monitor, self.began + Duration::from_secs_f64(self.at_s))
+    }
+
+    fn tick(&mut self, after_s: f64) -> ManagerUpdate {
+        self.feed(after_s, |time| Input::Tick { time })
+    }
+
+    fn bus(&mut self, after_s: f64, bus: u8, event: BusEvent) -> ManagerUpdate {
+        self.feed(after_s, |time| Input::Bus { time, bus: BusIndex(bus), event })
+    }
+
+    /// The line told after `seconds` of ticks, if any.
+    fn wait(&mut self, seconds: u32) -> Option<String> {
+        (0..seconds * 10).filter_map(|_| self.tick(0.1).status).last()
+    }
+}
+
+/// A frame as the example's DBC has it: 3.7 V, 0 A, 25 degrees C.
+fn good_frame() -> &'static Frame {
+    leaked(0x100, &[0x50, 0xA5, 0x05, 0, 0, 0, 0xC4, 0x09])
+}
+
+fn leaked(id: u16, data: &[u8]) -> &'static Frame {
+    Box::leak(Box::new(Frame::classic(CanId::Standard(id), data).expect("at most eight bytes")))
+}
+
+#[test]
+fn ready_comes_with_the_first_usable_reading_and_not_before() {
+    let mut scene = Scene::new(None);
+    assert_eq!(scene.tick(0.0), ManagerUpdate { ready: false, status: Some("waiting for the first frame".to_owned()) });
+    assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
+    // A frame that nothing is read from is none.
+    let foreign = leaked(0x7FE, &[1]);
+    assert!(!scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame: foreign }).ready);
+    let frame = good_frame();
+    let told = scene.feed(0.2, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    let status = Some("running: 2 interfaces, first frame after 0.4 s".to_owned());
+    assert_eq!(told, ManagerUpdate { ready: true, status });
+    assert!(!scene.tick(5.0).ready, "ready is told once");
+}
+
+#[test]
+fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_interface() {
+    let mut scene = Scene::new(Some(restored_words(Some(12.4))));
+    scene.bus(0.0, 0, BusEvent::Up);
+    scene.bus(0.1, 1, BusEvent::Missing);
+    assert!(!scene.tick(9.8).ready);
+    let told = scene.tick(0.1);
+    assert!(told.ready);
+    let line = told.status.expect("a line");
+    assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
+    // The first frame after that is told, too.
+    let frame = good_frame();
+    scene.feed(1.5, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    assert_eq!(
+        scene.readiness.told,
+        "running: 2 interfaces, first frame after 11.5 s, restored state 12 s old; can1 is missing"
+    );
+}
+
+#[test]
+fn changes_are_told_at_most_once_a_second_and_the_last_one_always() {
+    let mut scene = Scene::new(None);
+    let frame = good_frame();
+    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    let mut told = 0;
+    for n in 0..40 {
+        let event = if n % 2 == 0 { BusEvent::Down } else { BusEvent::Missing };
+        told += usize::from(scene.bus(0.05, 0, event).status.is_some());
+    }
+    assert!(told <= 3, "{told} lines in 2 s");
+    scene.wait(2);
+    assert!(scene.readiness.told.ends_with("; can0 is missing"), "{}", scene.readiness.told);
+}
+
+#[test]
+fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
+    let mut scene = Scene::new(None);
+    let frame = good_frame();
+    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    // Longer than a temperature may be old.
+    let line = scene.wait(130).expect("signals were lost");
+    assert!(line.starts_with("running without input; 3 of 3 signals lost (current, "), "{line}");
+    for _ in 0..20 {
+        scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    }
+    assert_eq!(scene.readiness.told, "running: 2 interfaces, first frame after 0.0 s");
+}
+
+#[test]
+fn a_refused_reload_stays_in_the_line_until_one_is_taken() {
+    let mut scene = Scene::new(None);
+    let frame = good_frame();
+    scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    scene.readiness.note_reload(Some("pack.toml:3: pack.cells = 0,\nmust be 1 to 1024".to_owned()));
+    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    assert!(line.ends_with("; reload refused: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");
+    scene.readiness.note_reload(None);
+    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    assert!(!line.contains("reload"), "{line}");
+}
+
+#[test]
+fn a_line_is_one_line_and_bounded() {
+    assert_eq!(one_line("a\nREADY=1\tb", 100), "a READY=1 b");
+    let long = "\u{fc}".repeat(2000);
+    let line = one_line(&long, 1000);
+    assert!(line.len() <= 1000 && line.ends_with("..."), "{} bytes", line.len());
+}

@@ -1,0 +1,181 @@
+//! A document for tests: every value told, of a few nothing is known.
+
+use super::counters::LoopCounters;
+use super::document::{
+    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
+    StatusCount, Store, VERSION,
+};
+use crate::alarm::{Alarm, Rule, Severity, State};
+use crate::control::protocol::UnknownAlarms;
+use crate::io::socket::LinkState;
+use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};
+use crate::quantity::{CellIndex, Mode, Timestamp};
+use crate::sample::ReadingCounts;
+
+/// Of a pack with so many cells; the last one is silent and the one before it not trusted, when there are several.
+pub fn sample(cells: u16) -> Document {
+    let mut counters = LoopCounters::default();
+    [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| counters.latency.record(seconds));
+    let time = Timestamp::from_secs(1_800_000_000.0);
+    Document {
+        version: VERSION,
+        program_version: "1.2.3".to_owned(),
+        pid: 4711,
+        time,
+        wall_time: time,
+        started: time.plus_secs(-11_520.0),
+        uptime_s: 11_520.0,
+        config: Some(ConfigFile { path: "pack.toml".to_owned(), sha256: "0123456789abcdef".repeat(4) }),
+        state: Validity::Valid,
+        interfaces: vec![interface("can0", LinkState::Up), interface("can1", LinkState::Missing)],
+        pack: pack(cells),
+        cells: (0..cells).map(|index| cell(index, cells)).collect(),
+        alarms: alarms(),
+        counters: Counters {
+            core: core(),
+            lifetime: Statistics { buses: Vec::new(), half_cycles: 1200, ..core() },
+            readings: ReadingCounts { accepted: 123_456, out_of_range: 7, ..ReadingCounts::default() },
+            time_backwards: 2,
+            service: ServiceCounters {
+                ticks: 1_152_000,
+                missed_deadlines: 3,
+                worst_lateness_s: 0.021,
+                reloads: 1,
+                reloads_refused: 0,
+                documents_skipped: 0,
+            },
+            clients: Clients { connected: 1, served: 90, refused: 5, dropped: 2 },
+        },
+        protection: vec![Protected {
+            interface: "can0".to_owned(),
+            id: "3E9".to_owned(),
+            checks: vec![StatusCount { status: "ok".to_owned(), count: 99 }],
+        }],
+        floods: vec![Flooded { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
+        latency: counters.latency.document(),
+        store: Some(Store {
+            path: "/var/lib/packwatch/packwatch.db".to_owned(),
+            works: Some(true),
+            commits: 21,
+            file_bytes: Some(65_536),
+            ..Store::default()
+        }),
+        events: vec![
+            serde_json::json!({ "time": time.nanos(), "event": "mode", "from": "rest", "to": "discharge" }),
+            serde_json::json!({ "time": time.nanos(), "event": "trust", "cell": 2, "trusted": false, "mean_nis": 3.25 }),
+        ],
+    }
+}
+
+fn interface(name: &str, state: LinkState) -> Interface {
+    Interface {
+        name: name.to_owned(),
+        state,
+        reconnects: 1,
+        frames: 86_400,
+        error_frames: 4,
+        bus_offs: 1,
+        kernel_dropped: 6,
+        queue_dropped: 0,
+        malformed: 0,
+        sent: 1200,
+        send_queue_full: 8,
+        send_failed: 9,
+    }
+}
+
+fn pack(cells: u16) -> Pack {
+    Pack {
+        validity: Validity::Valid,
+        mode: Mode::Discharge,
+        soc: Some(0.632),
+        soc_std: Some(0.012),
+        soc_low: Some(0.608),
+        soc_high: Some(0.656),
+        limiting_cell: Some(0),
+        voltage_v: Some(3.65 * f64::from(cells)),
+        current_a: Some(12.5),
+        temperature_max_c: Some(31.25),
+        weakest_cell: Some(0),
+        capacity_ah: Some(2.412),
+        capacity_std_ah: Some(0.021),
+        soh: Some(0.928),
+        shortest_lived_cell: Some(0),
+        remaining_cycles: Some(412.3),
+        remaining_cycles_low: Some(207.8),
+        remaining_cycles_high: Some(933.1),
+        remaining_days: Some(533.2),
+        usable_capacity_ah: Some(2.31),
+        usable_capacity_std_ah: Some(0.04),
+        recharge_period_s: None,
+        normalised_recharge_period_s: Some(5432.0),
+        normalised_recharge_period_std_s: Some(61.0),
+        reported_soc: None,
+        reported_soh: None,
+    }
+}
+
+fn cell(index: u16, cells: u16) -> Cell {
+    let wave = f64::from(index % 24) / 24.0;
+    let is_silent = cells > 1 && index + 1 == cells;
+    let known = |value: f64| (!is_silent).then_some(value);
+    Cell {
+        cell: index,
+        voltage_v: known(3.6 + 0.1 * wave),
+        current_a: Some(12.5),
+        temperature_c: known(25.0 + 6.0 * wave),
+        soc: known(0.6 + 0.2 * wave),
+        soc_std: known(0.012),
+        capacity_ah: known(2.4 + 0.05 * wave),
+        capacity_std_ah: known(0.02),
+        usable_capacity_ah: None,
+        usable_capacity_std_ah: None,
+        remaining_cycles: known(412.3 + wave),
+        remaining_cycles_low: known(207.8),
+        remaining_cycles_high: known(933.1),
+        remaining_days: known(533.2),
+        remaining_unknown: is_silent.then(|| "0 capacity readings, needs 6".to_owned()),
+        resistance_ratio: known(1.1 + 0.2 * wave),
+        resistance_ratio_std: known(0.03),
+        trusted: (!is_silent).then_some(cells < 3 || index + 2 != cells),
+    }
+}
+
+fn alarms() -> Alarms {
+    let raised = Alarm {
+        rule: Rule::CapacityLow,
+        severity: Severity::Severe,
+        cell: Some(CellIndex(0)),
+        state: State::Active,
+        value: Some(2.412),
+        probability: Some(0.973),
+        threshold: 2.5,
+        occurrences: 1,
+        first_raised: Some(Timestamp::ZERO),
+        last_raised: Some(Timestamp::ZERO),
+        raised_value: Some(2.42),
+        is_acknowledged: false,
+    };
+    let past = Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: State::Cleared, ..raised };
+    let past = Alarm { value: Some(0.632), threshold: 0.1, probability: None, is_acknowledged: true, ..past };
+    Alarms {
+        thresholds: 4,
+        raised: 1,
+        highest_severity: Some(Severity::Severe),
+        unknown: vec![UnknownAlarms { rule: Rule::RechargePeriodLow, severity: Severity::Warning, alarms: 1 }],
+        list: vec![raised, past],
+        omitted: 0,
+    }
+}
+
+fn core() -> Statistics {
+    Statistics {
+        buses: vec![BusStatistics { frames: 86_400, error_frames: 4, bus_offs: 1 }],
+        voltages_used: 120_000,
+        voltages_gated: 11,
+        half_cycles: 12,
+        capacity_updates: 12,
+        alarms_raised: AlarmCounts { info: 0, warning: 1, severe: 1 },
+        ..Statistics::default()
+    }
+}

@@ -1,0 +1,242 @@
+//! When something was stored, on every clock there is, and how long ago that was.
+//!
+//! The wall clock of a vehicle computer may say 1970 until somebody tells it better, and may step; the boot clock never
+//! steps but begins anew with every boot. So both are stored, with the boot they belong to.
+//!
+//! Over a boot only the wall clock can say how long it was, and only where something kept it while the computer was off.
+//! Without a hardware clock on a battery it goes on from where somebody last saved it (systemd does, at every boot): then a
+//! week off looks like seconds, and nothing about the time itself gives that away. So it is believed only where a hardware
+//! clock tells the same ([`WallClock`]), or a time server has set it.
+
+use std::fmt;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use crate::io::clock::Reading;
+use crate::quantity::Timestamp;
+
+/// A wall clock before this (2024-01-01) has not been set.
+const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
+
+/// Where the kernel shows its hardware clocks; a sandbox reads there what it may not ask the kernel (`adjtimex`).
+const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
+/// systemd's time client leaves this once a time server has set the clock in this boot.
+const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
+/// A hardware clock tells the same within this, s: it counts whole seconds, drifts a few a day, and the wall clock may
+/// have been set right since it was read at the boot.
+const HARDWARE_TOLERANCE_S: i64 = 60;
+
+/// One boot of one computer, as the kernel names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(into = "String", try_from = "String")]
+pub struct BootId(pub(super) [u8; 16]);
+
+/// Tells which boot this is, where the kernel's own file cannot be seen.
+const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
+
+impl BootId {
+    /// A kernel that does not say which boot this is.
+    const UNKNOWN: Self = Self([0; 16]);
+    /// No boot at all: bus time, from a record.
+    pub const REPLAY: Self = Self(*b"packwatch replay");
+
+    /// Of this boot.
+    pub fn current() -> Self {
+        let told = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok().and_then(|text| Self::parse(&text));
+        // A sandbox without that file (`ProcSubset=pid`) has it from its unit.
+        let told = told.or_else(|| std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text)));
+        // Two unknown boots are never the same one.
+        told.unwrap_or(Self::UNKNOWN)
+    }
+
+    /// From the kernel's form or ours.
+    pub(super) fn parse(text: &str) -> Option<Self> {
+        let digits: String = text.chars().filter(|c| *c != '-' && !c.is_whitespace()).collect();
+        u128::from_str_radix(&digits, 16).ok().filter(|_| digits.len() == 32).map(|id| Self(id.to_be_bytes()))
+    }
+}
+
+impl From<BootId> for String {
+    fn from(boot: BootId) -> Self {
+        boot.to_string()
+    }
+}
+
+impl TryFrom<String> for BootId {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        Self::parse(&text).ok_or_else(|| format!("boot {text:?}, must be 32 hexadecimal digits"))
+    }
+}
+
+impl fmt::Display for BootId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:032x}", u128::from_be_bytes(self.0))
+    }
+}
+
+/// A moment on every clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Stamp {
+    /// The wall clock, ns since 1970; may be wrong.
+    pub wall_ns: i64,
+    /// The clock of the inputs.
+    pub time: Timestamp,
+    /// Since this boot, sleep included, ns.
+    pub boottime_ns: i64,
+    /// Which boot.
+    pub boot: BootId,
+}
+
+/// What the wall clock is worth over the boot.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum WallClock {
+    /// Something kept it while the computer was off, or has told it since.
+    Kept,
+    /// Nothing shows that it is more than the time somebody saved before.
+    Unsure,
+}
+
+impl WallClock {
+    /// As it is at `now`, at the start. Set later, by GPS or a time server, it comes too late for the age of the state:
+    /// that is asked once.
+    pub fn look(now: &Stamp) -> Self {
+        Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
+    }
+
+    fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
+        let wall_s = now.wall_ns / 1_000_000_000;
+        // One without a battery counts from its own beginning: that there is one says nothing.
+        let tells_the_same = |clock: &Path| {
+            let told = std::fs::read_to_string(clock.join("since_epoch")).ok();
+            let told_s = told.and_then(|text| text.trim().parse::<i64>().ok());
+            told_s.is_some_and(|told_s| told_s.saturating_sub(wall_s).saturating_abs() <= HARDWARE_TOLERANCE_S)
+        };
+        let mut clocks = std::fs::read_dir(hardware_clocks).into_iter().flatten().flatten();
+        if clocks.any(|clock| tells_the_same(&clock.path())) || synchronised.exists() {
+            Self::Kept
+        } else {
+            Self::Unsure
+        }
+    }
+}
+
+/// How long ago something was stored.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Age {
+    /// Seconds.
+    Seconds(f64),
+    /// The clocks do not say.
+    Unknown,
+}
+
+impl Stamp {
+    /// Now, with the inputs' clock at `time`.
+    pub fn now(time: Timestamp, boot: BootId) -> Self {
+        let Reading { realtime_ns, boottime_ns } = Reading::now();
+        Self { wall_ns: realtime_ns, time, boottime_ns, boot }
+    }
+
+    /// Bus time of a record: the only clock there is.
+    pub fn replayed(time: Timestamp) -> Self {
+        Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
+    }
+
+    /// Whether both belong to one boot that is known.
+    pub fn same_boot(&self, other: &Self) -> bool {
+        self.boot == other.boot && self.boot != BootId::UNKNOWN
+    }
+
+    /// How long before `now` this was.
+    pub fn age(&self, now: &Self, wall: WallClock) -> Age {
+        let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
+        if self.same_boot(now) {
+            return Age::Seconds(seconds(self.boottime_ns, now.boottime_ns).max(0.0));
+        }
+        let can_be = now.wall_ns > self.wall_ns && self.wall_ns >= SANE_WALL_NS;
+        match wall {
+            // It was before this boot, so longer ago than that has lasted.
+            WallClock::Kept if can_be => {
+                Age::Seconds(seconds(self.wall_ns, now.wall_ns).max(seconds(0, now.boottime_ns)))
+            }
+            WallClock::Kept | WallClock::Unsure => Age::Unknown,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: i64 = 1_000_000_000;
+
+    fn stamp(boot: u8, boottime_s: i64, wall_s: i64) -> Stamp {
+        let boot = BootId([boot; 16]);
+        Stamp { wall_ns: wall_s * S, time: Timestamp::ZERO, boottime_ns: boottime_s * S, boot }
+    }
+
+    #[test]
+    fn within_one_boot_the_wall_clock_does_not_count() {
+        for wall_s in [0, 1_800_000_000, 4_000_000_000] {
+            let now = stamp(1, 130, wall_s);
+            assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unsure), Age::Seconds(30.0));
+        }
+    }
+
+    #[test]
+    fn over_a_boot_only_a_wall_clock_that_can_be_right_counts() {
+        let stored = stamp(1, 100, 1_800_000_000);
+        let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Kept);
+        assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Age::Seconds(600.0));
+        assert_eq!(age(stored, stamp(2, 5, 1_799_999_999)), Age::Unknown, "before what was stored");
+        assert_eq!(age(stored, stamp(2, 5, 30)), Age::Unknown, "1970");
+        assert_eq!(age(stamp(1, 100, 30), stamp(2, 5, 1_800_000_000)), Age::Unknown, "stored in 1970");
+        assert_eq!(age(stamp(0, 100, 30), stamp(0, 130, 60)), Age::Unknown, "boots that are not known");
+    }
+
+    #[test]
+    fn a_state_of_an_earlier_boot_is_at_least_as_old_as_this_one() {
+        let stored = stamp(1, 100, 1_800_000_000);
+        assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Kept), Age::Seconds(3_600.0));
+    }
+
+    #[test]
+    fn a_week_off_is_not_the_seconds_a_saved_clock_makes_of_it() {
+        // Without a hardware clock: the time of the last save, 20 s after the last checkpoint.
+        let (stored, now) = (stamp(1, 100, 1_800_000_000), stamp(2, 5, 1_800_000_020));
+        assert_eq!(stored.age(&now, WallClock::Unsure), Age::Unknown);
+    }
+
+    #[test]
+    fn a_wall_clock_is_kept_where_hardware_or_a_time_server_says_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let (clocks, synchronised) = (folder.path().join("rtc"), folder.path().join("synchronized"));
+        let judge = || WallClock::judge(&stamp(2, 5, 1_800_000_020), &clocks, &synchronised);
+        assert_eq!(judge(), WallClock::Unsure, "no hardware clock");
+        let tells = |text: &str| {
+            std::fs::create_dir_all(clocks.join("rtc0")).unwrap();
+            std::fs::write(clocks.join("rtc0/since_epoch"), text).unwrap();
+        };
+        for (told, expected) in [
+            ("1800000018\n", WallClock::Kept),
+            ("946684805\n", WallClock::Unsure), // 2000-01-01: no battery
+            ("1800604800\n", WallClock::Unsure),
+            ("\n", WallClock::Unsure),
+        ] {
+            tells(told);
+            assert_eq!(judge(), expected, "{told:?}");
+        }
+        std::fs::write(&synchronised, "").unwrap();
+        assert_eq!(judge(), WallClock::Kept, "a time server");
+    }
+
+    #[test]
+    fn a_boot_is_read_as_the_kernel_writes_it() {
+        let boot = BootId::parse("0f3c1c1e-7f7e-4c39-9a49-0123456789ab\n").unwrap();
+        assert_eq!(boot.to_string(), "0f3c1c1e7f7e4c399a490123456789ab");
+        assert_eq!(BootId::parse(&boot.to_string()), Some(boot));
+        assert_eq!(BootId::parse("none"), None);
+    }
+}

@@ -1,0 +1,320 @@
+//! A real state through the store and back.
+
+mod rounding;
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use super::database::Database;
+use super::folder::DATABASE;
+use super::parts::Parts;
+use super::*;
+use crate::can::encode::{InputEncoder, InputProtector};
+use crate::config::{self, Config};
+use crate::replay::{self, Settings, Sinks, When};
+use crate::io::csv_log::CsvOptions;
+use crate::io::log::{LogOptions, LogSource};
+use crate::monitor::{Input, Outputs};
+use crate::quantity::CellIndex;
+
+fn config() -> Config {
+    config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../config/measured.toml")).unwrap()
+}
+
+/// The log of a cell that is discharged and charged in turn, a quarter of an hour each.
+fn log(config: &Config, folder: &Path) -> LogSource {
+    let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
+    let mut soc: f64 = 0.9;
+    for second in 0..7_200_u32 {
+        let current_a = if second / 900 % 2 == 0 { 2.0 } else { -2.0 };
+        soc -= current_a / 3600.0 / 2.6;
+        let _ = writeln!(text, "{second},{current_a},{:.4},24.5", 3.3 + 0.8 * soc - 0.05 * current_a);
+    }
+    let path = folder.join("cell.csv");
+    std::fs::write(&path, text).unwrap();
+    let encoder = InputEncoder::new(&config.monitor.input);
+    let mut protector = InputProtector::new(&config.monitor.guards);
+    let options = LogOptions {
+        interfaces: config.interface_names(),
+        strict: true,
+        csv: CsvOptions { columns: Vec::new(), charge_positive: false, start_times: None, cells: 1, pack_total: false },
+        encode_row: Box::new(move |values, frames| {
+            let uncarried = encoder.encode(values, frames);
+            protector.protect(frames);
+            uncarried
+        }),
+    };
+    LogSource::new(vec![path], options)
+}
+
+/// The state after so many seconds of the log.
+fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
+    let folder = tempfile::tempdir().unwrap();
+    let config = config();
+    let mut source = log(&config, folder.path());
+    let settings = Settings {
+        snapshot: true,
+        snapshot_at: seconds.map(|seconds| When::After(seconds * 1_000_000_000)),
+        away: Some(Downtime::AsStamped),
+        store,
+        ..Settings::plain(30.0, config.interface_names())
+    };
+    let monitor = Monitor::new(config.monitor);
+    replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()
+}
+
+/// A monitor that has taken the state up.
+fn restored(snapshot: Snapshot) -> Monitor {
+    let mut monitor = Monitor::new(config().monitor);
+    let time = snapshot.time;
+    monitor.restore(snapshot, Downtime::AsStamped).unwrap();
+    monitor.handle(Input::Tick { time }, &mut Outputs::default());
+    monitor
+}
+
+#[test]
+fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
+    let parts = |snapshot: &Snapshot| Parts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
+    let (early, late) = (snapshot(Some(1500), None), snapshot(Some(5000), None));
+    let full = packed::read_full(&packed::full(&parts(&late))).unwrap();
+    assert_eq!(full.join(), serde_json::to_vec(&late).unwrap());
+    let delta = packed::delta(&parts(&late), &parts(&early), 1);
+    let read = packed::read_delta(&delta, &parts(&early), 1).unwrap().join();
+    let near = restored(serde_json::from_slice(&read).unwrap());
+    let exact = restored(late);
+    let (near, exact) = (near.capacity(CellIndex(0)), exact.capacity(CellIndex(0)));
+    assert!((near.mean - exact.mean).abs() < 1e-5 && (near.std() - exact.std()).abs() < 1e-5, "{near:?} {exact:?}");
+}
+
+#[test]
+fn the_database_holds_the_state_in_which_the_replay_ended() {
+    let folder = tempfile::tempdir().unwrap();
+    let state = folder.path().join("state");
+    let end = snapshot(None, Some(Recorder::create(&state, &config().store).unwrap()));
+    let now = Stamp::replayed(end.time.plus_secs(60.0));
+    let database = Database::open(&state.join(DATABASE), &now, 1000).unwrap();
+    let counts = database.counts();
+    assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
+    let stored = Document::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
+    assert_eq!(stored.stamp.age(&now, WallClock::Kept), Age::Seconds(60.0));
+    assert_eq!(serde_json::to_vec(&stored.snapshot).unwrap(), serde_json::to_vec(&end).unwrap());
+    restored(*stored.snapshot);
+}
+
+/// A document of a state taken at `boottime_s` of boot `boot`.
+pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
+    let boot = BootId([boot; 16]);
+    let time = Timestamp::from_secs(1.0);
+    let stamp = Stamp { wall_ns: wall_s * 1_000_000_000, time, boottime_ns: boottime_s * 1_000_000_000, boot };
+    let monitor = Monitor::new(config().monitor);
+    Document { folder: String::new(), stamp, snapshot: Box::new(monitor.snapshot()) }
+}
+
+#[test]
+fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
+    const WALL_S: i64 = 1_800_000_000;
+    let now = document(1, 100, WALL_S).stamp;
+    let of = |running: Option<Document>, stored: Option<Document>| -> Vec<(&str, Downtime)> {
+        candidates(running, stored, &now, WallClock::Kept)
+            .into_iter()
+            .map(|candidate| (candidate.source, candidate.away))
+            .collect()
+    };
+    let (running, stored) = (|at| Some(document(1, at, 0)), |at| Some(document(1, at, 0)));
+    let both = |first, second| [(first, Downtime::Seconds(2.0)), (second, Downtime::Seconds(50.0))];
+    assert_eq!(of(running(98), stored(50)), both("runtime folder", "database"));
+    assert_eq!(of(running(50), stored(98)), both("database", "runtime folder"));
+    assert_eq!(of(None, Some(document(2, 500, WALL_S - 600))), [("database", Downtime::Seconds(600.0))]);
+    assert_eq!(of(None, Some(document(2, 500, WALL_S + 600))), [("database", Downtime::Unknown)]);
+    assert_eq!(of(None, None), []);
+}
+
+/// Waits for the writer's answer to a ticket.
+fn answer(store: &Store, ticket: u64) -> Progress {
+    let progress = store.progress();
+    let begun = Instant::now();
+    while progress.borrow().ticket < ticket {
+        assert!(begun.elapsed() < Duration::from_secs(30), "no answer");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    *progress.borrow()
+}
+
+#[test]
+fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    // A file where the folder should be: nothing can be made there.
+    std::fs::write(&state, "").unwrap();
+    let (store, found) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let mut store = store.unwrap();
+    assert!(!found.works && found.states.is_empty());
+    let monitor = Monitor::new(config().monitor);
+    let kind = rows::tests::capacity(0, Some(2.0), 1.9);
+    let mut learn = |seconds: f64| {
+        let time = Timestamp::from_secs(seconds);
+        store.learned(&[Event { time, kind }], &monitor, time).unwrap()
+    };
+    let tickets = [learn(1.0), learn(2.0), learn(3.0)];
+    let last = tickets[2];
+    assert!(!answer(&store, last).works);
+    std::fs::remove_file(&state).unwrap();
+    let begun = Instant::now();
+    while !store.progress().borrow().works {
+        assert!(begun.elapsed() < Duration::from_secs(30), "not tried again");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert!(store.progress().borrow().file_bytes.is_some_and(|bytes| bytes > 0));
+    store.finish(&monitor, Timestamp::from_secs(4.0));
+    let entries = Reader::open(&state).unwrap().entries(&Filter::default()).unwrap();
+    assert_eq!(entries.iter().filter(|entry| entry.kind == Kind::Capacity).count(), 3);
+}
+
+#[test]
+fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    std::fs::write(&state, "").unwrap();
+    let (store, _) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let store = store.unwrap();
+    let mut progress = store.progress();
+    let (begun, mut changes) = (Instant::now(), 0);
+    while begun.elapsed() < Duration::from_millis(2500) {
+        changes += u32::from(progress.has_changed().unwrap());
+        progress.borrow_and_update();
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    // After 1 s, with 2 s to the next.
+    assert_eq!((changes, progress.borrow().failures), (1, 1));
+    // Tickets answered meanwhile are no attempts.
+    let desk = Arc::clone(&store.desk);
+    for _ in 0..3 {
+        let ticket = desk.leave(None, document(1, 1, 1), false);
+        assert_eq!(answer(&store, ticket).failures, 1);
+    }
+    std::fs::remove_file(&state).unwrap();
+    let monitor = Monitor::new(config().monitor);
+    store.finish(&monitor, Timestamp::from_secs(4.0));
+    assert!(Reader::open(&state).unwrap().state().is_some());
+}
+
+#[test]
+fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the_next_start() {
+    let place = tempfile::tempdir().unwrap();
+    let (store, _) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+    let mut store = store.unwrap();
+    let monitor = Monitor::new(config().monitor);
+    let learn = |store: &mut Store, seconds: f64| {
+        let time = Timestamp::from_secs(seconds);
+        let kind = rows::tests::capacity(0, Some(2.0), 1.9);
+        store.learned(&[Event { time, kind }], &monitor, time).unwrap()
+    };
+    let ticket = learn(&mut store, 1.0);
+    assert!(answer(&store, ticket).works);
+    // As a broken disk would: pages of nothing, in file and log.
+    for name in ["packwatch.db", "packwatch.db-wal"] {
+        let path = place.path().join(name);
+        let length = std::fs::metadata(&path).map_or(0, |file| file.len());
+        std::fs::write(&path, vec![0x5A; usize::try_from(length).unwrap()]).unwrap();
+    }
+    for second in 2..6 {
+        let ticket = learn(&mut store, f64::from(second));
+        answer(&store, ticket);
+        std::thread::sleep(Duration::from_millis(700));
+    }
+    store.finish(&monitor, Timestamp::from_secs(9.0));
+    let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+    let mut store = store.unwrap();
+    // Pages that were in memory may never have been read again: then the start finds it.
+    assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
+    let ticket = learn(&mut store, 10.0);
+    assert!(answer(&store, ticket).works);
+    store.finish(&monitor, Timestamp::from_secs(11.0));
+    let reader = Reader::open(place.path()).unwrap();
+    assert_eq!(reader.verify().unwrap().broken, None);
+    assert!(reader.state().is_some());
+    assert!(place.path().join("packwatch.db.damaged-1").exists());
+}
+
+/// A monitor whose state was taken at that time.
+fn at(seconds: f64) -> Monitor {
+    let mut monitor = Monitor::new(config().monitor);
+    monitor.handle(Input::Tick { time: Timestamp::from_secs(seconds) }, &mut Outputs::default());
+    monitor
+}
+
+fn states(found: &Found) -> Vec<(&'static str, f64)> {
+    found.states.iter().map(|state| (state.source, state.snapshot.time.secs())).collect()
+}
+
+#[test]
+fn on_a_disk_that_fails_the_last_state_is_in_the_runtime_folder() {
+    let place = tempfile::tempdir().unwrap();
+    let state = place.path().join("folder");
+    std::fs::write(&state, "").unwrap();
+    let (store, _) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
+    let file = place.path().join(runtime::FILE_NAME);
+    let mut store = store.unwrap();
+    store.runtime = Some(RuntimeState::start(file.clone()).unwrap());
+    store.tick(&at(3.0), Timestamp::from_secs(3.0), true);
+    store.finish(&at(3.9), Timestamp::from_secs(3.9));
+    assert_eq!(running_state(&file, &state).unwrap().snapshot.time, Timestamp::from_secs(3.9));
+}
+
+fn reasons(folder: &Path) -> Vec<String> {
+    let filter = Filter { kinds: vec![Kind::Reset], ..Filter::default() };
+    let entries = Reader::open(folder).unwrap().entries(&filter).unwrap();
+    entries.iter().map(|entry| entry.values[1].as_str().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
+    const ASIDE: &str = "database, set aside earlier";
+    let place = tempfile::tempdir().unwrap();
+    let open = || {
+        let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+        (store.unwrap(), found)
+    };
+    let finish = |store: Store, seconds: f64| store.finish(&at(seconds), Timestamp::from_secs(seconds));
+    finish(open().0, 1.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 1.0)]);
+    store.set_state_aside("snapshot is of 4 cells", Timestamp::from_secs(2.0));
+    finish(store, 2.0);
+    assert_eq!(reasons(place.path()), ["state_unfit"]);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 2.0), (ASIDE, 1.0)]);
+    // Stays, however many states come after it.
+    finish(store, 3.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 3.0), (ASIDE, 1.0)]);
+    // The edit was undone: they change places.
+    store.set_state_aside("snapshot is of 5 cells", Timestamp::from_secs(4.0));
+    finish(store, 4.0);
+    let (store, found) = open();
+    assert_eq!(states(&found), [(DATABASE_SOURCE, 4.0), (ASIDE, 3.0)]);
+    drop(found);
+    finish(store, 5.0);
+    // It belongs to the pack.
+    replace_pack(place.path()).unwrap();
+    assert_eq!(states(&open().1), []);
+}
+
+#[test]
+fn a_state_of_another_version_is_told_and_not_overwritten() {
+    let place = tempfile::tempdir().unwrap();
+    let path = place.path().join(DATABASE);
+    let now = document(1, 1, 1).stamp;
+    let mut database = Database::open(&path, &now, 1000).unwrap();
+    let parts = Parts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
+    database.commit(&[], Some(database::StateRecord { parts, exact: true, sets_aside: false })).unwrap();
+    drop(database);
+    let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
+    assert!(!found.works && found.states.is_empty());
+    store.unwrap().finish(&at(1.0), Timestamp::from_secs(1.0));
+    assert_eq!(reasons(place.path()), ["state_unfit"]);
+    let database = Database::open(&path, &now, 1000).unwrap();
+    let kept = "SELECT count(*) FROM state WHERE slot IN (0, 10)";
+    assert_eq!(database.connection().query_row(kept, [], |row| row.get::<_, i64>(0)).unwrap(), 2);
+}

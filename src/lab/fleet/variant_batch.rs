@@ -1,0 +1,184 @@
+//! The alarms of many settings from one replay.
+//!
+//! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on those of another. So one
+//! monitor's inputs to its alarms are given to further engines, the *lanes*: the n-th different threshold of each rule
+//! and severity is watched in lane n. A grid of five thresholds of one rule by five of another needs five lanes, not
+//! twenty-five, and every setting of the grid finds each of its thresholds in some lane.
+
+use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Raises, and clears, kept of one threshold in one log; more are counted only.
+const MAX_KEPT: usize = 20_000;
+
+/// An alarm was raised.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Raise {
+    /// When.
+    pub time: Timestamp,
+    /// Which cell; `None` = the pack.
+    pub cell: Option<CellIndex>,
+    /// The value that raised it, in the rule's unit.
+    pub value: Option<f64>,
+}
+
+/// What became of the alarms of one threshold in one log.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct AlarmHistory {
+    /// In the order of time.
+    pub raises: Vec<Raise>,
+    /// In the order of time.
+    pub clears: Vec<Timestamp>,
+    /// Raises and clears beyond those kept.
+    pub not_kept: u64,
+}
+
+/// One threshold in its lane.
+#[derive(Debug, Clone)]
+struct Watched {
+    config: RuleConfig,
+    lane: usize,
+    history: AlarmHistory,
+}
+
+/// Which thresholds are watched in which lane.
+#[derive(Debug, Clone, Default)]
+pub struct Lanes {
+    watched: Vec<Watched>,
+}
+
+impl Lanes {
+    /// Makes sure that a threshold is watched; its number.
+    pub fn watch(&mut self, config: &RuleConfig) -> usize {
+        if let Some(known) = self.watched.iter().position(|watched| watched.config == *config) {
+            return known;
+        }
+        let same = |watched: &&Watched| is_of(watched, config.rule, config.severity);
+        let lane = self.watched.iter().filter(same).count();
+        self.watched.push(Watched { config: config.clone(), lane, history: AlarmHistory::default() });
+        self.watched.len() - 1
+    }
+
+    /// The engines of all lanes.
+    pub fn engines(&self, cells: u16) -> Engines {
+        let lanes = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
+        let rules = |lane| self.watched.iter().filter(move |watched| watched.lane == lane);
+        let engine = |lane| AlarmEngine::new(rules(lane).map(|watched| watched.config.clone()).collect(), cells);
+        let watches = |lane| {
+            let numbers: Vec<u32> = rules(lane).map(|watched| 1 << (watched.config.rule as u8)).collect();
+            numbers.iter().fold(0, |mask, bit| mask | bit)
+        };
+        Engines { engines: (0..lanes).map(|lane| (engine(lane), watches(lane))).collect(), changes: Vec::new() }
+    }
+
+    fn note(&mut self, lane: usize, time: Timestamp, change: &AlarmChange) {
+        let alarm = &change.alarm;
+        let place =
+            self.watched.iter_mut().find(|watched| watched.lane == lane && is_of(watched, alarm.rule, alarm.severity));
+        let Some(Watched { history, .. }) = place else { return };
+        match change.change {
+            Change::Raised if history.raises.len() < MAX_KEPT => {
+                history.raises.push(Raise { time, cell: alarm.cell, value: alarm.value });
+            }
+            Change::Cleared if history.clears.len() < MAX_KEPT => history.clears.push(time),
+            Change::Raised | Change::Cleared => history.not_kept += 1,
+            Change::Suppressed | Change::Resumed | Change::Latched | Change::Acknowledged | Change::Forgotten => {}
+        }
+    }
+
+    /// What became of the alarms of the threshold with this number.
+    pub fn history(&self, number: usize) -> Option<&AlarmHistory> {
+        self.watched.get(number).map(|watched| &watched.history)
+    }
+}
+
+fn is_of(watched: &Watched, rule: Rule, severity: Severity) -> bool {
+    (watched.config.rule, watched.config.severity) == (rule, severity)
+}
+
+/// The lanes' engines in one replay.
+#[derive(Debug)]
+pub struct Engines {
+    /// Each with the rules it watches, a bit per wire number.
+    engines: Vec<(AlarmEngine, u32)>,
+    changes: Vec<AlarmChange>,
+}
+
+impl Engines {
+    /// Gives what the monitor told its alarms to all lanes, and notes what became of theirs.
+    pub fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], lanes: &mut Lanes) {
+        for (time, input) in inputs {
+            for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
+                if concerns(input, *watches) {
+                    engine.apply(*time, input, &mut self.changes);
+                }
+                self.changes.drain(..).for_each(|change| lanes.note(lane, *time, &change));
+            }
+        }
+    }
+}
+
+/// Whether an engine that watches these rules cares for an input.
+fn concerns(input: &AlarmInput, watches: u32) -> bool {
+    match input {
+        AlarmInput::Observe { rule, .. } | AlarmInput::InputsValid { rule, .. } => watches & 1 << (*rule as u8) != 0,
+        AlarmInput::Poll
+        | AlarmInput::Gap
+        | AlarmInput::Acknowledge(_)
+        | AlarmInput::Clear(_)
+        | AlarmInput::ForgetLearned => true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::alarm::{Observation, When};
+
+    fn low(rule: Rule, threshold: f64) -> RuleConfig {
+        RuleConfig {
+            rule,
+            severity: Severity::Warning,
+            threshold,
+            clear: threshold * 1.02,
+            when: When::Mean,
+            debounce_s: 0.0,
+            debounce_events: 1,
+            is_latching: false,
+        }
+    }
+
+    #[test]
+    fn a_grid_of_two_rules_needs_as_many_lanes_as_the_longer_list() {
+        let mut lanes = Lanes::default();
+        for capacity in [1.5, 1.6, 1.7] {
+            for soc in [0.1, 0.2] {
+                lanes.watch(&low(Rule::CapacityLow, capacity));
+                lanes.watch(&low(Rule::SocLow, soc));
+            }
+        }
+        assert_eq!(lanes.watched.len(), 5);
+        assert_eq!(lanes.engines(1).engines.len(), 3);
+    }
+
+    #[test]
+    fn each_threshold_has_its_own_history() {
+        let mut lanes = Lanes::default();
+        let numbers = [1.5, 1.6].map(|threshold| lanes.watch(&low(Rule::CapacityLow, threshold)));
+        let mut engines = lanes.engines(1);
+        for (second, value) in [(1, 1.7), (2, 1.55), (3, 1.7), (4, 1.4)] {
+            let (rule, cell) = (Rule::CapacityLow, Some(CellIndex(0)));
+            let seen = Observation::new(Some(value)).with_std(0.1);
+            let time = Timestamp::from_secs(f64::from(second));
+            engines.take(&[(time, AlarmInput::Observe { rule, cell, seen })], &mut lanes);
+        }
+        let seconds = |number: usize| {
+            let history = lanes.history(number).expect("watched");
+            let raised: Vec<f64> = history.raises.iter().map(|raise| raise.time.secs()).collect();
+            (raised, history.clears.len())
+        };
+        assert_eq!(seconds(numbers[0]), (vec![4.0], 0));
+        assert_eq!(seconds(numbers[1]), (vec![2.0, 4.0], 1));
+        assert_eq!(lanes.watch(&low(Rule::CapacityLow, 1.5)), numbers[0]);
+    }
+}

@@ -1,0 +1,153 @@
+//! The grid of the tables and the place of a SOC and a temperature in it.
+//!
+//! The same rules as [`CellModel::place`](crate::cell::CellModel::place): along SOC linear (the OCV goes on beyond 0 and 1, all else
+//! holds its edge); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
+//! temperatures the nearest edge holds.
+
+pub use crate::cell::arrhenius;
+
+/// Breakpoints of all tables.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Grid {
+    /// SOC breakpoints, strictly rising from 0 to 1, at least 2.
+    pub soc: Vec<f64>,
+    /// Temperature breakpoints, degrees C, strictly rising, at least 1.
+    pub temperature_c: Vec<f64>,
+}
+
+/// The two SOC columns and two temperature rows round one place, with the weights of the upper ones.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Place {
+    /// Lower SOC column.
+    pub s: usize,
+    /// Lower temperature row.
+    pub t: usize,
+    /// Weight of the upper column, in [0, 1].
+    pub along_s: f64,
+    /// The same without the limit, for the OCV.
+    pub beyond_s: f64,
+    /// Weight of the upper row for the OCV, in [0, 1]; 0 when there is one temperature only.
+    pub along_t: f64,
+    /// The same for resistances.
+    pub warped_t: f64,
+}
+
+/// Nodes and their weights; the first `len` hold.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Corners {
+    /// Node numbers: temperature row times columns plus column.
+    pub node: [usize; 4],
+    /// Weights, summing to 1.
+    pub weight: [f64; 4],
+    /// How many.
+    pub len: usize,
+}
+
+impl Corners {
+    /// Nodes with their weights.
+    pub fn iter(&self) -> impl Iterator<Item = (usize, f64)> + '_ {
+        (0..self.len).map(|i| (self.node[i], self.weight[i]))
+    }
+
+    /// The interpolated value of a table in node order.
+    pub fn at(&self, values: &[f64]) -> f64 {
+        self.iter().map(|(node, weight)| weight * values[node]).sum()
+    }
+}
+
+impl Grid {
+    /// Nodes of one table.
+    pub fn nodes(&self) -> usize {
+        self.soc.len() * self.temperature_c.len()
+    }
+
+    /// The place of a SOC and a temperature.
+    pub fn place(&self, soc: f64, temperature_c: f64) -> Place {
+        let (s, beyond_s) = locate(&self.soc, soc);
+        let temperatures = &self.temperature_c;
+        let (t, along_t, warped_t) = if temperatures.len() == 1 {
+            (0, 0.0, 0.0)
+        } else {
+            let (t, along) = locate(temperatures, temperature_c);
+            let along = along.clamp(0.0, 1.0);
+            let (low, high) = (arrhenius(temperatures[t]), arrhenius(temperatures[t + 1]));
+            let inside = temperature_c.clamp(temperatures[t], temperatures[t + 1]);
+            (t, along, (arrhenius(inside) - low) / (high - low))
+        };
+        Place { s, t, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, along_t, warped_t }
+    }
+
+    /// Corners for the OCV.
+    pub fn ocv_corners(&self, place: &Place) -> Corners {
+        self.corners(place, place.beyond_s, place.along_t)
+    }
+
+    /// Corners for time constants.
+    pub fn tau_corners(&self, place: &Place) -> Corners {
+        self.corners(place, place.along_s, place.along_t)
+    }
+
+    /// Corners for resistances.
+    pub fn resistance_corners(&self, place: &Place) -> Corners {
+        self.corners(place, place.along_s, place.warped_t)
+    }
+
+    fn corners(&self, place: &Place, along_s: f64, along_t: f64) -> Corners {
+        let columns = self.soc.len();
+        let first = place.t * columns + place.s;
+        let mut corners = Corners::default();
+        for (node, weight) in [
+            (first, (1.0 - along_s) * (1.0 - along_t)),
+            (first + 1, along_s * (1.0 - along_t)),
+            (first + columns, (1.0 - along_s) * along_t),
+            (first + columns + 1, along_s * along_t),
+        ] {
+            if weight != 0.0 {
+                (corners.node[corners.len], corners.weight[corners.len]) = (node, weight);
+                corners.len += 1;
+            }
+        }
+        corners
+    }
+}
+
+/// Interval of `x` in rising `breakpoints`, and how far along it `x` is (below 0 or above 1 outside).
+pub fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
+    let last = breakpoints.len() - 2;
+    let i = breakpoints[1..=last].partition_point(|&b| x >= b);
+    (i, (x - breakpoints[i]) / (breakpoints[i + 1] - breakpoints[i]))
+}
+
+/// Linear interpolation of `y` over rising `x`; outside, the nearest end.
+pub fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
+    if x.len() == 1 {
+        return y[0];
+    }
+    let (i, along) = locate(x, at);
+    y[i] + along.clamp(0.0, 1.0) * (y[i + 1] - y[i])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corners_sum_to_one_and_resistances_follow_arrhenius_between_nodes() {
+        let grid = Grid { soc: vec![0.0, 0.5, 1.0], temperature_c: vec![-20.0, 25.0] };
+        let place = grid.place(0.7, 0.0);
+        for corners in [grid.ocv_corners(&place), grid.resistance_corners(&place)] {
+            assert!((corners.iter().map(|(_, w)| w).sum::<f64>() - 1.0).abs() < 1e-12);
+        }
+        let table: Vec<f64> = [-20.0, 25.0].iter().flat_map(|&t| [0.05 * arrhenius(t); 3]).collect();
+        let found = grid.resistance_corners(&place).at(&table);
+        assert!((found - 0.05 * arrhenius(0.0)).abs() < 1e-12, "{found}");
+    }
+
+    #[test]
+    fn outside_the_grid_only_the_ocv_goes_on() {
+        let grid = Grid { soc: vec![0.0, 0.5, 1.0], temperature_c: vec![25.0] };
+        let place = grid.place(1.1, 60.0);
+        assert!((grid.ocv_corners(&place).at(&[3.0, 3.6, 4.2]) - 4.32).abs() < 1e-12);
+        assert!((grid.resistance_corners(&place).at(&[0.1, 0.2, 0.3]) - 0.3).abs() < 1e-12);
+    }
+}
