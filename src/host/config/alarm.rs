@@ -15,7 +15,7 @@ const USUAL_HYSTERESIS: f64 = 0.02;
 
 /// A value to compare with: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Level {
+pub(super) enum Level {
     /// In the rule's unit.
     Absolute(f64),
     /// A part of what a new cell has, from a text like "80 %".
@@ -24,7 +24,7 @@ pub enum Level {
 
 /// `2.08`, `"80 %"`, or `{ set = ..., clear = ... }` with either.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Threshold {
+pub(super) struct Threshold {
     pub set: Level,
     /// `None` = by the hysteresis.
     pub clear: Option<Level>,
@@ -79,7 +79,7 @@ fn probability(table: &DeTable<'_>) -> Option<When> {
 
 /// What relative thresholds are relative to.
 #[derive(Debug, Clone, Copy)]
-pub struct Rated {
+pub(super) struct Rated {
     /// Capacity on the label, Ah.
     pub capacity_ah: f64,
     /// What the reference charger needs for the recharge window of a cell with that capacity, s.
@@ -88,7 +88,7 @@ pub struct Rated {
 
 impl Rated {
     /// From the rated capacity and the recharge window.
-    pub fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
+    pub(super) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
         let current_a = recharge.reference_current_a.unwrap_or(capacity_ah / 2.0);
         let window = recharge.to_soc - recharge.from_soc;
         Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / current_a }
@@ -114,7 +114,7 @@ impl Rated {
 
 impl Alarm {
     /// The thresholds that are written, by severity, with their keys.
-    pub fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
+    pub(super) fn thresholds(&self) -> impl Iterator<Item = (&'static str, Severity, Threshold)> {
         let all = [
             ("info", Severity::Info, self.info),
             ("warning", Severity::Warning, self.warning),
@@ -137,7 +137,7 @@ impl Alarm {
     }
 
     /// The rules it makes; relative thresholds of a rule that has no whole were noted by [`check`].
-    pub fn rules(&self, rated: &Rated) -> Vec<RuleConfig> {
+    pub(super) fn rules(&self, rated: &Rated) -> Vec<RuleConfig> {
         let rule = |(_, severity, threshold): (_, _, Threshold)| {
             let set = rated.value(self.rule, threshold.set)?;
             Some(RuleConfig {
@@ -169,7 +169,7 @@ fn beyond_sign(rule: Rule) -> f64 {
 }
 
 /// Notes what does not fit together in the alarms.
-pub fn check(raw: &Raw, rated: Option<&Rated>, faults: &mut Faults) {
+pub(super) fn check(raw: &Raw, rated: Option<&Rated>, faults: &mut Faults) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
         for (key, severity, _) in alarm.thresholds() {

@@ -11,7 +11,7 @@ use crate::can::guard::GuardConfig;
 use crate::monitor::{CommandConfig, OutputConfig};
 
 /// What reads commands, and what checks them; `None` = none are obeyed, or faults are noted.
-pub fn commands(
+pub(super) fn commands(
     raw: &Raw,
     output: Option<&(OutputConfig, Database)>,
     found: &[Resolved<'_>],

@@ -23,7 +23,7 @@ use crate::sample::{Limits, SampleConfig, VoltageSource};
 
 /// The tables of a file; `None` = not there, or faulty (and noted).
 #[derive(Debug)]
-pub struct Raw {
+pub(super) struct Raw {
     pub file: String,
     /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
     pub broken: bool,
@@ -69,7 +69,7 @@ pub struct Raw {
 
 impl Raw {
     /// Reads every table; faults of single keys and unknown keys are noted.
-    pub fn read(document: &Document<'_>, faults: &mut Faults) -> Self {
+    pub(super) fn read(document: &Document<'_>, faults: &mut Faults) -> Self {
         let mut walk = Walk::new(document, SECTIONS, faults);
         let interfaces: Vec<Interface> = walk.many();
         Self {
@@ -115,7 +115,7 @@ impl Raw {
 
 /// What the frames of the buses mean, both ways.
 #[derive(Debug)]
-pub struct Traffic {
+pub(super) struct Traffic {
     pub input: InputMap,
     pub guards: Vec<GuardConfig>,
     pub output: Option<OutputConfig>,
@@ -124,7 +124,7 @@ pub struct Traffic {
 }
 
 /// Everything the core must know; `None` when a table is missing or faulty (and noted).
-pub fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: Traffic) -> Option<MonitorConfig> {
+pub(super) fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: Traffic) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;
@@ -155,7 +155,7 @@ pub fn monitor(raw: &Raw, mut model: CellModel, found: &Ranges, traffic: Traffic
 
 /// Ranges the DBC gives, in our units and sign; infinite where it gives none.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ranges {
+pub(super) struct Ranges {
     /// Pack current, A, positive = discharge.
     pub current_a: (f64, f64),
     /// Cell voltage, V.
@@ -165,7 +165,7 @@ pub struct Ranges {
 }
 
 /// A range that refuses nothing.
-pub const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
+pub(super) const UNLIMITED: (f64, f64) = (f64::NEG_INFINITY, f64::INFINITY);
 
 fn sample(raw: &Raw, pack: &Pack, model: &CellModel, found: &Ranges) -> Option<SampleConfig> {
     let (cells, voltage_source) = match raw.voltages_written {
@@ -275,7 +275,7 @@ fn estimator(keys: &Estimator, pack: &Pack, model: &CellModel) -> EstimatorConfi
 /// Of 365.25 / 12 days.
 const SECONDS_PER_MONTH: f64 = 2_629_800.0;
 
-pub fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
+pub(super) fn transition(keys: &Transition, pack_ah: f64) -> TransitionConfig {
     let dead_band_a = keys.dead_band_a.unwrap_or(pack_ah / 50.0);
     TransitionConfig {
         dead_band_a,
@@ -318,7 +318,7 @@ fn recharge(keys: &Recharge, rated_ah: f64) -> RechargeConfig {
 }
 
 /// How state and history are kept.
-pub fn store(keys: &Store) -> StoreConfig {
+pub(super) fn store(keys: &Store) -> StoreConfig {
     StoreConfig { checkpoint_s: keys.checkpoint_s, max_half_cycles: keys.max_half_cycles }
 }
 

@@ -12,7 +12,7 @@ const MAX_INTERFACES: usize = 16;
 const MAX_INTERFACE_NAME: usize = 15;
 
 /// Notes everything that does not fit together.
-pub fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
+pub(super) fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     interfaces(raw, faults);
     voltages(raw, faults);
     if let Some(pack) = &raw.pack {

@@ -112,7 +112,7 @@ pub struct OutputUse {
 }
 
 /// Describes a checked configuration and the signals found for it.
-pub fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outputs: Vec<OutputUse>) -> Description {
+pub(super) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outputs: Vec<OutputUse>) -> Description {
     let model = &config.monitor.model;
     let cell = format!(
         "{}: rated {} Ah, {} Ah when new, {} to {} V, {} RC branch{}{}",

@@ -59,7 +59,7 @@ impl Faults {
 
 /// A TOML text and its name.
 #[derive(Debug)]
-pub struct Document<'t> {
+pub(super) struct Document<'t> {
     /// As people named it.
     pub file: String,
     /// Whether the syntax is broken somewhere: what is missing may then stand in the broken part.
@@ -71,7 +71,7 @@ pub struct Document<'t> {
 impl<'t> Document<'t> {
     /// Parses `text`. Syntax faults go to `faults`; what could be understood is kept, so that the rest of
     /// the file is still checked.
-    pub fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
+    pub(super) fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
         let (root, errors) = DeTable::parse_recoverable(text);
         let document = Self { file: file.to_owned(), broken: !errors.is_empty(), text, root: root.into_inner() };
         for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
@@ -86,29 +86,29 @@ impl<'t> Document<'t> {
     }
 
     /// The whole file as a table.
-    pub fn root(&self) -> &DeTable<'t> {
+    pub(super) fn root(&self) -> &DeTable<'t> {
         &self.root
     }
 
     /// Line, from 1, on which `span` begins.
-    pub fn line(&self, span: &Range<usize>) -> usize {
+    pub(super) fn line(&self, span: &Range<usize>) -> usize {
         let before = self.text.as_bytes().get(..span.start).unwrap_or(self.text.as_bytes());
         1 + before.iter().filter(|&&b| b == b'\n').count()
     }
 
     /// What stands at `span`, cut to one short line.
-    pub fn quote(&self, span: &Range<usize>) -> String {
+    pub(super) fn quote(&self, span: &Range<usize>) -> String {
         let words: Vec<&str> = self.text.get(span.clone()).unwrap_or("").split_whitespace().collect();
         shorten(&words.join(" "))
     }
 
     /// Whether the table at `span` is written `{ ... }`.
-    pub fn is_inline(&self, span: &Range<usize>) -> bool {
+    pub(super) fn is_inline(&self, span: &Range<usize>) -> bool {
         self.text.get(span.clone()).is_some_and(|text| text.starts_with('{'))
     }
 
     /// The place of a table: its path for people, its line, and where its keys stand.
-    pub fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> Place {
+    pub(super) fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> Place {
         let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
             let key: &Spanned<std::borrow::Cow<'_, str>> = key;
             let found = match value.get_ref() {
@@ -122,7 +122,7 @@ impl<'t> Document<'t> {
 }
 
 /// `text` cut to the length of a quotation.
-pub fn shorten(text: &str) -> String {
+pub(super) fn shorten(text: &str) -> String {
     match text.char_indices().nth(MAX_QUOTE) {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text.to_owned(),

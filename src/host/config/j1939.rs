@@ -19,7 +19,7 @@ const FIRST_MAKER_SPN: u32 = 520_192;
 const TEST_FMI: u8 = 31;
 
 /// The node; `None` = there is none (not configured, silenced, or faults noted).
-pub fn node(
+pub(super) fn node(
     raw: &Raw,
     found: &[Resolved<'_>],
     output: Option<&OutputConfig>,
@@ -177,7 +177,7 @@ fn check_ids(
 }
 
 /// What the node is and tells, for people.
-pub fn words(config: &Config) -> Vec<String> {
+pub(super) fn words(config: &Config) -> Vec<String> {
     let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
     let interface = config.interfaces.get(j1939.bus.index()).map_or("", |interface| interface.name.as_str());
     let [dm1, dm2, ..] = j1939.node.sent_ids();

@@ -16,7 +16,7 @@ use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;
 use crate::quantity::MAX_CELLS;
 
-pub use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus};
+pub(super) use traffic::{Commands, FrameKeys, J1939, Output, OutputAlarm, OutputHealth, OutputStatus};
 
 /// Coldest and hottest temperature anybody may configure, degrees C.
 const TEMPERATURE_C: super::setting::Allowed = Between(-100.0, 200.0);
@@ -25,7 +25,7 @@ const DEVIATION: super::setting::Allowed = Between(0.0, 1e6);
 
 /// Which way a positive current flows on the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Positive {
+pub(super) enum Positive {
     /// Into the pack.
     Charge,
     /// Out of the pack.
@@ -34,7 +34,7 @@ pub enum Positive {
 
 /// Where the capacity measurement of a half-cycle comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Method {
+pub(super) enum Method {
     /// Charge over the swing the voltages tell.
     Swing,
     /// Charge over a nominal swing.
@@ -43,7 +43,7 @@ pub enum Method {
 
 /// End-to-end protection of a frame: off, or the AUTOSAR profile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum E2e {
+pub(super) enum E2e {
     /// None.
     Off,
     /// Profile 1, variant A.
@@ -176,7 +176,7 @@ macro_rules! signal_section {
 
 /// What every table that names a signal says.
 #[derive(Debug, Clone, Copy)]
-pub struct SignalSource<'a> {
+pub(super) struct SignalSource<'a> {
     /// Where it stands.
     pub place: &'a super::document::Place,
     /// `Message.Signal`, or a pattern.
@@ -476,7 +476,7 @@ section! {
 }
 
 /// Every table of the configuration, in the order of the reference page.
-pub const SECTIONS: &[SectionInfo] = &[
+pub(super) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Pack>(),
     SectionInfo::many::<Interface>(),
     SectionInfo::one::<Input>(),

@@ -20,7 +20,7 @@ use crate::quantity::BusIndex;
 const FRAMES: [&str; 3] = ["status", "health", "alarm"];
 
 /// What is sent and its layout; `None` = nothing (not configured, or faults noted).
-pub fn output(
+pub(super) fn output(
     raw: &Raw,
     config: &Path,
     model: Option<&CellModel>,
@@ -59,7 +59,7 @@ pub fn output(
 }
 
 /// The settings of a frame's message; `None` = faults noted.
-pub fn message_settings(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<MessageSettings> {
+pub(super) fn message_settings(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<MessageSettings> {
     let id = match keys.id {
         Some(id) => Some(configured_id(keys, id, faults)?),
         None if keys.extended => {
@@ -182,7 +182,7 @@ fn buses(raw: &Raw, keys: &Output) -> Vec<BusIndex> {
 }
 
 /// What is sent, for people.
-pub fn uses(raw: &Raw, output: Option<&OutputConfig>) -> Vec<OutputUse> {
+pub(super) fn uses(raw: &Raw, output: Option<&OutputConfig>) -> Vec<OutputUse> {
     let Some(output) = output else { return Vec::new() };
     let names = output.buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
     let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();

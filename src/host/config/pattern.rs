@@ -12,11 +12,11 @@ enum Piece {
 
 /// A parsed pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Pattern(Vec<Piece>);
+pub(super) struct Pattern(Vec<Piece>);
 
 impl Pattern {
     /// Parses; `Err` says what must be otherwise.
-    pub fn parse(text: &str) -> Result<Self, String> {
+    pub(super) fn parse(text: &str) -> Result<Self, String> {
         let mut pieces = Vec::new();
         let mut rest = text;
         while let Some((before, after)) = rest.split_once('{') {
@@ -36,12 +36,12 @@ impl Pattern {
     }
 
     /// Whether the cell's number is in it.
-    pub fn has_cell(&self) -> bool {
+    pub(super) fn has_cell(&self) -> bool {
         self.0.contains(&Piece::Cell)
     }
 
     /// The cell's number when `name` fits; `Some(None)` when it fits and carries no number.
-    pub fn fits(&self, name: &str) -> Option<Option<u32>> {
+    pub(super) fn fits(&self, name: &str) -> Option<Option<u32>> {
         fits(&self.0, name, None)
     }
 }

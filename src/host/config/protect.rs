@@ -13,7 +13,7 @@ use crate::can::guard::GuardConfig;
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faults: &mut Faults) -> Vec<GuardConfig> {
+pub(super) fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faults: &mut Faults) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
         check_profile(keys, faults);
@@ -133,7 +133,7 @@ fn header_words(mask: [u8; 3]) -> &'static str {
 }
 
 /// What is taken in, for people.
-pub fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
+pub(super) fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
     let monitor = &config.monitor;
     let rate = monitor.flood.max_frames_per_s;
     let mut words = vec![format!("at most {rate} frames a second of one identifier, a tenth of them at once")];

@@ -25,13 +25,13 @@ const MAX_IDENTITY_BITS: u16 = 53;
 
 /// The DBC files of a configuration.
 #[derive(Debug)]
-pub struct Databases {
+pub(super) struct Databases {
     files: Vec<(String, Database)>,
 }
 
 /// A configured signal, found.
 #[derive(Debug, Clone)]
-pub struct Resolved<'d> {
+pub(super) struct Resolved<'d> {
     /// What it feeds.
     pub channel: Channel,
     /// Interface it comes on.
@@ -52,7 +52,7 @@ pub struct Resolved<'d> {
 
 impl Databases {
     /// Reads the files; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
-    pub fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
+    pub(super) fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
         let mut files = Vec::new();
         for name in names {
             let path = beside(config, name);
@@ -63,7 +63,7 @@ impl Databases {
     }
 
     /// Every signal with its file and message.
-    pub fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
+    pub(super) fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
         let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
         messages.flat_map(|(file, message)| message.signals.iter().map(move |signal| (file, message, signal)))
     }
@@ -75,14 +75,14 @@ impl Databases {
 }
 
 /// Reads one DBC, or notes why not.
-pub fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Database> {
+pub(super) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<Database> {
     let file = path.display().to_string();
     let bytes = read(path).map_err(|error| faults.add(&file, 0, format!("cannot be read: {error}"))).ok()?;
     Database::parse_bytes(&bytes).map_err(|error| faults.add(&file, error.line, error.what)).ok()
 }
 
 /// Finds every configured signal.
-pub fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faults) -> Vec<Resolved<'d>> {
+pub(super) fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faults) -> Vec<Resolved<'d>> {
     let mut search = Search { raw, databases, faults, found: Vec::new() };
     if let Some(current) = &raw.current {
         let sign = match current.positive {
@@ -225,7 +225,7 @@ impl<'d> Search<'_, 'd> {
 }
 
 /// The interface a table names, the first when it names none; `None` = not there (noted by the cross checks).
-pub fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
+pub(super) fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
     let index = match interface {
         Some(name) => raw.interfaces.iter().position(|interface| interface.name == name)?,
         None => 0,
@@ -238,7 +238,7 @@ fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
 }
 
 /// What a channel is, for people (cells and sensors from 1).
-pub fn channel_words(channel: Channel) -> String {
+pub(super) fn channel_words(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
@@ -260,7 +260,7 @@ fn list(numbers: &[u32]) -> String {
 
 impl Resolved<'_> {
     /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
-    pub fn binding(&self) -> Result<Binding, LayoutFault> {
+    pub(super) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
         binding.offset = self.offset;
@@ -269,7 +269,7 @@ impl Resolved<'_> {
     }
 
     /// The DBC's range in our unit and sign; infinite when it gives none.
-    pub fn range(&self) -> (f64, f64) {
+    pub(super) fn range(&self) -> (f64, f64) {
         let layout = &self.signal.layout;
         if !layout.has_range() {
             return UNLIMITED;
@@ -280,13 +280,13 @@ impl Resolved<'_> {
 }
 
 /// The decoder's map; `None` when a layout cannot be read (noted when it was found).
-pub fn input_map(found: &[Resolved<'_>]) -> Option<InputMap> {
+pub(super) fn input_map(found: &[Resolved<'_>]) -> Option<InputMap> {
     let bindings: Result<Vec<_>, _> = found.iter().map(Resolved::binding).collect();
     bindings.ok().map(InputMap::new)
 }
 
 /// The widest range the DBC gives each kind of value; a total voltage counts per cell.
-pub fn ranges(found: &[Resolved<'_>], series: u16) -> Ranges {
+pub(super) fn ranges(found: &[Resolved<'_>], series: u16) -> Ranges {
     let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
         let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(Resolved::range);
         let widest = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))).unwrap_or(UNLIMITED);

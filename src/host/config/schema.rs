@@ -215,7 +215,7 @@ impl TableReader<'_> {
 }
 
 /// Reads the declared tables of one document.
-pub struct Walk<'a> {
+pub(super) struct Walk<'a> {
     document: &'a Document<'a>,
     /// Whether syntax or tables are broken somewhere, so that what is not found may still be there: then nothing
     /// is called missing.
@@ -225,14 +225,14 @@ pub struct Walk<'a> {
 
 impl<'a> Walk<'a> {
     /// A walk that has checked the document for unknown keys.
-    pub fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
+    pub(super) fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
         let mut walk = Self { document, broken: document.broken, faults };
         walk.refuse_unknown("", "", document.root(), known);
         walk
     }
 
     /// A table that is always read: without it in the file its required keys are missing.
-    pub fn one<S: Section>(&mut self) -> Option<S> {
+    pub(super) fn one<S: Section>(&mut self) -> Option<S> {
         if S::PATH.is_empty() {
             let root = self.document.root();
             return self.read(S::PATH, 1, Some(root));
@@ -247,12 +247,12 @@ impl<'a> Walk<'a> {
     }
 
     /// A table that may be left out.
-    pub fn optional<S: Section>(&mut self) -> Option<S> {
+    pub(super) fn optional<S: Section>(&mut self) -> Option<S> {
         if self.has::<S>() { self.one() } else { None }
     }
 
     /// A table that may be written any number of times; faulty ones are left out (and noted).
-    pub fn many<S: Section>(&mut self) -> Vec<S> {
+    pub(super) fn many<S: Section>(&mut self) -> Vec<S> {
         let Some(DeValue::Array(items)) = self.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
         };
@@ -267,12 +267,12 @@ impl<'a> Walk<'a> {
     }
 
     /// Whether the table is in the file.
-    pub fn has<S: Section>(&self) -> bool {
+    pub(super) fn has<S: Section>(&self) -> bool {
         self.find(S::PATH).is_some()
     }
 
     /// How many tables `[[path]]` are written; `None` when something else stands there.
-    pub fn count(&self, path: &str) -> Option<usize> {
+    pub(super) fn count(&self, path: &str) -> Option<usize> {
         match self.find(path).map(Spanned::get_ref) {
             None => Some(0),
             Some(DeValue::Array(items)) => Some(items.len()),
@@ -281,7 +281,7 @@ impl<'a> Walk<'a> {
     }
 
     /// The text at a full path, whatever else its table says.
-    pub fn text(&self, path: &str) -> Option<String> {
+    pub(super) fn text(&self, path: &str) -> Option<String> {
         self.find(path)?.get_ref().as_str().map(str::to_owned)
     }
 
@@ -372,7 +372,7 @@ fn join(path: &str, key: &str) -> String {
 }
 
 /// `, did you mean X` for the nearest of `names`, or nothing when none is near.
-pub fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
+pub(super) fn did_you_mean<'n>(found: &str, names: impl Iterator<Item = &'n str>) -> String {
     /// Jaro-Winkler similarity below which a hint confuses more than it helps.
     const NEAR: f64 = 0.8;
     let near = |name: &'n str| (strsim::jaro_winkler(&found.to_lowercase(), &name.to_lowercase()), name);

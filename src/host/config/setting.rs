@@ -170,7 +170,7 @@ lists! {
 
 /// Cell numbers as people write them: `"1-12, 15"`, counted from 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct CellRanges(pub Vec<RangeInclusive<u16>>);
+pub(super) struct CellRanges(pub Vec<RangeInclusive<u16>>);
 
 impl CellRanges {
     fn parse(text: &str) -> Option<Self> {

@@ -48,7 +48,7 @@ impl Draft {
 
 /// What became of clients; written by the thread, read by the loop.
 #[derive(Debug, Default)]
-pub struct ClientCounters {
+pub(super) struct ClientCounters {
     connected: AtomicU64,
     served: AtomicU64,
     refused: AtomicU64,

@@ -39,7 +39,7 @@ const CHECK_STEPS: i32 = 10_000;
 
 /// Why the database cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum OpenError {
+pub(super) enum OpenError {
     /// A newer program wrote it.
     #[error("layout version {found}, this program reads up to {known}; the file is left as it is")]
     Newer {
@@ -82,7 +82,7 @@ pub(super) fn is_damage(error: &rusqlite::Error) -> bool {
 
 /// The database, open for writing.
 #[derive(Debug)]
-pub struct Database {
+pub(super) struct Database {
     connection: Connection,
     meta: Meta,
     delta_encoder: DeltaEncoder,
@@ -106,7 +106,7 @@ pub(super) struct Meta {
 
 /// A state to be stored.
 #[derive(Debug)]
-pub struct StateRecord {
+pub(super) struct StateRecord {
     /// The state's document.
     pub parts: Parts,
     /// To the last bit (on stop), not rounded.
@@ -117,7 +117,7 @@ pub struct StateRecord {
 
 /// A state as it was stored.
 #[derive(Debug)]
-pub struct StoredState {
+pub(super) struct StoredState {
     /// The state's document, JSON.
     pub json: Vec<u8>,
     /// What was wrong with a later one.
@@ -126,7 +126,7 @@ pub struct StoredState {
 
 /// Rows in the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Counts {
+pub(super) struct Counts {
     /// Capacities, alarms and resets.
     pub chained: i64,
     /// Half-cycles.
@@ -137,7 +137,7 @@ pub struct Counts {
 
 impl Database {
     /// Opens the file, making it or bringing its layout up to date where needed.
-    pub fn open(path: &Path, now: &Stamp, max_half_cycles: u32) -> Result<Self, OpenError> {
+    pub(super) fn open(path: &Path, now: &Stamp, max_half_cycles: u32) -> Result<Self, OpenError> {
         Self::open_with(path, now, max_half_cycles, MIGRATIONS)
     }
 
@@ -174,13 +174,13 @@ impl Database {
     }
 
     /// Rows so far.
-    pub fn counts(&self) -> Counts {
+    pub(super) fn counts(&self) -> Counts {
         let Meta { head, half_cycles, pack, .. } = self.meta;
         Counts { chained: head.count, half_cycles, packs: pack }
     }
 
     /// Writes rows and state, all or nothing; durable when it returns.
-    pub fn commit(&mut self, batches: &[Batch], state: Option<StateRecord>) -> rusqlite::Result<()> {
+    pub(super) fn commit(&mut self, batches: &[Batch], state: Option<StateRecord>) -> rusqlite::Result<()> {
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
         let mut meta = self.meta;
         for batch in batches {
@@ -211,17 +211,17 @@ impl Database {
     }
 
     /// The latest state; `None` = none was stored. A damaged one is an error in words: the history may still be good.
-    pub fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
+    pub(super) fn state(&self) -> rusqlite::Result<Result<Option<StoredState>, String>> {
         read_state(&self.connection, &self.delta_encoder, STATE)
     }
 
     /// The state that was set aside; `None` = there is none, or it is not good.
-    pub fn state_aside(&self) -> Option<Document> {
+    pub(super) fn state_aside(&self) -> Option<Document> {
         read_document(&self.connection, ASIDE)
     }
 
     /// When in this boot another pack was connected last, boot time.
-    pub fn last_reset_ns(&self, boot: BootId) -> rusqlite::Result<Option<i64>> {
+    pub(super) fn last_reset_ns(&self, boot: BootId) -> rusqlite::Result<Option<i64>> {
         self.connection.query_row(
             "SELECT max(m.boottime_ns) FROM reset r JOIN moment m ON m.id = r.moment WHERE r.reason = 'pack_replaced' AND \
              m.boot = ?1",
@@ -232,7 +232,7 @@ impl Database {
 
     /// Closes the history of the pack, with what was learned last of its weakest cell, opens the next one's and forgets
     /// the state. The number of the pack that begins.
-    pub fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
+    pub(super) fn replace_pack(&mut self, now: &Stamp) -> rusqlite::Result<i64> {
         let transaction = self.connection.transaction_with_behavior(TransactionBehavior::Immediate)?;
         let mut meta = self.meta;
         let learned = transaction

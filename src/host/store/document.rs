@@ -12,7 +12,7 @@ use crate::monitor::Snapshot;
 
 /// A state and when it was taken.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Document {
+pub(super) struct Document {
     /// State folder it belongs to: two daemons may share a runtime folder.
     pub folder: String,
     /// When it was taken.

@@ -27,7 +27,7 @@ use super::stamp::Stamp;
 use super::wal::{self, Fault};
 
 /// Name of the database.
-pub const DATABASE: &str = "packwatch.db";
+pub(super) const DATABASE: &str = "packwatch.db";
 /// Name of its replacement while that is filled.
 const PART: &str = "packwatch.db.part";
 /// Name of its replacement that is complete.
@@ -47,7 +47,7 @@ pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which 
 
 /// See the module.
 #[derive(Debug)]
-pub struct Folder {
+pub(super) struct Folder {
     path: PathBuf,
     max_half_cycles: u32,
     /// Held as long as this lives.
@@ -60,7 +60,7 @@ pub struct Folder {
 
 /// A database that was opened.
 #[derive(Debug)]
-pub struct Opening {
+pub(super) struct Opening {
     pub database: Database,
     /// What to write into the history about it.
     pub rows: Vec<Row>,
@@ -82,17 +82,17 @@ impl fmt::Display for Folder {
 
 impl Folder {
     /// Of a path that need not exist yet.
-    pub fn new(path: PathBuf, max_half_cycles: u32) -> Self {
+    pub(super) fn new(path: PathBuf, max_half_cycles: u32) -> Self {
         Self { path, max_half_cycles, lock: None, damaged: None, replaced: None }
     }
 
     /// Its path.
-    pub fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
     /// Size of the database and its log; `None` = cannot be seen.
-    pub fn file_bytes(&self) -> Option<u64> {
+    pub(super) fn file_bytes(&self) -> Option<u64> {
         let path = self.path.join(DATABASE);
         let log = fs::metadata(with_suffix(&path, COMPANIONS[0])).map_or(0, |file| file.len());
         fs::metadata(path).ok().map(|file| file.len() + log)
@@ -102,7 +102,7 @@ impl Folder {
     ///
     /// # Errors
     /// `WouldBlock` when another process has it, else why it cannot be written.
-    pub fn take(&mut self) -> io::Result<()> {
+    pub(super) fn take(&mut self) -> io::Result<()> {
         if self.lock.is_some() {
             return Ok(());
         }
@@ -119,7 +119,7 @@ impl Folder {
     }
 
     /// Opens the database; a damaged one is replaced by what can be read of it.
-    pub fn open(&mut self, now: &Stamp) -> Result<Opening, OpenError> {
+    pub(super) fn open(&mut self, now: &Stamp) -> Result<Opening, OpenError> {
         self.take().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let was_replaced = self.finish_replacement()?;
         if was_replaced {
@@ -144,7 +144,7 @@ impl Folder {
     }
 
     /// The database is damaged: the next opening replaces it.
-    pub fn mark_damaged(&mut self, why: &str) {
+    pub(super) fn mark_damaged(&mut self, why: &str) {
         self.damaged = Some(why.to_owned());
     }
 

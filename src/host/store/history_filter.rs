@@ -42,7 +42,7 @@ struct WrittenLife {
 
 /// What one input's events are worth.
 #[derive(Debug, Clone, PartialEq)]
-pub enum CommitDecision {
+pub(super) enum CommitDecision {
     /// Nothing was learned, and nothing became of an alarm.
     Nothing,
     /// Rows to commit now, perhaps none, with the state they were learned in.
@@ -53,7 +53,7 @@ pub enum CommitDecision {
 
 /// Picks from the core's events what the history keeps.
 #[derive(Debug)]
-pub struct HistoryFilter {
+pub(super) struct HistoryFilter {
     written: BTreeMap<CellIndex, Written>,
     written_life: WrittenLife,
     own_commits: BTreeMap<Subject, TokenBucket>,
@@ -77,7 +77,7 @@ impl Default for HistoryFilter {
 
 impl HistoryFilter {
     /// Judges one input's events; rows that waited come with those that do not.
-    pub fn take(&mut self, events: &[Event]) -> CommitDecision {
+    pub(super) fn take(&mut self, events: &[Event]) -> CommitDecision {
         let Some(now) = events.iter().find(|event| is_learned(&event.kind)).map(|event| event.time) else {
             return CommitDecision::Nothing;
         };
@@ -100,13 +100,13 @@ impl HistoryFilter {
     }
 
     /// Rows that waited, when a checkpoint may take them.
-    pub fn for_checkpoint(&mut self, now: Timestamp) -> Vec<Row> {
+    pub(super) fn for_checkpoint(&mut self, now: Timestamp) -> Vec<Row> {
         let goes = !self.deferred.is_empty() && self.carried.take(now);
         if goes { self.deferred() } else { Vec::new() }
     }
 
     /// Rows that waited.
-    pub fn deferred(&mut self) -> Vec<Row> {
+    pub(super) fn deferred(&mut self) -> Vec<Row> {
         std::mem::take(&mut self.deferred)
     }
 

@@ -10,7 +10,7 @@ use crate::quantity::CellIndex;
 
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Row {
+pub(super) enum Row {
     /// A half-cycle, a capacity, an alarm, a filter that started again, another pack: as the core told it.
     Event(EventKind),
     /// Something that happened to the store itself.
@@ -24,7 +24,7 @@ pub enum Row {
 
 /// Rows of one moment.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Batch {
+pub(super) struct Batch {
     /// When.
     pub stamp: Stamp,
     /// What, in the order in which it was told.
@@ -33,7 +33,7 @@ pub struct Batch {
 
 /// A table of the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Table {
+pub(super) enum Table {
     /// Charges and discharges; the oldest are thinned.
     HalfCycle,
     /// Capacities learned; chained, never thinned.
@@ -48,9 +48,9 @@ pub enum Table {
 
 impl Table {
     /// All, in the order in which they are shown.
-    pub const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub(super) const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
     /// Those whose rows are chained by hash.
-    pub const CHAINED: [Self; 4] = [Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+    pub(super) const CHAINED: [Self; 4] = [Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
 
     /// Whether a database of this layout's version has it.
     pub(super) const fn is_in(self, version: i32) -> bool {
@@ -58,7 +58,7 @@ impl Table {
     }
 
     /// Its name in the database.
-    pub const fn name(self) -> &'static str {
+    pub(super) const fn name(self) -> &'static str {
         match self {
             Self::HalfCycle => "half_cycle",
             Self::Capacity => "capacity",
@@ -69,7 +69,7 @@ impl Table {
     }
 
     /// Its columns besides the moment, the sequence number and the hash.
-    pub const fn columns(self) -> &'static [&'static str] {
+    pub(super) const fn columns(self) -> &'static [&'static str] {
         match self {
             Self::HalfCycle => &[
                 "cell",

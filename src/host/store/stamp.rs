@@ -79,7 +79,7 @@ impl fmt::Display for BootId {
 
 /// A moment on every clock.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Stamp {
+pub(super) struct Stamp {
     /// The wall clock, ns since 1970; may be wrong.
     pub wall_ns: i64,
     /// The clock of the inputs.
@@ -92,7 +92,7 @@ pub struct Stamp {
 
 /// What the wall clock is worth over the boot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WallClock {
+pub(super) enum WallClock {
     /// Something kept it while the computer was off, or has told it since.
     Kept,
     /// Nothing shows that it is more than the time somebody saved before.
@@ -102,7 +102,7 @@ pub enum WallClock {
 impl WallClock {
     /// As it is at `now`, at the start. Set later, by GPS or a time server, it comes too late for the age of the state:
     /// that is asked once.
-    pub fn look(now: &Stamp) -> Self {
+    pub(super) fn look(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
 
@@ -125,7 +125,7 @@ impl WallClock {
 
 /// How long ago something was stored.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Age {
+pub(super) enum Age {
     /// Seconds.
     Seconds(f64),
     /// The clocks do not say.
@@ -134,23 +134,23 @@ pub enum Age {
 
 impl Stamp {
     /// Now, with the inputs' clock at `time`.
-    pub fn now(time: Timestamp, boot: BootId) -> Self {
+    pub(super) fn now(time: Timestamp, boot: BootId) -> Self {
         let Reading { realtime_ns, boottime_ns } = Reading::now();
         Self { wall_ns: realtime_ns, time, boottime_ns, boot }
     }
 
     /// Bus time of a record: the only clock there is.
-    pub fn replayed(time: Timestamp) -> Self {
+    pub(super) fn replayed(time: Timestamp) -> Self {
         Self { wall_ns: time.nanos(), time, boottime_ns: time.nanos(), boot: BootId::REPLAY }
     }
 
     /// Whether both belong to one boot that is known.
-    pub fn same_boot(&self, other: &Self) -> bool {
+    pub(super) fn same_boot(&self, other: &Self) -> bool {
         self.boot == other.boot && self.boot != BootId::UNKNOWN
     }
 
     /// How long before `now` this was.
-    pub fn age(&self, now: &Self, wall: WallClock) -> Age {
+    pub(super) fn age(&self, now: &Self, wall: WallClock) -> Age {
         let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
         if self.same_boot(now) {
             return Age::Seconds(seconds(self.boottime_ns, now.boottime_ns).max(0.0));

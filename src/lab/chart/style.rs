@@ -40,7 +40,7 @@ const COLOURS: [(&str, &str, &str); 14] = [
 ];
 
 /// Steps of a heat map from the lowest to the highest.
-pub const STEPS: [&str; 9] =
+pub(super) const STEPS: [&str; 9] =
     ["#00224e", "#123570", "#3b496c", "#575d6d", "#707173", "#8a8678", "#a59c74", "#c3b369", "#fee838"];
 
 impl Ink {
@@ -68,7 +68,7 @@ impl Ink {
 }
 
 /// Class of a step of a heat map.
-pub fn step_class(step: usize) -> String {
+pub(super) fn step_class(step: usize) -> String {
     format!("h-{step}")
 }
 

@@ -43,13 +43,13 @@ struct Watched {
 
 /// Which thresholds are watched in which lane.
 #[derive(Debug, Clone, Default)]
-pub struct Lanes {
+pub(super) struct Lanes {
     watched: Vec<Watched>,
 }
 
 impl Lanes {
     /// Makes sure that a threshold is watched; its number.
-    pub fn watch(&mut self, config: &RuleConfig) -> usize {
+    pub(super) fn watch(&mut self, config: &RuleConfig) -> usize {
         if let Some(known) = self.watched.iter().position(|watched| watched.config == *config) {
             return known;
         }
@@ -60,7 +60,7 @@ impl Lanes {
     }
 
     /// The engines of all lanes.
-    pub fn engines(&self, cells: u16) -> Engines {
+    pub(super) fn engines(&self, cells: u16) -> Engines {
         let lanes = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
         let rules = |lane| self.watched.iter().filter(move |watched| watched.lane == lane);
         let engine = |lane| AlarmEngine::new(rules(lane).map(|watched| watched.config.clone()).collect(), cells);
@@ -87,7 +87,7 @@ impl Lanes {
     }
 
     /// What became of the alarms of the threshold with this number.
-    pub fn history(&self, number: usize) -> Option<&AlarmHistory> {
+    pub(super) fn history(&self, number: usize) -> Option<&AlarmHistory> {
         self.watched.get(number).map(|watched| &watched.history)
     }
 }
@@ -98,7 +98,7 @@ fn is_of(watched: &Watched, rule: Rule, severity: Severity) -> bool {
 
 /// The lanes' engines in one replay.
 #[derive(Debug)]
-pub struct Engines {
+pub(super) struct Engines {
     /// Each with the rules it watches, a bit per wire number.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
@@ -106,7 +106,7 @@ pub struct Engines {
 
 impl Engines {
     /// Gives what the monitor told its alarms to all lanes, and notes what became of theirs.
-    pub fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], lanes: &mut Lanes) {
+    pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], lanes: &mut Lanes) {
         for (time, input) in inputs {
             for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
                 if concerns(input, *watches) {

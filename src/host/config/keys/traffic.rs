@@ -49,7 +49,7 @@ section! {
 
 /// What the table of a frame says.
 #[derive(Debug, Clone, Copy)]
-pub struct FrameKeys<'a> {
+pub(crate) struct FrameKeys<'a> {
     /// Where it stands.
     pub place: &'a crate::config::document::Place,
     /// Identifier.
@@ -148,7 +148,7 @@ section! {
 
 impl Commands {
     /// What all tables of frames have in common.
-    pub fn frame(&self) -> FrameKeys<'_> {
+    pub(crate) fn frame(&self) -> FrameKeys<'_> {
         FrameKeys {
             place: &self.place,
             id: self.id,

@@ -24,7 +24,7 @@ const MAX_HUNDREDS: u64 = 92_233_719;
 
 /// A usual line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FastLine {
+pub(crate) struct FastLine {
     /// Its stamp.
     pub time: Timestamp,
     /// Its interface.
@@ -42,7 +42,7 @@ pub struct FastLine {
 impl FastLine {
     /// The frame.
     #[inline(always)]
-    pub fn frame(&self) -> Frame {
+    pub(crate) fn frame(&self) -> Frame {
         Frame::of_word(self.id, self.payload, self.payload_len)
     }
 }
@@ -78,7 +78,7 @@ const NO_HEAD: [u64; 2] = [0, u64::MAX];
 
 /// Reads usual lines of known interfaces; remembers the second of the last one, since thousands of lines share it.
 #[derive(Debug, Clone)]
-pub struct FastLineParser {
+pub(crate) struct FastLineParser {
     interfaces: Vec<Interface>,
     shift_ns: i64,
     /// The first twelve bytes of the last line, up to the decimal point, as two words that overlap.
@@ -89,26 +89,26 @@ pub struct FastLineParser {
 
 impl FastLineParser {
     /// For interfaces of these names, in the order of their numbers.
-    pub fn new(interfaces: &[String]) -> Self {
+    pub(crate) fn new(interfaces: &[String]) -> Self {
         let mut lines = Self { interfaces: Vec::new(), shift_ns: 0, head: NO_HEAD, second_ns: 0 };
         lines.know(interfaces);
         lines
     }
 
     /// These are the interfaces from here on.
-    pub fn know(&mut self, interfaces: &[String]) {
+    pub(crate) fn know(&mut self, interfaces: &[String]) {
         let numbered = (0..u8::MAX).map(BusIndex).zip(interfaces);
         self.interfaces = numbered.filter_map(|(bus, name)| Interface::new(name.as_bytes(), bus)).collect();
     }
 
     /// Stamps are moved by so much from here on.
-    pub fn shift(&mut self, shift_ns: i64) {
+    pub(crate) fn shift(&mut self, shift_ns: i64) {
         (self.shift_ns, self.head) = (shift_ns, NO_HEAD);
     }
 
     /// Reads the first line of `text`; `None` where it is none of the usual ones, or too little text is left to tell.
     #[inline(always)]
-    pub fn parse(&mut self, text: &[u8]) -> Option<FastLine> {
+    pub(crate) fn parse(&mut self, text: &[u8]) -> Option<FastLine> {
         let text: &[u8; WINDOW] = text.first_chunk()?;
         let head = [word(text, 0), word(text, 4)];
         if head != self.head {
