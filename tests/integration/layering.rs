@@ -1,4 +1,4 @@
-//! Holds the code to the map in `src/lib.rs`: reads `src/` and fails, with file and line, when a module names
+//! Checks the code against the map in `src/lib.rs`: reads `src/` and fails, with file and line, when a module names
 //! one it may not import, or when the core names a run time, a clock, a file, a socket or a print.
 //!
 //! Comments, documentation and literals do not count; test modules do, so that they stay as pure as the code
@@ -8,7 +8,9 @@
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Module, what it may import, whether it belongs to the pure core. The one place the table is data.
+/// Module, the modules it may import, whether it belongs to the pure core. Lowest first.
+///
+/// The crates under `src` re-export the modules of the crates below them, so a module has one name everywhere.
 const TABLE: &[(&str, &[&str], Core)] = &[
     ("quantity", &[], Core::Pure),
     ("filter", &[], Core::Pure),
@@ -22,24 +24,52 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("sim", &["quantity", "can", "cell"], Core::Pure),
     ("doctor", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
-    ("config", BELOW_CONFIG, Core::Shell),
-    ("io", BELOW_IO, Core::Shell),
-    ("daemon", BELOW_DAEMON, Core::Shell),
+    ("config", CORE, Core::Shell),
+    ("io", MODULES.split_at(11).0, Core::Shell),
+    ("logging", MODULES.split_at(12).0, Core::Shell),
+    ("exporter", MODULES.split_at(13).0, Core::Shell),
+    ("replay", MODULES.split_at(14).0, Core::Shell),
+    ("diagnosis", MODULES.split_at(14).0, Core::Shell),
+    ("control", MODULES.split_at(14).0, Core::Shell),
+    ("store", MODULES.split_at(16).0, Core::Shell),
+    ("status", MODULES.split_at(16).0, Core::Shell),
+    ("service", MODULES.split_at(19).0, Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
-    ("cli", BELOW_CLI, Core::Shell),
+    ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
-/// Every module below `cli`, lowest first.
-const LAYERS: [&str; 16] = [
-    "quantity", "filter", "regress", "can", "sample", "cell", "health", "alarm", "monitor", "sim", "doctor", "ident",
-    "config", "io", "daemon", "lab",
+/// The modules of `src/core` and `src/host`, lowest first, then those of the lab.
+const MODULES: [&str; 23] = [
+    "quantity",
+    "filter",
+    "can",
+    "sample",
+    "cell",
+    "health",
+    "alarm",
+    "monitor",
+    "sim",
+    "doctor",
+    "config",
+    "io",
+    "logging",
+    "exporter",
+    "replay",
+    "control",
+    "diagnosis",
+    "store",
+    "status",
+    "service",
+    "regress",
+    "ident",
+    "lab",
 ];
-const BELOW_CONFIG: &[&str] = LAYERS.split_at(12).0;
-const BELOW_IO: &[&str] = LAYERS.split_at(13).0;
-const BELOW_DAEMON: &[&str] = LAYERS.split_at(14).0;
-const BELOW_LAB: &[&str] = LAYERS.split_at(15).0;
-const BELOW_CLI: &[&str] = &LAYERS;
+const CORE: &[&str] = MODULES.split_at(10).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(22).0;
+/// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
+const CRATES: [(&str, Option<&str>); 4] =
+    [("core", None), ("host", None), ("lab", Some("lab")), ("regress", Some("regress"))];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Core {
@@ -225,17 +255,38 @@ fn from_root(path: &str, depth: usize) -> String {
     relative.split("::").skip(supers).fold("crate".to_owned(), |root, part| root + "::" + part)
 }
 
+/// The module of a file below `src`, and how many modules deep the file lies in its crate.
+fn place(file: &str) -> (&str, usize) {
+    let mut parts: Vec<&str> = file.trim_end_matches(".rs").split('/').filter(|part| *part != "mod").collect();
+    let member = CRATES.iter().find(|(name, _)| parts.len() > 1 && parts[0] == *name);
+    let Some((_, whole)) = member else { return (parts[0], parts.len()) };
+    parts.remove(0);
+    let is_known = TABLE.iter().any(|(name, ..)| *name == parts[0]);
+    let module = if is_known { parts[0] } else { whole.unwrap_or(parts[0]) };
+    (module, parts.len())
+}
+
+/// A path as if all crates were one: `packwatch_core::can` and `packwatch::can` become `crate::can`.
+fn in_one_crate(path: &str) -> String {
+    let Some((first, rest)) = path.split_once("::") else { return path.to_owned() };
+    match first {
+        "packwatch" | "packwatch_core" | "packwatch_host" => format!("crate::{rest}"),
+        "packwatch_lab" => format!("crate::lab::{rest}"),
+        "packwatch_regress" => format!("crate::regress::{rest}"),
+        _ => path.to_owned(),
+    }
+}
+
 /// What is wrong with one file, as `file:line: text`, a line each.
 fn violations(file: &str, source: &str) -> Vec<String> {
-    let parts: Vec<&str> = file.trim_end_matches(".rs").split('/').filter(|part| *part != "mod").collect();
-    let module = parts[0];
+    let (module, depth) = place(file);
     let Some((_, allowed, core)) = TABLE.iter().find(|(name, ..)| *name == module) else {
         return vec![format!("src/{file}:1: module {module} has no row in the table of tests/integration/layering.rs")];
     };
     let tokens = tokens(source);
     let mut faults = Vec::new();
-    for (line, path) in paths(&tokens, parts.len()) {
-        let path = path.replacen("packwatch::", "crate::", 1);
+    for (line, path) in paths(&tokens, depth) {
+        let path = in_one_crate(&path);
         if let Some(why) = forbidden_import(module, allowed, &path).or_else(|| impure(*core, &path)) {
             faults.push(format!("src/{file}:{line}: {why}"));
         }
@@ -286,8 +337,8 @@ fn every_module_imports_only_what_the_map_allows() {
     let mut report = String::new();
     for path in files {
         let file = path.strip_prefix(&src).expect("below src").to_string_lossy().replace('\\', "/");
-        // lib.rs declares the modules; it has the map, and no code of its own.
-        if file == "lib.rs" {
+        // A lib.rs declares modules and has no code of its own.
+        if file == "lib.rs" || file.ends_with("/lib.rs") {
             continue;
         }
         let source = std::fs::read_to_string(&path).expect("a source file can be read");
@@ -299,11 +350,14 @@ fn every_module_imports_only_what_the_map_allows() {
 }
 
 #[test]
-fn the_map_in_lib_rs_and_the_table_name_the_same_modules() {
-    let source = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("src/lib.rs")).expect("lib.rs");
-    let mut declared: Vec<&str> =
-        source.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';')).collect();
-    declared.push("main");
+fn the_table_names_the_modules_that_the_crates_declare() {
+    let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let mut declared = vec!["regress".to_owned(), "ident".to_owned(), "lab".to_owned(), "main".to_owned()];
+    for lib in ["lib.rs", "core/lib.rs", "host/lib.rs"] {
+        let source = std::fs::read_to_string(src.join(lib)).expect("a lib.rs");
+        let names = source.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+        declared.extend(names.map(str::to_owned));
+    }
     declared.sort_unstable();
     let mut listed: Vec<&str> = TABLE.iter().map(|(name, ..)| *name).collect();
     listed.sort_unstable();
@@ -334,8 +388,12 @@ fn planted_violations_are_found_with_file_and_line() {
             "use crate::cell::{CellModel, estimator::Estimator};",
             "sim may not import crate::cell::estimator",
         ),
-        ("io/mod.rs", "use crate::daemon::Clock;", "io may not import crate::daemon::Clock"),
-        ("main.rs", "fn main() { packwatch::run(); }", "main may not import crate::service::run"),
+        ("host/io/log.rs", "use crate::service::Clock;", "io may not import crate::service::Clock"),
+        ("host/status.rs", "use super::service::Clock;", "status may not import crate::service::Clock"),
+        ("core/alarm/mod.rs", "use super::cell::CellModel;", "src/core/alarm/mod.rs:1: alarm may not import"),
+        ("regress/kernel.rs", "use packwatch_core::can::Frame;", "regress may not import crate::can::Frame"),
+        ("lab/ident/fit.rs", "use packwatch_host::io::log;", "ident may not import crate::io::log"),
+        ("main.rs", "fn main() { packwatch::service::run(); }", "main may not import crate::service::run"),
         ("novel/mod.rs", "", "src/novel/mod.rs:1: module novel has no row"),
     ];
     for (file, source, expected) in planted {
@@ -361,7 +419,9 @@ fn what_is_allowed_or_only_spoken_of_is_no_violation() {
         ("alarm/engine.rs", "use super::Rule;\nmod tests { use super::super::Rule; }"),
         ("alarm/engine/tests.rs", "use super::super::Rule;"),
         ("cell/mod.rs", "use std::time::Duration; let instant = 1; struct Instantaneous;"),
-        ("daemon/mod.rs", "use tokio::time::Instant; use crate::io::Log; fn f() { println!(\"x\"); }"),
+        ("host/service.rs", "use tokio::time::Instant; use crate::io::Log; fn f() { println!(\"x\"); }"),
+        ("lab/report.rs", "use crate::chart::Axis; use packwatch_host::store::Store;"),
+        ("regress/kernel.rs", "use crate::basis::Basis;"),
     ];
     for (file, source) in clean {
         assert_eq!(violations(file, source), Vec::<String>::new(), "{file} {source:?}");

@@ -9,7 +9,7 @@ use packwatch::io::candump::{Line, StampDigits, parse_line, write_line};
 use packwatch::io::csv_log::CsvOptions;
 use packwatch::io::journal::JournalWriter;
 use packwatch::io::log::{Batch, LogCounts, LogError, LogOptions, LogSource, Record};
-use packwatch::monitor::{Downtime, BusEvent, Input};
+use packwatch::monitor::{BusEvent, Downtime, Input};
 use packwatch::quantity::{BusIndex, Timestamp};
 use proptest::prelude::*;
 

@@ -4,8 +4,8 @@ use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{Change, Rule, Severity, State};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
-use packwatch::health::{Axis, Forecast, Usage, Reading};
-use packwatch::monitor::{Downtime, Command, EventKind, Input, Monitor, MonitorConfig};
+use packwatch::health::{Axis, Forecast, Reading, Usage};
+use packwatch::monitor::{Command, Downtime, EventKind, Input, Monitor, MonitorConfig};
 use packwatch::quantity::CellIndex;
 
 const HOT: &str = "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n";

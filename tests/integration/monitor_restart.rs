@@ -3,7 +3,7 @@
 use crate::support::rig::{Rig, learned};
 use packwatch::alarm::{Change, Rule, Selector, State};
 use packwatch::can::{CanId, Frame};
-use packwatch::monitor::{Downtime, BusEvent, Command, EventKind, Input, Outputs, Source};
+use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Outputs, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
 
 impl Rig {
@@ -63,7 +63,13 @@ fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
 
 #[test]
 fn what_was_learned_survives_every_restart_bit_for_bit() {
-    for away in [Downtime::Seconds(0.5), Downtime::Seconds(3.0), Downtime::Seconds(3e4), Downtime::Seconds(3e8), Downtime::Unknown] {
+    for away in [
+        Downtime::Seconds(0.5),
+        Downtime::Seconds(3.0),
+        Downtime::Seconds(3e4),
+        Downtime::Seconds(3e8),
+        Downtime::Unknown,
+    ] {
         let mut rig = learned();
         let before = learned_parts(&rig);
         assert!(before[0].to_string().contains("mean") && before[2].to_string().contains("true"));
@@ -98,8 +104,13 @@ impl Rig {
 }
 
 /// Every way to be away.
-const AWAYS: [Downtime; 5] =
-    [Downtime::Seconds(0.0), Downtime::Seconds(2.0), Downtime::Seconds(60.0), Downtime::Seconds(3e5), Downtime::Unknown];
+const AWAYS: [Downtime; 5] = [
+    Downtime::Seconds(0.0),
+    Downtime::Seconds(2.0),
+    Downtime::Seconds(60.0),
+    Downtime::Seconds(3e5),
+    Downtime::Unknown,
+];
 
 #[test]
 fn raised_acknowledged_latched_and_past_alarms_come_back_as_they_were() {

@@ -1,7 +1,7 @@
 //! What the core counts, and what it shows to those who look: on hand-made frames of a pack of two cells.
 
 use crate::support::rig::{Rig, learned};
-use packwatch::monitor::{Downtime, BusStatistics, Statistics, Validity};
+use packwatch::monitor::{BusStatistics, Downtime, Statistics, Validity};
 use packwatch::quantity::{CellIndex, Mode};
 
 #[test]

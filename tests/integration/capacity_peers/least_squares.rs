@@ -231,7 +231,8 @@ mod tests {
     fn awtls_is_tls_where_all_deviations_have_one_ratio() {
         let list = swings(&mut Random(7), 30, true);
         // A start whose deviations have the swings' ratio too: 10 Ah.
-        let [a, b] = [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
+        let [a, b] =
+            [Method::Awtls, Method::Tls].map(|m| run(m, 0.9, ScalarGaussian::from_std(10.0, 1.0), &list).capacity());
         assert!((a.mean - b.mean).abs() < 1e-9 && (a.variance / b.variance - 1.0).abs() < 1e-9, "{a:?} {b:?}");
     }
 

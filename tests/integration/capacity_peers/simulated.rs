@@ -94,7 +94,8 @@ impl Life {
 
     /// Of each peer in turn on these swings.
     fn peers(&self, config: &MonitorConfig, swings: &[(f64, Source)]) -> Vec<(Score, f64)> {
-        let start = ScalarGaussian::from_std(config.estimator.initial_capacity_ah, config.estimator.initial_capacity_std_ah);
+        let start =
+            ScalarGaussian::from_std(config.estimator.initial_capacity_ah, config.estimator.initial_capacity_std_ah);
         PEERS
             .iter()
             .map(|&(_, method, gamma)| {

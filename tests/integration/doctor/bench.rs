@@ -243,7 +243,7 @@ impl Broken {
         let survey = config::survey(&path).unwrap();
         let logs = [folder.path().join("pack.log")];
         let (report, _) =
-            doctor::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {}).unwrap();
+            diagnosis::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {}).unwrap();
         report
     }
 }
