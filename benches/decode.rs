@@ -86,7 +86,7 @@ fn decode_a_page_of_96_multiplexed_cells_plainly(bencher: Bencher) {
 }
 
 #[divan::bench]
-fn decode_a_frame_nobody_asked_for(bencher: Bencher) {
+fn decode_an_unmapped_frame(bencher: Bencher) {
     decode(bencher, &cells(), &Frame::classic(CanId::Standard(0x595), &[0; 8]).expect("8 bytes"));
 }
 

@@ -41,7 +41,7 @@ fn configuration(alarm: &str) -> MonitorConfig {
 /// What one second's frame says: current in A (positive = discharge), voltage in V, temperature in degrees C.
 type Second = (f64, f64, f64);
 
-/// What became of an alarm in a day.
+/// The life of an alarm in a day.
 #[derive(Debug, PartialEq)]
 struct Day {
     raised: usize,

@@ -79,7 +79,7 @@ fn json_says_the_same_for_scripts() {
 }
 
 #[test]
-fn all_faults_of_all_files_are_told_and_the_exit_code_is_78() {
+fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
     let folder = tempfile::tempdir().unwrap();
     let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
     write("cell.toml", "format = 1\nname = \"x\"\nrated_capacity_ah = 0\n");

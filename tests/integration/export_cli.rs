@@ -1,4 +1,4 @@
-//! `packwatch export` as its user runs it: the tables hold what a replay tells, and are whole or not there.
+//! `packwatch export` as its user runs it: the tables hold what a replay reports, and are whole or absent.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -85,8 +85,8 @@ fn half_cycles_and_alarms_are_those_of_a_replay_and_say_what_remains() {
         for (column, key) in
             [("cycles", "cycles"), ("cycles_low", "cycles_low"), ("cycles_high", "cycles_high"), ("days", "days")]
         {
-            let told = row[&format!("remaining_{column}")].parse::<f64>().ok();
-            assert_eq!(told, left.and_then(|left| left[key].as_f64()), "{column} of {row:?}");
+            let printed = row[&format!("remaining_{column}")].parse::<f64>().ok();
+            assert_eq!(printed, left.and_then(|left| left[key].as_f64()), "{column} of {row:?}");
         }
         known += usize::from(!row["remaining_cycles"].is_empty());
     }
@@ -94,16 +94,16 @@ fn half_cycles_and_alarms_are_those_of_a_replay_and_say_what_remains() {
 }
 
 #[test]
-fn tables_of_another_log_are_replaced_and_that_is_told() {
+fn tables_of_another_log_are_replaced_and_that_is_reported() {
     let bench = Bench::new();
     bench.run(&["export", "--out", "out", "life.log"]).success();
     fs::create_dir(bench.path("b")).unwrap();
     fs::copy(bench.path("life.log"), bench.path("b/life.log")).unwrap();
-    let told = bench.run(&["export", "--out", "out", "b/life.log"]).success();
-    let stdout = String::from_utf8_lossy(&told.get_output().stdout).into_owned();
+    let printed = bench.run(&["export", "--out", "out", "b/life.log"]).success();
+    let stdout = String::from_utf8_lossy(&printed.get_output().stdout).into_owned();
     assert!(stdout.contains("replaced the tables of life.log"), "{stdout}");
-    let told = bench.run(&["export", "--out", "out", "b/life.log"]).success();
-    assert!(!String::from_utf8_lossy(&told.get_output().stdout).contains("replaced"), "the same log is no other");
+    let printed = bench.run(&["export", "--out", "out", "b/life.log"]).success();
+    assert!(!String::from_utf8_lossy(&printed.get_output().stdout).contains("replaced"), "the same log is no other");
 }
 
 #[test]
@@ -169,8 +169,8 @@ fn files_say_where_they_come_from() {
 fn a_log_that_fails_leaves_no_table_and_the_others_go_on() {
     let bench = Bench::new();
     fs::write(bench.path("bad.log"), "(1.0) nonsense\n").unwrap();
-    let told = bench.run(&["export", "--strict", "--out", "out", "bad.log", "life.log", "none.log"]).code(1);
-    let stderr = String::from_utf8_lossy(&told.get_output().stderr).into_owned();
+    let printed = bench.run(&["export", "--strict", "--out", "out", "bad.log", "life.log", "none.log"]).code(1);
+    let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
     assert!(stderr.contains("bad.log:1:") && stderr.contains("none.log: cannot be read"), "{stderr}");
     assert_eq!(fs::read_dir(bench.path("out/life")).unwrap().count(), 4);
     for name in ["bad", "none"] {
@@ -186,7 +186,7 @@ fn the_page_about_the_columns_is_the_one_in_the_repository() {
     assert_eq!(
         fs::read_to_string(path).unwrap(),
         page,
-        "write it anew: packwatch export --columns-page > config/EXPORT.md"
+        "write it again: packwatch export --columns-page > config/EXPORT.md"
     );
 }
 

@@ -13,14 +13,14 @@ fn gpr(folder: &Path, args: &[&str]) -> std::process::Output {
     Command::cargo_bin("packwatch").unwrap().current_dir(folder).arg("gpr").args(args).output().unwrap()
 }
 
-fn told(folder: &Path, args: &[&str]) -> String {
+fn printed(folder: &Path, args: &[&str]) -> String {
     let output = gpr(folder, args);
     assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
 }
 
 fn json(folder: &Path, args: &[&str]) -> Value {
-    serde_json::from_str(&told(folder, &[args, &["--json"]].concat())).unwrap()
+    serde_json::from_str(&printed(folder, &[args, &["--json"]].concat())).unwrap()
 }
 
 /// Standard error of a run that must fail with this code and print nothing else.
@@ -62,7 +62,7 @@ fn rows(folder: &Path, name: &str, count: u32, seed: u64) -> PathBuf {
 const COLUMNS: [&str; 4] = ["--output", "voltage_v", "--inputs", "time,temperature,current"];
 
 #[test]
-fn cross_validation_tells_errors_coverage_time_and_memory_of_every_kernel() {
+fn cross_validation_reports_errors_coverage_time_and_memory_of_every_kernel() {
     let folder = tempfile::tempdir().unwrap();
     let (place, csv) = (folder.path(), rows(folder.path(), "cell.csv", 240, 3));
     let file = csv.file_name().unwrap().to_str().unwrap();
@@ -102,7 +102,7 @@ fn cross_validation_tells_errors_coverage_time_and_memory_of_every_kernel() {
     let rmse = (squares.iter().sum::<f64>() / 240.0).sqrt();
     assert!((rmse - kernels[0]["rmse"].as_f64().unwrap()).abs() < 1e-12);
     // For people: a line per kernel, the form said; pictures.
-    let shown = told(
+    let shown = printed(
         place,
         &[&["cv", file, "--kernel", "matern32", "--folds", "2", "--plots", "plots"], &COLUMNS[..]].concat(),
     );
@@ -147,7 +147,7 @@ fn a_saved_model_predicts_the_same_bit_for_bit_and_judges_where_it_can() {
         let first = json(place, &[&train[..], &COLUMNS].concat());
         assert_eq!((&first["rows"], &first["kernel"]), (&200.into(), &"matern32".into()));
         let model = std::fs::read(place.join("model.json")).unwrap();
-        told(place, &[&train[..], &COLUMNS].concat());
+        printed(place, &[&train[..], &COLUMNS].concat());
         assert!(std::fs::read(place.join("model.json")).unwrap() == model, "{form}: two trainings, two models");
         let found = json(place, &["predict", "model.json", "later.csv", "-o", "out.csv"]);
         assert_eq!((&found["rows"], &found["known"]), (&60.into(), &60.into()));
@@ -155,7 +155,7 @@ fn a_saved_model_predicts_the_same_bit_for_bit_and_judges_where_it_can() {
         assert!(found["score"]["coverage_95"].as_f64().unwrap() > 0.85, "{form}: {found}");
         let written = std::fs::read_to_string(place.join("out.csv")).unwrap();
         // The same from the loaded text, and on one thread; standard output carries the same rows.
-        let again = told(place, &["predict", "model.json", "later.csv", "--threads", "1"]);
+        let again = printed(place, &["predict", "model.json", "later.csv", "--threads", "1"]);
         assert!(again == written, "{form}: other predictions");
         assert_eq!(means_of_a_model_never_saved(place, form), means(&written), "{form}");
     }
@@ -197,7 +197,7 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
         [&["cv", "holes.csv", "--skip-missing", "--kernel", "exponential", "--folds", "2"], &COLUMNS[..]].concat();
     let found = json(place, &some);
     assert_eq!((&found["rows"], &found["skipped"]), (&38.into(), &2.into()));
-    assert!(told(place, &some).contains("2 rows left out: a value is missing"));
+    assert!(printed(place, &some).contains("2 rows left out: a value is missing"));
     // Too few rows; no such kernel; no model; a damaged one.
     std::fs::write(place.join("few.csv"), text.lines().take(4).collect::<Vec<_>>().join("\n")).unwrap();
     let few = refused(place, 1, &[&["cv", "few.csv"], &COLUMNS[..]].concat());
@@ -205,7 +205,7 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
     let kernel = refused(place, 2, &[&["cv", "cell.csv", "--kernel", "gaussian"], &COLUMNS[..]].concat());
     assert!(kernel.contains("found gaussian, allowed: exponential, squared_exponential"), "{kernel}");
     assert!(refused(place, 1, &["predict", "cell.csv", "cell.csv"]).contains("line 1: no model of gpr"));
-    told(place, &[&["train", "cell.csv", "-o", "model.json"], &COLUMNS[..]].concat());
+    printed(place, &[&["train", "cell.csv", "-o", "model.json"], &COLUMNS[..]].concat());
     let model = std::fs::read_to_string(place.join("model.json")).unwrap();
     std::fs::write(place.join("model.json"), model.replacen("targets\":[", "targets\":[1", 1)).unwrap();
     assert!(refused(place, 1, &["predict", "model.json", "cell.csv"]).contains("damaged: checksum"));
@@ -288,7 +288,7 @@ fn a_forecast_looks_at_nothing_after_its_origin() {
     };
     assert_eq!(of(&judged), of(&ahead));
     assert_eq!(ahead["outputs"][0]["horizons"][2]["score"], Value::Null);
-    let shown = told(place, &[&["forecast", "known.csv", "--origin", "100"], &asked[..]].concat());
+    let shown = printed(place, &[&["forecast", "known.csv", "--origin", "100"], &asked[..]].concat());
     assert!(
         shown.contains("low 95 %") && shown.contains("1320 rows are known; forecast from known.csv:1321"),
         "{shown}"

@@ -404,7 +404,7 @@ fn planted_violations_are_found_with_file_and_line() {
 }
 
 #[test]
-fn what_is_allowed_or_only_spoken_of_is_no_violation() {
+fn allowed_imports_and_mere_mentions_are_no_violation() {
     let clean: &[(&str, &str)] = &[
         ("alarm/mod.rs", "use crate::quantity::{CellIndex, Timestamp};\nuse crate::alarm::Rule;"),
         (

@@ -82,7 +82,7 @@ fn stamps_names_and_directions_are_read() {
 }
 
 #[test]
-fn what_is_no_data_frame_is_told_apart() {
+fn lines_without_a_data_frame_are_distinguished() {
     let parse = |line: &'static str| parse_line(line.as_bytes()).unwrap_or_else(|e| panic!("{line}: {e}"));
     let time = Timestamp::from_nanos(1_000_000_000);
     let error = Line::ErrorFrame { time, interface: b"can0", class: 4 };
@@ -154,7 +154,7 @@ proptest! {
     }
 
     #[test]
-    fn what_is_written_is_read(frame in any_frame(), nanos in any::<i64>()) {
+    fn a_written_line_reads_back(frame in any_frame(), nanos in any::<i64>()) {
         let time = Timestamp::from_nanos(nanos.max(-i64::MAX));
         let mut line = Vec::new();
         write_line(&mut line, time, StampDigits::Nanos, "can0", &frame).expect("memory");
@@ -260,18 +260,18 @@ proptest! {
 }
 
 #[test]
-fn a_batch_ends_with_its_file_and_says_whose_ticks_are_told() {
+fn a_batch_ends_with_its_file_and_says_whether_it_carries_ticks() {
     let folder = tempfile::tempdir().expect("a folder");
     let lines: String = (1..100).map(|n| format!("({n:010}.000000) can0 123#11\n")).collect();
     let plain = file(folder.path(), "a.log", lines.as_bytes());
     let journal =
         file(folder.path(), "b.log", format!("PACKWATCH-JOURNAL 1\n{}", lines.replace("(00", "(01")).as_bytes());
     let mut source = LogSource::new(vec![plain, journal], options(true));
-    let (mut batch, mut told) = (Batch::new(Batch::MAX), [0, 0]);
+    let (mut batch, mut reported) = (Batch::new(Batch::MAX), [0, 0]);
     while source.next_batch(&mut batch).expect("read") {
-        told[usize::from(batch.carries_ticks())] += batch.records().len();
+        reported[usize::from(batch.carries_ticks())] += batch.records().len();
     }
-    assert_eq!(told, [99, 99]);
+    assert_eq!(reported, [99, 99]);
 }
 
 fn file(folder: &Path, name: &str, text: &[u8]) -> PathBuf {
@@ -308,7 +308,7 @@ fn bad_lines_are_counted_and_the_first_is_shown() {
 }
 
 #[test]
-fn compressed_logs_are_the_same_and_a_torn_one_is_told() {
+fn compressed_logs_are_the_same_and_a_torn_one_is_reported() {
     let folder = tempfile::tempdir().expect("a folder");
     let text: Vec<u8> = (0..5000).flat_map(|n| format!("({n}.000000) can0 123#{:04X}\n", n).into_bytes()).collect();
     let plain = read(&[file(folder.path(), "a.log", &text)], true, |_| {}).expect("plain");
@@ -336,7 +336,7 @@ fn a_later_log_that_begins_earlier_follows_an_unknown_gap() {
 }
 
 #[test]
-fn a_journal_gives_back_what_was_written() {
+fn a_journal_reads_back_as_written() {
     let frame = Frame::classic(std_id(0x123), &[1, 2, 3]).expect("a frame");
     let at = Timestamp::from_nanos;
     let events = [
@@ -383,7 +383,7 @@ fn broken_journal_lines_are_bad_lines() {
 }
 
 #[test]
-fn csv_rows_become_frames_and_bad_fields_are_told_with_their_column() {
+fn csv_rows_become_frames_and_bad_fields_are_reported_with_their_column() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = b"time_s,current_a,voltage_v,temperature_c\n0,1.5,4.0,25\n1.25,,3.9,25\n2,NaN,3.9,25\n3,1,oops,25\n4,1\n5,2,3.8,\n";
     let path = file(folder.path(), "a.csv", text);

@@ -1,6 +1,6 @@
 //! Measured cells' whole lives (NASA PCoE B0005, B0006) through `packwatch replay`, against their published capacities.
 //!
-//! The published capacity is what 2 A delivers down to 2.7 V (both cells, whatever the cycler went on to), so it is held
+//! The published capacity is what 2 A delivers down to 2.7 V (both cells, even where the cycler discharged further), so it is held
 //! against the usable capacity. Discharge numbers count from 1; published values of B0005 first fall below 1.4 Ah at
 //! discharge 125 and never below 1.2 Ah, those of B0006 at 109. Each model knows its cell's first five cycles only.
 

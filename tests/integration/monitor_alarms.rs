@@ -85,7 +85,7 @@ fn interfaces_and_files_out_of_order_raise_their_alarms() {
         "[[alarm]]\nrule = \"bus_fault\"\nwarning = 1\nlatched = true\n[[alarm]]\nrule = \"store_failed\"\nsevere = 0\n",
     );
     rig.seconds(1);
-    assert_eq!(rig.unknown_rules(), 1, "nobody has said whether files can be written");
+    assert_eq!(rig.unknown_rules(), 1, "it is not known whether files can be written");
     rig.give(Input::Store { time: rig.now(), works: true });
     rig.give(Input::Bus { time: rig.now(), bus: BusIndex(0), event: BusEvent::Up });
     rig.seconds(1);
@@ -121,27 +121,27 @@ fn a_learned_alarm_whose_inputs_are_lost_is_suppressed_and_comes_back_as_it_was(
 }
 
 #[test]
-fn a_rule_that_cannot_be_judged_is_told_as_unknown_in_turn() {
+fn a_rule_that_cannot_be_judged_is_reported_as_unknown_in_turn() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"capacity_low\"\nwarning = 2.0\n");
     rig.seconds(5);
     assert_eq!(rig.unknown_rules(), 2);
-    let told = rig.wire();
-    assert!(told.len() >= 8, "twice a second: {}", told.len());
-    assert!(told.iter().all(|wire| (wire.rule, wire.state, wire.value, wire.test) == (1, 6, NO_VALUE, false)));
+    let reported = rig.wire();
+    assert!(reported.len() >= 8, "twice a second: {}", reported.len());
+    assert!(reported.iter().all(|wire| (wire.rule, wire.state, wire.value, wire.test) == (1, 6, NO_VALUE, false)));
 }
 
 #[test]
-fn commands_of_the_bus_are_obeyed_when_protected_and_in_sequence() {
+fn commands_of_the_bus_are_applied_when_protected_and_in_sequence() {
     let mut rig = learned();
-    let told = |rig: &Rig| rig.events.iter().filter(|e| matches!(e.kind, EventKind::Command { .. })).count();
+    let reported = |rig: &Rig| rig.events.iter().filter(|e| matches!(e.kind, EventKind::Command { .. })).count();
     let bad = |rig: &Rig| rig.events.iter().filter(|e| matches!(e.kind, EventKind::BadCommand { .. })).count();
     rig.command(1, 31, 2047);
-    assert_eq!((told(&rig), bad(&rig)), (0, 1), "the first frame only shows the counter");
+    assert_eq!((reported(&rig), bad(&rig)), (0, 1), "the first frame only shows the counter");
     rig.command(1, 1, 0);
-    assert_eq!((told(&rig), bad(&rig)), (1, 1));
+    assert_eq!((reported(&rig), bad(&rig)), (1, 1));
     let marked = rig.last_wire(Rule::CapacityLow);
     assert!((marked.acknowledged, marked.cell, marked.state) == (true, 0, 1), "{marked:?}");
-    // The same frame again, one with a wrong CRC, one that asks for nothing known: none is obeyed, told is one a second.
+    // The same frame again, one with a wrong CRC, one with an unknown command: none is applied, one a second is reported.
     rig.seconds(2);
     let again = command_frame(1, 1, 0, 1);
     rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &again });
@@ -152,7 +152,7 @@ fn commands_of_the_bus_are_obeyed_when_protected_and_in_sequence() {
     };
     rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &harmed });
     rig.command(9, 31, 2047);
-    assert_eq!((told(&rig), bad(&rig)), (1, 2));
+    assert_eq!((reported(&rig), bad(&rig)), (1, 2));
     // Clearing what is beyond its threshold is refused, and erases nothing.
     let capacity = rig.monitor.capacity(CellIndex(0));
     rig.command(2, 31, 2047);
@@ -165,15 +165,15 @@ fn commands_of_the_bus_are_obeyed_when_protected_and_in_sequence() {
 }
 
 #[test]
-fn another_pack_starts_from_what_is_configured_and_its_predecessor_is_told() {
+fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() {
     let mut rig = learned();
     let old_ah = rig.monitor.capacity(CellIndex(0)).mean.min(rig.monitor.capacity(CellIndex(1)).mean);
     rig.give(Input::Command { time: rig.now(), command: Command::PackReplaced });
-    let told = rig.events.iter().rev().find_map(|event| match event.kind {
+    let reported = rig.events.iter().rev().find_map(|event| match event.kind {
         EventKind::PackReplaced { capacity_ah, .. } => capacity_ah,
         _ => None,
     });
-    assert_eq!(told, Some(old_ah));
+    assert_eq!(reported, Some(old_ah));
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Forgotten, Change::Forgotten]);
     let alarm = rig.monitor.alarms().get(Rule::CapacityLow, Some(CellIndex(0))).unwrap();
     assert_eq!((alarm.state, alarm.occurrences, rig.monitor.alarms().count()), (State::Unknown, 0, 0));

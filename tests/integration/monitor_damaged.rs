@@ -1,7 +1,7 @@
-//! A stored state with one damaged number: refused, or the monitor goes on from it with finite outputs.
+//! A stored state with one damaged number: rejected, or restored with finite outputs.
 //!
 //! In: the state of a pack of two cells whose capacities are learned, as JSON, with each of its numbers in turn replaced
-//! by what damage or a failed calculation may leave. What is taken up is fed a charge and a discharge.
+//! by what damage or a failed calculation may leave. A restored state is fed a charge and a discharge.
 
 use crate::support::rig::{Rig, learned};
 use packwatch::monitor::{Downtime, EventKind, Monitor, RestoreError, Snapshot};
@@ -80,7 +80,7 @@ fn one_damaged_number_is_refused_or_harmless() {
             taken += 1;
             assert_eq!(rig.first_odd_second(), None, "{path} = {damage}: {:?}", rig.events);
             let resets = rig.events.iter().any(|event| matches!(event.kind, EventKind::FilterReset { .. }));
-            assert!(!resets, "{path} = {damage}: the filter never goes on");
+            assert!(!resets, "{path} = {damage}: the filter never stops resetting");
         }
     }
     println!("{} numbers: {unreadable} times no state, {refused} times refused, {taken} times harmless", paths.len());
@@ -88,15 +88,15 @@ fn one_damaged_number_is_refused_or_harmless() {
 }
 
 #[test]
-fn what_is_refused_says_which_number_it_is_and_what_it_may_be() {
+fn a_refused_state_names_the_number_and_its_range() {
     let mut document = serde_json::to_value(learned().monitor.snapshot()).unwrap();
     let covariance = document.pointer_mut("/cells/1/estimator/covariance").unwrap().as_array_mut().unwrap();
     *covariance.last_mut().unwrap() = (-0.25).into();
     let mut rig = Rig::new("");
     let error = rig.monitor.restore(serde_json::from_value(document).unwrap(), Downtime::AsStamped).unwrap_err();
     assert!(matches!(error, RestoreError::Number { cell: Some(1), .. }), "{error:?}");
-    let told = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-40 to 1e20";
-    assert_eq!(error.to_string(), told);
+    let reported = "snapshot is damaged: a variance of a cell's filter (cell 1) = -0.25, must be 1e-40 to 1e20";
+    assert_eq!(error.to_string(), reported);
     // Nothing of it was used: the monitor begins as a new one.
     rig.seconds(5);
     assert!(rig.monitor.latest().flatten().count() == 2);

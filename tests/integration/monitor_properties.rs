@@ -1,4 +1,4 @@
-//! Properties of the core that no single module can promise: a restored monitor goes on as if it had never stopped, and
+//! Properties of the core that no single module can promise: a restored monitor behaves as if it had never stopped, and
 //! ticks before `next_due` may be left out. Inputs: the paper's cell (with a recharge window, transitions and alarms in
 //! it) and a pack of 96 cells whose voltages come in many frames, both from the simulator. Outputs are compared bit for
 //! bit (floats by their shortest text that reads back the same).
@@ -126,13 +126,13 @@ fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], awa
         let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
         let mut restored = Monitor::new(config.clone());
         restored.restore(snapshot, away).expect("fits");
-        let mut told = [false; 3];
+        let mut reported = [false; 3];
         for (nth, record) in (0..).zip(&records[split..]) {
             let expected = outputs(&mut whole, record, &mut out);
             let got = outputs(&mut restored, record, &mut out);
             for kind in 0..3 {
-                if expected[kind] != got[kind] && !told[kind] {
-                    told[kind] = true;
+                if expected[kind] != got[kind] && !reported[kind] {
+                    reported[kind] = true;
                     found.push(format!(
                         "split {split} (t = {} s), {} differ {nth} inputs later at {} s\n  whole    {:.300}\n  restored {:.300}",
                         records[split - 1].time().secs(), WHAT[kind], record.time().secs(), expected[kind], got[kind],
@@ -186,14 +186,14 @@ fn a_restored_cell_that_was_not_away_estimates_as_if_it_had_never_stopped() {
 #[test]
 fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
     let (config, records) = paper();
-    // The input at which the never stopped monitor tells of its first half-cycle.
+    // The input at which the monitor that never stopped reports its first half-cycle.
     let (mut monitor, mut out) = (Monitor::new(config.clone()), Outputs::default());
-    let told = records.iter().position(|record| {
+    let reported = records.iter().position(|record| {
         out.clear();
         monitor.handle(record.input(), &mut out);
         out.events.iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. }))
     });
-    let split = told.expect("a half-cycle");
+    let split = reported.expect("a half-cycle");
     assert_same(&results(differences(&config, &records, &[split], Downtime::AsStamped), false));
 }
 
@@ -217,7 +217,7 @@ fn a_restored_pack_sends_as_if_it_had_never_stopped() {
     assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
 }
 
-/// The whole run against one that goes on with an `edit`ed configuration from one split to the next: a line for the first
+/// The whole run against one that continues with an `edit`ed configuration from one split to the next: a line for the first
 /// difference of each kind. (The event that says so is not among them: it comes between two inputs.)
 fn reload_differences(
     config: &MonitorConfig,
@@ -227,7 +227,7 @@ fn reload_differences(
 ) -> Vec<String> {
     let (mut whole, mut reloaded) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
     let (mut out_whole, mut out_reloaded) = (wanting_estimates(), wanting_estimates());
-    let (mut found, mut told, mut is_edited) = (Vec::new(), [false; 3], false);
+    let (mut found, mut reported, mut is_edited) = (Vec::new(), [false; 3], false);
     for (nth, record) in records.iter().enumerate() {
         if splits.contains(&nth) {
             let mut other = config.clone();
@@ -241,8 +241,8 @@ fn reload_differences(
         let expected = outputs(&mut whole, record, &mut out_whole);
         let got = outputs(&mut reloaded, record, &mut out_reloaded);
         for kind in 0..3 {
-            if expected[kind] != got[kind] && !told[kind] {
-                told[kind] = true;
+            if expected[kind] != got[kind] && !reported[kind] {
+                reported[kind] = true;
                 let (what, at_s) = (WHAT[kind], record.time().secs());
                 found.push(format!("{what} differ at {at_s} s\n  {:.300}\n  {:.300}", expected[kind], got[kind]));
             }

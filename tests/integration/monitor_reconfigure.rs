@@ -1,4 +1,4 @@
-//! Another configuration while the core runs: what is taken over, what goes on as it was, and what needs a restart.
+//! Another configuration while the core runs: what is applied, what continues unchanged, and what needs a restart.
 
 use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{Change, Rule, Severity, State};
@@ -64,7 +64,7 @@ fn a_changed_threshold_is_judged_at_once_and_keeps_the_past() {
 }
 
 #[test]
-fn what_a_debounce_counted_towards_the_old_threshold_does_not_count() {
+fn a_debounce_towards_the_old_threshold_does_not_count() {
     let mut rig = Rig::new(&(HOT.to_owned() + "debounce_s = 10\n"));
     rig.heat(60.0, 9);
     rig.reload(|config| config.rules[0].threshold = 55.0).unwrap();
@@ -87,7 +87,7 @@ fn an_alarm_nothing_watches_any_more_ends_with_an_event_and_a_frame() {
     assert_eq!(done.alarms_ended, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten]);
     let wire = rig.last_wire(Rule::TemperatureHigh);
-    assert_eq!((wire.state, wire.test), (6, false), "nobody can say");
+    assert_eq!((wire.state, wire.test), (6, false), "it is not known");
     assert!(rig.events.iter().any(|event| event.kind == EventKind::Reconfigured { alarms_ended: 1 }));
     // The other severity's has a life of its own.
     rig.heat(60.0, 1);
@@ -98,7 +98,7 @@ fn an_alarm_nothing_watches_any_more_ends_with_an_event_and_a_frame() {
 }
 
 #[test]
-fn what_was_learned_is_compared_with_another_threshold_at_once() {
+fn learned_values_are_compared_with_another_threshold_at_once() {
     let mut rig = learned();
     let capacity_ah = [0, 1].map(|cell| rig.monitor.capacity(CellIndex(cell)).mean);
     rig.events.clear();
@@ -110,7 +110,7 @@ fn what_was_learned_is_compared_with_another_threshold_at_once() {
 }
 
 #[test]
-fn another_end_of_life_is_not_judged_by_what_remained_until_the_old_one() {
+fn another_end_of_life_is_not_judged_by_the_remaining_life_to_the_old_one() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"remaining_life_low\"\nwarning = 30\n");
     rig.seconds(2);
     // 2.36 Ah are left, 0.004 Ah are lost in a cycle: some 70 cycles to 2.08 Ah, 135 to 1.82 Ah.
@@ -136,17 +136,17 @@ fn another_end_of_life_is_not_judged_by_what_remained_until_the_old_one() {
     .unwrap();
     assert!(cycles(&rig) > 102.0, "{}", cycles(&rig));
     assert_eq!(rig.changes(Rule::RemainingLifeLow), [], "what remained until the old end is below the new threshold");
-    let told = rig.events.iter().filter_map(|event| match event.kind {
+    let reported = rig.events.iter().filter_map(|event| match event.kind {
         EventKind::RemainingLife { cycles, .. } => cycles,
         _ => None,
     });
-    assert_eq!(told.collect::<Vec<_>>(), [cycles(&rig)]);
+    assert_eq!(reported.collect::<Vec<_>>(), [cycles(&rig)]);
     rig.reload(|config| config.health.end_of_life_ah = 2.2).unwrap();
     assert_eq!(rig.changes(Rule::RemainingLifeLow), [Change::Raised]);
 }
 
 #[test]
-fn what_was_measured_by_another_load_is_not_known() {
+fn a_usable_capacity_of_another_load_is_unknown() {
     let mut rig = Rig::with({
         let mut config = learned().config;
         config.health.usable =
@@ -186,13 +186,13 @@ fn commands_of_the_bus_keep_their_sequence() {
     let mut rig = learned();
     rig.command(1, 31, 2047);
     rig.reload(|config| config.rules[0].threshold = 4.9).unwrap();
-    // A check that began anew would take this for a first frame and not obey it.
+    // A check that had been reset would take this for a first frame and not apply the command.
     rig.command(1, 31, 2047);
     assert!(rig.events.iter().any(|event| matches!(event.kind, EventKind::Command { changed: 2, .. })));
 }
 
 #[test]
-fn what_needs_a_restart_is_refused_by_name_and_changes_nothing() {
+fn settings_that_need_a_restart_are_refused_by_name_and_change_nothing() {
     type Edit = fn(&mut MonitorConfig);
     let edits: [(Edit, &str); 11] = [
         (|config| config.interfaces = 2, "[[interface]]: 2, running with 1: needs a restart"),
@@ -226,7 +226,7 @@ fn what_needs_a_restart_is_refused_by_name_and_changes_nothing() {
 }
 
 #[test]
-fn a_node_keeps_its_address_and_tells_the_other_codes() {
+fn a_node_keeps_its_address_and_sends_the_other_codes() {
     let j1939 = "[j1939]\naddress = 249\nidentity_number = 1\nmanufacturer_code = 2047\n";
     let mut rig = Rig::new(&(HOT.to_owned() + j1939));
     rig.heat(60.0, 3);

@@ -18,10 +18,10 @@ impl Rig {
 }
 
 #[test]
-fn after_an_unknown_time_away_nothing_is_sure_but_what_was_learned() {
+fn after_an_unknown_downtime_only_learned_values_are_sure() {
     let mut rig = learned();
     let (capacity, before) = (rig.monitor.capacity(CellIndex(1)), rig.soc_std(0));
-    // Nobody measures the current: only the gap speaks.
+    // No current is measured: only the gap counts.
     rig.current_a = None;
     rig.restart(Downtime::Unknown);
     rig.seconds(1);
@@ -62,7 +62,7 @@ fn learned_parts(rig: &Rig) -> Vec<serde_json::Value> {
 }
 
 #[test]
-fn what_was_learned_survives_every_restart_bit_for_bit() {
+fn learned_values_survive_every_restart_bit_for_bit() {
     for away in [
         Downtime::Seconds(0.5),
         Downtime::Seconds(3.0),
@@ -157,7 +157,7 @@ fn no_frame_after_a_restart_says_that_a_raised_alarm_is_over() {
 }
 
 #[test]
-fn what_a_debounce_has_counted_is_kept_and_the_time_away_is_not_counted() {
+fn the_count_of_a_debounce_is_kept_and_the_downtime_is_not_counted() {
     for away in [Downtime::Seconds(60.0), Downtime::Seconds(3e5)] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 7);
@@ -171,7 +171,7 @@ fn what_a_debounce_has_counted_is_kept_and_the_time_away_is_not_counted() {
 }
 
 #[test]
-fn a_stored_alarm_nothing_watches_any_more_is_told_and_ended() {
+fn a_stored_alarm_without_a_rule_is_reported_and_ended() {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 12);
     rig.config.rules.clear();
@@ -319,7 +319,7 @@ fn a_latched_alarm_that_is_beyond_again_and_counting_is_not_cleared() {
 }
 
 #[test]
-fn a_flood_of_bad_commands_is_told_once_a_second() {
+fn a_flood_of_bad_commands_is_reported_once_a_second() {
     let mut rig = Rig::new(HOT);
     rig.seconds(1);
     for _ in 0..50 {
@@ -329,8 +329,8 @@ fn a_flood_of_bad_commands_is_told_once_a_second() {
             rig.give(Input::Frame { time: rig.now(), bus: BusIndex(0), frame: &nonsense });
         }
     }
-    let told = rig.events.iter().filter(|event| matches!(event.kind, EventKind::BadCommand { .. })).count();
-    assert!((4..=6).contains(&told), "{told} in five seconds");
+    let reported = rig.events.iter().filter(|event| matches!(event.kind, EventKind::BadCommand { .. })).count();
+    assert!((4..=6).contains(&reported), "{reported} in five seconds");
 }
 
 #[test]
@@ -362,19 +362,19 @@ fn trouble_codes_wait_for_the_address_after_a_quick_restart() {
         let mut rig = Rig::new(&(HOT.to_owned() + j1939));
         rig.heat(60.0, 12);
         rig.restart(away);
-        let (mut out, mut claimed, mut told) = (Outputs::default(), None, None);
+        let (mut out, mut claimed, mut reported) = (Outputs::default(), None, None);
         for tick in 1..100 {
             let time = rig.now().plus_nanos(tick * 10_000_000);
             rig.monitor.handle(Input::Tick { time }, &mut out);
             for sent in out.frames.drain(..) {
                 match sent.frame.id() {
                     CanId::Extended(0x18EE_FFF9) => claimed = claimed.or(Some(time)),
-                    CanId::Extended(0x18FE_CAF9) => told = told.or(Some(time)),
+                    CanId::Extended(0x18FE_CAF9) => reported = reported.or(Some(time)),
                     _ => {}
                 }
             }
         }
-        let waited_s = told.unwrap().since(claimed.unwrap());
+        let waited_s = reported.unwrap().since(claimed.unwrap());
         assert!((0.3..0.35).contains(&waited_s), "{away:?}: {waited_s} s");
     }
 }

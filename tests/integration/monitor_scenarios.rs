@@ -345,7 +345,7 @@ fn half_cycle_behind_an_unknown_gap_knows_how_little_it_knows_of_its_beginning()
     let mut b = Bench::new(c, 0.95);
     b.run(0.0, 60);
     b.run(2.0, 900);
-    // What nobody saw: the cell goes down to 30 %.
+    // Not measured: the cell discharges to 30 %.
     b.t += 3600.0;
     b.monitor.handle(Input::UnknownGap { time: Timestamp::from_secs(b.t) }, &mut b.out);
     (b.soc, b.u1) = (0.3, 0.0);
@@ -480,7 +480,7 @@ fn bad_share_unknown_or_silent_is_no_new_value() {
 }
 
 #[test]
-fn a_gap_of_unknown_length_is_told_once() {
+fn a_gap_of_unknown_length_is_reported_once() {
     let mut b = Bench::new(load("paper.toml"), 0.95);
     b.run(2.0, 60);
     b.t += 3600.0;
@@ -519,7 +519,7 @@ fn input_missing_pending_before_a_restart_does_not_count_the_time_away() {
 }
 
 #[test]
-fn a_state_taken_up_on_an_earlier_clock_goes_on_sending() {
+fn a_state_restored_on_an_earlier_clock_keeps_sending() {
     let mut b = Bench::new(load("paper.toml"), 0.9);
     b.run(2.6, 60);
     let mut monitor = Monitor::new(b.config.clone());

@@ -5,7 +5,7 @@ use packwatch::monitor::{BusStatistics, Downtime, Statistics, Validity};
 use packwatch::quantity::{CellIndex, Mode};
 
 #[test]
-fn readings_are_counted_by_what_became_of_them() {
+fn readings_are_counted_by_their_outcome() {
     let mut rig = Rig::new("");
     rig.seconds(10);
     // 100 frames of three kinds; every signal of them but one feeds something.
@@ -13,7 +13,7 @@ fn readings_are_counted_by_what_became_of_them() {
     assert_eq!((before.accepted, before.out_of_range), (600, 0));
     assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
     assert_eq!(rig.monitor.statistics().voltages_used, 200);
-    // Above what the pack's limits allow, and for so long that it is told only once.
+    // Above the pack's limits, and for so long that it is reported only once.
     rig.voltages_v[1] = Some(4.9);
     rig.seconds(2);
     let after = rig.monitor.reading_counts();
@@ -38,7 +38,7 @@ fn counts_go_on_after_a_restart() {
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
-    // And what was added since can be told from it.
+    // The difference is what was added since.
     let added = after.since(&before);
     assert_eq!((added.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
     assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
@@ -46,19 +46,19 @@ fn counts_go_on_after_a_restart() {
 }
 
 #[test]
-fn bad_commands_are_all_counted_though_told_once_a_second() {
+fn bad_commands_are_all_counted_and_reported_once_a_second() {
     let mut rig = Rig::new("");
     rig.seconds(1);
     for _ in 0..5 {
         // There is no rule of that number.
         rig.command(0, 30, 0x7FF);
     }
-    let told = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();
-    assert_eq!((told, rig.monitor.statistics().bad_commands), (1, 5));
+    let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();
+    assert_eq!((reported, rig.monitor.statistics().bad_commands), (1, 5));
 }
 
 #[test]
-fn what_is_not_known_any_more_is_not_shown() {
+fn values_no_longer_known_are_not_shown() {
     let mut rig = learned();
     let pack = rig.monitor.pack_view();
     assert_eq!((pack.validity, pack.mode), (Validity::Valid, Mode::Rest));

@@ -286,7 +286,7 @@ fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a
 }
 
 #[test]
-fn what_a_consumer_reads_of_the_dbc_is_the_configuration() {
+fn a_consumer_reads_the_configuration_from_the_dbc() {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("written.dbc");

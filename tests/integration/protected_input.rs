@@ -1,5 +1,5 @@
-//! Bad frames of protected messages, and floods, at the core's face: each is counted and told, none moves an estimate,
-//! and what comes in other messages goes on.
+//! Bad frames of protected messages, and floods, at the core's interface: each is counted and reported, none moves an estimate,
+//! and other messages are still processed.
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
@@ -144,13 +144,13 @@ impl Bench {
         self.monitor.protected().find(|of| of.id == id).unwrap().counts.get(status)
     }
 
-    /// (id, status, usable, count) of what was told about protected messages.
-    fn told(&self) -> Vec<(CanId, Status, bool, u64)> {
-        let told = self.events.iter().filter_map(|event| match event.kind {
+    /// (id, status, usable, count) of the reports about protected messages.
+    fn reported(&self) -> Vec<(CanId, Status, bool, u64)> {
+        let reported = self.events.iter().filter_map(|event| match event.kind {
             EventKind::Protection { id, status, usable, count, .. } => Some((id, status, usable, count)),
             _ => None,
         });
-        told.collect()
+        reported.collect()
     }
 
     fn has(&self, kind: &EventKind) -> bool {
@@ -194,19 +194,19 @@ fn damaged(frame: Frame) -> Frame {
 }
 
 #[test]
-fn a_good_stream_is_ok_after_its_first_frame_and_tells_nothing() {
+fn a_good_stream_is_ok_after_its_first_frame_and_reports_nothing() {
     let mut bench = Bench::new();
     (0..50).for_each(|_| bench.cycle());
     for id in [CURRENT, CELL_1] {
         assert_eq!((bench.count(id, Status::Initial), bench.count(id, Status::Ok)), (1, 49));
     }
-    assert_eq!(bench.told(), []);
+    assert_eq!(bench.reported(), []);
     assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (49, 50), "the first protected frame is not used");
     assert_eq!(bench.monitor.dropped().count(), 0);
 }
 
 #[test]
-fn a_wrong_crc_is_counted_told_once_and_moves_nothing() {
+fn a_wrong_crc_is_counted_reported_once_and_moves_nothing() {
     let (mut bench, mut untouched) = (Bench::running(), Bench::running());
     for _ in 0..3 {
         bench.wait();
@@ -220,14 +220,17 @@ fn a_wrong_crc_is_counted_told_once_and_moves_nothing() {
         }
     }
     assert_eq!(bench.soc(0), untouched.soc(0), "as if the frame had not come");
-    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 3), "the other cell goes on");
-    assert_eq!((bench.count(CELL_1, Status::WrongCrc), bench.told()), (3, vec![(CELL_1, Status::WrongCrc, false, 1)]));
+    assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 3), "the other cell is still estimated");
+    assert_eq!(
+        (bench.count(CELL_1, Status::WrongCrc), bench.reported()),
+        (3, vec![(CELL_1, Status::WrongCrc, false, 1)])
+    );
     let cell = Channel::CellVoltage(CellIndex(0));
     assert!(bench.has(&EventKind::SignalBad { channel: cell, fault: Fault::EndToEnd }));
     bench.forget();
     let good = cell_1(bench.counters[1].wrapping_sub(3), 3.9);
     bench.give(good);
-    assert_eq!(bench.told(), [(CELL_1, Status::Ok, true, 3)]);
+    assert_eq!(bench.reported(), [(CELL_1, Status::Ok, true, 3)]);
     assert!(bench.has(&EventKind::SignalGood { channel: cell, bad_readings: 3 }));
     assert_eq!(bench.estimates_of(0), 1);
 }
@@ -243,7 +246,7 @@ fn a_repeated_counter_is_not_used_again() {
     bench.give(frame);
     assert_eq!((bench.soc(0), bench.estimates_of(0)), (soc, 1));
     assert_eq!(bench.count(CELL_1, Status::Repeated), 1);
-    assert_eq!(bench.told(), [(CELL_1, Status::Repeated, false, 1)]);
+    assert_eq!(bench.reported(), [(CELL_1, Status::Repeated, false, 1)]);
 }
 
 #[test]
@@ -251,7 +254,7 @@ fn a_counter_skipped_within_the_allowed_step_is_used_and_counted() {
     let mut bench = Bench::running();
     let _lost = bench.next_current(1.0);
     bench.cycle();
-    assert_eq!((bench.count(CURRENT, Status::OkSomeLost), bench.told()), (1, vec![]));
+    assert_eq!((bench.count(CURRENT, Status::OkSomeLost), bench.reported()), (1, vec![]));
     assert_eq!(bench.estimates_of(0), 1);
 }
 
@@ -261,14 +264,14 @@ fn a_counter_skipped_beyond_the_allowed_step_is_not_used() {
     (0..5).for_each(|_| _ = bench.next_cell_1(2.7));
     bench.cycle();
     assert_eq!(bench.count(CELL_1, Status::WrongSequence), 1);
-    assert_eq!(bench.told(), [(CELL_1, Status::WrongSequence, false, 1)]);
+    assert_eq!(bench.reported(), [(CELL_1, Status::WrongSequence, false, 1)]);
     assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 1));
     bench.cycle();
-    assert_eq!(bench.told()[1..], [(CELL_1, Status::Ok, true, 1)], "profile 5 goes on from where the sender is");
+    assert_eq!(bench.reported()[1..], [(CELL_1, Status::Ok, true, 1)], "profile 5 continues from the counter of the sender");
 }
 
 #[test]
-fn an_old_frame_replayed_is_refused_and_the_stream_goes_on() {
+fn an_old_frame_replayed_is_refused_and_the_stream_continues() {
     let mut bench = Bench::running();
     bench.wait();
     let old = current(bench.counters[0].wrapping_sub(4), -50.0); // sent and used some time ago
@@ -277,8 +280,8 @@ fn an_old_frame_replayed_is_refused_and_the_stream_goes_on() {
     let current_bad = EventKind::SignalBad { channel: Channel::Current, fault: Fault::EndToEnd };
     assert!(bench.has(&current_bad));
     (0..10).for_each(|_| bench.cycle());
-    assert_eq!(bench.told().last(), Some(&(CURRENT, Status::Ok, true, 1)), "the next frame of the sender is good");
-    assert!(bench.estimates.iter().all(|estimate| estimate.current_a == 1.0), "nobody saw -50 A");
+    assert_eq!(bench.reported().last(), Some(&(CURRENT, Status::Ok, true, 1)), "the next frame of the sender is good");
+    assert!(bench.estimates.iter().all(|estimate| estimate.current_a == 1.0), "-50 A is never used");
     assert_eq!(bench.estimates_of(0), 10);
 }
 
@@ -306,16 +309,16 @@ fn frames_that_do_not_come_are_counted_where_the_period_is_known() {
         "2 s, less the first half period and the last, not looked at yet"
     );
     assert_eq!(bench.count(CELL_1, Status::NoNewData), 0, "no cycle time in the DBC");
-    assert_eq!(bench.told(), [(CURRENT, Status::NoNewData, false, 2)], "one may be lost");
+    assert_eq!(bench.reported(), [(CURRENT, Status::NoNewData, false, 2)], "one may be lost");
     assert_eq!(bench.estimates_of(1), 20);
 }
 
 #[test]
-fn a_flood_of_one_identifier_is_cut_counted_and_told_while_the_others_go_on() {
+fn a_flood_of_one_identifier_is_cut_counted_and_reported_while_the_others_continue() {
     let mut bench = Bench::running();
     let mut sent = 0;
     for _ in 0..20 {
-        // 10,000 a second, five times what is taken in; of a message nobody protects.
+        // 10,000 a second, five times the limit; of a message without protection.
         for _ in 0..1000 {
             bench.now = bench.now.plus_nanos(100_000);
             bench.give(cell_2(3.9));
@@ -337,7 +340,7 @@ fn a_flood_of_one_identifier_is_cut_counted_and_told_while_the_others_go_on() {
         _ => None,
     });
     assert_eq!(floods.collect::<Vec<_>>(), [(BUS, CELL_2, true, 1), (BUS, CELL_2, false, dropped.dropped)]);
-    assert_eq!(bench.told(), []);
+    assert_eq!(bench.reported(), []);
     assert_eq!(bench.estimates_of(0), 35);
 }
 
@@ -373,7 +376,7 @@ fn a_restart_keeps_the_counts_and_waits_for_a_first_frame() {
 }
 
 #[test]
-fn a_snapshot_of_an_earlier_version_without_these_counts_is_taken_up() {
+fn a_snapshot_of_an_earlier_version_without_these_counts_is_restored() {
     let bench = Bench::running();
     let mut document = serde_json::to_value(bench.monitor.snapshot()).unwrap();
     assert!(document.as_object_mut().unwrap().remove("intake").is_some());

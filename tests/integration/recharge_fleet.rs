@@ -67,9 +67,9 @@ struct Usage {
     discharge_a: f64,
 }
 
-/// What the Monitor said about one charge; `None` = not told.
+/// What the Monitor reported about one charge; `None` = nothing.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+struct ChargeReport {
     raw_s: Option<f64>,
     normalised_s: Option<f64>,
     std_s: Option<f64>,
@@ -89,7 +89,7 @@ struct Rig {
     ticks: Ticks,
     out: Outputs,
     seconds: f64,
-    told: Told,
+    reported: ChargeReport,
     alarms: u32,
     health: Option<[u8; 8]>,
     /// Charge counted (A s) and SOC estimated where this charge entered the window, and now.
@@ -126,7 +126,7 @@ impl Rig {
             ticks: Ticks::new(TICK_PERIOD_MS, 30.0),
             out: Outputs::default(),
             seconds: 0.0,
-            told: Told::default(),
+            reported: ChargeReport::default(),
             alarms: 0,
             health: None,
             own: None,
@@ -135,7 +135,7 @@ impl Rig {
         }
     }
 
-    /// One second at `current_a`: the sensors' frames, then the truth goes on.
+    /// One second at `current_a`: the sensors' frames, then the truth advances.
     fn second(&mut self, current_a: f64) {
         let measured_a = current_a * (1.0 + self.gain) + self.offset_a + 0.020 * self.dice.normal();
         let voltage_v = self.pack.lowest_v(current_a) + 0.005 * self.dice.normal();
@@ -163,8 +163,8 @@ impl Rig {
     fn listen(&mut self) {
         for event in self.out.events.drain(..) {
             if let EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } = event.kind {
-                let own_charge_s = self.told.own_charge_s;
-                self.told = Told { raw_s: seconds, normalised_s, std_s: normalised_std_s, own_charge_s };
+                let own_charge_s = self.reported.own_charge_s;
+                self.reported = ChargeReport { raw_s: seconds, normalised_s, std_s: normalised_std_s, own_charge_s };
             }
             let raised = matches!(event.kind, EventKind::Alarm { rule: Rule::RechargePeriodLow, active: true, .. });
             self.alarms += u32::from(raised);
@@ -189,7 +189,7 @@ impl Rig {
             let [start, end] = [self.own.map_or(now, |own| own[0]), now];
             self.own = Some([start, end]);
             let per_soc = (end.0 - start.0) / (end.1 - start.1);
-            self.told.own_charge_s = Some(per_soc * (window.to_soc - window.from_soc) / window.reference_current_a);
+            self.reported.own_charge_s = Some(per_soc * (window.to_soc - window.from_soc) / window.reference_current_a);
         }
     }
 
@@ -197,9 +197,9 @@ impl Rig {
         self.pack.cells()[0].soc
     }
 
-    /// Discharge, rest, charge, rest; what was told about the charge.
-    fn cycle(&mut self, usage: &Usage) -> Told {
-        self.told = Told::default();
+    /// Discharge, rest, charge, rest; returns the report about the charge.
+    fn cycle(&mut self, usage: &Usage) -> ChargeReport {
+        self.reported = ChargeReport::default();
         let (low_v, high_v) = (self.config.model.voltage_min_v, self.config.model.voltage_max_v);
         while self.soc() > usage.depth.0 && self.pack.lowest_v(usage.discharge_a) > low_v {
             self.second(usage.discharge_a);
@@ -213,7 +213,7 @@ impl Rig {
             self.second(current_a);
         }
         (0..REST_S).for_each(|_| self.second(0.0));
-        self.told
+        self.reported
     }
 }
 
@@ -245,7 +245,7 @@ fn spearman(pairs: &[(f64, Option<f64>)]) -> f64 {
     1.0 - 6.0 * x.iter().zip(&y).map(|(a, b)| (a - b) * (a - b)).sum::<f64>() / (n * (n * n - 1.0))
 }
 
-fn fleet() -> Vec<(Usage, Told)> {
+fn fleet() -> Vec<(Usage, ChargeReport)> {
     let config = configuration();
     let mut dice = Dice::new(40);
     let usages = (0..FLEET).map(|k| {
@@ -263,8 +263,8 @@ fn fleet() -> Vec<(Usage, Told)> {
     });
     let run = |(seed, usage): (u64, Usage)| {
         let mut rig = Rig::new(&config, &usage, seed);
-        let told = (0..CYCLES).map(|_| rig.cycle(&usage)).last().unwrap_or_default();
-        (usage, told)
+        let reported = (0..CYCLES).map(|_| rig.cycle(&usage)).last().unwrap_or_default();
+        (usage, reported)
     };
     (1..).zip(usages).map(run).collect()
 }
@@ -274,42 +274,42 @@ fn normalised_period_ranks_a_fleet_by_capacity_whatever_charger_temperature_and_
     let fleet = fleet();
     println!("true Ah  true s | raw s  normalised s +-  std  error % | own charge % | charger A  temp C  depth");
     let words = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.0}"));
-    for (usage, told) in &fleet {
+    for (usage, reported) in &fleet {
         let truth_s = true_period_s(usage.capacity_ah);
         let percent = |value: Option<f64>| value.map_or(f64::NAN, |v| 100.0 * (v / truth_s - 1.0));
         println!(
             "{:7.2}  {truth_s:6.0} | {:>5}  {:>12} +- {:>4}  {:+7.2} | {:+12.2} | {:9.2}  {:6.1}  {:.2} to {:.2}",
             usage.capacity_ah,
-            words(told.raw_s),
-            words(told.normalised_s),
-            words(told.std_s),
-            percent(told.normalised_s),
-            percent(told.own_charge_s),
+            words(reported.raw_s),
+            words(reported.normalised_s),
+            words(reported.std_s),
+            percent(reported.normalised_s),
+            percent(reported.own_charge_s),
             usage.charge_a,
             usage.temperature_c,
             usage.depth.0,
             usage.depth.1,
         );
     }
-    let rank = |value: fn(&Told) -> Option<f64>| {
-        spearman(&fleet.iter().map(|(usage, told)| (usage.capacity_ah, value(told))).collect::<Vec<_>>())
+    let rank = |value: fn(&ChargeReport) -> Option<f64>| {
+        spearman(&fleet.iter().map(|(usage, reported)| (usage.capacity_ah, value(reported))).collect::<Vec<_>>())
     };
     let (normalised, raw, own) = (rank(|t| t.normalised_s), rank(|t| t.raw_s), rank(|t| t.own_charge_s));
     println!("rank correlation with the true capacity: normalised {normalised:.4}, raw {raw:.3}, own charge {own:.4}");
-    let rms = |value: fn(&Told) -> Option<f64>| {
+    let rms = |value: fn(&ChargeReport) -> Option<f64>| {
         let errors = fleet.iter().filter_map(|(usage, t)| Some(value(t)? / true_period_s(usage.capacity_ah) - 1.0));
         let squares: Vec<f64> = errors.map(|error| error * error).collect();
         100.0 * (squares.iter().sum::<f64>() / squares.len() as f64).sqrt()
     };
     println!("RMS error: normalised {:.2} %, own charge {:.2} %", rms(|t| t.normalised_s), rms(|t| t.own_charge_s));
-    let inside = |(usage, told): &&(Usage, Told)| {
-        let error_s = told.normalised_s.map(|s| (s - true_period_s(usage.capacity_ah)).abs());
-        error_s.zip(told.std_s).is_some_and(|(error_s, std_s)| error_s <= 1.96 * std_s)
+    let inside = |(usage, reported): &&(Usage, ChargeReport)| {
+        let error_s = reported.normalised_s.map(|s| (s - true_period_s(usage.capacity_ah)).abs());
+        error_s.zip(reported.std_s).is_some_and(|(error_s, std_s)| error_s <= 1.96 * std_s)
     };
     let coverage = fleet.iter().filter(inside).count() as f64 / fleet.len() as f64;
     println!("95 % interval holds the truth: {:.0} % of the cells", 100.0 * coverage);
-    assert!(fleet.iter().all(|(_, told)| told.normalised_s.is_some()), "every charge covers enough");
-    assert!(fleet.iter().any(|(_, told)| told.raw_s.is_none()), "some charges do not cover the window");
+    assert!(fleet.iter().all(|(_, reported)| reported.normalised_s.is_some()), "every charge covers enough");
+    assert!(fleet.iter().any(|(_, reported)| reported.raw_s.is_none()), "some charges do not cover the window");
     assert!(normalised >= 0.98, "rank correlation {normalised}");
     assert!(raw < 0.7, "the raw period alone ranks them already: {raw}");
     assert!((0.90..=1.0).contains(&coverage), "coverage {coverage}");
@@ -333,11 +333,12 @@ fn a_charger_that_gets_weaker_moves_the_raw_period_and_not_the_normalised_one() 
     println!("charge  charger A  true Ah  true s | raw s  normalised s +- std  error %");
     let mut life = Vec::new();
     for k in 0..LIFE {
-        let told = rig.cycle(&usage(k));
+        let reported = rig.cycle(&usage(k));
         let capacity_ah = rig.pack.cells()[0].capacity_ah;
         rig.pack.complete_cycle();
-        let (Some(raw_s), Some(normalised_s), Some(std_s)) = (told.raw_s, told.normalised_s, told.std_s) else {
-            panic!("charge {k} was not told: {told:?}");
+        let (Some(raw_s), Some(normalised_s), Some(std_s)) = (reported.raw_s, reported.normalised_s, reported.std_s)
+        else {
+            panic!("charge {k} was not reported: {reported:?}");
         };
         let truth_s = true_period_s(capacity_ah);
         println!(

@@ -101,15 +101,16 @@ fn stdout_of(assert: &assert_cmd::assert::Assert) -> String {
 }
 
 #[test]
-fn each_log_is_replayed_as_if_alone_and_told_in_the_order_given() {
+fn each_log_is_replayed_as_if_alone_and_reported_in_the_order_given() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [3000, 5, 200]);
     let out = folder.path().join("out").display().to_string();
     let each = ["--each", "--json", "-j", "3", "--estimates", &out, "--events", &out, "--frames", &out];
-    let told = stdout_of(&replay(&[&logs.each_ref().map(String::as_str)[..], &each[..]].concat()).success());
-    let told: Vec<serde_json::Value> = told.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
-    assert_eq!(told.iter().map(|one| one["name"].as_str().expect("a name")).collect::<Vec<_>>(), logs);
-    assert_eq!(told.iter().map(|one| one["frames"].as_u64()).collect::<Vec<_>>(), [3000, 5, 200].map(Some));
+    let reported = stdout_of(&replay(&[&logs.each_ref().map(String::as_str)[..], &each[..]].concat()).success());
+    let reported: Vec<serde_json::Value> =
+        reported.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+    assert_eq!(reported.iter().map(|one| one["name"].as_str().expect("a name")).collect::<Vec<_>>(), logs);
+    assert_eq!(reported.iter().map(|one| one["frames"].as_u64()).collect::<Vec<_>>(), [3000, 5, 200].map(Some));
     for (n, log) in logs.iter().enumerate() {
         let alone = ["csv", "jsonl", "log"].map(|kind| folder.path().join(format!("alone.{kind}")));
         let [estimates, events, frames] = alone.each_ref().map(|path| path.to_str().expect("UTF-8"));
@@ -123,7 +124,7 @@ fn each_log_is_replayed_as_if_alone_and_told_in_the_order_given() {
 }
 
 #[test]
-fn a_log_that_fails_is_told_by_name_and_the_others_go_on() {
+fn a_log_that_fails_is_reported_by_name_and_the_others_continue() {
     let folder = tempfile::tempdir().expect("a folder");
     let logs = trips(folder.path(), [50, 50, 50]);
     fs::remove_file(&logs[1]).expect("removed");
@@ -131,17 +132,17 @@ fn a_log_that_fails_is_told_by_name_and_the_others_go_on() {
     let result = replay(&args).code(1);
     let error = String::from_utf8_lossy(&result.get_output().stderr).into_owned();
     assert!(error.starts_with(&logs[1]) && error.lines().count() == 1, "{error}");
-    let told = stdout_of(&result);
-    let places = logs.each_ref().map(|log| told.find(log.as_str()).expect("every log is told"));
-    assert!(places.is_sorted(), "{told}");
-    assert_eq!(told.matches("wall time").count(), 2, "{told}");
+    let reported = stdout_of(&result);
+    let places = logs.each_ref().map(|log| reported.find(log.as_str()).expect("every log is reported"));
+    assert!(places.is_sorted(), "{reported}");
+    assert_eq!(reported.matches("wall time").count(), 2, "{reported}");
     let json = stdout_of(&replay(&[&args[..], &["--json"][..]].concat()).code(1));
     let second: serde_json::Value = serde_json::from_str(json.lines().nth(1).expect("a line")).expect("JSON");
     assert_eq!((&second["name"], second["error"].is_string()), (&logs[1].as_str().into(), true));
 }
 
 #[test]
-fn what_makes_no_sense_for_each_log_is_refused_by_name() {
+fn options_that_make_no_sense_for_each_log_are_refused_by_name() {
     let folder = tempfile::tempdir().expect("a folder");
     let [log, other, _] = trips(folder.path(), [5, 5, 5]);
     let refused = |args: &[&str], code: i32| {
@@ -180,7 +181,7 @@ fn until_reads_no_further_than_it_says() {
 }
 
 #[test]
-fn a_log_read_at_a_run_gives_what_it_gives_record_by_record() {
+fn a_log_read_in_batches_gives_the_same_as_record_by_record() {
     let folder = tempfile::tempdir().expect("a folder");
     let text = fs::read_to_string(log(folder.path())).expect("readable");
     let mut rows: Vec<String> = text.lines().map(str::to_owned).collect();
@@ -197,7 +198,7 @@ fn a_log_read_at_a_run_gives_what_it_gives_record_by_record() {
         let mut summary: serde_json::Value = serde_json::from_str(&stdout_of(&replay(&args).success())).expect("JSON");
         let of_this_run = ["wall_s", "times_real_time", "frames_per_s", "cell_steps_per_s", "peak_memory_kib"];
         for key in of_this_run {
-            summary.as_object_mut().expect("an object").remove(key).expect("told");
+            summary.as_object_mut().expect("an object").remove(key).expect("reported");
         }
         (summary, paths.map(|path| fs::read(path).expect("result written")))
     });

@@ -72,7 +72,7 @@ fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
 }
 
 #[test]
-fn a_store_becomes_a_page_that_says_what_it_does_not_know() {
+fn a_store_becomes_a_page_that_says_what_is_unknown() {
     let place = Place::new();
     let (log, state) = (place.path("cell.csv"), place.path("state"));
     good(&["replay", "-c", &config(), &log, "--state", &state]);
@@ -85,14 +85,14 @@ fn a_store_becomes_a_page_that_says_what_it_does_not_know() {
 }
 
 #[test]
-fn plots_are_files_of_both_kinds_or_the_missing_font_is_told() {
+fn plots_are_files_of_both_kinds_or_the_missing_font_is_reported() {
     let place = Place::new();
     let (log, plots, out) = (place.path("cell.csv"), place.path("plots"), place.path("a.html"));
     let config = config();
     let output = packwatch(&["report", "-o", &out, "-c", &config, &log, "--plots", &plots]);
     if !output.status.success() {
-        let told = String::from_utf8_lossy(&output.stderr);
-        assert!(told.contains("no font is installed"), "{told}");
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(printed.contains("no font is installed"), "{printed}");
         return;
     }
     let names = |ending: &str| {
@@ -110,14 +110,14 @@ fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
     let page = place.page("a.html", &["-c", &config(), &log, "--reference", &table]);
     assert!(page.contains("reference 1.900 Ah"));
     fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
-    let told = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
-    assert!(told.contains("measured.csv:2: capacity \"much\", must be a number"), "{told}");
+    let printed = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
+    assert!(printed.contains("measured.csv:2: capacity \"much\", must be a number"), "{printed}");
     assert!(bad(&["report", "-o", &place.path("b.html"), "--state", &place.path("none")]).contains("no history there"));
     assert!(bad(&["report", "-c", &config(), &log, "-o", &log]).contains("is read, cannot be written too"));
 }
 
 #[test]
-fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said() {
+fn a_life_is_reported_with_its_truth_and_the_remaining_life_of_the_core() {
     let place = Place::new();
     let [log, truth, events, state] = ["life.log", "truth.csv", "events.jsonl", "state"].map(|name| place.path(name));
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml").display().to_string();
@@ -125,8 +125,8 @@ fn a_life_is_told_with_its_truth_and_what_remains_is_what_the_core_itself_said()
     good(&[&["simulate", "paper", "-c", &config, "-o", &log][..], &whole].concat());
     good(&["replay", "-c", &config, &log, "--events", &events, "--state", &state]);
     let text = fs::read_to_string(&events).expect("events");
-    let told = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
-    let mut lives = told.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
+    let printed = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
+    let mut lives = printed.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
     let last = lives.next_back().expect("a forecast");
     let digits = |name: &str| {
         let value = last[name].as_f64().expect("known");
@@ -171,8 +171,8 @@ fn a_browser_finds_nothing_to_fetch_nothing_to_complain_of_and_nothing_too_wide(
         command.arg(&tool).arg(&browser).arg(place.path(page));
         let output = command.args([width, "900", scheme]).output().expect("python3 runs");
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        let told: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let printed: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
         let expected = serde_json::json!({ "requests": [], "messages": [], "overflow_px": 0 });
-        assert_eq!(told, expected, "{page} at {width} pixels, {scheme}");
+        assert_eq!(printed, expected, "{page} at {width} pixels, {scheme}");
     }
 }

@@ -152,7 +152,7 @@ fn learned(monitor: &Monitor) -> Vec<ScalarGaussian> {
     (0..CELLS).map(|cell| monitor.capacity(CellIndex(cell))).collect()
 }
 
-/// A monitor that was started anew, and how it compares.
+/// A restarted monitor, and how it compares.
 struct Case {
     live: Live,
     until: Timestamp,
@@ -364,7 +364,7 @@ fn away(config: &MonitorConfig, hours: f64, used: f64, seed: u64) -> Vec<(f64, f
 }
 
 #[test]
-fn what_was_used_while_the_computer_was_off_is_found_at_the_first_rested_voltage() {
+fn charge_used_while_the_computer_was_off_is_found_at_the_first_rested_voltage() {
     let config = configuration();
     for (hours, used, bar) in [(8.0, 0.2, 0.02), (8.0, -0.1, 0.05), (1.0, 0.2, 0.03), (1000.0, 0.2, 0.02)] {
         for seed in [3, 4] {

@@ -1,4 +1,4 @@
-//! Forecasts of the remaining useful life held to their bars: on measured lives, on fades of many shapes that nobody tuned
+//! Forecasts of the remaining useful life held to their bars: on measured lives, on fades of many shapes that nothing was tuned
 //! anything to, and on board. `tests/rul.md` has the figures; `cargo test --test integration rul -- --nocapture` prints them.
 
 use std::path::{Path, PathBuf};
@@ -166,7 +166,7 @@ fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     config.health.end_of_life_ah = 1.3;
-    let (mut told, mut first) = (Vec::new(), None);
+    let (mut reported, mut first) = (Vec::new(), None);
     simulated_cell::live(config, Settings::of(Scenario::Paper, 2.6), |_, sim, monitor, events| {
         for event in events {
             let EventKind::RemainingLife {
@@ -183,15 +183,15 @@ fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
                 println!("after {} cycles: {cycles:.1} ({low:.1} to {high:.1}), truth {truth:.1}", sim.pack().cycles());
             }
             assert!(monitor.remaining_life(CellIndex(0)).is_ok());
-            told.push((truth, low, cycles, high));
+            reported.push((truth, low, cycles, high));
         }
     });
     assert!(first.is_some_and(|cycles| cycles <= 8), "{first:?}");
-    let before_end: Vec<_> = told.iter().filter(|(truth, ..)| *truth > 0.0).collect();
+    let before_end: Vec<_> = reported.iter().filter(|(truth, ..)| *truth > 0.0).collect();
     let covered = before_end.iter().filter(|(truth, low, _, high)| low <= truth && truth <= high).count();
     let share = covered as f64 / before_end.len() as f64;
     assert!(share >= 0.8, "{share}");
-    assert!(told.last().is_some_and(|&(_, _, cycles, high)| cycles == 0.0 && high == 0.0), "{:?}", told.last());
+    assert!(reported.last().is_some_and(|&(_, _, cycles, high)| cycles == 0.0 && high == 0.0), "{:?}", reported.last());
 }
 
 fn print(scored: &[Scored]) {

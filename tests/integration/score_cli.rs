@@ -7,7 +7,7 @@ use assert_cmd::Command;
 use assert_cmd::assert::Assert;
 use serde_json::Value;
 
-/// A straight open-circuit voltage, 3 V + 1.2 V x SOC, 2 Ah, and next to no resistance: every estimate can be told by hand.
+/// A straight open-circuit voltage, 3 V + 1.2 V x SOC, 2 Ah, and next to no resistance: every estimate can be calculated by hand.
 const MODEL: &str = "format = 1
 name = \"straight\"
 rated_capacity_ah = 2.0
@@ -89,7 +89,7 @@ fn a_perfect_cell_is_found_from_twenty_points_wrong() {
 
 #[test]
 fn an_error_of_the_cell_is_an_error_of_the_score() {
-    // The voltages claim 8 points more than the counter: whoever believes them is 8 points off, and not within the band.
+    // The voltages claim 8 points more than the counter: an estimator that trusts them is 8 points off, and not within the band.
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 1.5, 0.08);
     let score = &bench.json(&["drive.csv", "--start", "middle", "--told", "0", "--soc-std", "30"])["scores"][0];
@@ -116,7 +116,7 @@ fn a_start_in_the_middle_drops_the_rows_before_it() {
     let rows: Vec<u64> = document["scores"].as_array().unwrap().iter().map(|s| s["rows"].as_u64().unwrap()).collect();
     // 0.25 of 2 Ah is reached after 1800 s at 1 A.
     assert_eq!(rows, [5401, 5401 - 1800]);
-    // Told 10 points less than the 75 % that are true there; the first voltage has already had its say.
+    // The initial SOC is 10 points below the true 75 %; the first voltage has already corrected it.
     assert!((-10.1..-0.1).contains(&number(&document["scores"][1], "first_error_points")), "{document}");
 }
 
@@ -145,10 +145,10 @@ fn every_case_is_run_on_every_file_in_order() {
     bench.write_discharge("b.csv", 0.8, 0.0);
     let document = bench.json(&["b.csv", "a.csv", "--told=-20,-5", "--capacity-error=-5,5", "--plot", "plots"]);
     let cases: Vec<_> = document["scores"].as_array().unwrap().iter().collect();
-    let told = |case: &Value| (case["name"].as_str().unwrap().to_owned(), case["told_points"].as_f64().unwrap());
+    let printed = |case: &Value| (case["name"].as_str().unwrap().to_owned(), case["told_points"].as_f64().unwrap());
     assert_eq!(cases.len(), 8);
-    assert_eq!(told(cases[0]), ("b".to_owned(), -20.0));
-    assert_eq!(told(cases[7]), ("a".to_owned(), -5.0));
+    assert_eq!(printed(cases[0]), ("b".to_owned(), -20.0));
+    assert_eq!(printed(cases[7]), ("a".to_owned(), -5.0));
     assert_eq!(document["totals"].as_array().unwrap().len(), 4);
     assert_eq!(document["totals"][0]["files"], 2);
     assert_eq!(fs::read_dir(bench.path("plots")).unwrap().count(), 8);
@@ -214,7 +214,7 @@ fn a_life_is_held_against_its_table() {
 }
 
 #[test]
-fn bad_input_is_told_with_place_found_and_allowed() {
+fn bad_input_is_reported_with_place_found_and_allowed() {
     let bench = Bench::new();
     bench.write_discharge("drive.csv", 0.5, 0.0);
     bench.write("no_counter.csv", "time_s,current_a,voltage_v\n0,1,4\n1,1,4\n");
@@ -235,8 +235,8 @@ fn bad_input_is_told_with_place_found_and_allowed() {
     assert!(of(&["drive.csv", "--start", "middle"]).contains("drive.csv: never down to a SOC of 0.700"));
     assert!(of(&["drive.csv", "drive.csv"]).contains("drive.csv: named twice"));
     for wrong in [["--told", "much"], ["--remove", "1.5"], ["--settle", "soon"], ["--window", "0.7,0.4"]] {
-        let told = fault(bench.score(&[&["drive.csv"], &wrong[..]].concat()), 2);
-        assert!(told.contains("must be"), "{wrong:?}: {told}");
+        let printed = fault(bench.score(&[&["drive.csv"], &wrong[..]].concat()), 2);
+        assert!(printed.contains("must be"), "{wrong:?}: {printed}");
     }
 }
 
@@ -247,8 +247,8 @@ fn a_bad_model_or_configuration_is_a_configuration_fault() {
     bench.write("bad.toml", &MODEL.replace("capacity_ah = 2.0", "capacity_ah = -2.0"));
     let mut command = Command::cargo_bin("packwatch").unwrap();
     let run = command.current_dir(bench.folder.path()).args(["score", "--cell", "bad.toml", "drive.csv"]).assert();
-    let told = fault(run, 78);
-    assert!(told.contains("bad.toml:") && told.contains("capacity_ah"), "{told}");
+    let printed = fault(run, 78);
+    assert!(printed.contains("bad.toml:") && printed.contains("capacity_ah"), "{printed}");
     let missing = fault(bench.score(&["-c", "none.toml", "drive.csv"]), 78);
     assert!(missing.contains("none.toml: cannot be read"), "{missing}");
     let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");

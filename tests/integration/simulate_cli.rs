@@ -111,7 +111,7 @@ fn truth_has_a_row_per_cell_and_second_and_its_charge_balances() {
 }
 
 #[test]
-fn settings_out_of_range_are_refused_with_what_is_allowed() {
+fn settings_out_of_range_are_refused_with_the_allowed_range() {
     let example = config("example.toml");
     for (args, code, says) in [
         (vec!["--initial-soc", "2"], 2, "must be 0 to 1"),
@@ -130,7 +130,7 @@ fn settings_out_of_range_are_refused_with_what_is_allowed() {
 }
 
 #[test]
-fn a_configuration_that_is_not_there_and_a_log_that_cannot_be_written_are_told() {
+fn a_missing_configuration_and_a_log_that_cannot_be_written_are_reported() {
     let missing = packwatch(&["simulate", "paper", "-c", "/nowhere/pack.toml", "-o", "/dev/null"]);
     assert_eq!(missing.status.code(), Some(78));
     let example = config("example.toml");

@@ -77,7 +77,7 @@ impl Place {
 }
 
 #[test]
-fn what_a_replay_has_learned_is_in_the_history() {
+fn learned_values_of_a_replay_are_in_the_history() {
     let place = Place::filled();
     let state = place.state();
     let capacities = place.rows(&["--kind", "capacity"]);
@@ -106,9 +106,9 @@ fn verify_names_the_first_row_that_was_changed() {
     let mut after = before.clone();
     after[at + 7] ^= 1;
     fs::write(place.database(), after).expect("written");
-    let told = bad(&["history", "--state", &place.state(), "verify"]);
+    let printed = bad(&["history", "--state", &place.state(), "verify"]);
     let row = rows[2]["seq"].as_i64().expect("a number");
-    assert!(told.contains(&format!("row {row} (capacity) is not as it was written: expected ")), "{told}");
+    assert!(printed.contains(&format!("row {row} (capacity) is not as it was written: expected ")), "{printed}");
 }
 
 #[test]
@@ -117,8 +117,8 @@ fn a_replay_never_gets_into_a_history_that_exists() {
     let log = place.path("cell.csv");
     let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml").display().to_string();
     let before = fs::read(place.database()).expect("read");
-    let told = bad(&["replay", "-c", &config, &log, "--state", &place.state()]);
-    assert!(told.contains("packwatch.db: exists; a replay needs a state folder of its own"), "{told}");
+    let printed = bad(&["replay", "-c", &config, &log, "--state", &place.state()]);
+    assert!(printed.contains("packwatch.db: exists; a replay needs a state folder of its own"), "{printed}");
     assert_eq!(fs::read(place.database()).expect("read"), before);
 }
 
@@ -128,8 +128,8 @@ fn another_pack_without_a_daemon_begins_a_new_history() {
     let (state, socket) = (place.state(), place.path("none.sock"));
     let reset = ["reset", "--pack-replaced", "--state", &state, "--control", &socket];
     assert!(bad(&reset).contains("--yes"));
-    let told = good(&[&reset[..], &["--yes"]].concat());
-    assert!(told.contains("the history of pack 1 is closed, that of pack 2 begins"), "{told}");
+    let printed = good(&[&reset[..], &["--yes"]].concat());
+    assert!(printed.contains("the history of pack 1 is closed, that of pack 2 begins"), "{printed}");
     let mut resets = place.rows(&["--kind", "reset"]);
     resets.retain(|row| row["reason"] != "filter_reset");
     assert_eq!(resets.len(), 1);
@@ -137,18 +137,18 @@ fn another_pack_without_a_daemon_begins_a_new_history() {
     assert!(resets[0]["capacity_ah"].as_f64().is_some_and(|ah| (1.0..4.0).contains(&ah)), "{resets:?}");
     assert!(good(&["history", "--state", &state, "verify"]).contains("all as they were written"));
     let nowhere = place.path("nowhere");
-    let told = bad(&["reset", "--pack-replaced", "--yes", "--state", &nowhere, "--control", &socket]);
-    assert!(told.contains("no daemon runs, and there is no history"), "{told}");
+    let printed = bad(&["reset", "--pack-replaced", "--yes", "--state", &nowhere, "--control", &socket]);
+    assert!(printed.contains("no daemon runs, and there is no history"), "{printed}");
 }
 
 #[test]
 fn a_history_of_a_newer_program_or_none_at_all_is_said_to_be_so() {
     let place = Place::filled();
-    let told = bad(&["history", "--state", &place.path("nowhere")]);
-    assert!(told.contains("no history there"), "{told}");
+    let printed = bad(&["history", "--state", &place.path("nowhere")]);
+    assert!(printed.contains("no history there"), "{printed}");
     let mut bytes = fs::read(place.database()).expect("read");
     bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
     fs::write(place.database(), bytes).expect("written");
-    let told = bad(&["history", "--state", &place.state()]);
-    assert!(told.contains("layout version 99, this program reads 1 to 2"), "{told}");
+    let printed = bad(&["history", "--state", &place.state()]);
+    assert!(printed.contains("layout version 99, this program reads 1 to 2"), "{printed}");
 }

@@ -1,4 +1,4 @@
-//! `packwatch whatif` as its user runs it: one replay for all alarm settings, and what they would have told.
+//! `packwatch whatif` as its user runs it: one replay for all alarm settings, and the alarms each would have raised.
 
 use std::path::{Path, PathBuf};
 
@@ -46,7 +46,7 @@ fn row(document: &Value, log: usize, setting: usize) -> &Value {
 }
 
 #[test]
-fn one_replay_serves_a_grid_and_says_what_replays_of_each_setting_say() {
+fn one_replay_of_a_grid_equals_a_replay_of_each_setting() {
     let bench = Bench::new();
     let choices = ["--set", "capacity_low.threshold=2.35,2.2", "--set", "capacity_low.probability=0.5,0.9", "--set"];
     let sweep = bench.whatif(&[&choices[..], &["soc_low.warning=0.35", "--end-of-life", "80 %", "a.log.gz"]].concat());
@@ -57,8 +57,8 @@ fn one_replay_serves_a_grid_and_says_what_replays_of_each_setting_say() {
     assert_eq!(alone["replays_per_log"], 2);
     assert_eq!(sweep["logs"][0]["alarms"], {
         let all = alone["logs"][0]["alarms"].as_array().unwrap();
-        let told = all.iter().filter(|row| row["rule"] == "capacity_low" || row["rule"] == "soc_low");
-        Value::Array(told.cloned().collect())
+        let printed = all.iter().filter(|row| row["rule"] == "capacity_low" || row["rule"] == "soc_low");
+        Value::Array(printed.cloned().collect())
     });
     let raises: Vec<_> = (1..5).map(|setting| row(&sweep, 0, setting)["raises"].as_u64().unwrap()).collect();
     assert!(raises[0] >= 1, "{raises:?}");
@@ -114,27 +114,27 @@ fn the_csv_has_a_row_per_log_setting_and_alarm() {
 }
 
 #[test]
-fn a_log_that_fails_is_told_and_the_others_go_on() {
+fn a_log_that_fails_is_reported_and_the_others_continue() {
     let bench = Bench::new();
-    let told = bench.run(&["whatif"], &["--set", "capacity_low.warning=2.3", "a.log.gz", "none.log"]).code(1);
-    let output = told.get_output();
+    let printed = bench.run(&["whatif"], &["--set", "capacity_low.warning=2.3", "a.log.gz", "none.log"]).code(1);
+    let output = printed.get_output();
     assert!(String::from_utf8_lossy(&output.stderr).contains("none.log: cannot be read"), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
     // Settings that need a replay each: the next log's are its own.
     let noises = ["--set", "estimator.voltage_noise_v=0.005,0.01", "none.log", "a.log.gz"];
-    let told = bench.run(&["whatif"], &noises).code(1);
-    let output = told.get_output();
+    let printed = bench.run(&["whatif"], &noises).code(1);
+    let output = printed.get_output();
     assert_eq!(String::from_utf8_lossy(&output.stderr).matches("none.log").count(), 1, "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("a.log.gz"), "{output:?}");
     std::fs::write(bench.path("other.log"), "(1700000000.000000) can9 123#00\n").unwrap();
-    let told = bench.run(&["whatif"], &["other.log"]).code(1);
-    let output = told.get_output();
+    let printed = bench.run(&["whatif"], &["other.log"]).code(1);
+    let output = printed.get_output();
     assert!(output.stdout.is_empty(), "no table of nothing: {output:?}");
     let stderr = String::from_utf8_lossy(&output.stderr);
     assert!(stderr.contains("holds no record: no frame of the configured interfaces: the log has can9"), "{stderr}");
-    let told = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);
-    let stderr = String::from_utf8_lossy(&told.get_output().stderr).into_owned();
+    let printed = bench.run(&["whatif"], &["--set", "estimator.voltage_noise_v=0.01", "-"]).code(1);
+    let stderr = String::from_utf8_lossy(&printed.get_output().stderr).into_owned();
     assert!(stderr.contains("-: is read once"), "{stderr}");
-    let told = bench.run(&["whatif"], &["--set", "capacity_lo.warning=2.3", "a.log.gz"]).code(78);
-    assert!(String::from_utf8_lossy(&told.get_output().stderr).contains("did you mean capacity_low"));
+    let printed = bench.run(&["whatif"], &["--set", "capacity_lo.warning=2.3", "a.log.gz"]).code(78);
+    assert!(String::from_utf8_lossy(&printed.get_output().stderr).contains("did you mean capacity_low"));
 }

@@ -113,7 +113,7 @@ pub(crate) struct Look {
     /// Whether the half-cycle carried information: else no rule is asked.
     pub(crate) is_measured: bool,
     /// What the Monitor's own alarms of severity info, warning and severe did here.
-    pub(crate) told: [Option<Change>; 3],
+    pub(crate) reported: [Option<Change>; 3],
 }
 
 /// Where in a life something happened.
@@ -397,7 +397,7 @@ impl Rig {
                         mean_ah: capacity_ah,
                         std_ah: capacity_std_ah,
                         is_measured: measured_ah.is_some(),
-                        told: [None; 3],
+                        reported: [None; 3],
                     });
                 }
                 EventKind::Alarm { change, severity, .. } => {
@@ -407,7 +407,7 @@ impl Rig {
                         Severity::Severe => 2,
                     };
                     let look = self.life.looks.last_mut().expect("an alarm about capacity follows a half-cycle");
-                    look.told[slot] = Some(change);
+                    look.reported[slot] = Some(change);
                 }
                 EventKind::FilterReset { .. } => self.life.resets += 1,
                 _ => {}

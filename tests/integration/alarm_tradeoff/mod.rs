@@ -59,9 +59,9 @@ impl Fleet {
         assert!(self.healthy.iter().all(|life| life.crossing.is_none()), "healthy cells stay above");
         for life in self.all() {
             for (severity, rule) in MONITORED.into_iter().enumerate() {
-                let told: Vec<_> = life.looks.iter().map(|look| look.told[severity]).collect();
+                let reported: Vec<_> = life.looks.iter().map(|look| look.reported[severity]).collect();
                 assert_eq!(
-                    told,
+                    reported,
                     judged::changes(&CANDIDATES[rule], life),
                     "the Monitor's own {}",
                     CANDIDATES[rule].name

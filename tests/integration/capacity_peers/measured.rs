@@ -67,8 +67,8 @@ fn configuration(folder: &Path, cell: &str, start: f64, held: bool) -> PathBuf {
     path
 }
 
-/// What was told after a discharge.
-struct Told {
+/// What the monitor reported after a discharge.
+struct DischargeReport {
     time_s: f64,
     discharge: usize,
     published_ah: f64,
@@ -80,7 +80,7 @@ struct Told {
 
 struct Life {
     config: MonitorConfig,
-    told: Vec<Told>,
+    reported: Vec<DischargeReport>,
     filter: Vec<(f64, Source)>,
     outer: Vec<(f64, Source)>,
     loaded: Vec<(f64, Source)>,
@@ -112,7 +112,7 @@ fn live(config_path: &Path, rows: &Path, data: &Path, cell: &str) -> Life {
     let filter_at_ends = loaded.iter().map(|swing| (swing.start_s, of_filter(swing))).collect();
     let [outer, loaded] =
         [outer, loaded].map(|swings| swings.into_iter().map(|s| (s.start_s, Source::Voltage(s))).collect());
-    let mut life = Life { config, told: Vec::new(), filter: Vec::new(), outer, loaded, filter_at_ends };
+    let mut life = Life { config, reported: Vec::new(), filter: Vec::new(), outer, loaded, filter_at_ends };
     life.read(&events, &discharges(data, cell));
     life
 }
@@ -146,7 +146,7 @@ impl Life {
                 "capacity" if mode == "discharge" => {
                     let discharge = discharges.iter().filter(|(start_s, _)| *start_s <= time_s).count();
                     if discharge > 10 {
-                        self.told.push(self.told(&event, time_s, discharge, discharges[discharge - 1].1));
+                        self.reported.push(self.reported(&event, time_s, discharge, discharges[discharge - 1].1));
                     }
                 }
                 _ => {}
@@ -162,11 +162,11 @@ impl Life {
         Some((time_s - duration_s, Source::Filter(swing)))
     }
 
-    fn told(&self, event: &Value, time_s: f64, discharge: usize, published_ah: f64) -> Told {
+    fn reported(&self, event: &Value, time_s: f64, discharge: usize, published_ah: f64) -> DischargeReport {
         let number = |key: &str| event[key].as_f64().unwrap();
         let ours = ScalarGaussian::from_std(number("usable_capacity_ah"), number("usable_capacity_std_ah"));
         let (capacity_ah, ratio) = (number("capacity_ah"), number("resistance_ratio"));
-        // The SOC from which it was told to start: the one that gives it again.
+        // The initial SOC that makes the monitor report it again.
         let (mut low, mut high) = (0.5, 1.5);
         for _ in 0..30 {
             let middle = 0.5 * (low + high);
@@ -174,7 +174,7 @@ impl Life {
             if usable < ours.mean { low = middle } else { high = middle }
         }
         let (ratio_std, full_soc) = (number("resistance_ratio_std"), 0.5 * (low + high));
-        Told { time_s, discharge, published_ah, ours, ratio, ratio_std, full_soc }
+        DischargeReport { time_s, discharge, published_ah, ours, ratio, ratio_std, full_soc }
     }
 
     fn usable(&self) -> &UsableConfig {
@@ -182,32 +182,36 @@ impl Life {
     }
 
     /// What a capacity makes usable, the resistance's doubt included (its correlation with a peer's capacity is not known).
-    fn made_usable(&self, told: &Told, capacity: ScalarGaussian) -> ScalarGaussian {
+    fn made_usable(&self, reported: &DischargeReport, capacity: ScalarGaussian) -> ScalarGaussian {
         let at = |capacity_ah: f64, ratio: f64| {
-            usable_ah(&self.config.model, self.usable(), told.full_soc, capacity_ah, ratio)
+            usable_ah(&self.config.model, self.usable(), reported.full_soc, capacity_ah, ratio)
         };
-        let mean = at(capacity.mean, told.ratio);
-        let by_capacity = (at(1.01 * capacity.mean, told.ratio) - mean) / (0.01 * capacity.mean);
-        let by_ratio = (at(capacity.mean, 1.01 * told.ratio) - mean) / (0.01 * told.ratio);
-        let std = (by_capacity * capacity.std()).hypot(by_ratio * told.ratio_std);
+        let mean = at(capacity.mean, reported.ratio);
+        let by_capacity = (at(1.01 * capacity.mean, reported.ratio) - mean) / (0.01 * capacity.mean);
+        let by_ratio = (at(capacity.mean, 1.01 * reported.ratio) - mean) / (0.01 * reported.ratio);
+        let std = (by_capacity * capacity.std()).hypot(by_ratio * reported.ratio_std);
         ScalarGaussian::from_std(mean, std)
     }
 
     fn peer(&self, method: (Method, f64), swings: &[(f64, Source)]) -> Vec<ScalarGaussian> {
         let e = &self.config.estimator;
         let start = ScalarGaussian::from_std(e.initial_capacity_ah, e.initial_capacity_std_ah);
-        let times_s = self.told.iter().map(|told| told.time_s);
+        let times_s = self.reported.iter().map(|reported| reported.time_s);
         let capacities = follow(&self.config.model, &self.config.health.capacity, method, start, swings, times_s);
-        self.told.iter().zip(capacities).map(|(told, capacity)| self.made_usable(told, capacity)).collect()
+        self.reported.iter().zip(capacities).map(|(reported, capacity)| self.made_usable(reported, capacity)).collect()
     }
 
     fn scored(&self, usable: &[ScalarGaussian]) -> (Score, Option<usize>) {
-        let below = usable.iter().zip(&self.told).find(|(usable, _)| usable.mean < 1.4).map(|(_, told)| told.discharge);
-        (score(usable.iter().zip(&self.told).map(|(&usable, told)| (usable, told.published_ah))), below)
+        let below = usable
+            .iter()
+            .zip(&self.reported)
+            .find(|(usable, _)| usable.mean < 1.4)
+            .map(|(_, reported)| reported.discharge);
+        (score(usable.iter().zip(&self.reported).map(|(&usable, reported)| (usable, reported.published_ah))), below)
     }
 
     fn ours(&self) -> (Score, Option<usize>) {
-        self.scored(&self.told.iter().map(|told| told.ours).collect::<Vec<_>>())
+        self.scored(&self.reported.iter().map(|reported| reported.ours).collect::<Vec<_>>())
     }
 }
 
@@ -222,7 +226,7 @@ fn print(life: &str, name: &str, source: &str, (score, below): (Score, Option<us
 
 /// Prints ours; its score.
 fn print_ours(name: &str, life: &Life) -> Score {
-    assert!(life.told.len() > 145, "{name}: {} discharges", life.told.len());
+    assert!(life.reported.len() > 145, "{name}: {} discharges", life.reported.len());
     let ours = life.ours();
     print(name, "packwatch", "-", ours);
     ours.0

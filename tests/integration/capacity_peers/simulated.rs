@@ -19,20 +19,20 @@ use super::{PEERS, Score, Source, follow, score};
 use crate::support::simulated_cell;
 
 const NEW_AH: f64 = 2.6;
-/// What the start is told to be good for, part of the new capacity: it is that much wrong.
+/// Standard deviation of the initial capacity, as a part of it: the start is that much wrong.
 const START_STD: f64 = 0.2;
 /// Half-cycles left out of the scores: two full cycles, as for every method the start still weighs in them.
 const SETTLING: usize = 4;
 
 /// A half-cycle's end.
-struct Told {
+struct CapacityReport {
     time_s: f64,
     true_ah: f64,
     ours: ScalarGaussian,
 }
 
 struct Life {
-    told: Vec<Told>,
+    reported: Vec<CapacityReport>,
     filter: Vec<(f64, Source)>,
     readings: Vec<Reading>,
 }
@@ -52,8 +52,8 @@ fn configuration(start: f64, held: bool) -> MonitorConfig {
 }
 
 fn live(config: &MonitorConfig, settings: Settings) -> Life {
-    let mut life = Life { told: Vec::new(), filter: Vec::new(), readings: Vec::new() };
-    // The truth of a minute ago: a half-cycle is told after its end, when the loss has come.
+    let mut life = Life { reported: Vec::new(), filter: Vec::new(), readings: Vec::new() };
+    // The truth of a minute ago: a half-cycle is reported after its end, when the loss has come.
     let mut past_ah = std::collections::VecDeque::from(vec![settings.pack.capacity_ah; 60]);
     simulated_cell::live(config.clone(), settings, |time, sim, monitor, events| {
         past_ah.push_back(sim.pack().cells()[0].capacity_ah);
@@ -86,7 +86,7 @@ impl Life {
             }
             EventKind::Capacity { capacity_ah, capacity_std_ah, .. } => {
                 let ours = ScalarGaussian::from_std(capacity_ah, capacity_std_ah);
-                self.told.push(Told { time_s, true_ah, ours });
+                self.reported.push(CapacityReport { time_s, true_ah, ours });
             }
             _ => {}
         }
@@ -99,7 +99,7 @@ impl Life {
         PEERS
             .iter()
             .map(|&(_, method, gamma)| {
-                let times_s = self.told.iter().map(|told| told.time_s);
+                let times_s = self.reported.iter().map(|reported| reported.time_s);
                 let health = &config.health.capacity;
                 self.scored(&follow(&config.model, health, (method, gamma), start, swings, times_s))
             })
@@ -108,15 +108,15 @@ impl Life {
 
     /// Errors relative to the truth, and the last.
     fn scored(&self, capacities: &[ScalarGaussian]) -> (Score, f64) {
-        let relative = |(belief, told): (&ScalarGaussian, &Told)| {
-            (ScalarGaussian::from_std(belief.mean / told.true_ah, belief.std() / told.true_ah), 1.0)
+        let relative = |(belief, reported): (&ScalarGaussian, &CapacityReport)| {
+            (ScalarGaussian::from_std(belief.mean / reported.true_ah, belief.std() / reported.true_ah), 1.0)
         };
-        let last = capacities[capacities.len() - 1].mean / self.told[self.told.len() - 1].true_ah - 1.0;
-        (score(capacities.iter().zip(&self.told).skip(SETTLING).map(relative)), last)
+        let last = capacities[capacities.len() - 1].mean / self.reported[self.reported.len() - 1].true_ah - 1.0;
+        (score(capacities.iter().zip(&self.reported).skip(SETTLING).map(relative)), last)
     }
 
     fn ours(&self) -> (Score, f64) {
-        self.scored(&self.told.iter().map(|told| told.ours).collect::<Vec<_>>())
+        self.scored(&self.reported.iter().map(|reported| reported.ours).collect::<Vec<_>>())
     }
 }
 
@@ -156,7 +156,7 @@ fn simulated_capacity_is_no_worse_than_that_of_any_least_squares_on_its_swings()
 fn compare(name: &str, start: f64, settings: Settings) {
     let config = configuration(start, false);
     let (life, held) = (live(&config, settings), live(&configuration(start, true), settings));
-    assert!(life.told.len() > 90 && life.filter.len() > 90, "{} told", life.told.len());
+    assert!(life.reported.len() > 90 && life.filter.len() > 90, "{} reported", life.reported.len());
     let weighed = weigh(&config.model, &config.health.capacity, Ends::Outer, &life.readings);
     assert!(weighed.len() > 90, "{} swings weighed", weighed.len());
     let voltage: Vec<_> = weighed.into_iter().map(|swing| (swing.start_s, Source::Voltage(swing))).collect();

@@ -1,4 +1,4 @@
-//! Swings as the voltage alone tells them: SOC at both ends by inversion of the open-circuit curve.
+//! Swings from the voltage alone: SOC at both ends by inversion of the open-circuit curve.
 //!
 //! V + I R0 rho + sum U is taken as the open-circuit voltage, with the branches' voltages stepped open loop from rest
 //! (from 180 s on where a record begins under load) and the resistance ratio rho that the filter has; all readings of
@@ -201,7 +201,7 @@ impl Circuit {
     fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
         let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
         let mut load_v = self.branch_v.iter().sum::<f64>();
-        // Resistances are those of the SOC the voltage tells; two passes settle it.
+        // Resistances are those at the SOC of the voltage; two passes settle it.
         let mut soc = 0.5;
         for _ in 0..3 {
             let r0_ohm = model.r0_ohm(&model.place(soc, temperature_c)) * resistance_ratio;

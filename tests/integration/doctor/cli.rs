@@ -51,7 +51,7 @@ fn a_finding_gives_status_1_with_the_line_as_it_is_and_as_it_should_be() {
 }
 
 #[test]
-fn a_name_that_is_not_in_the_dbc_is_told_and_the_rest_is_diagnosed() {
+fn a_name_that_is_not_in_the_dbc_is_reported_and_the_rest_is_diagnosed() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.config("PackStatus.Current\"", "PackStatus.Curent\"");
     broken.table("[input.cell_voltage]", "scale = 1000.0");

@@ -12,7 +12,7 @@ use bench::{Bench, Broken};
 use faults::{FAULTS, Fault};
 use packwatch::doctor::{Report, Severity, Topic};
 
-/// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs nobody has looked at yet.
+/// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
 fn first_seed() -> u64 {
     std::env::var("PACKWATCH_FIRST_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1)
 }
@@ -31,8 +31,9 @@ const HEALTHY: &[(Bench, u64)] = &[
 ];
 
 fn findings(report: &Report) -> Vec<String> {
-    let told = report.findings.iter().filter(|finding| finding.severity != Severity::Note);
-    told.map(|finding| format!("{:?} {:?} {} | {}", finding.severity, finding.topic, finding.title, finding.seen))
+    let reported = report.findings.iter().filter(|finding| finding.severity != Severity::Note);
+    reported
+        .map(|finding| format!("{:?} {:?} {} | {}", finding.severity, finding.topic, finding.title, finding.seen))
         .collect()
 }
 
@@ -56,7 +57,7 @@ fn nothing_is_found_on_healthy_packs() {
 }
 
 #[test]
-fn a_dead_last_module_is_not_told_as_a_smaller_pack_for_certain() {
+fn a_dead_last_module_is_not_reported_as_a_smaller_pack_for_certain() {
     let mut broken = Broken::of(Bench::Pack12, 1);
     broken.data("110", |data| {
         if data[0] > 2 {
@@ -70,7 +71,7 @@ fn a_dead_last_module_is_not_told_as_a_smaller_pack_for_certain() {
 }
 
 #[test]
-fn a_silent_interface_is_told_with_the_time_that_was_listened() {
+fn a_silent_interface_is_reported_with_the_listening_time() {
     let mut doctor = Broken::of(Bench::Pack12, 1).doctor();
     doctor.handle_listened(60.0);
     let report = doctor.finish();
@@ -85,7 +86,7 @@ struct Tally {
     first: usize,
     later: usize,
     missed: usize,
-    told: Vec<String>,
+    reported: Vec<String>,
 }
 
 fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
@@ -97,20 +98,20 @@ fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
         let mut changes = report.findings.iter().filter(|f| is_it(f.topic)).flat_map(|f| &f.changes);
         proposed.is_empty() || changes.any(|c| format!("{} = {}", c.key, c.proposed).contains(proposed))
     };
-    let told: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note).collect();
-    let is_first = told.first().is_some_and(|finding| is_it(finding.topic));
+    let reported: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note).collect();
+    let is_first = reported.first().is_some_and(|finding| is_it(finding.topic));
     if is_first && says(fault.proposed) {
         tally.first += 1;
         return;
     }
-    if told.iter().any(|finding| is_it(finding.topic)) {
+    if reported.iter().any(|finding| is_it(finding.topic)) {
         tally.later += 1;
     } else {
         tally.missed += 1;
     }
     let changes: Vec<_> =
         report.findings.iter().flat_map(|f| &f.changes).map(|c| format!("{}={}", c.key, c.proposed)).collect();
-    tally.told.push(format!("{} on {bench:?} {seed}: {:?} {changes:?}", fault.name, findings(&report)));
+    tally.reported.push(format!("{} on {bench:?} {seed}: {:?} {changes:?}", fault.name, findings(&report)));
 }
 
 #[test]
@@ -131,6 +132,6 @@ fn each_fault_made_on_purpose_is_found_first() {
         tally.later,
         tally.missed
     );
-    assert!(tally.told.is_empty(), "{}", tally.told.join("\n"));
+    assert!(tally.reported.is_empty(), "{}", tally.reported.join("\n"));
     assert!(all >= 200, "only {all} cases");
 }

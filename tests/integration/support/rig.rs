@@ -193,7 +193,7 @@ impl Rig {
         result
     }
 
-    /// The process ended `away` ago and starts again; the clock goes on by that, if it is known.
+    /// The process ended `away` ago and starts again; the clock advances by that, if it is known.
     pub(crate) fn restart(&mut self, away: Downtime) {
         let text = serde_json::to_string(&self.monitor.snapshot()).unwrap();
         let snapshot: Snapshot = serde_json::from_str(&text).unwrap();

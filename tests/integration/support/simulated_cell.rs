@@ -10,7 +10,7 @@ use packwatch::sim::{Simulation, Wiring};
 /// A hole in the record longer than this means that its recorder was asleep, s; there is none here.
 const SLEEP_GAP_S: f64 = 30.0;
 
-/// Runs `settings` to its end; after each moment `each` sees its time, the truth, the core, and what the core told.
+/// Runs `settings` to its end; after each moment `each` sees its time, the truth, the core, and the events of the core.
 pub(crate) fn live(
     config: MonitorConfig,
     settings: packwatch::sim::Settings,
