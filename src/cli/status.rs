@@ -1,5 +1,8 @@
 //! `packwatch status`: what the running daemon knows, as a table, as its own JSON, as metrics, or live on the screen.
 
+#[cfg(test)]
+#[path = "../host/status/sample.rs"]
+mod sample;
 mod table;
 mod view;
 

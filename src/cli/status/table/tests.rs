@@ -1,7 +1,7 @@
 //! The table of sample documents.
 
 use super::*;
-use crate::status::sample::sample;
+use crate::cli::status::sample::sample;
 
 #[test]
 fn a_short_pack_is_listed_whole_and_what_is_unknown_is_a_dash() {

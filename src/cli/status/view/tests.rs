@@ -9,9 +9,9 @@ use ratatui::style::Color;
 
 use super::app::{HISTORY, News, Page};
 use super::*;
-use crate::quantity::Timestamp;
 use crate::status::document::Document;
-use crate::status::sample::sample;
+use crate::cli::status::sample::sample;
+use crate::quantity::Timestamp;
 
 fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)
