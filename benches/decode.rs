@@ -1,11 +1,11 @@
 //! Time of one frame through [`InputMap::decode`], and of the frames of one set of values through [`InputEncoder`].
 
 use divan::{Bencher, black_box};
-use packwatch::can::dbc::Database;
-use packwatch::can::decode::{Binding, InputMap};
-use packwatch::can::encode::InputEncoder;
-use packwatch::can::{CanId, Frame};
-use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+use packwatch_host::can::dbc::Database;
+use packwatch_host::can::decode::{Binding, InputMap};
+use packwatch_host::can::encode::InputEncoder;
+use packwatch_host::can::{CanId, Frame};
+use packwatch_host::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 /// Cells of the shipped example pack, three on each of 32 pages.
 const CELLS: u16 = 96;
