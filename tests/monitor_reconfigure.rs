@@ -6,7 +6,7 @@ mod rig;
 use packwatch::alarm::{Change, Rule, Severity, State};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
-use packwatch::health::{Axis, Forecast, Usage, Reading};
+use packwatch::health::{Axis, Forecast, Usage, CapacityReading};
 use packwatch::monitor::{Downtime, Command, EventKind, Input, Monitor, MonitorConfig};
 use packwatch::quantity::CellIndex;
 use rig::{Rig, learned, load};
@@ -126,7 +126,7 @@ fn another_end_of_life_is_not_judged_by_what_remained_until_the_old_one() {
     for cycle in 0..60 {
         let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };
         let capacity_ah = 2.6 - 0.004 * f64::from(cycle);
-        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+        forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
     }
     let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     (0..2).for_each(|cell| stored["cells"][cell]["forecast"] = serde_json::to_value(&forecast).unwrap());

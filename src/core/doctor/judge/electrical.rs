@@ -79,7 +79,7 @@ fn scaled(judge: &Judge<'_>, slope: Slope) -> Slope {
 /// The model's resistance for a step of about a second and for one that has settled, ohm.
 fn model_ohm(judge: &Judge<'_>, model: &CellModel) -> (f64, f64) {
     let voltage_v = judge.cell_voltage().unwrap_or(f64::NAN) * judge.voltage_factor;
-    let place = model.place(model.soc_of_ocv(voltage_v, warmth_c(judge)).clamp(0.05, 0.95), warmth_c(judge));
+    let place = model.grid_position(model.soc_of_ocv(voltage_v, warmth_c(judge)).clamp(0.05, 0.95), warmth_c(judge));
     (model.r0_ohm(&place), model.settled_ohm(&place))
 }
 
@@ -266,15 +266,15 @@ fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &Run) -> f64 {
     let (_, settled) = model_ohm(judge, model);
     let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
     let moved = -cell_a * run.seconds / 3600.0 / judge.plan.capacity_ah;
-    let end = model.place((soc + moved).clamp(0.0, 1.0), temperature_c);
-    model.ocv_v(&end) - model.ocv_v(&model.place(soc, temperature_c))
+    let end = model.grid_position((soc + moved).clamp(0.0, 1.0), temperature_c);
+    model.ocv_v(&end) - model.ocv_v(&model.grid_position(soc, temperature_c))
 }
 
 /// Open-circuit voltage and its slope against the model's.
 fn model_fit(judge: &mut Judge<'_>, drift: Option<Drift>) {
     let Some(model) = &judge.plan.model else { return };
     let temperature_c = warmth_c(judge);
-    let ends = [0.0, 1.0].map(|soc| model.ocv_v(&model.place(soc, temperature_c)));
+    let ends = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
     let rests: Vec<f64> = judge.doctor.link.rests.iter().map(|rest| rest.end_v).collect();
     let highest = rests.iter().copied().fold(f64::NAN, f64::max);
     let lowest = rests.iter().copied().fold(f64::NAN, f64::min);
@@ -334,7 +334,7 @@ fn model_fit(judge: &mut Judge<'_>, drift: Option<Drift>) {
 }
 
 fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel) -> bool {
-    let half = model.ocv_v(&model.place(0.5, warmth_c(judge)));
+    let half = model.ocv_v(&model.grid_position(0.5, warmth_c(judge)));
     half > 3.5 && judge.cell_voltage().is_some_and(|v| (3.18..3.38).contains(&v))
 }
 
