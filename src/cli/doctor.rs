@@ -13,8 +13,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
-use crate::config::{self, Survey};
-use crate::diagnosis::{self, Interrupt};
+use crate::diagnosis::{self, Interrupt, Survey};
 use crate::replay::Progress;
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
@@ -63,7 +62,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let mut survey = config::survey(&args.config)?;
+    let mut survey = diagnosis::survey(&args.config)?;
     rename(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;

@@ -3,6 +3,8 @@
 //!
 //! Listening is passive: nothing is sent. Both loops end early when told to, with what was seen so far.
 
+mod survey;
+
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -11,7 +13,6 @@ use std::time::{Duration, Instant};
 use nix::errno::Errno;
 
 use crate::can::encode::{InputEncoder, InputProtector};
-use crate::config::Survey;
 use crate::doctor::{Doctor, Report};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
@@ -19,6 +20,8 @@ use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
 use crate::io::socket::{Tap, Tapped};
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::{BusIndex, Timestamp};
+
+pub use survey::{Survey, survey};
 
 /// How often the interfaces are read: a full bus brings 80 frames in that time, the kernel keeps thousands.
 const READ_PERIOD: Duration = Duration::from_millis(10);

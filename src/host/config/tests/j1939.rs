@@ -123,7 +123,7 @@ fn of_several_interfaces_one_must_be_named() {
 
 #[test]
 fn a_number_without_a_node_is_a_fault() {
-    let fault = "pack.toml:21: alarm[2].spn = 7000, must have a table [j1939], without it nothing is told on J1939";
+    let fault = "pack.toml:21: alarm[2].spn = 7000, must have a table [j1939], without it nothing is sent on J1939";
     assert_eq!(faults(&with("")), [fault]);
 }
 
