@@ -14,7 +14,7 @@ use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 use crate::diagnosis::{self, Interrupt, Survey};
-use crate::replay::Progress;
+use crate::replay::ReplayProgress;
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
 
@@ -123,7 +123,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     let bar = Bar::new(&args.logs);
     let result = diagnosis::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
-        bar.show(Progress { bytes: progress.bytes, frames: progress.frames, times_real_time });
+        bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });
     bar.clear();
     let (mut report, counts) = result.map_err(|error| Failure::new(error.to_string()))?;

@@ -30,7 +30,7 @@ use super::store::StateSetting;
 use crate::io::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
+use crate::io::socket::{Link, LinkConfig, LinkOutput, LinkMessage};
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
@@ -160,7 +160,7 @@ impl Service {
         Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
-    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
         let mut links = JoinSet::new();
         let mut outputs = Vec::new();
         for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {

@@ -96,7 +96,7 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
 }
 
 /// As [`load`], through `read`; faults are noted beside those of other files.
-pub fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
+pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
     let text = read_text(path, read, faults)?;
     let document = Document::parse(&path.display().to_string(), &text, faults);
     let mut reader = SchemaReader::new(&document, SECTIONS, faults);

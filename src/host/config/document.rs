@@ -15,13 +15,13 @@ const MAX_SYNTAX_FAULTS: usize = 10;
 
 /// Everything found wrong, in files of any kind.
 #[derive(Debug, Default)]
-pub struct Faults {
+pub(crate) struct Faults {
     list: Vec<(String, usize, String)>,
 }
 
 impl Faults {
     /// Notes `text` about line `line` of `file`; line 0 = the file as a whole.
-    pub fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
+    pub(crate) fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
         let fault = (file.to_owned(), line, text.into());
         if !self.list.contains(&fault) {
             self.list.push(fault);
@@ -29,17 +29,17 @@ impl Faults {
     }
 
     /// How many faults there are.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.list.len()
     }
 
     /// Whether nothing was found.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.list.is_empty()
     }
 
     /// One line each: the files in the order in which they first failed, each by line.
-    pub fn into_lines(self) -> Vec<String> {
+    pub(crate) fn into_lines(self) -> Vec<String> {
         let mut files: Vec<&str> = Vec::new();
         for (file, _, _) in &self.list {
             if !files.contains(&file.as_str()) {
@@ -153,7 +153,7 @@ struct KeyPlace {
 
 /// Where a table stands, so that a later check can still name file, line, key and found.
 #[derive(Debug, Clone, PartialEq)]
-pub struct TablePlace {
+pub(crate) struct TablePlace {
     /// File as people named it.
     pub file: String,
     /// `input.current`, `alarm[2]`; empty for the top of the file.
@@ -165,27 +165,27 @@ pub struct TablePlace {
 
 impl TablePlace {
     /// Full name of a key of this table.
-    pub fn key(&self, key: &str) -> String {
+    pub(crate) fn key(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
     /// Whether the key is written in the file.
-    pub fn has(&self, key: &str) -> bool {
+    pub(crate) fn has(&self, key: &str) -> bool {
         self.spots.contains_key(key)
     }
 
     /// The text of a key's value, cut to one short line.
-    pub fn found(&self, key: &str) -> Option<&str> {
+    pub(crate) fn found(&self, key: &str) -> Option<&str> {
         self.spots.get(key).map(|spot| spot.found.as_str())
     }
 
     /// Line of a key; of the table when the key is not written.
-    pub fn line_of(&self, key: &str) -> usize {
+    pub(crate) fn line_of(&self, key: &str) -> usize {
         self.spots.get(key).map_or(self.line, |spot| spot.line)
     }
 
     /// Notes `KEY = FOUND, WHAT`.
-    pub fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
+    pub(crate) fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
         let name = self.key(key);
         let text = match self.spots.get(key) {
             Some(spot) => format!("{name} = {}, {what}", spot.found),
@@ -195,7 +195,7 @@ impl TablePlace {
     }
 
     /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.
-    pub fn note(&self, faults: &mut Faults, key: &str, what: &str) {
+    pub(crate) fn note(&self, faults: &mut Faults, key: &str, what: &str) {
         faults.add(&self.file, self.line_of(key), format!("{}: {what}", self.key(key)));
     }
 }

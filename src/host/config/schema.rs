@@ -44,12 +44,12 @@ pub(crate) struct Key {
 
 impl Key {
     /// The range for people; empty when anything of the type goes.
-    pub fn range(&self) -> String {
+    pub(crate) fn range(&self) -> String {
         if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
     /// The allowed values with their type, as a fault says it.
-    pub fn must_be(&self) -> String {
+    pub(crate) fn must_be(&self) -> String {
         let range = self.range();
         if self.allowed == ValueRange::NotEmpty {
             return format!("must be {} that is not empty", self.kind);
@@ -238,7 +238,7 @@ macro_rules! tables {
 
         impl $name {
             /// Reads every table; faults of single keys and unknown keys are noted.
-            pub(crate) fn read(
+            pub(super) fn read(
                 document: &$crate::config::document::Document<'_>,
                 faults: &mut $crate::config::document::Faults,
             ) -> Self {
@@ -287,7 +287,7 @@ pub(crate) struct TableReader<'a> {
 
 impl TableReader<'_> {
     /// The value of `key`, its default, or `None` with a fault noted.
-    pub fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
+    pub(crate) fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);
         };

@@ -8,7 +8,7 @@ use toml::de::{DeInteger, DeValue};
 
 /// The range of a key's value; of each element when the value is a list.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ValueRange {
+pub(crate) enum ValueRange {
     /// Anything of the type (numbers must still be finite).
     Any,
     /// A number from the first to the second, both included.
@@ -46,7 +46,7 @@ impl fmt::Display for ValueRange {
 
 /// Why a value is refused, and where exactly.
 #[derive(Debug, Clone, PartialEq)]
-pub enum ValueFault {
+pub(crate) enum ValueFault {
     /// Not the key's type.
     Type(Range<usize>),
     /// The type, but not in the range.
@@ -54,7 +54,7 @@ pub enum ValueFault {
 }
 
 /// A type a key may have.
-pub trait Setting: Sized {
+pub(crate) trait Setting: Sized {
     /// The type in words.
     const KIND: &'static str;
     /// The words it may be, when it is a choice.

@@ -8,7 +8,7 @@ use crate::status::StatusServer;
 use crate::status::collect::{Before, Identity, Sources};
 use crate::status::counters::LoopCounters;
 use crate::status::document::ConfigFile;
-use crate::io::socket::{LinkOutput, Received, LinkEvent};
+use crate::io::socket::{LinkOutput, LinkMessage, LinkEvent};
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
 
@@ -34,7 +34,7 @@ impl StatusPublisher {
     }
 
     /// The frames among these have their estimates now.
-    pub(super) fn note_frames(&mut self, batch: &[Received], now: Timestamp) {
+    pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
         frames.for_each(|received| self.counters.latency.record(now.since(received.time)));
     }
