@@ -15,9 +15,9 @@ mod intake;
 mod rows;
 mod summary;
 
-use crate::io::event_log;
 use super::store::Recorder;
 use crate::can::Frame;
+use crate::io::event_log;
 use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
@@ -26,7 +26,7 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
 pub use clock::LogTime;
-use clock::{Pace, WindowPosition, RecordSpan, TimeWindow};
+use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};
 pub use in_order::in_order;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};

@@ -20,7 +20,7 @@ use serde::Serialize;
 pub use history::{History, HistoryError, Row};
 pub use truth::end_of_life;
 
-use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
+use crate::health::{Axis, Forecast, InsufficientData, Reading, RemainingLife, Usage};
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not decide a mean.
 pub const WORST_ERROR: f64 = 1.0;

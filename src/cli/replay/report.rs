@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::replay::{ReplayProgress, ProtectedSummary, ReplaySummary};
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
+use crate::replay::{ProtectedSummary, ReplayProgress, ReplaySummary};
 
 /// Alarms listed for people; JSON has more.
 const MAX_SHOWN_ALARMS: usize = 20;

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::document::{Document, Faults, TablePlace};
 use super::schema::Presence::{Default, Optional, Required};
-use super::schema::{Section as _, SectionInfo, SchemaReader, section};
+use super::schema::{SchemaReader, Section as _, SectionInfo, section};
 use super::setting::ValueRange::{Above, Between, NotEmpty};
 use super::{ConfigFaults, ReadFile, read_text};
 use crate::cell::{Branch, CellModel, MAX_BRANCHES, Table, Thermal};

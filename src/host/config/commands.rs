@@ -42,10 +42,7 @@ pub(super) fn commands(
     if let Some(interface) = raw.interfaces.get(bus.index()).filter(|interface| is_fd && !interface.fd) {
         keys.place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
     }
-    let check = CheckConfig {
-        max_delta_counter_init: keys.max_delta_counter,
-        ..CheckConfig::new(protection)
-    };
+    let check = CheckConfig { max_delta_counter_init: keys.max_delta_counter, ..CheckConfig::new(protection) };
     let guard = GuardConfig { bus, id: plan.id(), check, cycle_time_s: None };
     Some((CommandConfig { bus, plan }, guard))
 }

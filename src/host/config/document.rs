@@ -72,7 +72,8 @@ impl<'t> Document<'t> {
     /// Parses `text`. Syntax faults go to `faults`; the readable rest is kept and checked.
     pub(super) fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
         let (root, errors) = DeTable::parse_recoverable(text);
-        let document = Self { file: file.to_owned(), broken: !errors.is_empty(), source: text, root: root.into_inner() };
+        let document =
+            Self { file: file.to_owned(), broken: !errors.is_empty(), source: text, root: root.into_inner() };
         for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
             let line = error.span().map_or(0, |span| document.line(&span));
             faults.add(file, line, error.message().trim().replace('\n', ", "));

@@ -176,7 +176,13 @@ impl<'d> Search<'_, 'd> {
         }
     }
 
-    fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, (file, message, signal): SignalMatch<'d>) {
+    fn add(
+        &mut self,
+        channel: Channel,
+        source: &SignalSource<'_>,
+        sign: f64,
+        (file, message, signal): SignalMatch<'d>,
+    ) {
         let Some(bus) = self.raw.bus_of(source.interface) else {
             return; // an interface that is not there was noted by the cross checks
         };

@@ -59,7 +59,9 @@ impl Setting for When {
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         match value.get_ref() {
             DeValue::String(text) if text.as_ref() == "mean" => Ok(Self::Mean),
-            DeValue::Table(table) if table.len() == 1 => probability(table).ok_or_else(|| ValueFault::Type(value.span())),
+            DeValue::Table(table) if table.len() == 1 => {
+                probability(table).ok_or_else(|| ValueFault::Type(value.span()))
+            }
             _ => Err(ValueFault::Type(value.span())),
         }
     }

@@ -176,5 +176,7 @@ fn limits(config: &Config) -> [(f64, f64); 3] {
 fn outputs(config: &Config) -> Vec<OutputPlan> {
     let Some(output) = &config.monitor.output else { return Vec::new() };
     let named = output.plan.ids().into_iter().zip(["status", "health", "alarm"]);
-    named.map(|(id, name)| OutputPlan { buses: output.buses.clone(), id, name, table: format!("output.{name}") }).collect()
+    named
+        .map(|(id, name)| OutputPlan { buses: output.buses.clone(), id, name, table: format!("output.{name}") })
+        .collect()
 }

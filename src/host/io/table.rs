@@ -240,11 +240,14 @@ mod tests {
             faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.0));
             faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").0));
         }
-        assert_eq!(faults, [
-            "t.csv:2: column soc: found \"0.5\", must be a fraction",
-            "t.csv:4: column soc: found \"x\", must be a fraction",
-            "t.csv:4: column name: found no such field, must be a name",
-        ]);
+        assert_eq!(
+            faults,
+            [
+                "t.csv:2: column soc: found \"0.5\", must be a fraction",
+                "t.csv:4: column soc: found \"x\", must be a fraction",
+                "t.csv:4: column name: found no such field, must be a name",
+            ]
+        );
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Records of a log: [`Record`], an input that owns its frame, and [`Batch`], many of them at once.
 
 use crate::can::Frame;
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Content of an unused slot.
