@@ -25,13 +25,19 @@
 //! A reading beyond the gate leaves the state unchanged. After every reading has been beyond it for `lost_after_s`, the
 //! filter restarts: SOC and branches from the voltage, resistance and capacity are kept.
 
+use downtime::update_after_downtime;
 use nalgebra::{SMatrix, SVector};
+use noise::VoltageReading;
 use serde::{Deserialize, Serialize};
 
 use super::circuit::{self, BranchAt};
 use super::config::{CapacityState, EstimatorConfig};
 use super::model::{CellModel, MAX_BRANCHES};
+
 use crate::filter::{FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
+
+pub use bank::EstimatorBank;
+pub use state::CellState;
 
 /// Variance of a known value: small against any noise, large against rounding.
 const KNOWN_VARIANCE: f64 = 1e-12;
@@ -146,12 +152,6 @@ mod bank;
 mod downtime;
 mod noise;
 mod state;
-
-pub use bank::EstimatorBank;
-pub use state::CellState;
-
-use downtime::update_after_downtime;
-use noise::VoltageReading;
 
 impl CellEstimator {
     /// An estimator before its first measurement.

@@ -5,6 +5,7 @@
 //! goes in as the shared part of the deviation.
 
 use super::{CellSlot, Event, EventKind, Monitor, MonitorConfig, Outputs};
+
 use crate::alarm::{Observation, Rule};
 use crate::health::{
     Axis, CapacityReading, CapacityUpdate, Forecast, HalfCycle, InsufficientData, Remaining, RemainingLife, Usage,

@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 
 use super::data::{Data, Learned};
 use super::{Setting, pictures};
+
 use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 

@@ -22,6 +22,7 @@ use nalgebra::{SMatrix, SVector};
 use tables::{LineCache, Tables};
 
 use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, StepResult, thermal_c, widened};
+
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, MAX_BRANCHES};
 use crate::filter::simd::Lanes;

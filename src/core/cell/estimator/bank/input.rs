@@ -5,6 +5,7 @@
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
 use super::{CellSlot, WIDTH};
+
 use crate::cell::{CellStep, StepResult};
 use crate::filter::Update;
 use crate::filter::simd::{Lanes, Mask};
