@@ -9,8 +9,8 @@ use super::Failure;
 use super::fleet::LogArgs;
 use super::score::write_table;
 use crate::config::{self, Config};
-use crate::lab::fleet::Reading;
-use crate::lab::fleet::export::{self, Exported, Format, Settings};
+use crate::lab::fleet::LogAccess;
+use crate::lab::fleet::export::{self, ExportResult, TableFormat, ExportSettings};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
@@ -29,8 +29,8 @@ enum FormatName {
 #[command(
     after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json per log. All logs of a fleet in one \
                   query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Tables that are there already are \
-                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others go on; the exit code is then 1. The \
-                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv beside it."
+                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others continue; the exit code is then 1. The \
+                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv next to it."
 )]
 pub(crate) struct Args {
     /// Print the columns with their types and units as Markdown, and do nothing else
@@ -42,10 +42,10 @@ pub(crate) struct Args {
     /// Form of the tables
     #[arg(long, value_enum, default_value = "parquet")]
     format: FormatName,
-    /// Folder for the logs' folders; made when it is not there
+    /// Folder for the logs' folders; created when it does not exist
     #[arg(short, long, value_name = "DIR", required_unless_present = "columns_page")]
     out: Option<PathBuf>,
-    /// At most one estimate per cell in so many seconds, the first; 0 = every one
+    /// Period in which at most one estimate per cell is exported, the first; 0 = every estimate
     #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = period)]
     period: f64,
     /// Print one JSON document
@@ -66,11 +66,11 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let config = config::load(config)?;
     let open = |config: &Config, log: &Path| args.logs.open(config, log);
-    let settings = Settings {
-        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
+    let settings = ExportSettings {
+        access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         format: match args.format {
-            FormatName::Parquet => Format::Parquet,
-            FormatName::Csv => Format::Csv,
+            FormatName::Parquet => TableFormat::Parquet,
+            FormatName::Csv => TableFormat::Csv,
         },
         out: out.clone(),
         period_s: args.period,
@@ -80,13 +80,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.advance(bytes));
     bar.clear();
     let (good, failed): (Vec<_>, Vec<_>) = results.map_err(Failure::new)?.into_iter().partition(Result::is_ok);
-    let good: Vec<Exported> = good.into_iter().flatten().collect();
+    let good: Vec<ExportResult> = good.into_iter().flatten().collect();
     let failed: Vec<String> = failed.into_iter().filter_map(Result::err).collect();
     quiet(if args.json { json(&good, &failed) } else { table(&good) })?;
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }
 
-/// The reader of our output may have seen enough: no failure.
+/// Maps a write error; a closed output is no failure.
 fn quiet(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
@@ -94,17 +94,17 @@ fn quiet(written: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-fn json(good: &[Exported], failed: &[String]) -> io::Result<()> {
+fn json(good: &[ExportResult], failed: &[String]) -> io::Result<()> {
     let mut out = io::stdout().lock();
     serde_json::to_writer_pretty(&mut out, &json!({ "version": VERSION, "logs": good, "failed": failed }))?;
     writeln!(out)
 }
 
-fn table(good: &[Exported]) -> io::Result<()> {
+fn table(good: &[ExportResult]) -> io::Result<()> {
     if good.is_empty() {
         return Ok(());
     }
-    let row = |exported: &Exported| {
+    let row = |exported: &ExportResult| {
         let rows = |table: &str| exported.rows.get(table).copied().unwrap_or(0).to_string();
         vec![
             exported.log.display().to_string(),

@@ -1,6 +1,6 @@
 //! `packwatch fit`: measured data to a cell model.
 //!
-//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is whole.
+//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is complete.
 
 mod report;
 
@@ -11,7 +11,7 @@ use std::time::Instant;
 use super::Failure;
 use crate::cell::MAX_BRANCHES;
 use crate::io::result_file::ResultFile;
-use crate::lab::fit::{self, Request};
+use crate::lab::fit::{self, FitRequest};
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
@@ -23,17 +23,17 @@ pub(crate) struct Args {
     /// Cell model to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// What people call the cell
+    /// Name of the cell for display
     #[arg(long)]
     name: String,
-    /// Capacity SOC divides by, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
+    /// Capacity that defines SOC, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
     #[arg(long, value_name = "AH", value_parser = positive)]
     capacity: Option<f64>,
     /// Capacity on the label, Ah [default: the capacity]
     #[arg(long, value_name = "AH", value_parser = positive)]
     rated: Option<f64>,
     /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
-    /// of a new cell tells it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
+    /// of a new cell determines it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: from the data]
@@ -120,8 +120,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     shown.map_err(|error| Failure::new(format!("standard output: {error}")))
 }
 
-fn request(args: &Args) -> Request {
-    Request {
+fn request(args: &Args) -> FitRequest {
+    FitRequest {
         name: args.name.clone(),
         capacity_ah: args.capacity,
         rated_ah: args.rated,

@@ -1,4 +1,4 @@
-//! What the commands over many logs have in common: the logs, how they are read, progress.
+//! Arguments shared by the commands over many logs: the logs, how to read them, progress.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use super::Failure;
 use super::replay::{InputArgs, log_options};
 use crate::config::Config;
 use crate::io::log::LogSource;
-use crate::lab::fleet::{Opened, truth};
+use crate::lab::fleet::{OpenedLog, truth};
 
 /// The logs and how they are read.
 #[derive(Debug, clap::Args)]
@@ -25,7 +25,7 @@ pub(crate) struct LogArgs {
 }
 
 impl LogArgs {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         for (index, log) in self.logs.iter().enumerate() {
             if self.logs[..index].contains(log) {
@@ -35,7 +35,7 @@ impl LogArgs {
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
             return Err(Failure::new(format!(
-                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv beside each serves as well"
+                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv next to each log works as well"
             )));
         }
         if self.logs.len() > 1 && self.is_stdin() {
@@ -45,15 +45,15 @@ impl LogArgs {
     }
 
     /// Opens a log as it is read with a configuration.
-    pub(crate) fn open(&self, config: &Config, log: &Path) -> Opened {
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> OpenedLog {
         let mut options = log_options(&self.input, config);
-        let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
-        let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));
-        options.csv.start_times = options.csv.start_times.or(beside);
+        let found = if options.csv.start_times.is_none() { truth::cycles_next_to(log) } else { None };
+        let note = found.as_ref().map(|table| format!("dated by {}", table.display()));
+        options.csv.start_times = options.csv.start_times.or(found);
         (LogSource::new([log.to_owned()], options), note)
     }
 
-    /// A hole longer than this means that the recorder was asleep, s.
+    /// A gap longer than this means that the recorder was asleep, s.
     pub(crate) fn sleep_gap_s(&self) -> f64 {
         self.input.sleep_gap
     }
@@ -63,7 +63,7 @@ impl LogArgs {
         self.logs.iter().any(|log| log == Path::new("-"))
     }
 
-    /// Threads asked for.
+    /// Number of threads; `None` = one per core.
     pub(crate) fn threads(&self) -> Option<usize> {
         self.jobs.map(usize::from)
     }
@@ -84,12 +84,12 @@ impl LogArgs {
 pub(crate) struct Bar(ProgressBar);
 
 impl Bar {
-    /// More bytes were read.
+    /// Adds bytes read.
     pub(crate) fn advance(&self, bytes: u64) {
         self.0.inc(bytes);
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
-use crate::lab::gpr::{self, PartColumn, Table, Trained, Wanted};
+use crate::lab::gpr::{self, PartColumn, Table, TrainedModel, ColumnSelection};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs, whole};
 
@@ -17,18 +17,18 @@ use args::{FileArgs, ModelArgs, whole};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: What,
+    what: GprCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
-    /// Predict every row from a model that has not seen it, and tell how good that is
+enum GprCommand {
+    /// Predict every row from a model fitted without it, and report the errors
     Cv(Box<CvArgs>),
     /// Fit a model to all rows and save it
     Train(Box<TrainArgs>),
     /// Predict rows with a saved model
     Predict(PredictArgs),
-    /// Predict rows to come from rows that were, without inputs of the future
+    /// Forecast future rows from past rows, without inputs of the future
     Forecast(Box<forecast::ForecastArgs>),
 }
 
@@ -94,7 +94,7 @@ struct PredictArgs {
     #[command(flatten)]
     files: FileArgs,
     /// Where to: CSV with file, line, inputs, the output where it is known, its mean, standard deviation and the ends of its
-    /// 95 % interval; - is standard output (what is told then goes to standard error)
+    /// 95 % interval; - is standard output (the summary then goes to standard error)
     #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
     out: PathBuf,
     /// Threads [default: one per core]
@@ -105,7 +105,7 @@ struct PredictArgs {
     json: bool,
 }
 
-/// What is predicted, and from what.
+/// The predicted column and its inputs.
 #[derive(Debug, clap::Args)]
 struct ColumnArgs {
     /// Column that is predicted, by its name, or without its unit: voltage finds voltage_v
@@ -120,17 +120,17 @@ impl ColumnArgs {
     /// Inputs, then the output.
     fn table(&self, files: &FileArgs) -> Result<Table, Failure> {
         let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
-        let wanted = Wanted { columns: &columns, optional: &[], missing: files.missing() };
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing: files.missing() };
         read(&files.files, &wanted, &PartColumn::None)
     }
 }
 
-/// Reads files; a column named twice would be known exactly, so it is refused.
-fn read(files: &[PathBuf], wanted: &Wanted<'_>, part: &PartColumn) -> Result<Table, Failure> {
+/// Reads files; rejects a column named twice, which would predict itself.
+fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Table, Failure> {
     let table = Table::read(files, wanted, part).map_err(failure)?;
     let names = &table.names[..wanted.columns.len()];
     if let Some((_, twice)) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
-        return Err(Failure::new(format!("column {twice} is asked for twice, must be an input or an output, once")));
+        return Err(Failure::new(format!("column {twice} is named twice, must be an input or an output, once")));
     }
     Ok(table)
 }
@@ -142,21 +142,21 @@ fn failure(error: impl std::fmt::Display) -> Failure {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
-        What::Cv(args) => cv(args),
-        What::Train(args) => train(args),
-        What::Predict(args) => predict(args),
-        What::Forecast(args) => forecast::run(args),
+        GprCommand::Cv(args) => cv(args),
+        GprCommand::Train(args) => train(args),
+        GprCommand::Predict(args) => predict(args),
+        GprCommand::Forecast(args) => forecast::run(args),
     }
 }
 
 fn make_folder(folder: Option<&Path>) -> Result<(), Failure> {
     let made = folder.map_or(Ok(()), std::fs::create_dir_all);
     made.map_err(|error| {
-        Failure::new(format!("{}: cannot be made: {error}", folder.unwrap_or(Path::new("")).display()))
+        Failure::new(format!("{}: cannot be created: {error}", folder.unwrap_or(Path::new("")).display()))
     })
 }
 
-/// The reader of our output may have seen enough: no failure.
+/// Maps a write error; a closed output is no failure.
 fn quiet(written: io::Result<()>) -> Result<(), Failure> {
     match written {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
@@ -202,7 +202,7 @@ fn train(args: &TrainArgs) -> Result<(), Failure> {
     let settings = args.model.settings(&args.kernel, table.len());
     let bar = report::Bar::new(1);
     let mut watcher = |progress| bar.show(&args.kernel.to_string(), 0, progress);
-    let trained = Trained::fit(&table, &settings, &mut watcher).map_err(failure)?;
+    let trained = TrainedModel::fit(&table, &settings, &mut watcher).map_err(failure)?;
     bar.clear();
     let seconds = begin.elapsed().as_secs_f64();
     trained.save(&args.out).map_err(failure)?;
@@ -216,13 +216,13 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
         return Err(Failure::new("--json: needs --out FILE.csv, for both would be written to standard output"));
     }
     args.files.check_result(&args.out)?;
-    let trained = Trained::load(&args.model, args::threads(args.threads)).map_err(failure)?;
+    let trained = TrainedModel::load(&args.model, args::threads(args.threads)).map_err(failure)?;
     let output = [trained.output.clone()];
-    let wanted = Wanted { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
+    let wanted = ColumnSelection { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
     let table = Table::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
-        // The reader of our output has seen enough: no failure.
+        // The reader of the output has closed it: no failure.
         Err(error) if to_stdout && error.0.contains("Broken pipe") => return Ok(()),
         written => written.map_err(failure)?,
     }

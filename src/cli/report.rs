@@ -1,4 +1,4 @@
-//! `packwatch report`: a page that shows how a battery is and was, from a store's history or from a replay.
+//! `packwatch report`: a page on the condition and history of a battery, from a store's history or from a replay.
 
 use std::cell::RefCell;
 use std::fs;
@@ -13,7 +13,7 @@ use crate::replay::{self, Settings, Sinks, Summary, Watch};
 use crate::store::Reader;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
-use crate::lab::report::{self, Data, Origin, Setting};
+use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
 
 /// Arguments of `report`.
@@ -34,7 +34,7 @@ pub(crate) struct Args {
     /// Write every picture as SVG and PNG into this folder as well
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Truth to show beside the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
+    /// Truth to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
     /// or both, and time_s (s), start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data; with a column
     /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
     #[arg(long, value_name = "TABLE.csv")]
@@ -60,7 +60,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut provenance = provenance;
     provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
     provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
-    let setting = Setting {
+    let setting = PageContext {
         title: args.title(),
         config: config.as_ref(),
         config_text: config_text.map_err(|error| Failure::new(error.to_string()))?,
@@ -68,18 +68,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         provenance,
     };
     match write(&args.out, &report::page(&data, &setting)) {
-        // The reader of our output has seen enough: no failure.
+        // The reader of the output has closed it: no failure.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
         written => written.map_err(|error| Failure::new(error.to_string()))?,
     }
     let Some(folder) = &args.plots else { return Ok(()) };
     fs::create_dir_all(folder)
-        .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
+        .map_err(|error| Failure::new(format!("{}: cannot be created: {error}", folder.display())))?;
     report::write_plots(folder, &data, &setting).map(drop).map_err(|error| Failure::new(error.to_string()))
 }
 
 impl Args {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
         let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
         check_place(&self.out, inputs).map_err(Failure::new)
@@ -99,7 +99,7 @@ fn write(path: &Path, page: &str) -> io::Result<()> {
     file.finish()
 }
 
-/// Lines of the provenance: what, and which.
+/// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {

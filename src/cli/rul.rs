@@ -6,9 +6,9 @@ use std::path::PathBuf;
 
 use super::Failure;
 use super::score::names;
-use crate::lab::rul::{self, Now, Scored, Threshold};
+use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
 
-/// Parts of the life asked for at most: one per per cent.
+/// Most parts of the life: one per per cent.
 const MAX_PARTS: usize = 99;
 
 /// Arguments of `rul`.
@@ -16,8 +16,8 @@ const MAX_PARTS: usize = 99;
 #[command(
     after_help = "A file with a type column counts its discharges as full cycles; without one its days count, and any of \
                   them may have been rest. The end of life is where the non-increasing line of least squares through all \
-                  capacities passes the threshold: capacity that comes back after a rest and goes again neither delays nor \
-                  hastens it. Forecasts at parts of the life see nothing of what comes after."
+                  capacities passes the threshold: a passing recovery after a rest neither delays nor hastens it. Forecasts at \
+                  parts of the life use no later reading."
 )]
 pub(crate) struct Args {
     /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, rising), capacity_ah or
@@ -47,21 +47,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("{}: named twice, again as number {}", file.display(), index + 1)));
     }
     let shown = if args.at.is_empty() {
-        let forecasts: Vec<Now> = each(args, rul::now)?;
+        let forecasts: Vec<CurrentForecast> = each(args, rul::now)?;
         if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
     } else {
         let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);
-        let scored: Vec<Scored> = each(args, score)?;
+        let scored: Vec<HistoryScore> = each(args, score)?;
         if args.json { report::scored_json(&scored, args.alpha) } else { report::scored_table(&scored, args.alpha) }
     };
     match shown {
-        // The reader of our output has seen enough: no failure.
+        // The reader of the output has closed it: no failure.
         Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
         written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
     }
 }
 
-/// Every file with every threshold, in the order given.
+/// Runs `work` for every file with every threshold, in the order given.
 fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
     let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
     for (path, name) in args.files.iter().zip(names(&args.files)) {

@@ -1,8 +1,7 @@
-//! Work over many logs at once: what other settings would have done ([`whatif`]), and tables of what came out
-//! ([`export`]).
+//! Work over many logs at once: alarms under other settings ([`whatif`]), and tables of the results ([`export`]).
 //!
 //! In: a configuration and logs of any form `replay` reads. Each log is replayed by itself, the logs on all cores; a log
-//! that fails is told and the others go on. Memory is bounded by what is kept per log, not by its length.
+//! that fails is reported and the others continue. Memory is bounded by the results per log, not by its length.
 
 pub mod drive;
 pub mod export;
@@ -13,7 +12,7 @@ pub mod truth;
 pub mod variants;
 pub mod whatif;
 
-pub use drive::{Opened, Reading};
+pub use drive::{OpenedLog, LogAccess};
 
 use rayon::prelude::*;
 

@@ -1,6 +1,6 @@
 //! Gaussian process regression on files: tables in, cross-validation, trained models, predictions, forecasts, pictures.
 //!
-//! [`Table`] reads columns of CSV files; [`cross_validate`] makes the paper's experiment; [`Trained`] is a model with the
+//! [`Table`] reads columns of CSV files; [`cross_validate`] makes the paper's experiment; [`TrainedModel`] is a model with the
 //! names of its columns, saved and loaded; [`forecast`] predicts rows to come from rows that were, without inputs of the
 //! future. The arithmetic is [`crate::regress`]. Nothing here prints.
 
@@ -14,8 +14,8 @@ use std::path::Path;
 use std::time::Instant;
 
 pub use pictures::{write_cross_validation, write_forecast};
-pub use table::{Missing, PartColumn, Table, Wanted};
-pub use trained::{Trained, write_predictions};
+pub use table::{MissingPolicy, PartColumn, Table, ColumnSelection};
+pub use trained::{TrainedModel, write_predictions};
 
 use crate::io::result_file::ResultFile;
 use crate::regress::{self, Folds, Rows, Score, Settings, Watcher};
@@ -39,7 +39,7 @@ impl From<csv::Error> for GprError {
 
 /// Cross-validation of one kernel.
 #[derive(Debug, Clone)]
-pub struct Validated {
+pub struct CrossValidation {
     /// The kernel, as text.
     pub kernel: String,
     /// Predictions of all rows, and the folds.
@@ -62,28 +62,28 @@ pub fn split(table: &Table) -> (Vec<f64>, Vec<f64>) {
 /// Cross-validates one kernel on a table whose last column is the output.
 ///
 /// # Errors
-/// Too few rows for the folds, settings out of range, or the watcher gave up.
+/// Too few rows for the folds, settings out of range, or the watcher stopped it.
 pub fn cross_validate(
     table: &Table,
     settings: &Settings,
     folds: usize,
     watcher: &mut Watcher<'_>,
-) -> Result<Validated, GprError> {
+) -> Result<CrossValidation, GprError> {
     let (inputs, targets) = split(table);
     let rows = Rows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
-    forget_peak();
+    reset_peak();
     let begin = Instant::now();
     let folds = regress::cross_validate(&rows, settings, folds, &|| begin.elapsed().as_secs_f64(), watcher)?;
     let score = regress::score(&folds.predictions, &targets);
     let seconds = begin.elapsed().as_secs_f64();
-    Ok(Validated { kernel: settings.kernel.to_string(), folds, score, seconds, peak_kib: peak_kib() })
+    Ok(CrossValidation { kernel: settings.kernel.to_string(), folds, score, seconds, peak_kib: peak_kib() })
 }
 
-/// Writes what the cross-validation predicted for every row, by kernel.
+/// Writes the cross-validation's prediction of every row, by kernel.
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_validated(path: &Path, table: &Table, all: &[Validated]) -> Result<(), GprError> {
+pub fn write_validated(path: &Path, table: &Table, all: &[CrossValidation]) -> Result<(), GprError> {
     let output = &table.names[table.width() - 1];
     let mut out = csv::Writer::from_writer(create(path)?);
     let own = ["kernel", "file", "line", "fold"].map(str::to_owned);
@@ -111,16 +111,16 @@ fn finish(out: csv::Writer<ResultFile>) -> Result<(), GprError> {
     file.finish().map_err(|error| GprError(error.to_string()))
 }
 
-/// Writes a text as a whole or not at all.
+/// Writes a text completely or not at all.
 fn write_text(path: &Path, text: &str) -> Result<(), GprError> {
     let mut file = create(path)?;
     file.write_all(text.as_bytes()).map_err(|error| GprError(error.to_string()))?;
     file.finish().map_err(|error| GprError(error.to_string()))
 }
 
-/// Sets the kernel's note of the most memory held back to what is held now, so that the next peak is its own. Where that
-/// cannot be done the peaks are those since the start of the process: still true as a bound.
-fn forget_peak() {
+/// Resets the kernel's record of the peak memory, so that the next peak belongs to the next kernel. Where that fails, peaks
+/// count from the start of the process and are still upper bounds.
+fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
 }
 

@@ -1,4 +1,4 @@
-//! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours, as cyclers write them.
+//! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours from a cycler.
 //!
 //! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and where they exist `temperature_c`,
 //! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`) at each
@@ -14,10 +14,10 @@ const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
 /// A stretch of rows over which time runs on.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Part {
+pub struct MeasuredPart {
     /// Its key in the part column; empty where there is none.
     pub key: String,
-    /// What the `type` column says in its first row: `charge`, `discharge`; empty where there is none.
+    /// Value of the `type` column in its first row: `charge`, `discharge`; empty where there is none.
     pub kind: String,
     /// Seconds since the part's own beginning.
     pub time_s: Vec<f64>,
@@ -31,7 +31,7 @@ pub struct Part {
     pub discharged_ah: Vec<f64>,
 }
 
-impl Part {
+impl MeasuredPart {
     /// Rows.
     pub fn len(&self) -> usize {
         self.time_s.len()
@@ -49,7 +49,7 @@ pub struct MeasuredFile {
     /// Where it was read from.
     pub path: PathBuf,
     /// Its parts in the file's order; one where there is no part column.
-    pub parts: Vec<Part>,
+    pub parts: Vec<MeasuredPart>,
 }
 
 /// Why a measured file cannot be used.
@@ -80,7 +80,7 @@ impl MeasuredFile {
         let fail = |e: csv::Error| MeasuredError(format!("{name}: {e}"));
         let headers = reader.headers().map_err(fail)?.clone();
         let columns = Columns::find(&headers).map_err(|what| MeasuredError(format!("{name}:1: {what}")))?;
-        let mut parts: Vec<Part> = Vec::new();
+        let mut parts: Vec<MeasuredPart> = Vec::new();
         let mut record = csv::ByteRecord::new();
         while reader.read_byte_record(&mut record).map_err(fail)? {
             let line = record.position().map_or(0, csv::Position::line);
@@ -101,7 +101,7 @@ impl MeasuredFile {
 
     /// Rows of all parts.
     pub fn rows(&self) -> usize {
-        self.parts.iter().map(Part::len).sum()
+        self.parts.iter().map(MeasuredPart::len).sum()
     }
 }
 
@@ -128,7 +128,7 @@ fn take_row(
     columns: &Columns,
     headers: &csv::StringRecord,
     record: &csv::ByteRecord,
-    parts: &mut Vec<Part>,
+    parts: &mut Vec<MeasuredPart>,
 ) -> Result<(), String> {
     let text = |column: usize| record.get(column).map_or_else(Default::default, String::from_utf8_lossy);
     let number = |column: usize| match record.get(column) {
@@ -149,7 +149,7 @@ fn take_row(
     }
     if parts.last().is_none_or(|part| part.key != key) {
         let kind = columns.kind.map_or_else(Default::default, text).into_owned();
-        parts.push(Part { key: key.into_owned(), kind, ..Part::default() });
+        parts.push(MeasuredPart { key: key.into_owned(), kind, ..MeasuredPart::default() });
     }
     let Some(part) = parts.last_mut() else { return Ok(()) };
     let values = (number(columns.current)?, number(columns.voltage)?);

@@ -1,4 +1,4 @@
-//! What `fit` shows: progress on the terminal, the table of residuals, JSON.
+//! Output of `fit`: progress on the terminal, the table of residuals, JSON.
 
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -6,9 +6,9 @@ use std::path::Path;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::ident::fit::Residual;
-use crate::lab::fit::{Outcome, Progress};
+use crate::lab::fit::{FitOutcome, FitProgress};
 
-/// Live line on the terminal; nothing where standard error is none.
+/// Live line on the terminal; nothing where standard error is no terminal.
 pub(super) struct Bar(ProgressBar);
 
 impl Bar {
@@ -20,10 +20,10 @@ impl Bar {
         Self(bar)
     }
 
-    pub(super) fn show(&self, progress: Progress) {
+    pub(super) fn show(&self, progress: FitProgress) {
         self.0.set_message(match progress {
-            Progress::Read(done, all) => format!("read {done} of {all} files"),
-            Progress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
+            FitProgress::Read(done, all) => format!("read {done} of {all} files"),
+            FitProgress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
         });
         self.0.tick();
     }
@@ -33,8 +33,8 @@ impl Bar {
     }
 }
 
-/// Residuals per file, notes, and how the fit went.
-pub(super) fn table(outcome: &Outcome, seconds: f64, path: &Path) -> io::Result<()> {
+/// Prints residuals per file, notes, and the end of the fit.
+pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Result<()> {
     let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
     let width = names.iter().map(String::len).max().unwrap_or(0).max(5);
     let mut out = io::stdout().lock();
@@ -57,8 +57,8 @@ pub(super) fn table(outcome: &Outcome, seconds: f64, path: &Path) -> io::Result<
     writeln!(out, "{ended} after {} passes, {seconds:.1} s; written to {}", fit.passes, path.display())
 }
 
-/// The same for programs.
-pub(super) fn json(outcome: &Outcome, seconds: f64) -> io::Result<()> {
+/// Prints the outcome as JSON.
+pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
     let of_file = |file: &crate::lab::fit::FileResidual| {
         let r = &file.residual;
         serde_json::json!({

@@ -1,4 +1,4 @@
-//! `packwatch gpr forecast`: rows to come from rows that were.
+//! `packwatch gpr forecast`: forecasts future rows from past rows.
 
 use std::io::{self, Write};
 use std::ops::ControlFlow;
@@ -11,8 +11,8 @@ use super::super::Failure;
 use super::super::score::write_table;
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
 use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
-use super::{PartColumn, Table, Wanted, failure, make_folder, quiet, read};
-use crate::lab::gpr::forecast::{self, Forecast, Horizon, MAX_LAGS, MAX_STEPS, OutputForecast, Plan, Steps, horizons};
+use super::{PartColumn, Table, ColumnSelection, failure, make_folder, quiet, read};
+use crate::lab::gpr::forecast::{self, TableForecast, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, ForecastPlan, RowSpacing, horizons};
 use crate::lab::gpr::{self, peak_kib};
 use crate::regress::Kernel;
 
@@ -25,22 +25,22 @@ pub(super) struct ForecastArgs {
     /// Columns that are forecast
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
     outputs: Vec<String>,
-    /// Further columns whose past is looked at; their future is not needed
+    /// Further columns whose past is used; their future is not needed
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',')]
     inputs: Vec<String>,
-    /// Values of each column that a forecast looks at: the one at the origin and those before it
+    /// Values of each column that a forecast uses: the one at the origin and those before it
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<1, MAX_LAGS>)]
     lags: usize,
     /// Rows ahead: forecasts of 1 to N rows, of more than 10 for 10 of them, spread evenly in ratio
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = whole::<1, MAX_STEPS>)]
     steps: usize,
-    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast what nobody knows
+    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast the unknown future
     #[arg(long, value_name = "PERCENT", default_value_t = 70.0, value_parser = percent)]
     origin: f64,
     /// Take every N-th row only (of each part)
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole::<1, 1_000_000>)]
     every: usize,
-    /// Column at whose values rows do not belong together any more; none = there is no such column [default: cycle, segment
+    /// Column whose value separates parts that do not belong together; none = there is no such column [default: cycle, segment
     /// or ref where there is one]
     #[arg(long, value_name = "COLUMN")]
     part: Option<String>,
@@ -68,12 +68,12 @@ fn percent(text: &str) -> Result<f64, String> {
     number.ok_or_else(|| "must be per cent above 0, at most 100".to_owned())
 }
 
-/// What was asked and what came of it.
-struct Shown<'a> {
+/// A forecast with its plan.
+struct ForecastReport<'a> {
     table: &'a Table,
-    plan: &'a Plan,
-    forecast: &'a Forecast,
-    steps: Option<Steps>,
+    plan: &'a ForecastPlan,
+    forecast: &'a TableForecast,
+    steps: Option<RowSpacing>,
     seconds: f64,
 }
 
@@ -85,7 +85,7 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let table = args.table()?;
     let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
     let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);
-    let plan = Plan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
+    let plan = ForecastPlan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
     let bar = Bar::new(outputs * horizons(args.steps).len());
     let mut done = |fits, _| bar.done(fits, "forecasts");
     let made = forecast::run(&table, &plan, &mut |_| ControlFlow::Continue(()), &mut done);
@@ -97,9 +97,9 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     if let Some(folder) = &args.plots {
         gpr::write_forecast(folder, &table, &made).map_err(failure)?;
     }
-    let steps = if table.has[0] { Steps::of(&table, table.width() - 1) } else { None };
+    let steps = if table.has[0] { RowSpacing::of(&table, table.width() - 1) } else { None };
     let seconds = begin.elapsed().as_secs_f64();
-    let shown = Shown { table: &table, plan: &plan, forecast: &made, steps, seconds };
+    let shown = ForecastReport { table: &table, plan: &plan, forecast: &made, steps, seconds };
     quiet(if args.json { shown.json() } else { shown.table() })
 }
 
@@ -108,7 +108,7 @@ impl ForecastArgs {
     fn table(&self) -> Result<Table, Failure> {
         let columns: Vec<String> = self.outputs.iter().chain(&self.inputs).cloned().collect();
         let time = ["time".to_owned()];
-        let wanted = Wanted { columns: &columns, optional: &time, missing: self.files.missing() };
+        let wanted = ColumnSelection { columns: &columns, optional: &time, missing: self.files.missing() };
         let part = match self.part.as_deref() {
             None => PartColumn::Usual,
             Some("none") => PartColumn::None,
@@ -118,7 +118,7 @@ impl ForecastArgs {
     }
 }
 
-impl Shown<'_> {
+impl ForecastReport<'_> {
     fn table(&self) -> io::Result<()> {
         let mut out = io::stdout().lock();
         self.head(&mut out)?;
@@ -180,11 +180,11 @@ impl Shown<'_> {
     }
 }
 
-/// Errors of forecasts made after the origin.
+/// Prints the errors of forecasts made after the origin.
 fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
     let heads =
-        ["ahead", "forecasts", "RMSE", "stays as it is", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];
-    let line = |horizon: &Horizon| {
+        ["ahead", "forecasts", "RMSE", "persistence", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];
+    let line = |horizon: &HorizonForecast| {
         let cells = horizon.score.zip(horizon.persistence_rmse).map(|(s, persistence)| {
             [
                 short(s.rmse),
@@ -206,10 +206,10 @@ fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
     write_table(out, &rows, 0)
 }
 
-/// Forecasts of what nobody knows.
+/// Prints forecasts without measured values.
 fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
     let heads = ["ahead", "mean", "std", "low 95 %", "high 95 %", "trained on"];
-    let line = |horizon: &Horizon| {
+    let line = |horizon: &HorizonForecast| {
         let p = &horizon.at_origin;
         let numbers = [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(short);
         let own = [horizon.steps.to_string()];
@@ -220,7 +220,7 @@ fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
     write_table(out, &rows, 0)
 }
 
-fn horizon_json(horizon: &Horizon) -> Value {
+fn horizon_json(horizon: &HorizonForecast) -> Value {
     let p = &horizon.at_origin;
     let score = horizon.score.map(|s| {
         json!({

@@ -1,4 +1,4 @@
-//! What `gpr` shows: progress, tables, JSON.
+//! Output of `gpr`: progress, tables, JSON.
 
 use std::io::{self, Write};
 use std::ops::ControlFlow;
@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value, json};
 
 use super::super::score::write_table;
-use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
+use crate::lab::gpr::{Table, TrainedModel, CrossValidation, peak_kib};
 use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
 
 /// Version of the JSON documents.
@@ -20,7 +20,7 @@ const TICKS: usize = 100;
 pub(super) struct Bar(ProgressBar);
 
 impl Bar {
-    /// Of so many fits.
+    /// Creates a bar over a number of fits.
     pub(super) fn new(fits: usize) -> Self {
         let bar = ProgressBar::with_draw_target(Some((fits * TICKS) as u64), ProgressDrawTarget::stderr_with_hz(5));
         let template = "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}";
@@ -28,7 +28,7 @@ impl Bar {
         Self(bar)
     }
 
-    /// A step of a search; `before` fits are done beside those of this cross-validation.
+    /// Shows a step of a search; `before` fits were done before this cross-validation.
     pub(super) fn show(&self, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
         let part = (p.search - 1) * p.max_iterations + p.iteration;
         let whole = (p.searches * p.max_iterations).max(1);
@@ -38,13 +38,13 @@ impl Bar {
         ControlFlow::Continue(())
     }
 
-    /// So many fits are done.
+    /// Sets the number of finished fits.
     pub(super) fn done(&self, fits: usize, what: &str) {
         self.0.set_position((fits * TICKS) as u64);
         self.0.set_message(what.to_owned());
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub(super) fn clear(&self) {
         self.0.finish_and_clear();
     }
@@ -60,7 +60,7 @@ pub(super) fn form(form: Form) -> String {
 }
 
 fn form_note(of: Form, default_form: bool) -> String {
-    let why = if default_form { " (chosen by the number of rows; --form says otherwise)" } else { "" };
+    let why = if default_form { " (chosen by the number of rows; --form overrides it)" } else { "" };
     format!("form {}{why}", form(of))
 }
 
@@ -105,17 +105,17 @@ pub(super) struct Cv<'a> {
     pub(super) table: &'a Table,
     pub(super) settings: &'a Settings,
     pub(super) folds: usize,
-    pub(super) all: &'a [Validated],
+    pub(super) all: &'a [CrossValidation],
     pub(super) default_form: bool,
 }
 
 /// Sum over the folds.
-fn total(validated: &Validated, of: impl Fn(&Fold) -> f64) -> f64 {
+fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
 
 /// Matrices with jitter, and the most of it, over the folds.
-fn jitter(validated: &Validated) -> Jitter {
+fn jitter(validated: &CrossValidation) -> Jitter {
     validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
         matrices: all.matrices + fold.jitter.matrices,
         largest: all.largest.max(fold.jitter.largest),
@@ -131,7 +131,7 @@ impl Cv<'_> {
         &self.table.names[self.table.width() - 1]
     }
 
-    /// For people.
+    /// Prints tables.
     pub(super) fn table(&self, seconds: f64) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (rows, inputs, output) = (self.table.len(), self.inputs().join(", "), self.output());
@@ -146,7 +146,7 @@ impl Cv<'_> {
         )?;
         let heads =
             ["kernel", "RMSE", "mean abs.", "inside", "width", "training s", "predicting s", "peak MiB", "rows"];
-        let line = |validated: &Validated| {
+        let line = |validated: &CrossValidation| {
             let s = &validated.score;
             vec![
                 validated.kernel.clone(),
@@ -173,7 +173,7 @@ impl Cv<'_> {
         writeln!(out, "\n{seconds:.1} s in all")
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self, seconds: f64) -> io::Result<()> {
         let fold = |fold: &Fold| {
             json!({
@@ -182,7 +182,7 @@ impl Cv<'_> {
                 "interval_factor": fold.interval_factor, "hyperparameters": hyperparameters(&fold.hyperparameters),
             })
         };
-        let kernel = |validated: &Validated| {
+        let kernel = |validated: &CrossValidation| {
             let s = &validated.score;
             json!({
                 "kernel": validated.kernel, "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error,
@@ -204,14 +204,14 @@ impl Cv<'_> {
 
 /// A model that was trained.
 pub(super) struct Train<'a> {
-    pub(super) trained: &'a Trained,
+    pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a Table,
     pub(super) seconds: f64,
     pub(super) default_form: bool,
 }
 
 impl Train<'_> {
-    /// For people.
+    /// Prints tables.
     pub(super) fn table(&self, path: &Path) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (trained, model) = (self.trained, &self.trained.model);
@@ -239,7 +239,7 @@ impl Train<'_> {
         writeln!(out, "written to {}", path.display())
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let (trained, model) = (self.trained, &self.trained.model);
         write_json(&json!({
@@ -256,14 +256,14 @@ impl Train<'_> {
 
 /// Predictions of a saved model.
 pub(super) struct Predict<'a> {
-    pub(super) trained: &'a Trained,
+    pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a Table,
     pub(super) known: usize,
     pub(super) score: Option<Score>,
 }
 
 impl Predict<'_> {
-    /// For people, beside the rows or instead of them.
+    /// Prints a summary, on standard error when the rows go to standard output.
     pub(super) fn text(&self, to_stderr: bool) -> io::Result<()> {
         let mut text = Vec::new();
         let (rows, output) = (self.table.len(), &self.trained.output);
@@ -280,7 +280,7 @@ impl Predict<'_> {
         if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let score = self.score.map(|s| {
             json!({

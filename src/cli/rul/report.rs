@@ -1,4 +1,4 @@
-//! What `rul` tells: tables and JSON.
+//! Output of `rul`: tables and JSON.
 
 use std::io::{self, Write};
 
@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::super::score::write_table;
 use crate::health::{Axis, Remaining};
-use crate::lab::rul::{self, Judged, Now, Scored, Total, WORST_ERROR};
+use crate::lab::rul::{self, ForecastScore, CurrentForecast, HistoryScore, ScoreTotal, WORST_ERROR};
 
 /// Version of the JSON documents.
 const VERSION: u32 = 1;
@@ -15,7 +15,7 @@ const VERSION: u32 = 1;
 struct NowDocument<'a> {
     version: u32,
     interval: [f64; 2],
-    forecasts: &'a [Now],
+    forecasts: &'a [CurrentForecast],
 }
 
 #[derive(Serialize)]
@@ -23,20 +23,20 @@ struct ScoredDocument<'a> {
     version: u32,
     interval: [f64; 2],
     alpha: f64,
-    files: &'a [Scored],
-    total: Option<Total>,
+    files: &'a [HistoryScore],
+    total: Option<ScoreTotal>,
 }
 
-/// Quantiles of the interval told.
+/// Quantiles of the interval.
 const INTERVAL: [f64; 2] = [0.05, 0.95];
 
-/// Forecasts now, for programs.
-pub(super) fn now_json(forecasts: &[Now]) -> io::Result<()> {
+/// Prints forecasts at the end of the histories as JSON.
+pub(super) fn now_json(forecasts: &[CurrentForecast]) -> io::Result<()> {
     json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
 }
 
-/// Judged forecasts, for programs.
-pub(super) fn scored_json(files: &[Scored], alpha: f64) -> io::Result<()> {
+/// Prints scored forecasts as JSON.
+pub(super) fn scored_json(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
     json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
 }
 
@@ -46,10 +46,10 @@ fn json(document: &impl Serialize) -> io::Result<()> {
     writeln!(out)
 }
 
-/// Forecasts now, for people.
-pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
+/// Prints forecasts at the end of the histories as a table.
+pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the rate of use of late\n")?;
+    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the recent rate of use\n")?;
     let heads = ["file", "end of life", "readings", "capacity", "loss per unit", "cycles", "days"];
     let mut rows = vec![heads.map(str::to_owned).to_vec()];
     rows.extend(forecasts.iter().map(|now| {
@@ -73,8 +73,8 @@ pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
     Ok(())
 }
 
-/// Judged forecasts, for people.
-pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
+/// Prints scored forecasts as a table.
+pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let percent = 100.0 * alpha;
     writeln!(out, "remaining: median (5 to 95 %); passes when the median is within {percent:.0} % of the truth")?;
@@ -110,9 +110,9 @@ pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
     }
 }
 
-fn judged_row(file: &Scored, judged: &Judged) -> Vec<String> {
+fn judged_row(file: &HistoryScore, judged: &ForecastScore) -> Vec<String> {
     let forecast = judged.forecast.map(|[low, median, high]| Remaining { low, median, high });
-    let baseline = |said: Option<f64>| said.map_or("never".to_owned(), |said| format!("{said:.1}"));
+    let baseline = |end: Option<f64>| end.map_or("never".to_owned(), |end| format!("{end:.1}"));
     vec![
         file.name.clone(),
         format!("{:.3} Ah", file.threshold_ah),
@@ -131,8 +131,8 @@ fn judged_row(file: &Scored, judged: &Judged) -> Vec<String> {
     ]
 }
 
-/// What was not judged, and what was refused.
-fn notes(out: &mut impl Write, files: &[Scored]) -> io::Result<()> {
+/// Prints which files were not scored, and which forecasts are missing.
+fn notes(out: &mut impl Write, files: &[HistoryScore]) -> io::Result<()> {
     for file in files {
         let (name, threshold_ah) = (&file.name, file.threshold_ah);
         match file.end_of_life {
@@ -154,7 +154,7 @@ fn notes(out: &mut impl Write, files: &[Scored]) -> io::Result<()> {
     Ok(())
 }
 
-fn totals(out: &mut impl Write, total: &Total) -> io::Result<()> {
+fn totals(out: &mut impl Write, total: &ScoreTotal) -> io::Result<()> {
     writeln!(out, "\n{} forecasts, {} refused", total.forecasts, total.refused)?;
     writeln!(out, "interval holds the truth  {}", part(total.coverage))?;
     writeln!(out, "median passes alpha       {}", part(total.within_alpha))?;

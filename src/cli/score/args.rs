@@ -1,4 +1,4 @@
-//! What `score` can be told.
+//! Arguments of `score`.
 
 use std::path::{Path, PathBuf};
 
@@ -23,7 +23,7 @@ impl From<Start> for score::Start {
     }
 }
 
-/// Error of the SOC told, points; `None` = nothing told.
+/// Error of the initial SOC, points; `None` = no initial SOC is given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 
@@ -59,12 +59,12 @@ pub(crate) struct Args {
     /// Part of the full charge already taken out where a start in the middle begins
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = part, help_heading = "Starts")]
     pub(crate) remove: f64,
-    /// Error of the SOC the estimator is told, points (-20: told 20 points less than true); "none": it is told nothing
-    /// and starts from its first voltage
-    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = told,
+    /// Error of the initial SOC given to the estimator, points (-20: 20 points below the truth); "none": no SOC is given and
+    /// it starts from its first voltage
+    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
           allow_hyphen_values = true, help_heading = "Starts")]
     pub(crate) told: Vec<InitialSocError>,
-    /// Standard deviation told with the SOC, points; as large as --told says when not given, and 5 at least
+    /// Standard deviation of the initial SOC, points; when not given, as large as --told and 5 at least
     #[arg(long, value_name = "POINTS", value_parser = percent_above_0, help_heading = "Starts")]
     pub(crate) soc_std: Option<f64>,
     /// Error of the capacity the estimator starts with, percent of the model's
@@ -79,13 +79,13 @@ pub(crate) struct Args {
           allow_hyphen_values = true, help_heading = "Starts")]
     pub(crate) current_offset: Vec<f64>,
 
-    /// Time after the start that no statistic counts: 600, 600s, 10min or 1h
+    /// Time after the start without statistics: 600, 600s, 10min or 1h
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration, help_heading = "Truth and statistics")]
     pub(crate) settle: f64,
     /// Charge from full to empty that the truth is stated in, Ah; the cell model's capacity_ah when not given
     #[arg(long, value_name = "AH", value_parser = above_0, help_heading = "Truth and statistics")]
     pub(crate) truth_capacity: Option<f64>,
-    /// A hole in a file longer than this means that nobody measured, s
+    /// A gap in a file longer than this means that the recorder was asleep, s
     #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0, help_heading = "Truth and statistics")]
     pub(crate) sleep_gap: f64,
 
@@ -117,7 +117,7 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     pub(super) fn check(&self) -> Result<(), Failure> {
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
@@ -134,7 +134,7 @@ impl Args {
     }
 }
 
-/// Short names that tell the files apart: folder and name without endings, the whole path where two are the same.
+/// Returns short names that distinguish the files: folder and name without endings, the whole path where two are the same.
 pub(crate) fn names(files: &[PathBuf]) -> Vec<String> {
     let short = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -168,7 +168,7 @@ fn percent_above_0(text: &str) -> Result<f64, String> {
     number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and at most 100".to_owned()))
 }
 
-fn told(text: &str) -> Result<InitialSocError, String> {
+fn initial_soc_error(text: &str) -> Result<InitialSocError, String> {
     if text == "none" {
         return Ok(InitialSocError(None));
     }
@@ -226,12 +226,14 @@ mod tests {
         assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
         assert_eq!(load("2,-10,2.7"), Ok(Load { current_a: 2.0, temperature_c: -10.0, cutoff_v: 2.7 }));
         assert!(["2,24", "0,24,2.7", "2,24,2.7,1", "a,b,c"].iter().all(|text| load(text).is_err()));
-        assert_eq!((told("none"), told("-20")), (Ok(InitialSocError(None)), Ok(InitialSocError(Some(-20.0)))));
-        assert!(told("-101").is_err() && told("NaN").is_err() && part("1").is_err() && capacity_error("-100").is_err());
+        assert_eq!(initial_soc_error("none"), Ok(InitialSocError(None)));
+        assert_eq!(initial_soc_error("-20"), Ok(InitialSocError(Some(-20.0))));
+        assert!(initial_soc_error("-101").is_err() && initial_soc_error("NaN").is_err());
+        assert!(part("1").is_err() && capacity_error("-100").is_err());
     }
 
     #[test]
-    fn names_tell_files_apart() {
+    fn names_distinguish_files() {
         let files = ["a/25C/x.csv.gz", "a/10C/x.csv.gz", "b/10C/x.csv", "y.csv"].map(PathBuf::from);
         assert_eq!(names(&files), ["25C/x", "a/10C/x.csv.gz", "b/10C/x.csv", "y"]);
     }

@@ -1,4 +1,4 @@
-//! What `score` tells: a progress bar, tables, JSON.
+//! Output of `score`: a progress bar, tables, JSON.
 
 use std::io::{self, Write};
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::config::Config;
 use crate::lab::score::{
-    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, Job, LifeScore, Settings, SocScore, Start,
+    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, ScoreJob, LifeScore, ScoreSettings, SocScore, Start,
 };
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.
@@ -17,7 +17,7 @@ pub(super) struct Bar {
 }
 
 impl Bar {
-    pub(super) fn new(jobs: &[Job]) -> Self {
+    pub(super) fn new(jobs: &[ScoreJob]) -> Self {
         let bytes: Vec<f64> =
             jobs.iter().map(|job| std::fs::metadata(&job.path).map_or(0.0, |found| found.len() as f64)).collect();
         let total = bytes.iter().sum::<f64>() as u64;
@@ -28,7 +28,7 @@ impl Bar {
         Self { bar, bytes }
     }
 
-    /// `part` of the work on file `index` is done.
+    /// Adds a share of the work on file `index`.
     pub(super) fn advance(&self, index: usize, part: f64) {
         self.bar.inc((part * self.bytes.get(index).copied().unwrap_or(0.0)).round() as u64);
     }
@@ -38,10 +38,10 @@ impl Bar {
     }
 }
 
-/// Everything there is to show.
-pub(super) struct Shown<'a> {
+/// Scores with their settings.
+pub(super) struct ScoreReport<'a> {
     pub(super) config: &'a Config,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a ScoreSettings,
     pub(super) cases: &'a [Case],
     pub(super) scores: &'a [CaseScore],
 }
@@ -89,8 +89,8 @@ struct LifeTotal<'a> {
     least_coverage: f64,
 }
 
-impl Shown<'_> {
-    /// One JSON document on standard output.
+impl ScoreReport<'_> {
+    /// Prints one JSON document on standard output.
     pub(super) fn json(&self) -> io::Result<()> {
         let document = Document {
             config: self.config.path.display().to_string(),
@@ -107,7 +107,7 @@ impl Shown<'_> {
         writeln!(out)
     }
 
-    /// Tables for people on standard output.
+    /// Prints tables on standard output.
     pub(super) fn table(&self) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let settings = self.settings;
@@ -188,7 +188,7 @@ impl Shown<'_> {
         rows
     }
 
-    /// What was not handed on or not judged.
+    /// Prints which values were not fed or not scored.
     fn notes(&self, out: &mut impl Write) -> io::Result<()> {
         for score in self.scores {
             let (name, case) = (&score.name, describe(&score.case));
@@ -197,7 +197,7 @@ impl Shown<'_> {
                 writeln!(out, "{name}, {case}: {left_out} of {} rows left out (no truth or no estimate)", score.rows)?;
             }
             if score.uncarried_values > 0 {
-                writeln!(out, "{name}, {case}: {} values that no frame could carry", score.uncarried_values)?;
+                writeln!(out, "{name}, {case}: {} values that no frame can carry", score.uncarried_values)?;
             }
             if let Some(life) = score.life.as_ref().filter(|life| life.left_out > 0) {
                 let (left_out, all) = (life.left_out, life.discharges);
@@ -267,7 +267,7 @@ fn describe(case: &Case) -> String {
         Start::Full => "full".to_owned(),
         Start::Middle => "middle".to_owned(),
     }];
-    words.extend(case.told_points.map(|points| format!("told {points:+}")));
+    words.extend(case.soc_error_points.map(|points| format!("told {points:+}")));
     words.extend((case.capacity_error_percent != 0.0).then(|| format!("C {:+} %", case.capacity_error_percent)));
     words.extend((case.current_offset_a != 0.0).then(|| format!("I {:+} A", case.current_offset_a)));
     words.extend(case.seed.map(|seed| format!("windows {seed}")));

@@ -1,21 +1,21 @@
-//! What `whatif` tells programs: one JSON document, or CSV.
+//! Output of `whatif` for programs: one JSON document, or CSV.
 
 use std::io::{self, Write};
 use std::path::Path;
 
 use serde_json::json;
 
-use super::report::Shown;
+use super::report::WhatifReport;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::Variant;
-use crate::lab::fleet::whatif::{AlarmRow, LogResult};
+use crate::lab::fleet::whatif::{ThresholdScore, LogResult};
 use crate::quantity::Timestamp;
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
-/// Columns of the CSV besides the values set.
+/// Columns of the CSV in addition to the values set.
 const HEADS: [&str; 23] = [
     "log",
     "judged_by",
@@ -42,8 +42,8 @@ const HEADS: [&str; 23] = [
     "flickers",
 ];
 
-impl Shown<'_> {
-    /// One JSON document.
+impl WhatifReport<'_> {
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let horizon = match self.settings.horizon {
             None => json!(null),
@@ -79,7 +79,7 @@ impl Shown<'_> {
         writeln!(out)
     }
 
-    /// A row per log, setting and alarm.
+    /// Writes a row per log, setting and alarm.
     pub(super) fn csv(&self, path: &Path) -> io::Result<()> {
         let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
         out.write_record(HEADS.into_iter().chain(self.grid.keys.iter().map(String::as_str)))?;
@@ -95,7 +95,7 @@ impl Shown<'_> {
     }
 }
 
-fn csv_row(log: &LogResult, row: &AlarmRow) -> [String; HEADS.len()] {
+fn csv_row(log: &LogResult, row: &ThresholdScore) -> [String; HEADS.len()] {
     fn text(value: Option<impl ToString>) -> String {
         value.map(|value| value.to_string()).unwrap_or_default()
     }

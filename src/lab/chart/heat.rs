@@ -82,8 +82,8 @@ impl Heat {
         let decimals = self.decimals;
         let (low, high) = (format!("{low:.decimals$}"), format!("{high:.decimals$}"));
         let needs = text_width(&low, 11.5) + text_width(&high, 11.5) + 18.0 * 9.0 + 110.0;
-        let beside = text_width(&self.label, 11.5) + 130.0;
-        let (mut x, y) = if beside + needs < width { (beside, top) } else { (0.0, top + 18.0) };
+        let label_end = text_width(&self.label, 11.5) + 130.0;
+        let (mut x, y) = if label_end + needs < width { (label_end, top) } else { (0.0, top + 18.0) };
         svg.text(x, y + 12.0, "l", &low);
         x += text_width(&low, 11.5) + 6.0;
         for step in 0..STEPS.len() {

@@ -1,9 +1,9 @@
-//! What came out of logs, as tables any engine reads: estimates, half-cycles and alarms, Parquet or CSV.
+//! Exports the results of logs as tables: estimates, half-cycles and alarms, in Parquet or CSV.
 //!
-//! In: a configuration and logs. Out: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
+//! Input: a configuration and logs. Output: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
 //! `.csv`; columns and units in [`columns`]) and `about.json`, which is written last: where it is, the others are whole.
 //! Promise: a file has its final name only when it is complete; memory is bounded by a row group per table and log,
-//! whatever the length of the log; a log that fails leaves no file of its own and the others go on.
+//! independent of the length of the log; a log that fails leaves no file and the others continue.
 
 mod columns;
 mod rows;
@@ -18,7 +18,7 @@ use serde_json::json;
 
 use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned};
 use self::table::TableFile;
-use super::drive::{Driven, Reading, drive};
+use super::drive::{DriveSummary, LogAccess, drive};
 use crate::config::Config;
 use crate::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
@@ -33,14 +33,14 @@ const VERSION: u32 = 1;
 
 /// Form of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum TableFormat {
     /// Apache Parquet, Snappy.
     Parquet,
     /// Comma-separated values with a heading.
     Csv,
 }
 
-impl Format {
+impl TableFormat {
     const fn ending(self) -> &'static str {
         match self {
             Self::Parquet => "parquet",
@@ -49,13 +49,13 @@ impl Format {
     }
 }
 
-/// What all logs have in common.
+/// Settings of all logs.
 #[derive(Clone)]
-pub struct Settings<'a> {
-    /// How they are read.
-    pub reading: Reading<'a>,
+pub struct ExportSettings<'a> {
+    /// How to read the logs.
+    pub access: LogAccess<'a>,
     /// Form of the tables.
-    pub format: Format,
+    pub format: TableFormat,
     /// Folder for the logs' folders.
     pub out: PathBuf,
     /// At most one estimate per cell in each period, s; 0 = every one.
@@ -66,7 +66,7 @@ pub struct Settings<'a> {
 
 /// A log's tables.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Exported {
+pub struct ExportResult {
     /// The log.
     pub log: PathBuf,
     /// Folder of its tables.
@@ -75,20 +75,20 @@ pub struct Exported {
     pub rows: BTreeMap<&'static str, u64>,
     /// From the first stamp to the last, days.
     pub days: f64,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Exports all logs; per log what was written, or why nothing was. `report` is told bytes read.
+/// Exports all logs; returns per log what was written, or the error. `report` receives the bytes read since its last call.
 ///
 /// # Errors
 /// When no threads can be started.
 pub fn run(
     config: &Config,
     logs: &[PathBuf],
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Vec<Result<Exported, String>>, String> {
+) -> Result<Vec<Result<ExportResult, String>>, String> {
     let names = names(logs);
     super::in_parallel(logs, settings.jobs, |index, log| export(config, log, &names[index], settings, report))
 }
@@ -97,34 +97,34 @@ fn export(
     config: &Config,
     log: &Path,
     name: &str,
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
     report: &dyn Fn(u64),
-) -> Result<Exported, String> {
+) -> Result<ExportResult, String> {
     let folder = settings.out.join(name);
-    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be made: {error}", folder.display()))?;
-    let mut tables = Tables::create(config, name, &folder, settings)?;
+    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be created: {error}", folder.display()))?;
+    let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
-    let source = (settings.reading.open)(config, log);
+    let source = (settings.access.open)(config, log);
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
-        let taken = tables.take(monitor, out);
+        let result = tables.take(monitor, out);
         out.clear();
-        taken
+        result
     };
     let monitor = Monitor::new(config.monitor.clone());
-    let driven = drive(source, monitor, out, settings.reading.sleep_gap_s, &mut each, report)?;
+    let driven = drive(source, monitor, out, settings.access.sleep_gap_s, &mut each, report)?;
     let span = driven.span_of(log)?;
     let metadata = metadata(config, log, span, settings);
     let mut notes = driven.notes.clone();
-    notes.extend(forget_about(&folder, log)?);
+    notes.extend(remove_about(&folder, log)?);
     let rows = tables.finish(&metadata)?;
-    let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes };
+    let exported = ExportResult { log: log.to_owned(), folder, rows, days: driven.days(), notes };
     write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }
 
-/// Takes away what an earlier export said of itself, since its tables are replaced one by one; a note when they were those
-/// of another log.
-fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
+/// Removes the `about.json` of an earlier export, since its tables are replaced one by one; returns a note when they were
+/// those of another log.
+fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
     let path = folder.join("about.json");
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
     std::fs::remove_file(&path).map_err(|error| format!("{}: cannot be removed: {error}", path.display()))?;
@@ -133,12 +133,12 @@ fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
     Ok(other.map(|other| format!("replaced the tables of {other}")))
 }
 
-/// What the files say of themselves.
+/// Metadata of the files.
 fn metadata(
     config: &Config,
     log: &Path,
     (first, last): (Timestamp, Timestamp),
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
 ) -> Vec<(&'static str, String)> {
     let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
     vec![
@@ -152,7 +152,7 @@ fn metadata(
     ]
 }
 
-fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
+fn write_about(exported: &ExportResult, driven: &DriveSummary, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
@@ -167,8 +167,8 @@ fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str
     file.finish().map_err(|error| error.to_string())
 }
 
-/// A name per log that a folder can have: the file's without endings; with the folder's before it, or a number after it,
-/// where several are the same.
+/// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before
+/// it or a number after it.
 fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
@@ -193,7 +193,7 @@ fn names(logs: &[PathBuf]) -> Vec<String> {
     names
 }
 
-/// What is safe in a file's name everywhere.
+/// Replaces characters that are not safe in file names.
 fn clean(name: &str) -> String {
     let safe = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '_' };
     let name: String = name.chars().map(safe).collect();
@@ -201,7 +201,7 @@ fn clean(name: &str) -> String {
 }
 
 /// The three tables of one log.
-struct Tables {
+struct LogTables {
     log: Arc<str>,
     estimates: TableFile<EstimateRow>,
     half_cycles: TableFile<HalfCycleRow>,
@@ -212,12 +212,12 @@ struct Tables {
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// A half-cycle whose capacity comes next.
+    /// A half-cycle whose capacity event follows.
     half_cycle: Option<HalfCycle>,
 }
 
-impl Tables {
-    fn create(config: &Config, name: &str, folder: &Path, settings: &Settings<'_>) -> Result<Self, String> {
+impl LogTables {
+    fn create(config: &Config, name: &str, folder: &Path, settings: &ExportSettings<'_>) -> Result<Self, String> {
         let cells = usize::from(config.monitor.sample.cells);
         let (form, ending) = (settings.format, settings.format.ending());
         let path = |table: &str| folder.join(format!("{table}.{ending}"));
@@ -277,13 +277,13 @@ impl Tables {
         self.moved_ah.get(cell.index()).map_or(f64::NAN, |moved_ah| moved_ah / (2.0 * self.rated_ah))
     }
 
-    /// Since the first thing that was told.
+    /// Time since the first result, ns.
     fn since_ns(&mut self, time: Timestamp) -> i64 {
         let first = *self.first.get_or_insert(time);
         time.nanos().saturating_sub(first.nanos())
     }
 
-    /// Completes the files, each with what it says of itself; rows of each.
+    /// Completes the files with their metadata; returns the rows of each.
     fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, String> {
         Ok(BTreeMap::from([
             ("estimates", self.estimates.finish(metadata)?),

@@ -1,15 +1,15 @@
-//! Rows to come from rows that were: a forecast that needs nothing of the future.
+//! Forecasts future rows from past rows; needs no inputs of the future.
 //!
-//! In: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at row
-//! t is what is known then: for every column its value and its last differences ([`Plan::lags`] values in all). For every
+//! Input: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at
+//! row t holds what is known then: for every column its value and its last differences ([`ForecastPlan::lags`] values in all). For every
 //! output and every horizon h there is a process of its own (a direct forecast) that predicts the change from t to t + h:
 //! errors of one step do not feed the next, and each horizon has its own noise. Without knowledge the forecast falls
 //! back to the mean change, so to persistence.
 //!
-//! The interval comes from forecasts that really were made: the process is fitted again to the beginning of the training
-//! rows and judged on the block that follows, block after block; how wide it is, and where, follows from |error| /
+//! The interval is calibrated on real forecasts: the process is fitted again to the beginning of the training
+//! rows and judged on the block that follows, block after block; its width at each place follows from |error| /
 //! standard deviation of these ([`spread`]). (Rows left out one by one would not do: windows overlap, and each row's
-//! neighbours give it away.) No row after the origin is looked at.
+//! neighbours reveal it.) No row after the origin is used.
 
 mod spread;
 mod windows;
@@ -17,7 +17,7 @@ mod windows;
 use std::path::Path;
 use std::time::Instant;
 
-pub use windows::{Steps, Windows};
+pub use windows::{RowSpacing, LagWindows};
 
 use super::{GprError, Table, create, finish};
 use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
@@ -27,7 +27,7 @@ use spread::Spread;
 pub const MAX_LAGS: usize = 200;
 /// Most rows ahead.
 pub const MAX_STEPS: usize = 10_000;
-/// Most horizons that get a process of their own; between them nothing is said.
+/// Most horizons with a process of their own; there are no forecasts between them.
 pub const MAX_HORIZONS: usize = 10;
 /// Fewest windows to train on.
 const FEWEST: usize = 20;
@@ -44,8 +44,8 @@ const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What to forecast.
 #[derive(Debug, Clone)]
-pub struct Plan {
-    /// The first so many columns of the table are forecast.
+pub struct ForecastPlan {
+    /// Number of the table's first columns to forecast.
     pub outputs: usize,
     /// Values of each column that a window has, 1 or more.
     pub lags: usize,
@@ -59,9 +59,9 @@ pub struct Plan {
     pub settings: Settings,
 }
 
-/// What came of it.
+/// Forecasts of all outputs.
 #[derive(Debug, Clone)]
-pub struct Forecast {
+pub struct TableForecast {
     /// Rows that were known.
     pub origin: usize,
     /// Row from which the forecast at the origin is made: the last known one that has a window.
@@ -78,12 +78,12 @@ pub struct OutputForecast {
     /// Its place in the table.
     pub column: usize,
     /// By rows ahead, rising.
-    pub horizons: Vec<Horizon>,
+    pub horizons: Vec<HorizonForecast>,
 }
 
-/// Forecasts of one column so many rows ahead.
+/// Forecasts of one column, `steps` rows ahead.
 #[derive(Debug, Clone)]
-pub struct Horizon {
+pub struct HorizonForecast {
     /// Rows ahead.
     pub steps: usize,
     /// Windows it learned from.
@@ -94,20 +94,20 @@ pub struct Horizon {
     pub factor: f64,
     /// Time of fit and calibration, s.
     pub fit_s: f64,
-    /// What was added to diagonals.
+    /// Jitter added to diagonals.
     pub jitter: Jitter,
     /// The forecast made at the origin.
     pub at_origin: Prediction,
     /// Rows after the origin from which forecasts were made, and the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Their errors; `None` when nothing comes after the origin.
+    /// Their errors; `None` when there are no rows after the origin.
     pub score: Option<Score>,
-    /// Root of the mean squared error of "it stays as it is" over the same rows.
+    /// Root of the mean squared error of persistence (the value stays as it is) over the same rows.
     pub persistence_rmse: Option<f64>,
 }
 
-/// Rows ahead that get a process: all up to [`MAX_HORIZONS`], else so many with even ratios, the first and the last
-/// included.
+/// Returns the horizons that get a process: all up to [`MAX_HORIZONS`], else that many with even ratios, including the first
+/// and the last.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -119,18 +119,18 @@ pub fn horizons(steps: usize) -> Vec<usize> {
     all
 }
 
-/// Makes the forecasts. `done` hears of every horizon that is finished: how many, of how many.
+/// Makes the forecasts. `done` receives the number of finished horizons, and of all.
 ///
 /// # Errors
 /// Numbers out of range, too few rows for the lags and steps, or no positive definite matrix.
 pub fn run(
     table: &Table,
-    plan: &Plan,
+    plan: &ForecastPlan,
     watcher: &mut Watcher<'_>,
     done: &mut dyn FnMut(usize, usize),
-) -> Result<Forecast, GprError> {
+) -> Result<TableForecast, GprError> {
     check(plan)?;
-    let windows = Windows::new(table, plan.lags);
+    let windows = LagWindows::new(table, plan.lags);
     let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
     let from = windows.last_before(origin).ok_or_else(|| {
         GprError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
@@ -141,7 +141,7 @@ pub fn run(
         let mut start = Vec::new();
         let mut horizons = Vec::new();
         for &steps in &list {
-            let task = Task { plan, windows: &windows, column, steps, origin };
+            let task = HorizonTask { plan, windows: &windows, column, steps, origin };
             let (horizon, model) = task.run(&start, from, watcher)?;
             start = model.hyperparameters().into_iter().map(|h| h.value).collect();
             horizons.push(horizon);
@@ -149,10 +149,10 @@ pub fn run(
         }
         outputs.push(OutputForecast { name: table.names[column].clone(), column, horizons });
     }
-    Ok(Forecast { origin, from, outputs })
+    Ok(TableForecast { origin, from, outputs })
 }
 
-fn check(plan: &Plan) -> Result<(), GprError> {
+fn check(plan: &ForecastPlan) -> Result<(), GprError> {
     let range = |what: &str, found: usize, most: usize| match (1..=most).contains(&found) {
         true => Ok(()),
         false => Err(GprError(format!("{what} = {found}, must be 1 to {most}"))),
@@ -165,17 +165,17 @@ fn check(plan: &Plan) -> Result<(), GprError> {
     Ok(())
 }
 
-/// One column so many rows ahead.
-struct Task<'a> {
-    plan: &'a Plan,
-    windows: &'a Windows<'a>,
+/// Fit and forecasts of one column, `steps` rows ahead.
+struct HorizonTask<'a> {
+    plan: &'a ForecastPlan,
+    windows: &'a LagWindows<'a>,
     column: usize,
     steps: usize,
     origin: usize,
 }
 
-impl Task<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(Horizon, Model), GprError> {
+impl HorizonTask<'_> {
+    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(HorizonForecast, Model), GprError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
@@ -191,7 +191,7 @@ impl Task<'_> {
         let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), HELD_OUT);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
         let (score, persistence_rmse) = self.judge(&held_out);
-        let horizon = Horizon {
+        let horizon = HorizonForecast {
             steps: self.steps,
             trained,
             calibrated: spread.count(),
@@ -246,7 +246,7 @@ impl Task<'_> {
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            // What came may lie beyond the block: a block may be shorter than the horizon.
+            // The forecast row may lie beyond the block: a block may be shorter than the horizon.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
             let rows = chosen(&rows, BLOCK_WINDOWS);
@@ -294,11 +294,11 @@ impl Task<'_> {
     }
 }
 
-/// Writes every forecast: that at the origin and those after it, with what came where that is known.
+/// Writes every forecast: that at the origin and those after it, with the measured value where it is known.
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, data: &Table, forecast: &Forecast) -> Result<(), GprError> {
+pub fn write(path: &Path, data: &Table, forecast: &TableForecast) -> Result<(), GprError> {
     let mut out = csv::Writer::from_writer(create(path)?);
     out.write_record(["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"])?;
     for output in &forecast.outputs {
@@ -319,8 +319,8 @@ pub fn write(path: &Path, data: &Table, forecast: &Forecast) -> Result<(), GprEr
     finish(out)
 }
 
-/// At most so many of them, one from each of so many equal stretches, at a place in it that differs from stretch to
-/// stretch: a fixed stride would meet rows that repeat, as those of cycles do, always at the same phase.
+/// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs from stretch to
+/// stretch: a fixed stride would always meet repeating rows, such as those of cycles, at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * GOLDEN).fract() };

@@ -22,7 +22,7 @@ const MAX_TOLD: usize = 40;
 
 /// What is to be done with a row that lacks a value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Missing {
+pub enum MissingPolicy {
     /// The whole work is refused, with file and line.
     Refused,
     /// The row is left out and counted.
@@ -31,13 +31,13 @@ pub enum Missing {
 
 /// What to read.
 #[derive(Debug, Clone)]
-pub struct Wanted<'a> {
+pub struct ColumnSelection<'a> {
     /// Columns that every row must have, as their reader calls them.
     pub columns: &'a [String],
     /// Columns that need not be there, nor have a value in every row (NaN then).
     pub optional: &'a [String],
     /// Rows that lack a value.
-    pub missing: Missing,
+    pub missing: MissingPolicy,
 }
 
 /// Which column says what belongs together.
@@ -89,7 +89,7 @@ impl Table {
     /// # Errors
     /// A file cannot be read, a column is unknown or ambiguous, a value is missing or no number, there are too many rows:
     /// with file, line, column, what was found and what is allowed.
-    pub fn read(paths: &[PathBuf], wanted: &Wanted<'_>, part: &PartColumn) -> Result<Self, GprError> {
+    pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, GprError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
             table.read_file(path, wanted, part).map_err(|what| GprError(format!("{}{what}", path.display())))?;
@@ -172,7 +172,7 @@ impl Table {
     }
 
     /// One file; errors begin with the colon after its name.
-    fn read_file(&mut self, path: &Path, wanted: &Wanted<'_>, part: &PartColumn) -> Result<(), String> {
+    fn read_file(&mut self, path: &Path, wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<(), String> {
         let source = lines::open(path, &Arc::default()).map_err(|error| format!(": {error}"))?;
         let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
         let fail = |error: csv::Error| format!(": {error}");
@@ -185,7 +185,7 @@ impl Table {
         while reader.read_byte_record(&mut record).map_err(fail)? {
             let line = record.position().map_or(0, csv::Position::line);
             let values = row(&header, &columns, wanted.columns.len(), &record);
-            let Some(values) = values.map_err(|bad| bad.told(line, wanted.missing)).or_else(Bad::skipped)? else {
+            let Some(values) = values.map_err(|bad| bad.told(line, wanted.missing)).or_else(RowError::skipped)? else {
                 self.skipped += 1;
                 continue;
             };
@@ -204,7 +204,7 @@ impl Table {
     }
 
     /// Where the columns are; those of later files must have the names that the first one has.
-    fn columns(&mut self, header: &[String], wanted: &Wanted<'_>) -> Result<Vec<Option<usize>>, String> {
+    fn columns(&mut self, header: &[String], wanted: &ColumnSelection<'_>) -> Result<Vec<Option<usize>>, String> {
         let first = self.names.is_empty();
         let mut columns = Vec::new();
         for (k, name) in wanted.columns.iter().chain(wanted.optional).enumerate() {
@@ -228,17 +228,17 @@ impl Table {
 }
 
 /// A row that cannot be used.
-enum Bad {
+enum RowError {
     Missing(String),
     Wrong(String),
 }
 
-impl Bad {
+impl RowError {
     /// As an error that begins with the line; a missing value that may be skipped stays one.
-    fn told(self, line: u64, missing: Missing) -> Self {
+    fn told(self, line: u64, missing: MissingPolicy) -> Self {
         match (self, missing) {
-            (Self::Missing(what), Missing::Skipped) => Self::Missing(what),
-            (Self::Missing(what), Missing::Refused) => {
+            (Self::Missing(what), MissingPolicy::Skipped) => Self::Missing(what),
+            (Self::Missing(what), MissingPolicy::Refused) => {
                 Self::Wrong(format!(":{line}: {what}; --skip-missing leaves such rows out"))
             }
             (Self::Wrong(what), _) => Self::Wrong(format!(":{line}: {what}")),
@@ -260,7 +260,7 @@ fn row(
     columns: &[Option<usize>],
     needed: usize,
     record: &csv::ByteRecord,
-) -> Result<Option<Vec<f64>>, Bad> {
+) -> Result<Option<Vec<f64>>, RowError> {
     let mut values = Vec::with_capacity(columns.len());
     for (k, column) in columns.iter().enumerate() {
         let text = column.and_then(|column| record.get(column)).unwrap_or_default();
@@ -271,11 +271,11 @@ fn row(
         } else {
             let number = std::str::from_utf8(text).ok().and_then(|text| text.parse::<f64>().ok());
             let number = number.filter(|value| !value.is_infinite());
-            let wrong = || Bad::Wrong(format!("column {name}: found {:?}, must be a finite number", shown()));
+            let wrong = || RowError::Wrong(format!("column {name}: found {:?}, must be a finite number", shown()));
             number.ok_or_else(wrong)?
         };
         if value.is_nan() && k < needed {
-            return Err(Bad::Missing(format!("column {name}: found {:?}, must be a finite number", shown())));
+            return Err(RowError::Missing(format!("column {name}: found {:?}, must be a finite number", shown())));
         }
         values.push(value);
     }
@@ -343,12 +343,12 @@ pub(super) fn label(column: &str) -> String {
 mod tests {
     use super::*;
 
-    fn read(text: &str, columns: &[&str], missing: Missing) -> Result<Table, String> {
+    fn read(text: &str, columns: &[&str], missing: MissingPolicy) -> Result<Table, String> {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cell.csv");
         std::fs::write(&path, text).expect("written");
         let columns: Vec<String> = columns.iter().map(|name| (*name).to_owned()).collect();
-        let wanted = Wanted { columns: &columns, optional: &[], missing };
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing };
         let found = Table::read(std::slice::from_ref(&path), &wanted, &PartColumn::None);
         found.map_err(|e| e.0.replace(&format!("{}/", folder.path().display()), ""))
     }
@@ -357,29 +357,29 @@ mod tests {
 
     #[test]
     fn columns_are_found_with_and_without_their_unit() {
-        let table = read(TEXT, &["voltage_mv", "time"], Missing::Refused).expect("reads");
+        let table = read(TEXT, &["voltage_mv", "time"], MissingPolicy::Refused).expect("reads");
         assert_eq!(table.names, ["voltage_mv", "time_s"]);
         assert_eq!((table.row(3), table.lines[3], table.parts.clone()), (&[3200.0, 3.0][..], 5, vec![0]));
-        let ambiguous = read(TEXT, &["voltage"], Missing::Refused).expect_err("two");
+        let ambiguous = read(TEXT, &["voltage"], MissingPolicy::Refused).expect_err("two");
         assert_eq!(
             ambiguous,
             "cell.csv:1: column \"voltage\" is ambiguous, found voltage_v, voltage_mv, must be one of them by its whole name"
         );
-        let unknown = read(TEXT, &["current"], Missing::Refused).expect_err("none");
+        let unknown = read(TEXT, &["current"], MissingPolicy::Refused).expect_err("none");
         assert_eq!(unknown, "cell.csv:1: no column \"current\", must be one of time_s, voltage_v, voltage_mv");
     }
 
     #[test]
     fn missing_values_are_refused_with_their_line_or_skipped_and_counted() {
-        let refused = read(TEXT, &["voltage_v"], Missing::Refused).expect_err("a hole");
+        let refused = read(TEXT, &["voltage_v"], MissingPolicy::Refused).expect_err("a hole");
         let expected =
             "cell.csv:3: column voltage_v: found \"\", must be a finite number; --skip-missing leaves such rows out";
         assert_eq!(refused, expected);
-        let table = read(TEXT, &["voltage_v"], Missing::Skipped).expect("reads");
+        let table = read(TEXT, &["voltage_v"], MissingPolicy::Skipped).expect("reads");
         assert_eq!((table.len(), table.skipped, table.lines.clone()), (2, 2, vec![2, 5]));
         for wrong in ["x", "inf", "1e999"] {
             let text = format!("a\n1\n{wrong}\n");
-            let refused = read(&text, &["a"], Missing::Skipped).expect_err(wrong);
+            let refused = read(&text, &["a"], MissingPolicy::Skipped).expect_err(wrong);
             assert_eq!(refused, format!("cell.csv:3: column a: found {wrong:?}, must be a finite number"));
         }
     }
@@ -391,7 +391,7 @@ mod tests {
         let parts = |text: &str, part: &PartColumn| {
             std::fs::write(&path, text).expect("written");
             let columns = ["a".to_owned()];
-            let wanted = Wanted { columns: &columns, optional: &[], missing: Missing::Refused };
+            let wanted = ColumnSelection { columns: &columns, optional: &[], missing: MissingPolicy::Refused };
             let table = Table::read(&[path.clone(), path.clone()], &wanted, part).expect("reads");
             assert_eq!((table.after(0, 1).is_some(), table.file_of(3)), (table.parts.len() < 6, path.as_path()));
             (table.every(2).lines, table.parts)

@@ -1,4 +1,4 @@
-//! A model with the names of its columns: trained from a table, saved, loaded, put to other files.
+//! A model with the names of its columns: trained from a table, saved, loaded, applied to other files.
 //!
 //! The file is one line of JSON that names the columns, then the two lines of the model itself (see the arithmetic), which
 //! have a checksum.
@@ -10,16 +10,16 @@ use serde::{Deserialize, Serialize};
 use super::{GprError, Table, create, finish, split, table, write_text};
 use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
 
-/// What the first line says it is.
+/// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
-/// Version written; others are refused.
+/// Version written; other versions are rejected.
 const VERSION: u32 = 1;
-/// Largest file read: rows enough for the most a model may have.
+/// Largest file read, bytes: enough for the largest model.
 const MAX_BYTES: u64 = 1 << 32;
 
-/// A fitted model and what its numbers are.
+/// A fitted model and the names of its columns.
 #[derive(Debug)]
-pub struct Trained {
+pub struct TrainedModel {
     /// Column that is predicted.
     pub output: String,
     /// Columns it is predicted from, in the model's order.
@@ -30,18 +30,18 @@ pub struct Trained {
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Names {
+struct ModelHeader {
     format: String,
     version: u32,
     output: String,
     inputs: Vec<String>,
 }
 
-impl Trained {
+impl TrainedModel {
     /// Fits a model to a table whose last column is the output.
     ///
     /// # Errors
-    /// Too few rows, settings out of range, no positive definite matrix, or the watcher gave up.
+    /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
     pub fn fit(table: &Table, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
         let (inputs, targets) = split(table);
         let width = table.width();
@@ -55,7 +55,7 @@ impl Trained {
     /// # Errors
     /// The file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), GprError> {
-        let names = Names {
+        let names = ModelHeader {
             format: FORMAT.to_owned(),
             version: VERSION,
             output: self.output.clone(),
@@ -65,7 +65,7 @@ impl Trained {
         write_text(path, &format!("{names}\n{}", self.model.save()?))
     }
 
-    /// Reads one, to work with so many threads.
+    /// Reads a model that works with `threads` threads.
     ///
     /// # Errors
     /// The file cannot be read, is no such model, is damaged, or is of another version.
@@ -78,7 +78,7 @@ impl Trained {
         let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
         let (first, rest) =
             text.split_once('\n').ok_or_else(|| fail("one line only, must be three: no model".into()))?;
-        let names: Names =
+        let names: ModelHeader =
             serde_json::from_str(first).map_err(|error| fail(format!("line 1: no model of gpr: {error}")))?;
         if names.format != FORMAT || names.version != VERSION {
             let found = (&names.format, names.version);
@@ -103,13 +103,13 @@ impl Trained {
     }
 }
 
-/// Writes predictions of a table's rows; its last column is the output, NaN where it is not known.
+/// Writes predictions of a table's rows; its last column is the output, NaN where it is unknown.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn write_predictions(
     path: &Path,
-    trained: &Trained,
+    trained: &TrainedModel,
     table: &Table,
     predictions: &[Prediction],
 ) -> Result<(), GprError> {

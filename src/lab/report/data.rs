@@ -1,4 +1,4 @@
-//! What a report is about, gathered from a store's rows or from a replay's events and estimates.
+//! Data of a report, collected from a store's rows or from a replay's events and estimates.
 //!
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
@@ -10,7 +10,7 @@ use crate::quantity::{CellIndex, Mode};
 /// Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
 const FIRST_DATE_S: f64 = 3.0e8;
 
-/// Where data come from.
+/// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// A store's history: what was learned and alarms, no samples.
@@ -21,7 +21,7 @@ pub enum Origin {
 
 /// A charge or discharge of a cell.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Half {
+pub(super) struct HalfCycleRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
     pub(super) is_charge: bool,
@@ -30,12 +30,12 @@ pub(super) struct Half {
     pub(super) mean_temperature_c: Option<f64>,
 }
 
-/// What was learned at a transition.
+/// Estimates of a cell after a half-cycle.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Learned {
+pub(super) struct CapacityRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
-    /// What this half-cycle alone said, Ah.
+    /// Capacity by this half-cycle alone, Ah.
     pub(super) measured_ah: Option<f64>,
     /// Its standard deviation, Ah.
     pub(super) measured_std_ah: Option<f64>,
@@ -48,16 +48,16 @@ pub(super) struct Learned {
 
 /// A charge that covered the window.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Recharge {
+pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
     pub(super) raw_s: Option<f64>,
     /// Mean and standard deviation.
     pub(super) normalised_s: Option<(f64, f64)>,
 }
 
-/// Something that became of an alarm.
+/// A change of an alarm.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct AlarmRow {
+pub(super) struct AlarmRecord {
     pub(super) time_s: f64,
     pub(super) rule: String,
     pub(super) severity: String,
@@ -68,26 +68,26 @@ pub(super) struct AlarmRow {
     pub(super) threshold: Option<f64>,
 }
 
-/// Where the data come from and how they are.
+/// Origin and quality of the data.
 #[derive(Debug, Clone)]
-pub struct Source {
+pub struct DataSource {
     /// Which kind.
     pub origin: Origin,
     /// Pack of the store, from 1, and packs before it.
     pub pack: Option<i64>,
-    /// Why it may not be believed: a sentence without its full stop.
+    /// Why the data may be wrong: a sentence without its full stop.
     pub doubt: Option<String>,
 }
 
 /// Everything a report shows.
 #[derive(Debug)]
 pub struct Data {
-    pub(super) source: Source,
-    pub(super) halves: Vec<Half>,
-    pub(super) learned: Vec<Learned>,
-    pub(super) recharges: Vec<Recharge>,
-    pub(super) alarms: Vec<AlarmRow>,
-    /// Resets, damages, lost trust: when and what.
+    pub(super) source: DataSource,
+    pub(super) halves: Vec<HalfCycleRecord>,
+    pub(super) learned: Vec<CapacityRecord>,
+    pub(super) recharges: Vec<RechargeRecord>,
+    pub(super) alarms: Vec<AlarmRecord>,
+    /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
     first_s: f64,
@@ -95,10 +95,10 @@ pub struct Data {
 }
 
 impl Data {
-    /// Nothing yet.
+    /// Creates data without any record.
     pub fn new(origin: Origin) -> Self {
         Self {
-            source: Source { origin, pack: None, doubt: None },
+            source: DataSource { origin, pack: None, doubt: None },
             halves: Vec::new(),
             learned: Vec::new(),
             recharges: Vec::new(),
@@ -123,19 +123,19 @@ impl Data {
         Ok(data)
     }
 
-    /// The record may not be believed: a sentence without its full stop.
+    /// Sets why the data may be wrong: a sentence without its full stop.
     pub fn doubt(&mut self, why: String) {
         self.source.doubt = Some(why);
     }
 
-    /// Takes a row of a store.
+    /// Adds a row of a store.
     fn take_entry(&mut self, entry: &Entry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
         self.span(time_s);
         let row = Values(entry);
         let cell = row.number("cell").map(|cell| cell as usize);
         match (entry.kind, cell) {
-            (Kind::HalfCycle, Some(cell)) => self.halves.push(Half {
+            (Kind::HalfCycle, Some(cell)) => self.halves.push(HalfCycleRecord {
                 time_s,
                 cell,
                 is_charge: row.text("mode") == "charge",
@@ -143,7 +143,7 @@ impl Data {
                 duration_s: row.number("duration_s").unwrap_or(f64::NAN),
                 mean_temperature_c: row.number("mean_temperature_c"),
             }),
-            (Kind::Capacity, Some(cell)) => self.learned.push(Learned {
+            (Kind::Capacity, Some(cell)) => self.learned.push(CapacityRecord {
                 time_s,
                 cell,
                 measured_ah: row.number("measured_ah"),
@@ -152,7 +152,7 @@ impl Data {
                 usable_ah: row.pair("usable_capacity_ah", "usable_capacity_std_ah"),
                 resistance: row.pair("resistance_ratio", "resistance_ratio_std").unwrap_or((f64::NAN, f64::NAN)),
             }),
-            (Kind::Alarm, cell) => self.alarms.push(AlarmRow {
+            (Kind::Alarm, cell) => self.alarms.push(AlarmRecord {
                 time_s,
                 rule: row.text("rule"),
                 severity: row.text("severity"),
@@ -168,23 +168,23 @@ impl Data {
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason").replace('_', " "))));
             }
-            // A row of a cell without its number: the store writes none. And the forecast is made anew here.
+            // The store writes no row of a cell without its number. The forecast is computed again here.
             (Kind::HalfCycle | Kind::Capacity, None) | (Kind::RemainingLife, _) => {}
         }
     }
 
-    /// Takes an event of a replay.
+    /// Adds an event of a replay.
     pub fn take_event(&mut self, event: &Event) {
         let time_s = event.time.secs();
         self.span(time_s);
         match event.kind {
             EventKind::HalfCycle { cell, mode, charge_ah, duration_s, mean_temperature_c, .. } => {
                 let (cell, is_charge) = (cell.index(), mode == Mode::Charge);
-                self.halves.push(Half { time_s, cell, is_charge, charge_ah, duration_s, mean_temperature_c });
+                self.halves.push(HalfCycleRecord { time_s, cell, is_charge, charge_ah, duration_s, mean_temperature_c });
             }
             EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
                 let normalised_s = normalised_s.zip(normalised_std_s);
-                self.recharges.push(Recharge { time_s, raw_s: seconds, normalised_s });
+                self.recharges.push(RechargeRecord { time_s, raw_s: seconds, normalised_s });
             }
             EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
             EventKind::Capacity { .. } | EventKind::Alarm { .. } => self.take_learned(time_s, &event.kind),
@@ -205,7 +205,7 @@ impl Data {
                 resistance_ratio,
                 resistance_ratio_std,
                 ..
-            } => self.learned.push(Learned {
+            } => self.learned.push(CapacityRecord {
                 time_s,
                 cell: cell.index(),
                 measured_ah,
@@ -215,7 +215,7 @@ impl Data {
                 resistance: (resistance_ratio, resistance_ratio_std),
             }),
             EventKind::Alarm { rule, cell, change, active, severity, value, threshold, .. } => {
-                self.alarms.push(AlarmRow {
+                self.alarms.push(AlarmRecord {
                     time_s,
                     rule: rule.name().to_owned(),
                     severity: severity.name().to_owned(),
@@ -258,7 +258,7 @@ impl Data {
         self.recharges.clear();
     }
 
-    /// Takes an estimate of a replay.
+    /// Adds an estimate of a replay.
     pub fn take_estimate(&mut self, estimate: &Estimate) {
         self.span(estimate.time.secs());
         self.trace.take(estimate);
@@ -269,17 +269,17 @@ impl Data {
         self.last_s = self.last_s.max(time_s);
     }
 
-    /// First and last moment; `None` = there is nothing.
+    /// First and last time, s; `None` = there are no data.
     pub(super) fn ends_s(&self) -> Option<(f64, f64)> {
         (self.first_s <= self.last_s).then_some((self.first_s, self.last_s))
     }
 
-    /// Whether moments are dates.
+    /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
         self.first_s >= FIRST_DATE_S
     }
 
-    /// Cells that anything is known of.
+    /// Number of cells with data.
     pub(super) fn cells(&self) -> usize {
         let learned = self.learned.iter().map(|row| row.cell + 1);
         let halves = self.halves.iter().map(|row| row.cell + 1);
@@ -287,7 +287,7 @@ impl Data {
     }
 }
 
-/// A word of the core as it is written everywhere.
+/// Returns the serialised name of an enum value.
 fn word(value: &impl serde::Serialize) -> String {
     serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
 }

@@ -2,14 +2,14 @@
 
 use super::data::{Data, Origin};
 use super::pictures::{self, NOT_STORED};
-use super::{Setting, forecast, summary};
+use super::{PageContext, forecast, summary};
 use crate::chart::{Picture, Size, escape, variables};
 
 /// Rows of tables; all is in the pictures, and in `packwatch history`.
 const MAX_ROWS: usize = 200;
 
 /// A part of the page.
-struct Part {
+struct Section {
     id: &'static str,
     title: &'static str,
     /// Names of its pictures.
@@ -20,8 +20,8 @@ struct Part {
     none: fn(&Data) -> &'static str,
 }
 
-const PARTS: [Part; 7] = [
-    Part {
+const SECTIONS: [Section; 7] = [
+    Section {
         id: "soc",
         title: "State of charge",
         pictures: &["soc", "soc_recent"],
@@ -29,7 +29,7 @@ const PARTS: [Part; 7] = [
                each pixel column shows the lowest and the highest value in it.",
         none: |data| if data.source.origin == Origin::Store { NOT_STORED } else { "unknown: no estimate was made" },
     },
-    Part {
+    Section {
         id: "capacity",
         title: "Capacity",
         pictures: &["capacity", "usable_capacity"],
@@ -37,7 +37,7 @@ const PARTS: [Part; 7] = [
                a load, and also falls when resistance rises. A pack is as good as its weakest cell.",
         none: |_| "unknown: no charge or discharge has taught anything about the capacity yet",
     },
-    Part {
+    Section {
         id: "recharge",
         title: "Recharge period",
         pictures: &["recharge_period"],
@@ -45,21 +45,21 @@ const PARTS: [Part; 7] = [
                charger does not look like a worn battery.",
         none: |_| "unknown: no charge covered enough of the window",
     },
-    Part {
+    Section {
         id: "resistance",
         title: "Resistance",
         pictures: &["resistance"],
         note: "Grows with age: the battery gives less power and heats up more.",
         none: |_| "unknown: not learned yet",
     },
-    Part {
+    Section {
         id: "temperature",
         title: "Temperature",
         pictures: &["temperature"],
         note: "",
         none: |_| "unknown: no temperature was measured",
     },
-    Part {
+    Section {
         id: "cells",
         title: "Cells",
         pictures: &["cells_capacity", "cells_resistance"],
@@ -68,7 +68,7 @@ const PARTS: [Part; 7] = [
             if data.cells() == 1 { "one cell: see above" } else { "unknown: nothing was learned about the cells yet" }
         },
     },
-    Part {
+    Section {
         id: "estimator",
         title: "Health of the estimator",
         pictures: &["innovation", "coverage"],
@@ -106,13 +106,13 @@ pre{overflow-x:auto;background:var(--card);padding:12px;border-radius:6px;font-s
 h2,h2+p{break-after:avoid}.scroll{overflow:visible}pre{white-space:pre-wrap}*{print-color-adjust:exact;-webkit-print-color-adjust:exact}}";
 
 /// The page as text.
-pub fn page(data: &Data, setting: &Setting<'_>) -> String {
+pub fn page(data: &Data, setting: &PageContext<'_>) -> String {
     let outlook = forecast::outlook(data, setting);
     let summary = summary::of(data, setting, &outlook);
     let pictures = pictures::all(data, setting);
     let mut out = head(data, setting);
     verdict(&mut out, &summary);
-    for part in &PARTS {
+    for part in &SECTIONS {
         self::part(&mut out, part, data, &pictures);
         match part.id {
             "capacity" => about_forecast(&mut out, data, &outlook),
@@ -125,7 +125,7 @@ pub fn page(data: &Data, setting: &Setting<'_>) -> String {
     out
 }
 
-fn head(data: &Data, setting: &Setting<'_>) -> String {
+fn head(data: &Data, setting: &PageContext<'_>) -> String {
     let title = escape(&setting.title);
     let span = data.ends_s().map_or("there is no record".to_owned(), |(first_s, last_s)| {
         let days = (last_s - first_s) / 86_400.0;
@@ -141,7 +141,7 @@ fn head(data: &Data, setting: &Setting<'_>) -> String {
         1 => "one cell".to_owned(),
         cells => format!("{cells} cells"),
     };
-    let links = PARTS.iter().map(|part| (part.id, part.title)).chain([("alarms", "Alarms"), ("origin", "Origin")]);
+    let links = SECTIONS.iter().map(|part| (part.id, part.title)).chain([("alarms", "Alarms"), ("origin", "Origin")]);
     let links: String = links.map(|(id, title)| format!("<a href=\"#{id}\">{title}</a>")).collect();
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
@@ -188,7 +188,7 @@ fn figure(out: &mut String, picture: &Picture) {
     out.push_str("</figure>\n");
 }
 
-fn part(out: &mut String, part: &Part, data: &Data, pictures: &[(String, Picture)]) {
+fn part(out: &mut String, part: &Section, data: &Data, pictures: &[(String, Picture)]) {
     begin(out, part.id, part.title, part.note);
     let own = || part.pictures.iter().filter_map(|name| pictures.iter().find(|(known, _)| known == name));
     if own().count() == 0 {
@@ -310,7 +310,7 @@ fn pairs(out: &mut String, rows: &[(String, String)]) {
     out.push_str("</tbody></table></div>\n");
 }
 
-fn end(out: &mut String, data: &Data, setting: &Setting<'_>) {
+fn end(out: &mut String, data: &Data, setting: &PageContext<'_>) {
     begin(out, "origin", "Where this comes from", "");
     let mut rows = vec![("Program".to_owned(), concat!("packwatch ", env!("CARGO_PKG_VERSION")).to_owned())];
     rows.extend(setting.provenance.iter().cloned());

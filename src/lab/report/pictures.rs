@@ -2,26 +2,26 @@
 
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
-use super::series::{self, Step};
-use super::trace::{Moment, OF_95};
-use super::{Setting, summary};
+use super::series::{self, CellStep};
+use super::trace::{TraceBin, OF_95};
+use super::{PageContext, summary};
 use crate::alarm::Rule;
-use crate::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Point, Scale, Shape, Span};
+use crate::chart::{Axis, Chart, Heat, Ink, StateBand, StateBands, Layer, Picture, Point, Scale, Shape, Span};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
     "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
 
-/// A hole of this part of the whole interrupts a line, if it is this long as well: some sensors are slow.
+/// A gap of this part of the whole interrupts a line, if it is also this long: some sensors are slow.
 const MAX_HOLE_PART: usize = 100;
 const MAX_HOLE_S: f64 = 100.0;
-/// And of at least this many bins.
+/// Fewest bins of such a gap.
 const MAX_HOLE_BINS: usize = 3;
-/// The last half-cycles have a picture of their own when they are at most this part of the record.
+/// The last half-cycles get their own picture when they are at most this part of the record.
 const MAX_RECENT: f64 = 0.9;
 
-/// Every picture that there are data for, with the name of its file.
-pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> {
+/// Returns every picture that has data, with the name of its file.
+pub(super) fn all(data: &Data, setting: &PageContext<'_>) -> Vec<(String, Picture)> {
     let outlook = forecast::outlook(data, setting);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
     [
@@ -43,14 +43,14 @@ pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> 
     .collect()
 }
 
-/// The x axis: dates, or time since the start in a unit that fits.
-struct Clock {
+/// The x axis: dates, or time since the start in a suitable unit.
+struct TimeAxis {
     axis: Axis,
     zero_s: f64,
     unit_s: f64,
 }
 
-impl Clock {
+impl TimeAxis {
     fn of(data: &Data) -> Self {
         let (first_s, last_s) = data.ends_s().unwrap_or((0.0, 0.0));
         Self::between(data, first_s, last_s)
@@ -77,12 +77,12 @@ impl Clock {
 }
 
 /// The mildest threshold of a rule, as configured, else as its alarms say.
-pub(super) fn threshold(data: &Data, setting: &Setting<'_>, rule: Rule) -> Option<f64> {
+pub(super) fn threshold(data: &Data, setting: &PageContext<'_>, rule: Rule) -> Option<f64> {
     thresholds(data, setting, rule).first().map(|(value, _)| *value)
 }
 
 /// Every threshold of a rule with its severity, the mildest first.
-fn thresholds(data: &Data, setting: &Setting<'_>, rule: Rule) -> Vec<(f64, String)> {
+fn thresholds(data: &Data, setting: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
     let mut all: Vec<(f64, String)> = match setting.config {
         Some(config) => {
             let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
@@ -99,7 +99,7 @@ fn thresholds(data: &Data, setting: &Setting<'_>, rule: Rule) -> Vec<(f64, Strin
     all
 }
 
-fn levels(data: &Data, setting: &Setting<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
+fn levels(data: &Data, setting: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
     thresholds(data, setting, rule).into_iter().map(|(value, severity)| {
         let ink = ink_of(&severity);
         Layer::new(&format!("limit ({severity})"), ink, Shape::Level(value))
@@ -115,7 +115,7 @@ fn ink_of(severity: &str) -> Ink {
 }
 
 /// The moments at which alarms of a rule were raised.
-fn raised(data: &Data, clock: &Clock, rule: Rule) -> Option<Layer> {
+fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
     let points: Vec<Point> = rows
         .map(|row| Point {
@@ -132,7 +132,7 @@ fn moment(data: &Data, time_s: f64) -> String {
 }
 
 /// Bins of a trace as a band and, where cells differ or bins are long, the range within.
-fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
+fn range(bins: &[(f64, &TraceBin)], clock: &TimeAxis, pick: fn(&TraceBin) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
     let band = bins.iter().map(|(time_s, bin)| {
         let (low, high) = pick(bin);
         (clock.x(*time_s), factor * low, factor * high)
@@ -141,8 +141,8 @@ fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64)
 }
 
 /// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
-fn filled<'a>(bins: impl Iterator<Item = (f64, &'a Moment)>) -> Vec<(f64, &'a Moment)> {
-    let all: Vec<(f64, &Moment)> = bins.collect();
+fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
+    let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
     let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
     let mut empty = 0;
@@ -159,9 +159,9 @@ fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
 
-fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn soc(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let bins = filled(life.iter());
     let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
     let mut layers =
@@ -177,14 +177,14 @@ fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let moments: Vec<(f64, &Moment)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
+fn soc_recent(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+    let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
-    // As good as the whole record: the picture before shows it.
+    // Almost the whole record: the picture before shows it.
     if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
         return None;
     }
-    let clock = Clock::between(data, moments.first()?.0, moments.last()?.0);
+    let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
@@ -205,7 +205,7 @@ fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
 }
 
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.
-fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Vec<Layer> {
+fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str) -> Vec<Layer> {
     let interval =
         steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
     let mut layers = vec![Layer::new("95 % interval", ink, Shape::Band(interval.collect()))];
@@ -218,20 +218,20 @@ fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Ve
     layers
 }
 
-fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
+fn capacity(data: &Data, setting: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
     let steps = series::steps(data, series::capacity, false);
     let (first_s, mut last_s) = data.ends_s().filter(|_| !steps.is_empty())?;
     let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
     last_s = fan.iter().map(|point| point.time_s).fold(last_s, f64::max);
-    let clock = Clock::between(data, first_s, last_s);
+    let clock = TimeAxis::between(data, first_s, last_s);
     let mut layers = vec![];
     if data.cells() == 1 {
-        let said = data.learned.iter().filter_map(|row| {
+        let single = data.learned.iter().filter_map(|row| {
             let y = row.measured_ah?;
             let tip = format!("{}: this half-cycle alone {y:.3} Ah", moment(data, row.time_s));
             Some(Point { x: clock.x(row.time_s), y, tip })
         });
-        layers.push(Layer::new("one half-cycle alone", Ink::Grey, Shape::Points(said.collect())));
+        layers.push(Layer::new("one half-cycle alone", Ink::Grey, Shape::Points(single.collect())));
     }
     layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
     if !fan.is_empty() {
@@ -240,13 +240,13 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
-    // Measured capacities are under load, unless there is no such estimate to set them beside.
+    // Measured capacities are under load and belong to the usable capacity, unless there is none.
     if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
         layers.extend(references(data, &clock, setting));
     }
     let limits: Vec<Layer> = levels(data, setting, Rule::CapacityLow).collect();
     let end = forecast::end_of_life_ah(data, setting).map(Shape::Level);
-    // A limit at the same height would hide it, or it the limit.
+    // A limit at the same height would be hidden.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -260,8 +260,8 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
     }))
 }
 
-/// Single half-cycles may say anything: the axis follows what they add up to, with its interval.
-fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
+/// Returns an axis over the filtered values with their interval: single half-cycles may lie far outside.
+fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
     for layer in layers {
@@ -277,7 +277,7 @@ fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
     Axis::number(label).within((low - room).max(0.0), high + room)
 }
 
-fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer> {
+fn references(data: &Data, clock: &TimeAxis, setting: &PageContext<'_>) -> Option<Layer> {
     let capacities = &setting.reference.capacities;
     let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
         x: clock.x(time_s),
@@ -294,7 +294,7 @@ fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer
 }
 
 /// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
-fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
+fn true_soc(setting: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
     let within = setting.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =
         within.map(|&(time_s, low, high)| (clock.x(time_s), 100.0 * low, 100.0 * high)).collect();
@@ -309,12 +309,12 @@ fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64))
     }
 }
 
-fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn usable(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::usable, false);
     if steps.is_empty() {
         return None;
     }
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Orange, "weakest");
     if setting.reference.is_loaded {
         layers.extend(references(data, &clock, setting));
@@ -333,8 +333,8 @@ fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let clock = Clock::of(data);
+fn recharge(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+    let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     let minutes = |seconds: f64| seconds / 60.0;
     let normalised = || data.recharges.iter().filter_map(|row| Some((clock.x(row.time_s), row.normalised_s?)));
@@ -381,12 +381,12 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
 }
 
-fn resistance(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn resistance(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::resistance, true);
     if steps.is_empty() {
         return None;
     }
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Purple, "highest");
     layers.extend(levels(data, setting, Rule::ResistanceHigh));
     layers.extend(raised(data, &clock, Rule::ResistanceHigh));
@@ -399,8 +399,8 @@ fn resistance(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let clock = Clock::of(data);
+fn temperature(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+    let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     if let Some(life) = &data.trace.life {
         let bins = filled(life.iter());
@@ -429,13 +429,13 @@ fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
 
 fn alarms(data: &Data) -> Option<Picture> {
     let (_, last_s) = data.ends_s().filter(|_| !data.alarms.is_empty())?;
-    let clock = Clock::of(data);
-    let mut lanes: Vec<Lane> = Vec::new();
-    let mut open: Vec<(usize, &super::data::AlarmRow)> = Vec::new();
+    let clock = TimeAxis::of(data);
+    let mut lanes: Vec<StateBand> = Vec::new();
+    let mut open: Vec<(usize, &super::data::AlarmRecord)> = Vec::new();
     for row in &data.alarms {
         let name = format!("{} ({})", row.rule, row.severity);
         let lane = lanes.iter().position(|lane| lane.name == name).unwrap_or_else(|| {
-            lanes.push(Lane { name, spans: Vec::new() });
+            lanes.push(StateBand { name, spans: Vec::new() });
             lanes.len() - 1
         });
         let known = open.iter().position(|(at, before)| *at == lane && before.cell == row.cell);
@@ -452,7 +452,7 @@ fn alarms(data: &Data) -> Option<Picture> {
         lanes[lane].spans.push(span(data, &clock, from, last_s, "still raised at"));
     }
     let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
-    Some(Picture::Lanes(Lanes {
+    Some(Picture::StateBands(StateBands {
         title: "Alarms".to_owned(),
         description: format!(
             "{} changes of alarms; each bar is an alarm from when it was raised until it ended",
@@ -464,7 +464,7 @@ fn alarms(data: &Data) -> Option<Picture> {
     }))
 }
 
-fn span(data: &Data, clock: &Clock, from: &super::data::AlarmRow, to_s: f64, end: &str) -> Span {
+fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f64, end: &str) -> Span {
     Span {
         from: clock.x(from.time_s),
         to: clock.x(to_s),
@@ -473,7 +473,7 @@ fn span(data: &Data, clock: &Clock, from: &super::data::AlarmRow, to_s: f64, end
     }
 }
 
-fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Picture> {
+fn heat(data: &Data, title: &str, label: &str, pick: series::ValueSelector) -> Option<Picture> {
     if data.cells() < 2 || data.learned.is_empty() {
         return None;
     }
@@ -488,7 +488,7 @@ fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Pic
     Some(Picture::Heat(Heat {
         title: title.to_owned(),
         description: format!("{label} of every cell, from the start to the end of the record"),
-        x: Clock::of(data).axis,
+        x: TimeAxis::of(data).axis,
         label: label.to_owned(),
         rows,
         tips,
@@ -498,7 +498,7 @@ fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Pic
 
 fn innovation(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let band = range(&filled(life.iter()), &clock, |bin| bin.innovation_v, 1e3);
     Some(Picture::Chart(Chart {
         title: "Innovation: measured minus expected voltage".to_owned(),
@@ -511,7 +511,7 @@ fn innovation(data: &Data) -> Option<Picture> {
 
 fn coverage(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
     // From 80 % where nothing lies lower.
@@ -521,7 +521,7 @@ fn coverage(data: &Data) -> Option<Picture> {
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
     Some(Picture::Chart(Chart {
-        title: "How sure the estimator is, and rightly".to_owned(),
+        title: "Coverage of the estimator's 95 % interval".to_owned(),
         description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
         x: clock.axis,
         y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),

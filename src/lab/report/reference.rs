@@ -1,4 +1,4 @@
-//! Measured or true capacities and SOC from a CSV, to be drawn beside the estimates.
+//! Measured or true capacities and SOC from a CSV, to be drawn next to the estimates.
 
 use std::io::Read;
 use std::path::Path;
@@ -12,15 +12,15 @@ const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
 const SOC: [&str; 1] = ["soc"];
 /// Names a column of moments may have.
 const TIME: [&str; 4] = ["time_s", "start", "date", "time"];
-/// A smaller change of the capacity, part of it, is not worth a point of its own.
+/// Smallest relative change of the capacity that gets a point of its own.
 const KEPT_CHANGE: f64 = 2e-4;
 
-/// What was measured; times in s on the data's clock.
+/// Measured or true values; times in s on the data's clock.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
-    /// Moment and Ah; where a row tells its cell, of the weakest cell.
+    /// Moment and Ah; where rows name their cell, of the weakest cell.
     pub capacities: Vec<(f64, f64)>,
-    /// They were measured under load; else they are those between full and empty.
+    /// Whether they were measured under load; else they are those between full and empty.
     pub is_loaded: bool,
     /// Moment, SOC of the lowest and the highest cell, fraction.
     pub socs: Vec<(f64, f64, f64)>,
@@ -35,7 +35,7 @@ struct Columns {
 }
 
 /// Reads a table with a capacity (`capacity_ah` or `capacity_ah_source`, Ah), an SOC (`soc`, fraction), or both, and a
-/// moment (`time_s`, s; `start`, `date` or `time`, s or like 2008-04-02T13:08:17). An empty field is passed over. With a
+/// moment (`time_s`, s; `start`, `date` or `time`, s or like 2008-04-02T13:08:17). An empty field is skipped. With a
 /// column `cell`, rows of one moment are joined to the weakest cell's capacity and the lowest and highest SOC.
 ///
 /// # Errors
@@ -102,7 +102,7 @@ impl Reference {
     }
 }
 
-/// A little beyond full and empty an SOC may be; 0 to 100 would be percent.
+/// Parses a number. An SOC may lie slightly beyond full and empty; values up to 100 would be percent.
 fn number(name: &str, text: &str, most: f64) -> Result<f64, String> {
     let least = if most.is_finite() { 1.0 - most } else { 0.0 };
     let value = text.parse().ok().filter(|value: &f64| value.is_finite() && (least..=most).contains(value));
@@ -110,7 +110,7 @@ fn number(name: &str, text: &str, most: f64) -> Result<f64, String> {
     value.ok_or_else(|| format!("{name} {text:?}, must be {allowed}"))
 }
 
-/// Leaves the points at which the capacity has changed, and the last.
+/// Keeps the points at which the capacity has changed, and the last.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn dates_and_seconds_are_read_and_rows_without_a_capacity_passed_over() {
+    fn dates_and_seconds_are_read_and_rows_without_a_capacity_skipped() {
         let rows = of("cycle,start,capacity_ah_source\n0,2008-04-02T13:08:17,\n1,2008-04-02T15:25:41,1.856\n").unwrap();
         assert_eq!((rows.capacities, rows.is_loaded), (vec![(1_207_149_941.0, 1.856)], true));
         assert_eq!(of("time_s,capacity_ah\n20,2\n10,1\n").unwrap().capacities[0].1, 1.0);
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_its_line() {
+    fn a_fault_names_its_line() {
         assert!(of("a,b\n1,2\n").unwrap_err().contains("r.csv:1: no column capacity_ah or capacity_ah_source or soc"));
         assert!(of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: capacity \"NaN\""));
         assert!(of("time_s,capacity_ah\nsoon,2\n").unwrap_err().contains("r.csv:2: time \"soon\""));

@@ -23,7 +23,7 @@ pub struct HistoryError(pub String);
 
 /// A reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Row {
+pub struct CapacityReading {
     /// Line of the file.
     pub line: u64,
     /// Units of the history's axis since the first reading.
@@ -44,7 +44,7 @@ pub struct History {
     /// What counts as use.
     pub axis: Axis,
     /// In order of time, at least one.
-    pub rows: Vec<Row>,
+    pub rows: Vec<CapacityReading>,
 }
 
 struct Columns {
@@ -56,7 +56,7 @@ struct Columns {
 
 /// What is counted over the lines read so far.
 #[derive(Default)]
-struct Counted {
+struct UseCounter {
     first: Option<Timestamp>,
     last: Option<Timestamp>,
     discharges: f64,
@@ -66,7 +66,7 @@ struct Counted {
     rest_days: f64,
 }
 
-impl Row {
+impl CapacityReading {
     /// What passed since another.
     pub fn since(&self, before: &Self) -> Usage {
         Usage {
@@ -90,13 +90,13 @@ impl History {
         let fail = |e: csv::Error| HistoryError(format!("{name}: {e}"));
         let headers = reader.headers().map_err(fail)?.clone();
         let columns = Columns::find(&headers).map_err(|what| HistoryError(format!("{name}:1: {what}")))?;
-        let (mut counted, mut rows) = (Counted::default(), Vec::new());
+        let (mut counted, mut rows) = (UseCounter::default(), Vec::new());
         for record in reader.records() {
             let record = record.map_err(fail)?;
             let line = record.position().map_or(0, csv::Position::line);
             let row = counted.take(&columns, &headers, &record);
             let row = row.map_err(|what| HistoryError(format!("{name}:{line}: {what}")))?;
-            rows.extend(row.map(|row| Row { line, ..row }));
+            rows.extend(row.map(|row| CapacityReading { line, ..row }));
         }
         if rows.is_empty() {
             let column = &headers[columns.capacity];
@@ -129,14 +129,14 @@ impl Columns {
     }
 }
 
-impl Counted {
+impl UseCounter {
     /// Takes a line; a reading when it is one.
     fn take(
         &mut self,
         columns: &Columns,
         headers: &csv::StringRecord,
         record: &csv::StringRecord,
-    ) -> Result<Option<Row>, String> {
+    ) -> Result<Option<CapacityReading>, String> {
         let field = |column: usize| record.get(column).unwrap_or_default();
         let fault = |column: usize, allowed: &str| {
             format!("column {}: found {:?}, must be {allowed}", &headers[column], field(column))
@@ -173,14 +173,14 @@ impl Counted {
         self.last = Some(time);
     }
 
-    fn row(&mut self, columns: &Columns, time: Timestamp, capacity_ah: f64) -> Row {
+    fn row(&mut self, columns: &Columns, time: Timestamp, capacity_ah: f64) -> CapacityReading {
         if self.first.is_none() {
             (self.first, self.before, self.rest_days) = (Some(time), self.discharges, 0.0);
         }
         let days = self.first.map_or(0.0, |first| time.since(first) / DAY_S);
         let cycles = if columns.kind.is_some() { self.discharges - self.before } else { 0.0 };
         let used = if columns.kind.is_some() { cycles } else { days };
-        Row { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
+        CapacityReading { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
     }
 }
 

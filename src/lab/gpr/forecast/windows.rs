@@ -1,10 +1,10 @@
-//! What is known at a row: values and differences of the rows before it, and which rows have that.
+//! Lag windows: values and differences of the rows up to a row, and which rows have them.
 
 use super::super::Table;
 
 /// Windows of a table.
 #[derive(Debug)]
-pub struct Windows<'a> {
+pub struct LagWindows<'a> {
     table: &'a Table,
     columns: usize,
     lags: usize,
@@ -12,16 +12,16 @@ pub struct Windows<'a> {
     part: Vec<(usize, usize)>,
 }
 
-/// How far apart in time the rows are.
+/// Time between the rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Steps {
+pub struct RowSpacing {
     /// Median, in the unit of the time column.
     pub median: f64,
     /// 5 % and 95 % of the steps are below.
     pub range: (f64, f64),
 }
 
-impl Steps {
+impl RowSpacing {
     /// Of a column of the table, within its parts; `None` when there are no steps or no times.
     pub fn of(table: &Table, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
@@ -33,15 +33,15 @@ impl Steps {
         Some(Self { median: at(0.5)?, range: (at(0.05)?, at(0.95)?) })
     }
 
-    /// Whether nine of ten are as long as the median, give or take a tenth.
+    /// Whether nine of ten steps are within a tenth of the median.
     pub fn even(&self) -> bool {
         let near = |step: f64| (step - self.median).abs() <= 0.1 * self.median.abs();
         near(self.range.0) && near(self.range.1)
     }
 }
 
-impl<'a> Windows<'a> {
-    /// Of the columns of the table that every row has, so many values each.
+impl<'a> LagWindows<'a> {
+    /// Creates windows over the table's required columns with `lags` values of each.
     pub fn new(table: &'a Table, lags: usize) -> Self {
         let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
         let spans = table.parts.iter().copied().zip(ends);
@@ -73,7 +73,7 @@ impl<'a> Windows<'a> {
         self.table.row(row)[column]
     }
 
-    /// What a column changes by within so many rows.
+    /// Returns the change of a column within `steps` rows.
     pub fn change(&self, row: usize, column: usize, steps: usize) -> f64 {
         self.value(row + steps, column) - self.value(row, column)
     }
@@ -109,7 +109,7 @@ mod tests {
     #[test]
     fn windows_hold_the_past_and_do_not_cross_parts() {
         let table = table();
-        let windows = Windows::new(&table, 3);
+        let windows = LagWindows::new(&table, 3);
         assert_eq!(windows.features(&[4]), [16.0, 7.0, 5.0, 40.0, 10.0, 10.0]);
         assert_eq!((windows.between(0, 8, 1), windows.between(0, 8, 2)), (vec![2, 3], vec![2]));
         assert_eq!((windows.between(0, 4, 1), windows.between(3, 8, 0)), (vec![2], vec![3, 4, 7]));
@@ -120,9 +120,9 @@ mod tests {
     #[test]
     fn steps_are_counted_within_parts() {
         let mut uneven = table();
-        assert!(Steps::of(&uneven, 2).expect("steps").even());
+        assert!(RowSpacing::of(&uneven, 2).expect("steps").even());
         uneven.values[3 * 5 + 2] = 1000.0;
-        let steps = Steps::of(&uneven, 2).expect("steps");
+        let steps = RowSpacing::of(&uneven, 2).expect("steps");
         assert!(!steps.even() && steps.median == 1.0, "{steps:?}");
     }
 }
