@@ -17,6 +17,7 @@ use super::candump::{self, Line, fast_line};
 use super::csv_log::{CsvLog, CsvOptions, RowResult};
 use super::journal::{self, Mark};
 use super::lines::{self, Lines, RawLine};
+use super::table::TableError;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
@@ -36,6 +37,12 @@ pub const MAX_ADOPTED: usize = 64;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct LogError(pub String);
+
+impl From<TableError> for LogError {
+    fn from(error: TableError) -> Self {
+        Self(error.0)
+    }
+}
 
 /// Turns one CSV row's values into the frames that would have carried them; gives how many values no frame could carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
@@ -214,7 +221,7 @@ impl LogSource {
                     }
                     None => false,
                 },
-                Form::Csv(log) => self.state.next_row(log, &open.name)?.is_some_and(|raw| {
+                Form::Csv(log) => self.state.next_row(log)?.is_some_and(|raw| {
                     let (gap, time) = self.state.place(raw);
                     self.queue.extend(gap);
                     let uncarried = (self.encode_row)(&log.values, &mut self.frames);
@@ -428,23 +435,23 @@ impl State {
     }
 
     /// The next good row's time on the file's own clock.
-    fn next_row(&mut self, log: &mut CsvLog, name: &str) -> Result<Option<Timestamp>, LogError> {
+    fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
             match log.next() {
-                Ok(RowResult::Row(row)) => {
+                Ok(RowResult::Good(row)) => {
                     self.counts.lines += 1;
                     if row.after_unknown_gap {
                         (self.fresh, self.unknown) = (true, true);
                     }
                     return Ok(Some(row.time));
                 }
-                Ok(RowResult::Bad { line, what }) => {
+                Ok(RowResult::Bad(error)) => {
                     self.counts.lines += 1;
-                    self.bad(|| format!("{name}:{line}: {what}"))?;
+                    self.bad(|| error.0)?;
                 }
                 Ok(RowResult::End) => return Ok(None),
                 Err(error) => {
-                    self.bad(|| format!("{name}: damaged: {error}"))?;
+                    self.bad(|| error.0)?;
                     return Ok(None);
                 }
             }
