@@ -7,7 +7,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
-use packwatch::lab::gpr::{MissingPolicy, PartColumn, Table, TrainedModel, ColumnSelection};
+use packwatch::lab::gpr::{MissingPolicy, PartColumn, ColumnTable, TrainedModel, ColumnSelection};
 use packwatch::regress::{Form, Settings};
 use serde_json::Value;
 
@@ -125,8 +125,8 @@ fn means(text: &str) -> Vec<u64> {
 fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
     let table = |name: &str| {
         let columns = ["time", "temperature", "current", "voltage_v"].map(str::to_owned);
-        let wanted = ColumnSelection { columns: &columns, optional: &[], missing: MissingPolicy::Refused };
-        Table::read(&[folder.join(name)], &wanted, &PartColumn::None).unwrap()
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing: MissingPolicy::Rejected };
+        ColumnTable::read(&[folder.join(name)], &wanted, &PartColumn::None).unwrap()
     };
     let mut settings = Settings::new("matern32".parse().unwrap(), 200);
     settings.form = match form {

@@ -37,7 +37,7 @@ fn forecasts_of_measured_lives_cover_the_truth_and_beat_both_baselines() {
         let mut files: Vec<PathBuf> = files.map(|file| file.unwrap().path()).collect();
         files.sort();
         for file in files.iter().filter(|file| file.to_string_lossy().ends_with(ending)) {
-            let history = rul::read(file).unwrap();
+            let history = History::read(file).unwrap();
             let name = file.file_stem().unwrap().to_string_lossy();
             scored.extend(thresholds.iter().map(|&t| rul::score(&history, &name, t, &AT, ALPHA)));
         }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
-use crate::lab::gpr::{self, PartColumn, Table, TrainedModel, ColumnSelection};
+use crate::lab::gpr::{self, PartColumn, ColumnTable, TrainedModel, ColumnSelection};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs, whole};
 
@@ -118,7 +118,7 @@ struct ColumnArgs {
 
 impl ColumnArgs {
     /// Inputs, then the output.
-    fn table(&self, files: &FileArgs) -> Result<Table, Failure> {
+    fn table(&self, files: &FileArgs) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
         let wanted = ColumnSelection { columns: &columns, optional: &[], missing: files.missing() };
         read(&files.files, &wanted, &PartColumn::None)
@@ -126,8 +126,8 @@ impl ColumnArgs {
 }
 
 /// Reads files; rejects a column named twice, which would predict itself.
-fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Table, Failure> {
-    let table = Table::read(files, wanted, part).map_err(failure)?;
+fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<ColumnTable, Failure> {
+    let table = ColumnTable::read(files, wanted, part).map_err(failure)?;
     let names = &table.names[..wanted.columns.len()];
     if let Some((_, twice)) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
         return Err(Failure::new(format!("column {twice} is named twice, must be an input or an output, once")));
@@ -219,7 +219,7 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let trained = TrainedModel::load(&args.model, args::threads(args.threads)).map_err(failure)?;
     let output = [trained.output.clone()];
     let wanted = ColumnSelection { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
-    let table = Table::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
+    let table = ColumnTable::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
         // The reader of the output has closed it: no failure.

@@ -51,7 +51,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
     let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
-    let reference = args.reference.as_deref().map(report::read_reference).transpose().map_err(Failure::new)?;
+    let reference = args.reference.as_deref().map(report::read_reference).transpose();
+    let reference = reference.map_err(|error| Failure::new(error.to_string()))?;
     let (data, provenance) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
@@ -60,14 +61,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut provenance = provenance;
     provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
     provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
-    let setting = PageContext {
+    let context = PageContext {
         title: args.title(),
         config: config.as_ref(),
         config_text: config_text.map_err(|error| Failure::new(error.to_string()))?,
         reference: reference.unwrap_or_default(),
         provenance,
     };
-    match write(&args.out, &report::page(&data, &setting)) {
+    match write(&args.out, &report::page(&data, &context)) {
         // The reader of the output has closed it: no failure.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
         written => written.map_err(|error| Failure::new(error.to_string()))?,
@@ -75,7 +76,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let Some(folder) = &args.plots else { return Ok(()) };
     fs::create_dir_all(folder)
         .map_err(|error| Failure::new(format!("{}: cannot be created: {error}", folder.display())))?;
-    report::write_plots(folder, &data, &setting).map(drop).map_err(|error| Failure::new(error.to_string()))
+    report::write_plots(folder, &data, &context).map(drop).map_err(|error| Failure::new(error.to_string()))
 }
 
 impl Args {

@@ -65,7 +65,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
     let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
     for (path, name) in args.files.iter().zip(names(&args.files)) {
-        let history = rul::read(path).map_err(|error| Failure::new(error.to_string()))?;
+        let history = rul::History::read(path).map_err(|error| Failure::new(error.to_string()))?;
         all.extend(args.end_of_life.iter().map(|&threshold| work(&history, &name, threshold)));
     }
     Ok(all)

@@ -13,7 +13,7 @@ use std::path::PathBuf;
 pub use picture::write as write_plot;
 pub use toml::text;
 
-use super::measured::{MeasuredError, MeasuredFile};
+use super::measured::MeasuredFile;
 use crate::cell::Thermal;
 use crate::ident::error_table::WeightedRecord;
 use crate::ident::fit::{FittedTables, Residual, FitSettings};
@@ -21,6 +21,7 @@ use crate::ident::grid::Grid;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{error_table, fit, thermal};
+use crate::io::table::TableError;
 
 /// Least share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
@@ -129,8 +130,8 @@ pub struct FitOutcome {
 #[error("{0}")]
 pub struct FitFailure(pub String);
 
-impl From<MeasuredError> for FitFailure {
-    fn from(error: MeasuredError) -> Self {
+impl From<TableError> for FitFailure {
+    fn from(error: TableError) -> Self {
         Self(error.0)
     }
 }

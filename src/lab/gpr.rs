@@ -1,6 +1,6 @@
 //! Gaussian process regression on files: tables in, cross-validation, trained models, predictions, forecasts, pictures.
 //!
-//! [`Table`] reads columns of CSV files; [`cross_validate`] makes the paper's experiment; [`TrainedModel`] is a model with the
+//! [`ColumnTable`] reads columns of CSV files; [`cross_validate`] makes the paper's experiment; [`TrainedModel`] is a model with the
 //! names of its columns, saved and loaded; [`forecast`] predicts rows to come from rows that were, without inputs of the
 //! future. The arithmetic is [`crate::regress`]. Nothing here prints.
 
@@ -14,10 +14,11 @@ use std::path::Path;
 use std::time::Instant;
 
 pub use pictures::{write_cross_validation, write_forecast};
-pub use table::{MissingPolicy, PartColumn, Table, ColumnSelection};
+pub use table::{MissingPolicy, PartColumn, ColumnTable, ColumnSelection};
 pub use trained::{TrainedModel, write_predictions};
 
 use crate::io::result_file::ResultFile;
+use crate::io::table::TableError;
 use crate::regress::{self, Folds, Rows, Score, Settings, Watcher};
 
 /// Why there is no regression.
@@ -28,6 +29,12 @@ pub struct GprError(pub String);
 impl From<regress::Fault> for GprError {
     fn from(fault: regress::Fault) -> Self {
         Self(fault.to_string())
+    }
+}
+
+impl From<TableError> for GprError {
+    fn from(error: TableError) -> Self {
+        Self(error.0)
     }
 }
 
@@ -53,7 +60,7 @@ pub struct CrossValidation {
 }
 
 /// Inputs (all columns but the last, row after row) and targets (the last).
-pub fn split(table: &Table) -> (Vec<f64>, Vec<f64>) {
+pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
     let width = table.width();
     let inputs = table.values.chunks_exact(width).flat_map(|row| row[..width - 1].iter().copied()).collect();
     (inputs, table.column(width - 1).collect())
@@ -64,7 +71,7 @@ pub fn split(table: &Table) -> (Vec<f64>, Vec<f64>) {
 /// # Errors
 /// Too few rows for the folds, settings out of range, or the watcher stopped it.
 pub fn cross_validate(
-    table: &Table,
+    table: &ColumnTable,
     settings: &Settings,
     folds: usize,
     watcher: &mut Watcher<'_>,
@@ -83,7 +90,7 @@ pub fn cross_validate(
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_validated(path: &Path, table: &Table, all: &[CrossValidation]) -> Result<(), GprError> {
+pub fn write_validated(path: &Path, table: &ColumnTable, all: &[CrossValidation]) -> Result<(), GprError> {
     let output = &table.names[table.width() - 1];
     let mut out = csv::Writer::from_writer(create(path)?);
     let own = ["kernel", "file", "line", "fold"].map(str::to_owned);

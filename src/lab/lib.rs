@@ -6,6 +6,7 @@ pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
 pub mod chart;
+mod fields;
 pub mod fit;
 pub mod fleet;
 pub mod gpr;

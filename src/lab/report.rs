@@ -41,8 +41,8 @@ pub struct PageContext<'a> {
 ///
 /// # Errors
 /// A file cannot be written, or there is no font for the words of a PNG.
-pub fn write_plots(folder: &Path, data: &Data, setting: &PageContext<'_>) -> Result<usize, PlotError> {
-    let pictures = pictures::all(data, setting);
+pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Result<usize, PlotError> {
+    let pictures = pictures::all(data, context);
     for (name, picture) in &pictures {
         chart::write(&folder.join(format!("{name}.svg")), picture, Format::Svg)?;
         chart::write(&folder.join(format!("{name}.png")), picture, Format::Png)?;

@@ -13,11 +13,9 @@ mod baseline;
 mod history;
 mod truth;
 
-use std::path::Path;
-
 use serde::Serialize;
 
-pub use history::{History, HistoryError, CapacityReading};
+pub use history::{CapacityReading, History};
 pub use truth::end_of_life;
 
 use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
@@ -134,15 +132,7 @@ impl Threshold {
     }
 }
 
-/// Reads a history.
-///
-/// # Errors
-/// It cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
-pub fn read(path: &Path) -> Result<History, HistoryError> {
-    History::read(path)
-}
-
-/// The forecast at the end of the history.
+/// Makes the forecast at the end of the history.
 pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForecast {
     let forecast = fed(history, f64::INFINITY);
     let threshold_ah = threshold.ampere_hours(history);

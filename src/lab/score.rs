@@ -27,7 +27,8 @@ pub use life::{DischargeScore, LifeScore};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
 use super::chart::PlotError;
-use super::measured::{MeasuredError, MeasuredFile};
+use super::measured::MeasuredFile;
+use crate::io::table::TableError;
 use crate::monitor::MonitorConfig;
 
 /// Half-width of a Gaussian's 95 % interval in standard deviations.
@@ -87,7 +88,7 @@ pub struct ScoreJob {
 pub enum ScoreError {
     /// A file cannot be read.
     #[error(transparent)]
-    Measured(#[from] MeasuredError),
+    Table(#[from] TableError),
     /// A plot cannot be written.
     #[error(transparent)]
     Plot(#[from] PlotError),

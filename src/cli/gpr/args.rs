@@ -33,7 +33,7 @@ impl FileArgs {
     }
 
     pub(super) fn missing(&self) -> MissingPolicy {
-        if self.skip_missing { MissingPolicy::Skipped } else { MissingPolicy::Refused }
+        if self.skip_missing { MissingPolicy::Skipped } else { MissingPolicy::Rejected }
     }
 }
 

@@ -11,7 +11,7 @@ use super::super::Failure;
 use super::super::score::write_table;
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
 use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
-use super::{PartColumn, Table, ColumnSelection, failure, make_folder, quiet, read};
+use super::{PartColumn, ColumnTable, ColumnSelection, failure, make_folder, quiet, read};
 use crate::lab::gpr::forecast::{self, TableForecast, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, ForecastPlan, RowSpacing, horizons};
 use crate::lab::gpr::{self, peak_kib};
 use crate::regress::Kernel;
@@ -70,7 +70,7 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// A forecast with its plan.
 struct ForecastReport<'a> {
-    table: &'a Table,
+    table: &'a ColumnTable,
     plan: &'a ForecastPlan,
     forecast: &'a TableForecast,
     steps: Option<RowSpacing>,
@@ -105,12 +105,12 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
 
 impl ForecastArgs {
     /// Outputs, inputs, and the time where there is one.
-    fn table(&self) -> Result<Table, Failure> {
+    fn table(&self) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.outputs.iter().chain(&self.inputs).cloned().collect();
         let time = ["time".to_owned()];
         let wanted = ColumnSelection { columns: &columns, optional: &time, missing: self.files.missing() };
         let part = match self.part.as_deref() {
-            None => PartColumn::Usual,
+            None => PartColumn::Default,
             Some("none") => PartColumn::None,
             Some(name) => PartColumn::Named(name.to_owned()),
         };

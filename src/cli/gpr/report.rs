@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{Map, Value, json};
 
 use super::super::score::write_table;
-use crate::lab::gpr::{Table, TrainedModel, CrossValidation, peak_kib};
+use crate::lab::gpr::{ColumnTable, TrainedModel, CrossValidation, peak_kib};
 use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
 
 /// Version of the JSON documents.
@@ -76,7 +76,7 @@ pub(super) fn jitter_json(jitter: Jitter) -> Value {
     json!({ "matrices": jitter.matrices, "largest": jitter.largest })
 }
 
-pub(super) fn skipped(out: &mut impl Write, table: &Table) -> io::Result<()> {
+pub(super) fn skipped(out: &mut impl Write, table: &ColumnTable) -> io::Result<()> {
     if table.skipped > 0 {
         writeln!(out, "{} rows left out: a value is missing", table.skipped)?;
     }
@@ -102,7 +102,7 @@ pub(super) fn short(value: f64) -> String {
 
 /// A cross-validation.
 pub(super) struct Cv<'a> {
-    pub(super) table: &'a Table,
+    pub(super) table: &'a ColumnTable,
     pub(super) settings: &'a Settings,
     pub(super) folds: usize,
     pub(super) all: &'a [CrossValidation],
@@ -205,7 +205,7 @@ impl Cv<'_> {
 /// A model that was trained.
 pub(super) struct Train<'a> {
     pub(super) trained: &'a TrainedModel,
-    pub(super) table: &'a Table,
+    pub(super) table: &'a ColumnTable,
     pub(super) seconds: f64,
     pub(super) default_form: bool,
 }
@@ -257,7 +257,7 @@ impl Train<'_> {
 /// Predictions of a saved model.
 pub(super) struct Predict<'a> {
     pub(super) trained: &'a TrainedModel,
-    pub(super) table: &'a Table,
+    pub(super) table: &'a ColumnTable,
     pub(super) known: usize,
     pub(super) score: Option<Score>,
 }

@@ -16,10 +16,11 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde_json::json;
 
-use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned};
+use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
 use crate::config::Config;
+use crate::fields::Fields;
 use crate::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
@@ -213,7 +214,7 @@ struct LogTables {
     rated_ah: f64,
     moved_ah: Vec<f64>,
     /// A half-cycle whose capacity event follows.
-    half_cycle: Option<HalfCycle>,
+    half_cycle: Option<(CellIndex, Fields)>,
 }
 
 impl LogTables {
@@ -255,20 +256,25 @@ impl LogTables {
     fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), String> {
         let (log, time) = (self.log.clone(), event.time);
         let since_s = self.since_ns(time) as f64 * 1e-9;
-        if let Some(half) = HalfCycle::of(&event.kind) {
-            if let Some(moved_ah) = self.moved_ah.get_mut(half.cell.index()) {
-                *moved_ah += half.charge_ah;
+        match event.kind {
+            EventKind::HalfCycle { cell, charge_ah, .. } => {
+                if let Some(moved_ah) = self.moved_ah.get_mut(cell.index()) {
+                    *moved_ah += charge_ah;
+                }
+                self.half_cycle = Some((cell, Fields::of_event(&event.kind)));
             }
-            self.half_cycle = Some(half);
-        } else if let Some((cell, learned)) = Learned::of(&event.kind) {
-            let half = self.half_cycle.take().filter(|half| half.cell == cell);
-            let half = half.ok_or("a capacity came without its half-cycle")?;
-            let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
-            self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, learned, remaining })?;
-        } else if matches!(event.kind, EventKind::PackReplaced { .. }) {
-            self.moved_ah.fill(0.0);
-        } else if let Some(alarm) = Alarm::of(&event.kind) {
-            self.alarms.push(&AlarmRow { log, time, since_s, alarm })?;
+            EventKind::Capacity { cell, .. } => {
+                let half = self.half_cycle.take().filter(|half| half.0 == cell);
+                let (_, half) = half.ok_or("a capacity came without its half-cycle")?;
+                let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
+                let capacity = Fields::of_event(&event.kind);
+                self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, capacity, remaining })?;
+            }
+            EventKind::PackReplaced { .. } => self.moved_ah.fill(0.0),
+            EventKind::Alarm { rule, .. } => {
+                self.alarms.push(&AlarmRow { log, time, since_s, rule, alarm: Fields::of_event(&event.kind) })?;
+            }
+            _ => {}
         }
         Ok(())
     }

@@ -8,11 +8,10 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use crate::io::{lines, stamp};
-use crate::score::CycleTable;
+use crate::io::table::{Table, TableError};
 use crate::quantity::{CellIndex, Timestamp};
+use crate::score::CycleTable;
 
 /// Smallest relative change of the capacity that is stored.
 const KEPT_CHANGE: f64 = 2e-4;
@@ -41,37 +40,28 @@ pub struct Truth {
 }
 
 impl Truth {
-    /// Reads it.
+    /// Reads a truth of either form.
     ///
     /// # Errors
     /// It cannot be read, is of neither form, or a field is wrong: file, line, found, allowed.
-    pub fn read(path: &Path) -> Result<Self, String> {
-        let name = path.display();
-        let unreadable = |error: std::io::Error| format!("{name}: cannot be read: {error}");
-        let file = lines::open(path, &Arc::default()).map_err(unreadable)?;
-        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
-        let headers = reader.headers().map_err(|error| format!("{name}: {error}"))?.clone();
-        let column = |wanted: &str| headers.iter().position(|header| header.trim_start_matches('\u{feff}') == wanted);
-        match (column("time_s"), column("cell"), column("capacity_ah"), column("capacity_ah_source")) {
-            (Some(time), Some(cell), Some(capacity), _) => {
-                read_simulated(&mut reader, [time, cell, capacity]).map_err(|what| format!("{name}:{what}"))
-            }
-            (.., Some(_)) => Self::of_table(path),
-            _ => {
-                let found: Vec<_> = headers.iter().collect();
-                Err(format!(
-                    "{name}:1: columns {}, must have time_s, cell, capacity_ah or type, start, capacity_ah_source",
-                    found.join(",")
-                ))
-            }
+    pub fn read(path: &Path) -> Result<Self, TableError> {
+        let table = Table::open(path)?;
+        let header = table.header();
+        match ["time_s", "cell", "capacity_ah", "capacity_ah_source"].map(|name| header.find(name)) {
+            [Some(time), Some(cell), Some(capacity), _] => read_simulated(table, [time, cell, capacity]),
+            [.., Some(_)] => Self::of_table(path),
+            _ => Err(header.fault(format_args!(
+                "columns {}, must have time_s, cell, capacity_ah or type, start, capacity_ah_source",
+                header.names().join(",")
+            ))),
         }
     }
 
-    fn of_table(path: &Path) -> Result<Self, String> {
-        let table = CycleTable::read(path).map_err(|error| error.to_string())?;
+    fn of_table(path: &Path) -> Result<Self, TableError> {
+        let table = CycleTable::read(path)?;
         let points: Vec<_> = table.discharges.iter().filter_map(|d| Some((d.start, d.capacity_ah?))).collect();
         let span = points.first().zip(points.last()).map(|(first, last)| (first.0, last.0));
-        let span = span.ok_or_else(|| format!("{}: no discharge has a capacity", path.display()))?;
+        let span = span.ok_or_else(|| TableError(format!("{}: no discharge has a capacity", path.display())))?;
         Ok(Self { kind: TruthKind::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
     }
 
@@ -96,28 +86,24 @@ impl Truth {
     }
 }
 
-fn read_simulated(reader: &mut csv::Reader<Box<dyn std::io::Read>>, columns: [usize; 3]) -> Result<Truth, String> {
+fn read_simulated(mut table: Table, [time, cell, capacity]: [usize; 3]) -> Result<Truth, TableError> {
     let (mut cells, mut span): (BTreeMap<CellIndex, Vec<(Timestamp, f64)>>, _) = (BTreeMap::new(), None);
-    let mut record = csv::StringRecord::new();
-    while reader.read_record(&mut record).map_err(|error| format!(" {error}"))? {
-        let line = record.position().map_or(0, csv::Position::line);
-        let field = |index: usize| record.get(index).unwrap_or_default();
-        let bad = |index: usize, what: &str| format!("{line}: {:?}, must be {what}", field(index));
-        let time = stamp::parse_stamp(field(columns[0])).ok_or_else(|| bad(columns[0], "seconds"))?;
-        let cell = field(columns[1]).parse().map(CellIndex).map_err(|_| bad(columns[1], "a cell from 0"))?;
-        let ah = field(columns[2]).parse::<f64>().ok().filter(|ah| ah.is_finite() && *ah >= 0.0);
-        let ah = ah.ok_or_else(|| bad(columns[2], "0 Ah or more"))?;
-        let (first, last) = span.unwrap_or((time, time));
-        if time < last {
-            return Err(bad(columns[0], "no earlier than the row before"));
+    while let Some(row) = table.next_row()? {
+        let now = row.stamp(time)?;
+        let index = row.text(cell).parse().map(CellIndex).map_err(|_| row.fault(cell, "a cell from 0"))?;
+        const ALLOWED: &str = "0 Ah or more";
+        let ah = row.number_in(capacity, 0.0..=f64::MAX, ALLOWED)?.ok_or_else(|| row.fault(capacity, ALLOWED))?;
+        let (first, last) = span.unwrap_or((now, now));
+        if now < last {
+            return Err(row.fault(time, "no earlier than the row before"));
         }
-        span = Some((first, time));
-        let points = cells.entry(cell).or_default();
+        span = Some((first, now));
+        let points = cells.entry(index).or_default();
         if points.last().is_none_or(|(_, kept)| (ah - kept).abs() > KEPT_CHANGE * kept) {
-            points.push((time, ah));
+            points.push((now, ah));
         }
     }
-    let span = span.ok_or("2: no row, must have one per time and cell")?;
+    let span = span.ok_or_else(|| table.header().file_fault("no row, must have one per time and cell"))?;
     Ok(Truth { kind: TruthKind::Capacity, cells, span })
 }
 
@@ -164,7 +150,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("t.csv");
         std::fs::write(&path, text).expect("written");
-        Truth::read(&path).map_err(|error| error.replace(&path.display().to_string(), "t.csv"))
+        Truth::read(&path).map_err(|error| error.0.replace(&path.display().to_string(), "t.csv"))
     }
 
     #[test]
@@ -191,10 +177,10 @@ mod tests {
 
     #[test]
     fn a_fault_names_its_line() {
-        assert_eq!(read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"), "t.csv:2: \"x\", must be 0 Ah or more");
+        assert_eq!(read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"), "t.csv:2: column capacity_ah: found \"x\", must be 0 Ah or more");
         assert_eq!(
             read("time_s,cell,capacity_ah\n5,0,2\n4,0,2\n").expect_err("bad"),
-            "t.csv:3: \"4\", must be no earlier than the row before"
+            "t.csv:3: column time_s: found \"4\", must be no earlier than the row before"
         );
         assert!(read("a,b\n1,2\n").expect_err("bad").starts_with("t.csv:1: columns a,b, must have"));
         assert!(read("time_s,cell,capacity_ah\n").expect_err("bad").contains("no row"));

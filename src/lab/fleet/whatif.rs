@@ -178,7 +178,8 @@ fn replay(
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
     // Before the replay, which may take hours: a table that cannot be read is reported at once.
-    let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
+    let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read);
+    let truth = truth.transpose().map_err(|error| error.to_string())?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);
     let mut engines = batch.engines(monitor.sample.cells);

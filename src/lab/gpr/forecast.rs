@@ -19,7 +19,7 @@ use std::time::Instant;
 
 pub use windows::{RowSpacing, LagWindows};
 
-use super::{GprError, Table, create, finish};
+use super::{GprError, ColumnTable, create, finish};
 use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
 use spread::Spread;
 
@@ -124,7 +124,7 @@ pub fn horizons(steps: usize) -> Vec<usize> {
 /// # Errors
 /// Numbers out of range, too few rows for the lags and steps, or no positive definite matrix.
 pub fn run(
-    table: &Table,
+    table: &ColumnTable,
     plan: &ForecastPlan,
     watcher: &mut Watcher<'_>,
     done: &mut dyn FnMut(usize, usize),
@@ -298,7 +298,7 @@ impl HorizonTask<'_> {
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, data: &Table, forecast: &TableForecast) -> Result<(), GprError> {
+pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), GprError> {
     let mut out = csv::Writer::from_writer(create(path)?);
     out.write_record(["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"])?;
     for output in &forecast.outputs {

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::forecast::{TableForecast, HorizonForecast, OutputForecast};
-use super::{Table, CrossValidation, table};
+use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
 
 /// Rows of the stretch that is drawn with its interval: each can be seen.
@@ -18,7 +18,7 @@ const BEFORE: usize = 60;
 ///
 /// # Errors
 /// A file cannot be written, or there is no font for the words of a PNG.
-pub fn write_cross_validation(folder: &Path, data: &Table, all: &[CrossValidation]) -> Result<(), PlotError> {
+pub fn write_cross_validation(folder: &Path, data: &ColumnTable, all: &[CrossValidation]) -> Result<(), PlotError> {
     let output = data.names.last().map_or("", String::as_str);
     let truth: Vec<f64> = data.column(data.width() - 1).collect();
     for validated in all {
@@ -33,7 +33,7 @@ pub fn write_cross_validation(folder: &Path, data: &Table, all: &[CrossValidatio
 ///
 /// # Errors
 /// As [`write_cross_validation`].
-pub fn write_forecast(folder: &Path, data: &Table, forecast: &TableForecast) -> Result<(), PlotError> {
+pub fn write_forecast(folder: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), PlotError> {
     for output in &forecast.outputs {
         let mut charts = vec![fan(data, forecast, output)];
         if output.horizons.iter().any(|horizon| horizon.score.is_some()) {
@@ -139,7 +139,7 @@ fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     }
 }
 
-fn fan(data: &Table, forecast: &TableForecast, output: &OutputForecast) -> Chart {
+fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) -> Chart {
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
@@ -202,7 +202,7 @@ fn coverage(output: &OutputForecast) -> Chart {
 }
 
 /// Forecasts of the last horizon against what came, over the rows they are for.
-fn held_out(data: &Table, output: &OutputForecast) -> Chart {
+fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;
     let all = || horizon.held_out.iter();

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{GprError, Table, create, finish, split, table, write_text};
+use super::{GprError, ColumnTable, create, finish, split, table, write_text};
 use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
 
 /// Format name in the first line.
@@ -42,7 +42,7 @@ impl TrainedModel {
     ///
     /// # Errors
     /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
-    pub fn fit(table: &Table, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
+    pub fn fit(table: &ColumnTable, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
         let (inputs, targets) = split(table);
         let width = table.width();
         let rows = Rows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
@@ -96,7 +96,7 @@ impl TrainedModel {
     ///
     /// # Errors
     /// A covariance matrix that is not positive definite.
-    pub fn predict(&self, table: &Table) -> Result<Vec<Prediction>, GprError> {
+    pub fn predict(&self, table: &ColumnTable) -> Result<Vec<Prediction>, GprError> {
         let d = self.inputs.len();
         let inputs: Vec<f64> = table.values.chunks_exact(table.width()).flat_map(|row| &row[..d]).copied().collect();
         Ok(self.model.predict(&inputs)?)
@@ -110,7 +110,7 @@ impl TrainedModel {
 pub fn write_predictions(
     path: &Path,
     trained: &TrainedModel,
-    table: &Table,
+    table: &ColumnTable,
     predictions: &[Prediction],
 ) -> Result<(), GprError> {
     let mut out = csv::Writer::from_writer(create(path)?);

@@ -46,16 +46,16 @@ pub(super) struct Outlook {
 }
 
 /// Capacity at the end of life, Ah: as configured, else the mildest limit of the record's alarms.
-pub(super) fn end_of_life_ah(data: &Data, setting: &PageContext<'_>) -> Option<f64> {
-    let configured = setting.config.map(|config| config.monitor.health.end_of_life_ah);
-    configured.or_else(|| pictures::threshold(data, setting, Rule::CapacityLow))
+pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
+    let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
+    configured.or_else(|| pictures::threshold(data, context, Rule::CapacityLow))
 }
 
 /// The outlook of the cell whose life ends first, or why there is none.
-pub(super) fn outlook(data: &Data, setting: &PageContext<'_>) -> Result<Outlook, String> {
-    let end_ah = end_of_life_ah(data, setting)
+pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook, String> {
+    let end_ah = end_of_life_ah(data, context)
         .ok_or("the record does not say which capacity is the end of life; a configuration (-c) does")?;
-    let cells = cells(data, setting);
+    let cells = cells(data, context);
     let lives: Vec<Result<RemainingLife, InsufficientData>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
     let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
     let unknown = refused.map(|(cell, why)| unknown_lives(&lives, cell, why));
@@ -89,9 +89,9 @@ fn display(why: InsufficientData) -> String {
 }
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
-pub(super) fn cells(data: &Data, setting: &PageContext<'_>) -> Vec<Forecast> {
-    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
-    let gain_std = setting.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
+pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
+    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let gain_std = context.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
     let learned: BTreeMap<_, &CapacityRecord> = data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
     let rated_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);

@@ -21,17 +21,17 @@ const MAX_HOLE_BINS: usize = 3;
 const MAX_RECENT: f64 = 0.9;
 
 /// Returns every picture that has data, with the name of its file.
-pub(super) fn all(data: &Data, setting: &PageContext<'_>) -> Vec<(String, Picture)> {
-    let outlook = forecast::outlook(data, setting);
+pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Picture)> {
+    let outlook = forecast::outlook(data, context);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
     [
-        named("soc", soc(data, setting)),
-        named("soc_recent", soc_recent(data, setting)),
-        named("capacity", capacity(data, setting, outlook.as_ref().ok())),
-        named("usable_capacity", usable(data, setting)),
-        named("recharge_period", recharge(data, setting)),
-        named("resistance", resistance(data, setting)),
-        named("temperature", temperature(data, setting)),
+        named("soc", soc(data, context)),
+        named("soc_recent", soc_recent(data, context)),
+        named("capacity", capacity(data, context, outlook.as_ref().ok())),
+        named("usable_capacity", usable(data, context)),
+        named("recharge_period", recharge(data, context)),
+        named("resistance", resistance(data, context)),
+        named("temperature", temperature(data, context)),
         named("alarms", alarms(data)),
         named("cells_capacity", heat(data, "Capacity of every cell", "capacity, Ah", series::capacity)),
         named("cells_resistance", heat(data, "Resistance of every cell", "resistance, times new", series::resistance)),
@@ -77,13 +77,13 @@ impl TimeAxis {
 }
 
 /// The mildest threshold of a rule, as configured, else as its alarms say.
-pub(super) fn threshold(data: &Data, setting: &PageContext<'_>, rule: Rule) -> Option<f64> {
-    thresholds(data, setting, rule).first().map(|(value, _)| *value)
+pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
+    thresholds(data, context, rule).first().map(|(value, _)| *value)
 }
 
 /// Every threshold of a rule with its severity, the mildest first.
-fn thresholds(data: &Data, setting: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
-    let mut all: Vec<(f64, String)> = match setting.config {
+fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
+    let mut all: Vec<(f64, String)> = match context.config {
         Some(config) => {
             let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
             rules.map(|row| (row.threshold, row.severity.name().to_owned())).collect()
@@ -99,8 +99,8 @@ fn thresholds(data: &Data, setting: &PageContext<'_>, rule: Rule) -> Vec<(f64, S
     all
 }
 
-fn levels(data: &Data, setting: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
-    thresholds(data, setting, rule).into_iter().map(|(value, severity)| {
+fn levels(data: &Data, context: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
+    thresholds(data, context, rule).into_iter().map(|(value, severity)| {
         let ink = ink_of(&severity);
         Layer::new(&format!("limit ({severity})"), ink, Shape::Level(value))
     })
@@ -159,14 +159,14 @@ fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
 
-fn soc(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
     let clock = TimeAxis::of(data);
     let bins = filled(life.iter());
     let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0)))];
-    layers.extend(true_soc(setting, &clock, data.ends_s()?));
+    layers.extend(true_soc(context, &clock, data.ends_s()?));
     layers.push(Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))));
     Some(Picture::Chart(Chart {
         title: "State of charge over the whole record".to_owned(),
@@ -177,7 +177,7 @@ fn soc(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     }))
 }
 
-fn soc_recent(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
     // Almost the whole record: the picture before shows it.
@@ -188,7 +188,7 @@ fn soc_recent(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
-    layers.extend(true_soc(setting, &clock, (moments.first()?.0, moments.last()?.0)));
+    layers.extend(true_soc(context, &clock, (moments.first()?.0, moments.last()?.0)));
     if data.cells() > 1 {
         layers.push(Layer::new("highest cell", Ink::Green, Shape::Line(soc.iter().map(|p| (p.0, p.2)).collect())));
         layers.push(Layer::new("lowest cell", Ink::Blue, Shape::Line(soc.iter().map(|p| (p.0, p.1)).collect())));
@@ -218,7 +218,7 @@ fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str
     layers
 }
 
-fn capacity(data: &Data, setting: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
+fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
     let steps = series::steps(data, series::capacity, false);
     let (first_s, mut last_s) = data.ends_s().filter(|_| !steps.is_empty())?;
     let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
@@ -241,11 +241,11 @@ fn capacity(data: &Data, setting: &PageContext<'_>, outlook: Option<&Outlook>) -
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
     // Measured capacities are under load and belong to the usable capacity, unless there is none.
-    if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
-        layers.extend(references(data, &clock, setting));
+    if !context.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
+        layers.extend(references(data, &clock, context));
     }
-    let limits: Vec<Layer> = levels(data, setting, Rule::CapacityLow).collect();
-    let end = forecast::end_of_life_ah(data, setting).map(Shape::Level);
+    let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
+    let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
     // A limit at the same height would be hidden.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
@@ -277,15 +277,15 @@ fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     Axis::number(label).within((low - room).max(0.0), high + room)
 }
 
-fn references(data: &Data, clock: &TimeAxis, setting: &PageContext<'_>) -> Option<Layer> {
-    let capacities = &setting.reference.capacities;
+fn references(data: &Data, clock: &TimeAxis, context: &PageContext<'_>) -> Option<Layer> {
+    let capacities = &context.reference.capacities;
     let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
         x: clock.x(time_s),
         y: capacity_ah,
         tip: format!("{}: reference {capacity_ah:.3} Ah", moment(data, time_s)),
     });
     let points: Vec<Point> = points.collect();
-    let words = match (setting.reference.is_loaded, data.cells() > 1) {
+    let words = match (context.reference.is_loaded, data.cells() > 1) {
         (true, _) => "measured (reference)",
         (false, true) => "true, weakest cell (reference)",
         (false, false) => "true (reference)",
@@ -294,8 +294,8 @@ fn references(data: &Data, clock: &TimeAxis, setting: &PageContext<'_>) -> Optio
 }
 
 /// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
-fn true_soc(setting: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
-    let within = setting.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
+fn true_soc(context: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
+    let within = context.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =
         within.map(|&(time_s, low, high)| (clock.x(time_s), 100.0 * low, 100.0 * high)).collect();
     let line = |pick: fn(&(f64, f64, f64)) -> f64| Shape::Line(rows.iter().map(|row| (row.0, pick(row))).collect());
@@ -309,19 +309,19 @@ fn true_soc(setting: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64
     }
 }
 
-fn usable(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn usable(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::usable, false);
     if steps.is_empty() {
         return None;
     }
     let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Orange, "weakest");
-    if setting.reference.is_loaded {
-        layers.extend(references(data, &clock, setting));
+    if context.reference.is_loaded {
+        layers.extend(references(data, &clock, context));
     }
-    layers.extend(levels(data, setting, Rule::UsableCapacityLow));
+    layers.extend(levels(data, context, Rule::UsableCapacityLow));
     layers.extend(raised(data, &clock, Rule::UsableCapacityLow));
-    let load = setting.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
+    let load = context.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
         format!(" at {} A, {} \u{b0}C, down to {} V", usable.current_a, usable.temperature_c, usable.cutoff_v)
     });
     Some(Picture::Chart(Chart {
@@ -333,7 +333,7 @@ fn usable(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     }))
 }
 
-fn recharge(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     let minutes = |seconds: f64| seconds / 60.0;
@@ -364,7 +364,7 @@ fn recharge(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
         return None;
     }
     if !is_stored {
-        let limits = levels(data, setting, Rule::RechargePeriodLow).map(|mut layer| {
+        let limits = levels(data, context, Rule::RechargePeriodLow).map(|mut layer| {
             if let Shape::Level(seconds) = &mut layer.shape {
                 *seconds = minutes(*seconds);
             }
@@ -373,7 +373,7 @@ fn recharge(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
         layers.extend(limits);
         layers.extend(raised(data, &clock, Rule::RechargePeriodLow));
     }
-    let window = setting.config.map(|config| &config.monitor.health.recharge);
+    let window = context.config.map(|config| &config.monitor.health.recharge);
     let window =
         window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
     let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
@@ -381,14 +381,14 @@ fn recharge(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
 }
 
-fn resistance(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn resistance(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::resistance, true);
     if steps.is_empty() {
         return None;
     }
     let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Purple, "highest");
-    layers.extend(levels(data, setting, Rule::ResistanceHigh));
+    layers.extend(levels(data, context, Rule::ResistanceHigh));
     layers.extend(raised(data, &clock, Rule::ResistanceHigh));
     Some(Picture::Chart(Chart {
         title: "Resistance over life".to_owned(),
@@ -399,7 +399,7 @@ fn resistance(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     }))
 }
 
-fn temperature(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
+fn temperature(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     if let Some(life) = &data.trace.life {
@@ -416,7 +416,7 @@ fn temperature(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
     if layers.is_empty() {
         return None;
     }
-    layers.extend(levels(data, setting, Rule::TemperatureHigh));
+    layers.extend(levels(data, context, Rule::TemperatureHigh));
     layers.extend(raised(data, &clock, Rule::TemperatureHigh));
     Some(Picture::Chart(Chart {
         title: "Temperature".to_owned(),
@@ -430,26 +430,26 @@ fn temperature(data: &Data, setting: &PageContext<'_>) -> Option<Picture> {
 fn alarms(data: &Data) -> Option<Picture> {
     let (_, last_s) = data.ends_s().filter(|_| !data.alarms.is_empty())?;
     let clock = TimeAxis::of(data);
-    let mut lanes: Vec<StateBand> = Vec::new();
+    let mut bands: Vec<StateBand> = Vec::new();
     let mut open: Vec<(usize, &super::data::AlarmRecord)> = Vec::new();
     for row in &data.alarms {
         let name = format!("{} ({})", row.rule, row.severity);
-        let lane = lanes.iter().position(|lane| lane.name == name).unwrap_or_else(|| {
-            lanes.push(StateBand { name, spans: Vec::new() });
-            lanes.len() - 1
+        let band = bands.iter().position(|band| band.name == name).unwrap_or_else(|| {
+            bands.push(StateBand { name, spans: Vec::new() });
+            bands.len() - 1
         });
-        let known = open.iter().position(|(at, before)| *at == lane && before.cell == row.cell);
+        let known = open.iter().position(|(at, before)| *at == band && before.cell == row.cell);
         match (row.is_active, known) {
-            (true, None) => open.push((lane, row)),
+            (true, None) => open.push((band, row)),
             (false, Some(index)) => {
-                let (lane, from) = open.remove(index);
-                lanes[lane].spans.push(span(data, &clock, from, row.time_s, "until"));
+                let (band, from) = open.remove(index);
+                bands[band].spans.push(span(data, &clock, from, row.time_s, "until"));
             }
             (true, Some(_)) | (false, None) => {}
         }
     }
-    for (lane, from) in open {
-        lanes[lane].spans.push(span(data, &clock, from, last_s, "still raised at"));
+    for (band, from) in open {
+        bands[band].spans.push(span(data, &clock, from, last_s, "still raised at"));
     }
     let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
     Some(Picture::StateBands(StateBands {
@@ -459,7 +459,7 @@ fn alarms(data: &Data) -> Option<Picture> {
             data.alarms.len()
         ),
         x: clock.axis,
-        lanes,
+        bands,
         keys: keys.map(|(ink, word)| (ink, word.to_owned())).to_vec(),
     }))
 }

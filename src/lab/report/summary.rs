@@ -68,16 +68,16 @@ struct ActiveAlarm<'a> {
 }
 
 /// Makes the summary.
-pub(super) fn of(data: &Data, setting: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
+pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
     let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
-    let unknown = unknown(data, setting);
+    let unknown = unknown(data, context);
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
         Some("severe") => Condition::Act,
         Some("warning") => Condition::Plan,
         Some(_) => Condition::Watch,
-        None if is_over(data, setting, outlook) => Condition::Watch,
+        None if is_over(data, context, outlook) => Condition::Watch,
         None if unknown.is_some() => Condition::Unknown,
         None if !measuring.is_empty() => Condition::Watch,
         None => Condition::Good,
@@ -86,26 +86,26 @@ pub(super) fn of(data: &Data, setting: &PageContext<'_>, outlook: &Result<Outloo
         verdict,
         how: how(verdict, worst, &measuring, data, unknown),
         since: since(data, &battery, &measuring),
-        what: what(verdict, worst, &measuring, knows_limits(data, setting)),
-        tiles: tiles(data, setting, outlook, &raised),
+        what: what(verdict, worst, &measuring, knows_limits(data, context)),
+        tiles: tiles(data, context, outlook, &raised),
     }
 }
 
 /// Whether the capacity is below the end of life, independent of the alarms.
-fn is_over(data: &Data, setting: &PageContext<'_>, outlook: &Result<Outlook, String>) -> bool {
+fn is_over(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> bool {
     let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
-    let is_below = least.zip(forecast::end_of_life_ah(data, setting)).is_some_and(|(least, end)| least < end);
+    let is_below = least.zip(forecast::end_of_life_ah(data, context)).is_some_and(|(least, end)| least < end);
     is_below || outlook.as_ref().is_ok_and(Outlook::is_over)
 }
 
 /// Whether the record or a configuration defines limits.
-fn knows_limits(data: &Data, setting: &PageContext<'_>) -> bool {
-    setting.config.is_some() || !data.alarms.is_empty()
+fn knows_limits(data: &Data, context: &PageContext<'_>) -> bool {
+    context.config.is_some() || !data.alarms.is_empty()
 }
 
 /// Returns why this battery cannot be called good, independent of alarms; `None` = it can.
-fn unknown(data: &Data, setting: &PageContext<'_>) -> Option<String> {
-    let cells = setting.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
+fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
+    let cells = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     let measured: BTreeSet<usize> =
         data.learned.iter().filter(|row| row.measured_ah.is_some()).map(|row| row.cell).collect();
     if let Some(doubt) = &data.source.doubt {
@@ -120,7 +120,7 @@ fn unknown(data: &Data, setting: &PageContext<'_>) -> Option<String> {
             cells - measured.len()
         ));
     }
-    (!knows_limits(data, setting)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
+    (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
 }
 
 fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
@@ -270,9 +270,9 @@ fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> T
     Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into() }
 }
 
-fn tiles(data: &Data, setting: &PageContext<'_>, outlook: &Result<Outlook, String>, raised: &[ActiveAlarm<'_>]) -> Vec<Tile> {
+fn tiles(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>, raised: &[ActiveAlarm<'_>]) -> Vec<Tile> {
     let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
-    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let of_cell =
         |step: &series::CellStep| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
     let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));

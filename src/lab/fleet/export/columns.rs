@@ -6,8 +6,6 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
-use serde::Serialize;
-
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
@@ -115,23 +113,23 @@ pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
     "time" Time "UTC", "when it was over", |row| FieldValue::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "", "cell, from 0", |row| whole(row.half.cell.0);
+    "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
     "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
-    "mode" Word "", "charge or discharge", |row| word(&row.half.mode);
-    "charge_ah" Real "Ah", "charge moved", |row| real(row.half.charge_ah);
-    "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| maybe(row.half.swing);
-    "swing_std" Real "fraction" null, "its standard deviation", |row| maybe(row.half.swing_std);
-    "duration_s" Real "s", "duration", |row| real(row.half.duration_s);
-    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| real(row.half.mean_current_a);
-    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| maybe(row.half.mean_temperature_c);
-    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| maybe(row.learned.measured_ah);
-    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.measured_std_ah);
-    "capacity_ah" Real "Ah", "learned capacity after it", |row| real(row.learned.capacity_ah);
-    "capacity_std_ah" Real "Ah", "its standard deviation", |row| real(row.learned.capacity_std_ah);
-    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| maybe(row.learned.usable_capacity_ah);
-    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.usable_capacity_std_ah);
-    "resistance_ratio" Real "", "resistance relative to new", |row| real(row.learned.resistance_ratio);
-    "resistance_ratio_std" Real "", "its standard deviation", |row| real(row.learned.resistance_ratio_std);
+    "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
+    "charge_ah" Real "Ah", "charge moved", |row| FieldValue::Real(row.half.number("charge_ah"));
+    "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| FieldValue::Real(row.half.number("swing"));
+    "swing_std" Real "fraction" null, "its standard deviation", |row| FieldValue::Real(row.half.number("swing_std"));
+    "duration_s" Real "s", "duration", |row| FieldValue::Real(row.half.number("duration_s"));
+    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| FieldValue::Real(row.half.number("mean_current_a"));
+    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| FieldValue::Real(row.half.number("mean_temperature_c"));
+    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| FieldValue::Real(row.capacity.number("measured_ah"));
+    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("measured_std_ah"));
+    "capacity_ah" Real "Ah", "learned capacity after it", |row| FieldValue::Real(row.capacity.number("capacity_ah"));
+    "capacity_std_ah" Real "Ah", "its standard deviation", |row| FieldValue::Real(row.capacity.number("capacity_std_ah"));
+    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| FieldValue::Real(row.capacity.number("usable_capacity_ah"));
+    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("usable_capacity_std_ah"));
+    "resistance_ratio" Real "", "resistance relative to new", |row| FieldValue::Real(row.capacity.number("resistance_ratio"));
+    "resistance_ratio_std" Real "", "its standard deviation", |row| FieldValue::Real(row.capacity.number("resistance_ratio_std"));
     "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little is known", |row| cycles(row, |left| left.median);
     "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
     "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
@@ -145,18 +143,18 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
     "time" Time "UTC", "when", |row| FieldValue::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "" null, "cell, from 0; null = the pack", |row| FieldValue::Whole(row.alarm.cell.map(|cell| cell.0.into()));
-    "rule" Word "", "rule of the alarm", |row| text(row.alarm.rule.name());
-    "severity" Word "", "info, warning or severe", |row| text(row.alarm.severity.name());
-    "change" Word "", "change: raised, cleared, ...", |row| word(&row.alarm.change);
-    "state" Word "", "its state after the change", |row| word(&row.alarm.state);
-    "active" Flag "", "whether it is raised after the change", |row| FieldValue::Flag(row.alarm.active);
-    "value" Real "unit" null, "the value that caused the change", |row| maybe(row.alarm.value);
-    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| maybe(row.alarm.probability);
-    "threshold" Real "unit", "the threshold it is compared with", |row| real(row.alarm.threshold);
-    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.alarm.rule.row().unit.symbol());
-    "occurrences" Whole "", "times it was raised", |row| FieldValue::Whole(Some(row.alarm.occurrences));
-    "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.acknowledged);
+    "cell" Whole "" null, "cell, from 0; null = the pack", |row| FieldValue::Whole(row.alarm.whole("cell"));
+    "rule" Word "", "rule of the alarm", |row| text(row.rule.name());
+    "severity" Word "", "info, warning or severe", |row| text(row.alarm.text("severity"));
+    "change" Word "", "change: raised, cleared, ...", |row| text(row.alarm.text("change"));
+    "state" Word "", "its state after the change", |row| text(row.alarm.text("state"));
+    "active" Flag "", "whether it is raised after the change", |row| FieldValue::Flag(row.alarm.flag("active"));
+    "value" Real "unit" null, "the value that caused the change", |row| FieldValue::Real(row.alarm.number("value"));
+    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| FieldValue::Real(row.alarm.number("probability"));
+    "threshold" Real "unit", "the threshold it is compared with", |row| FieldValue::Real(row.alarm.number("threshold"));
+    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.rule.row().unit.symbol());
+    "occurrences" Whole "", "times it was raised", |row| FieldValue::Whole(row.alarm.whole("occurrences"));
+    "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
 fn real<'r>(value: f64) -> FieldValue<'r> {
@@ -173,12 +171,6 @@ fn whole<'r>(value: u16) -> FieldValue<'r> {
 
 fn text(value: &str) -> FieldValue<'_> {
     FieldValue::Word(Some(value.into()))
-}
-
-/// A choice as events and configurations write it.
-fn word<'r>(value: &impl Serialize) -> FieldValue<'r> {
-    let word = serde_json::to_value(value).ok();
-    FieldValue::Word(word.and_then(|word| word.as_str().map(|word| word.to_owned().into())))
 }
 
 fn branch(row: &EstimateRow, index: usize) -> FieldValue<'_> {

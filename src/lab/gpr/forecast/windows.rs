@@ -1,11 +1,11 @@
 //! Lag windows: values and differences of the rows up to a row, and which rows have them.
 
-use super::super::Table;
+use super::super::ColumnTable;
 
 /// Windows of a table.
 #[derive(Debug)]
 pub struct LagWindows<'a> {
-    table: &'a Table,
+    table: &'a ColumnTable,
     columns: usize,
     lags: usize,
     /// First and one past the last row of the part of each row.
@@ -23,7 +23,7 @@ pub struct RowSpacing {
 
 impl RowSpacing {
     /// Of a column of the table, within its parts; `None` when there are no steps or no times.
-    pub fn of(table: &Table, column: usize) -> Option<Self> {
+    pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
         let mut steps: Vec<f64> =
@@ -42,7 +42,7 @@ impl RowSpacing {
 
 impl<'a> LagWindows<'a> {
     /// Creates windows over the table's required columns with `lags` values of each.
-    pub fn new(table: &'a Table, lags: usize) -> Self {
+    pub fn new(table: &'a ColumnTable, lags: usize) -> Self {
         let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
         let spans = table.parts.iter().copied().zip(ends);
         let part = spans.flat_map(|(begin, end)| std::iter::repeat_n((begin, end), end - begin)).collect();
@@ -95,14 +95,14 @@ impl<'a> LagWindows<'a> {
 mod tests {
     use super::*;
 
-    fn table() -> Table {
-        Table {
+    fn table() -> ColumnTable {
+        ColumnTable {
             names: vec!["a".into(), "b".into(), "time_s".into()],
             values: (0..8).flat_map(|k| [f64::from(k * k), f64::from(10 * k), f64::from(k)]).collect(),
             lines: (2..10).collect(),
             has: vec![true],
             parts: vec![0, 5],
-            ..Table::default()
+            ..ColumnTable::default()
         }
     }
 

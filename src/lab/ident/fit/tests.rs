@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::cell::circuit::BranchAt;
-use crate::cell::{CellModel, Discretisation};
+use crate::cell::{CellModel, Discretisation, Thermal};
 use crate::ident::RawRows;
 use crate::ident::pass::accumulate;
 use crate::ident::record::Limits;
@@ -69,7 +69,14 @@ fn truth() -> CellModel {
         ocv_v,
         r0_ohm,
         branches,
-        ..crate::cell::model::tests::small_model()
+        name: "test".into(),
+        rated_capacity_ah: CAPACITY_AH,
+        capacity_ah: CAPACITY_AH,
+        voltage_min_v: 2.7,
+        voltage_max_v: 4.2,
+        ocv_ageing_shift: 0.0,
+        voltage_error_v: None,
+        thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
     }
 }
 
