@@ -7,7 +7,8 @@ use serde_json::json;
 
 use super::Failure;
 use super::fleet::LogArgs;
-use super::score::write_table;
+use super::numbers::within;
+use super::output::{print_json, unless_closed, write_table};
 use crate::config::{self, Config};
 use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::export::{self, ExportResult, TableFormat, ExportSettings};
@@ -58,7 +59,7 @@ pub(crate) struct Args {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.columns_page {
-        return quiet(io::stdout().write_all(export::reference().as_bytes()));
+        return unless_closed(io::stdout().write_all(export::reference().as_bytes()));
     }
     args.logs.check()?;
     let (Some(config), Some(out)) = (&args.config, &args.out) else {
@@ -77,27 +78,16 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         jobs: args.logs.threads(),
     };
     let bar = args.logs.bar(1);
-    let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.advance(bytes));
-    bar.clear();
+    let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.inc(bytes));
+    bar.finish_and_clear();
     let (good, failed): (Vec<_>, Vec<_>) = results.map_err(Failure::new)?.into_iter().partition(Result::is_ok);
     let good: Vec<ExportResult> = good.into_iter().flatten().collect();
     let failed: Vec<String> = failed.into_iter().filter_map(Result::err).collect();
-    quiet(if args.json { json(&good, &failed) } else { table(&good) })?;
+    unless_closed(match args.json {
+        true => print_json(&json!({ "version": VERSION, "logs": good, "failed": failed })),
+        false => table(&good),
+    })?;
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
-}
-
-/// Maps a write error; a closed output is no failure.
-fn quiet(written: io::Result<()>) -> Result<(), Failure> {
-    match written {
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(error.to_string())),
-    }
-}
-
-fn json(good: &[ExportResult], failed: &[String]) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, &json!({ "version": VERSION, "logs": good, "failed": failed }))?;
-    writeln!(out)
 }
 
 fn table(good: &[ExportResult]) -> io::Result<()> {
@@ -117,9 +107,7 @@ fn table(good: &[ExportResult]) -> io::Result<()> {
     };
     let mut text = Vec::new();
     let heads = ["log", "folder", "days", "estimates", "half-cycles", "alarms"];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    rows.extend(good.iter().map(row));
-    write_table(&mut text, &rows, 2)?;
+    write_table(&mut text, &heads, good.iter().map(row), 2)?;
     for exported in good {
         exported.notes.iter().try_for_each(|note| writeln!(text, "note: {}: {note}", exported.log.display()))?;
     }
@@ -127,6 +115,5 @@ fn table(good: &[ExportResult]) -> io::Result<()> {
 }
 
 fn period(text: &str) -> Result<f64, String> {
-    let good = |value: &f64| (0.0..=1e6).contains(value);
-    text.parse().ok().filter(good).ok_or_else(|| "must be 0 to 1e6 s".to_owned())
+    within(text, |value| (0.0..=1e6).contains(&value), "0 to 1e6 s")
 }

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 
 use super::Failure;
+use super::output::{check_distinct, progress_bar};
 use super::replay::{InputArgs, log_options};
 use crate::config::Config;
 use crate::io::log::LogSource;
@@ -27,11 +28,7 @@ pub(crate) struct LogArgs {
 impl LogArgs {
     /// Checks the arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
-        for (index, log) in self.logs.iter().enumerate() {
-            if self.logs[..index].contains(log) {
-                return Err(Failure::new(format!("{}: named twice", log.display())));
-            }
-        }
+        check_distinct(&self.logs)?;
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
             return Err(Failure::new(format!(
@@ -69,34 +66,9 @@ impl LogArgs {
     }
 
     /// Progress in bytes, each log read `times`.
-    pub(crate) fn bar(&self, times: usize) -> Bar {
+    pub(crate) fn bar(&self, times: usize) -> ProgressBar {
         let size = |path: &PathBuf| std::fs::metadata(path).map_or(0, |meta| meta.len());
         let total = self.logs.iter().map(size).sum::<u64>() * times as u64;
-        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
-        let template = "{bar:32} {bytes}/{total_bytes} eta {eta}";
-        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Bar(bar)
+        progress_bar(total, "{bar:32} {bytes}/{total_bytes} eta {eta}")
     }
-}
-
-/// Progress on standard error, when that is a terminal.
-#[derive(Debug)]
-pub(crate) struct Bar(ProgressBar);
-
-impl Bar {
-    /// Adds bytes read.
-    pub(crate) fn advance(&self, bytes: u64) {
-        self.0.inc(bytes);
-    }
-
-    /// Removes the bar.
-    pub(crate) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
-}
-
-/// A number above 0.
-pub(crate) fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.trim().parse().map_err(|_| "must be a number".to_owned())?;
-    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above 0".to_owned()) }
 }

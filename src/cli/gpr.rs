@@ -4,11 +4,11 @@ mod args;
 mod forecast;
 mod report;
 
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
+use super::output::{create_folder, failure, unless_closed};
 use crate::lab::gpr::{self, PartColumn, ColumnTable, TrainedModel, ColumnSelection};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs, whole};
@@ -135,10 +135,6 @@ fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> R
     Ok(table)
 }
 
-fn failure(error: impl std::fmt::Display) -> Failure {
-    Failure::new(error.to_string())
-}
-
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
@@ -149,34 +145,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-fn make_folder(folder: Option<&Path>) -> Result<(), Failure> {
-    let made = folder.map_or(Ok(()), std::fs::create_dir_all);
-    made.map_err(|error| {
-        Failure::new(format!("{}: cannot be created: {error}", folder.unwrap_or(Path::new("")).display()))
-    })
-}
-
-/// Maps a write error; a closed output is no failure.
-fn quiet(written: io::Result<()>) -> Result<(), Failure> {
-    match written {
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
-    }
-}
-
 fn cv(args: &CvArgs) -> Result<(), Failure> {
     let begin = Instant::now();
-    make_folder(args.plots.as_deref())?;
+    args.plots.iter().try_for_each(|folder| create_folder(folder))?;
     args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.columns.table(&args.files)?;
-    let bar = report::Bar::new(args.kernel.len() * args.folds);
+    let bar = report::fit_bar(args.kernel.len() * args.folds);
     let mut all = Vec::new();
     for (k, kernel) in args.kernel.iter().enumerate() {
         let settings = args.model.settings(kernel, table.len());
-        let mut watcher = |progress| bar.show(&kernel.to_string(), k * args.folds, progress);
+        let mut watcher = |progress| report::show_step(&bar, &kernel.to_string(), k * args.folds, progress);
         all.push(gpr::cross_validate(&table, &settings, args.folds, &mut watcher).map_err(failure)?);
     }
-    bar.clear();
+    bar.finish_and_clear();
     if let Some(path) = &args.predictions {
         gpr::write_validated(path, &table, &all).map_err(failure)?;
     }
@@ -184,7 +165,7 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
         gpr::write_cross_validation(folder, &table, &all).map_err(failure)?;
     }
     let settings = args.model.settings(&args.kernel[0], table.len());
-    let shown = report::Cv {
+    let shown = report::CvReport {
         table: &table,
         settings: &settings,
         folds: args.folds,
@@ -192,7 +173,7 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
         default_form: args.model.by_rows(),
     };
     let seconds = begin.elapsed().as_secs_f64();
-    quiet(if args.json { shown.json(seconds) } else { shown.table(seconds) })
+    unless_closed(if args.json { shown.json(seconds) } else { shown.table(seconds) })
 }
 
 fn train(args: &TrainArgs) -> Result<(), Failure> {
@@ -200,14 +181,14 @@ fn train(args: &TrainArgs) -> Result<(), Failure> {
     args.files.check_result(&args.out)?;
     let table = args.columns.table(&args.files)?;
     let settings = args.model.settings(&args.kernel, table.len());
-    let bar = report::Bar::new(1);
-    let mut watcher = |progress| bar.show(&args.kernel.to_string(), 0, progress);
+    let bar = report::fit_bar(1);
+    let mut watcher = |progress| report::show_step(&bar, &args.kernel.to_string(), 0, progress);
     let trained = TrainedModel::fit(&table, &settings, &mut watcher).map_err(failure)?;
-    bar.clear();
+    bar.finish_and_clear();
     let seconds = begin.elapsed().as_secs_f64();
     trained.save(&args.out).map_err(failure)?;
-    let shown = report::Train { trained: &trained, table: &table, seconds, default_form: args.model.by_rows() };
-    quiet(if args.json { shown.json() } else { shown.table(&args.out) })
+    let shown = report::TrainReport { trained: &trained, table: &table, seconds, default_form: args.model.by_rows() };
+    unless_closed(if args.json { shown.json() } else { shown.table(&args.out) })
 }
 
 fn predict(args: &PredictArgs) -> Result<(), Failure> {
@@ -231,9 +212,9 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let truth: Vec<f64> = rows.iter().map(|row| table.row(*row)[trained.inputs.len()]).collect();
     let judged: Vec<_> = rows.iter().map(|row| predictions[*row]).collect();
     let score = (!rows.is_empty()).then(|| score(&judged, &truth));
-    let shown = report::Predict { trained: &trained, table: &table, known: rows.len(), score };
+    let shown = report::PredictReport { trained: &trained, table: &table, known: rows.len(), score };
     if args.json {
-        return quiet(shown.json());
+        return unless_closed(shown.json());
     }
-    quiet(shown.text(to_stdout))
+    unless_closed(shown.text(to_stdout))
 }

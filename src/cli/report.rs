@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use super::Failure;
+use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config::{self, Config};
 use crate::replay::{self, Settings, Sinks, Summary, Watch};
@@ -52,7 +53,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = args.config.as_deref().map(config::load).transpose()?;
     let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
     let reference = args.reference.as_deref().map(report::read_reference).transpose();
-    let reference = reference.map_err(|error| Failure::new(error.to_string()))?;
+    let reference = reference.map_err(failure)?;
     let (data, provenance) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
@@ -64,19 +65,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let context = PageContext {
         title: args.title(),
         config: config.as_ref(),
-        config_text: config_text.map_err(|error| Failure::new(error.to_string()))?,
+        config_text: config_text.map_err(failure)?,
         reference: reference.unwrap_or_default(),
         provenance,
     };
-    match write(&args.out, &report::page(&data, &context)) {
-        // The reader of the output has closed it: no failure.
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
-        written => written.map_err(|error| Failure::new(error.to_string()))?,
-    }
+    unless_closed(write(&args.out, &report::page(&data, &context)))?;
     let Some(folder) = &args.plots else { return Ok(()) };
-    fs::create_dir_all(folder)
-        .map_err(|error| Failure::new(format!("{}: cannot be created: {error}", folder.display())))?;
-    report::write_plots(folder, &data, &context).map(drop).map_err(|error| Failure::new(error.to_string()))
+    create_folder(folder)?;
+    report::write_plots(folder, &data, &context).map(drop).map_err(failure)
 }
 
 impl Args {
@@ -136,7 +132,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
     let settings = Settings::plain(args.input.sleep_gap, config.interface_names());
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
-    let (summary, _) = result.map_err(|error| Failure::new(error.to_string()))?;
+    let (summary, _) = result.map_err(failure)?;
     // The replay has ended and with it the closure that shared the data.
     let data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     Ok((data, provenance(args, &summary)))

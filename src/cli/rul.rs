@@ -5,7 +5,8 @@ mod report;
 use std::path::PathBuf;
 
 use super::Failure;
-use super::score::names;
+use super::numbers::{above_0, finite, fraction};
+use super::output::{check_distinct, failure, short_names, unless_closed};
 use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
 
 /// Most parts of the life: one per per cent.
@@ -43,9 +44,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.at.len() > MAX_PARTS {
         return Err(Failure::new(format!("--at: {} parts, must be at most {MAX_PARTS}", args.at.len())));
     }
-    if let Some((index, file)) = args.files.iter().enumerate().find(|(i, file)| args.files[..*i].contains(file)) {
-        return Err(Failure::new(format!("{}: named twice, again as number {}", file.display(), index + 1)));
-    }
+    check_distinct(&args.files)?;
     let shown = if args.at.is_empty() {
         let forecasts: Vec<CurrentForecast> = each(args, rul::now)?;
         if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
@@ -54,25 +53,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         let scored: Vec<HistoryScore> = each(args, score)?;
         if args.json { report::scored_json(&scored, args.alpha) } else { report::scored_table(&scored, args.alpha) }
     };
-    match shown {
-        // The reader of the output has closed it: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
-    }
+    unless_closed(shown)
 }
 
 /// Runs `work` for every file with every threshold, in the order given.
 fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
     let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
-    for (path, name) in args.files.iter().zip(names(&args.files)) {
-        let history = rul::History::read(path).map_err(|error| Failure::new(error.to_string()))?;
+    for (path, name) in args.files.iter().zip(short_names(&args.files)) {
+        let history = rul::History::read(path).map_err(failure)?;
         all.extend(args.end_of_life.iter().map(|&threshold| work(&history, &name, threshold)));
     }
     Ok(all)
-}
-
-fn number(text: &str) -> Option<f64> {
-    text.trim().parse::<f64>().ok().filter(|value| value.is_finite())
 }
 
 /// `1.4`, `1.4 Ah`, `70 %`.
@@ -80,22 +71,20 @@ fn threshold(text: &str) -> Result<Threshold, String> {
     const EXPECTED: &str =
         "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
     let found = match text.trim().strip_suffix('%') {
-        Some(percent) => {
-            number(percent).filter(|p| *p > 0.0 && *p < 100.0).map(|percent| Threshold::OfFirst(percent / 100.0))
-        }
-        None => number(text.trim().trim_end_matches("Ah")).filter(|ah| *ah > 0.0).map(Threshold::AmpereHours),
+        Some(percent) => below_100(percent).map(Threshold::OfFirst),
+        None => above_0(text.trim().trim_end_matches("Ah")).ok().map(Threshold::AmpereHours),
     };
     found.ok_or_else(|| EXPECTED.to_owned())
 }
 
-/// Per cent to a part.
-fn part(text: &str) -> Result<f64, String> {
-    let percent = number(text.trim().trim_end_matches('%')).filter(|p| *p > 0.0 && *p < 100.0);
-    percent.map(|percent| percent / 100.0).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
+/// Per cent above 0 and below 100, as a fraction.
+fn below_100(percent: &str) -> Option<f64> {
+    finite(percent).ok().filter(|percent| *percent > 0.0 && *percent < 100.0).map(|percent| percent / 100.0)
 }
 
-fn fraction(text: &str) -> Result<f64, String> {
-    number(text).filter(|f| *f > 0.0 && *f < 1.0).ok_or_else(|| "must be above 0 and below 1".to_owned())
+/// Per cent to a part.
+fn part(text: &str) -> Result<f64, String> {
+    below_100(text.trim().trim_end_matches('%')).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
 }
 
 #[cfg(test)]

@@ -5,10 +5,10 @@ mod report;
 
 use std::path::{Path, PathBuf};
 
-pub(crate) use args::{Args, names};
-pub(crate) use report::write_table;
+pub(crate) use args::Args;
 
 use super::Failure;
+use super::output::{create_folder, failure, short_names, unless_closed};
 use crate::config::{self, Config, ConfigFaults};
 use crate::health::UsableConfig;
 use crate::lab::score::{self, Case, CycleTable, ScoreJob, ScoreSettings};
@@ -26,20 +26,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let settings = settings(args, &config)?;
     let jobs = jobs(args)?;
     let cases = args.cases();
-    if let Some(folder) = &settings.plots {
-        std::fs::create_dir_all(folder)
-            .map_err(|e| Failure::new(format!("{}: cannot be created: {e}", folder.display())))?;
-    }
+    settings.plots.iter().try_for_each(|folder| create_folder(folder))?;
     let bar = report::Bar::new(&jobs);
     let scores = score::run(&jobs, &cases, &settings, &|index, part| bar.advance(index, part));
     bar.clear();
-    let scores = scores.map_err(|error| Failure::new(error.to_string()))?;
-    let shown = report::ScoreReport { config: &config, settings: &settings, cases: &cases, scores: &scores };
-    match if args.json { shown.json() } else { shown.table() } {
-        // The reader of the output has closed it: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(error.to_string())),
-    }
+    let scores = scores.map_err(failure)?;
+    let report = report::ScoreReport { config: &config, settings: &settings, cases: &cases, scores: &scores };
+    unless_closed(if args.json { report.json() } else { report.table() })
 }
 
 /// Loads the configuration, with the cell model of --cell in place of its own.
@@ -106,10 +99,10 @@ fn settings(args: &Args, config: &Config) -> Result<ScoreSettings, Failure> {
 }
 
 fn jobs(args: &Args) -> Result<Vec<ScoreJob>, Failure> {
-    let names = names(&args.files);
+    let names = short_names(&args.files);
     let tables = args.cycles.iter().map(|path| CycleTable::read(path).map(Some));
     let tables: Result<Vec<_>, _> = tables.collect();
-    let mut tables = tables.map_err(|error| Failure::new(error.to_string()))?;
+    let mut tables = tables.map_err(failure)?;
     tables.resize(args.files.len(), None);
     let jobs = args.files.iter().zip(names).zip(tables);
     Ok(jobs.map(|((path, name), cycles)| ScoreJob { path: path.clone(), cycles, name }).collect())

@@ -6,7 +6,9 @@ mod report;
 use std::path::{Path, PathBuf};
 
 use super::Failure;
-use super::fleet::{LogArgs, positive};
+use super::fleet::LogArgs;
+use super::numbers::{above_0, percent};
+use super::output::unless_closed;
 use crate::alarm::Rule;
 use crate::config::Config;
 use crate::io::result_file::check_place;
@@ -97,19 +99,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let jobs = args.jobs();
     let bar = args.logs.bar(grid.replays);
-    let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.advance(bytes));
-    bar.clear();
+    let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.inc(bytes));
+    bar.finish_and_clear();
     let results = results.map_err(Failure::new)?;
     let failed = results.iter().filter_map(|result| result.as_ref().err().cloned()).collect();
     let rules = args.rules(&grid);
     let good: Vec<&LogResult> = results.iter().filter_map(|result| result.as_ref().ok()).collect();
     let shown = report::WhatifReport { grid: &grid, settings: &settings, rated_ah, rules: &rules, logs: &good, failed };
-    let written = args.write(&shown);
-    match written {
-        // The reader of the output has closed it: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => {}
-        written => written.map_err(|error| Failure::new(error.to_string()))?,
-    }
+    unless_closed(args.write(&shown))?;
     if shown.failed.is_empty() { Ok(()) } else { Err(Failure::new(shown.failed.join("\n"))) }
 }
 
@@ -157,19 +154,16 @@ impl Args {
 
 fn end_of_life(text: &str) -> Result<EndOfLifeArg, String> {
     match text.trim().strip_suffix('%') {
-        Some(percent) => positive(percent).and_then(|percent| match percent {
-            percent if percent <= 100.0 => Ok(EndOfLifeArg::Part(percent / 100.0)),
-            _ => Err("must be above 0 and at most 100 %".to_owned()),
-        }),
-        None => positive(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned()),
+        Some(digits) => percent(digits).map(|percent| EndOfLifeArg::Part(percent / 100.0)),
+        None => above_0(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned()),
     }
 }
 
 fn horizon(text: &str) -> Result<Horizon, String> {
     let fault = |_| "must be equivalent full cycles above 0, or days like 90d".to_owned();
     match text.trim().strip_suffix('d') {
-        Some(days) => positive(days).map(Horizon::Days).map_err(fault),
-        None => positive(text).map(Horizon::Cycles).map_err(fault),
+        Some(days) => above_0(days).map(Horizon::Days).map_err(fault),
+        None => above_0(text).map(Horizon::Cycles).map_err(fault),
     }
 }
 

@@ -9,28 +9,21 @@ use crate::ident::fit::Residual;
 use crate::lab::fit::{FitOutcome, FitProgress};
 
 /// Live line on the terminal; nothing where standard error is no terminal.
-pub(super) struct Bar(ProgressBar);
-
-impl Bar {
-    pub(super) fn new() -> Self {
-        let bar = ProgressBar::new_spinner();
-        if let Ok(style) = ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
-            bar.set_style(style);
-        }
-        Self(bar)
+pub(super) fn spinner() -> ProgressBar {
+    let bar = ProgressBar::new_spinner();
+    match ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
     }
+}
 
-    pub(super) fn show(&self, progress: FitProgress) {
-        self.0.set_message(match progress {
-            FitProgress::Read(done, all) => format!("read {done} of {all} files"),
-            FitProgress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
-        });
-        self.0.tick();
-    }
-
-    pub(super) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
+/// Shows the progress of the fit.
+pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
+    bar.set_message(match progress {
+        FitProgress::Read(done, all) => format!("read {done} of {all} files"),
+        FitProgress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
+    });
+    bar.tick();
 }
 
 /// Prints residuals per file, notes, and the end of the fit.

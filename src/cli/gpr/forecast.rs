@@ -8,7 +8,7 @@ use std::time::Instant;
 use serde_json::{Value, json};
 
 use super::super::Failure;
-use super::super::score::write_table;
+use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
 use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
 use super::{PartColumn, ColumnTable, ColumnSelection, failure, make_folder, quiet, read};
@@ -63,11 +63,6 @@ pub(super) struct ForecastArgs {
     json: bool,
 }
 
-fn percent(text: &str) -> Result<f64, String> {
-    let number = text.trim().trim_end_matches('%').trim().parse::<f64>().ok().filter(|p| *p > 0.0 && *p <= 100.0);
-    number.ok_or_else(|| "must be per cent above 0, at most 100".to_owned())
-}
-
 /// A forecast with its plan.
 struct ForecastReport<'a> {
     table: &'a ColumnTable,
@@ -80,16 +75,16 @@ struct ForecastReport<'a> {
 /// Runs the command.
 pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let begin = Instant::now();
-    make_folder(args.plots.as_deref())?;
+    args.plots.iter().try_for_each(|folder| create_folder(folder))?;
     args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.table()?;
     let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
     let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);
     let plan = ForecastPlan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
-    let bar = Bar::new(outputs * horizons(args.steps).len());
-    let mut done = |fits, _| bar.done(fits, "forecasts");
+    let bar = fit_bar(outputs * horizons(args.steps).len());
+    let mut done = |fits, _| show_fits(&bar, fits, "forecasts");
     let made = forecast::run(&table, &plan, &mut |_| ControlFlow::Continue(()), &mut done);
-    bar.clear();
+    bar.finish_and_clear();
     let made = made.map_err(failure)?;
     if let Some(path) = &args.predictions {
         forecast::write(path, &table, &made).map_err(failure)?;
@@ -100,7 +95,7 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let steps = if table.has[0] { RowSpacing::of(&table, table.width() - 1) } else { None };
     let seconds = begin.elapsed().as_secs_f64();
     let shown = ForecastReport { table: &table, plan: &plan, forecast: &made, steps, seconds };
-    quiet(if args.json { shown.json() } else { shown.table() })
+    unless_closed(if args.json { shown.json() } else { shown.table() })
 }
 
 impl ForecastArgs {
@@ -169,7 +164,7 @@ impl ForecastReport<'_> {
         let output = |output: &OutputForecast| json!({ "name": output.name, "horizons": output.horizons.iter().map(horizon_json).collect::<Vec<_>>() });
         let steps =
             self.steps.map(|s| json!({ "median": s.median, "p5": s.range.0, "p95": s.range.1, "even": s.even() }));
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "rows": table.len(), "parts": table.parts.len(), "skipped": table.skipped,
             "columns": table.names[..table.width() - table.has.len()], "lags": plan.lags, "steps": plan.steps,
             "kernel": plan.settings.kernel.to_string(), "form": form(plan.settings.form), "seed": plan.settings.seed,
@@ -201,9 +196,7 @@ fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
             .chain([horizon.trained.to_string()])
             .collect()
     };
-    let rows: Vec<Vec<String>> =
-        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
-    write_table(out, &rows, 0)
+    write_table(out, &heads, output.horizons.iter().map(line), 0)
 }
 
 /// Prints forecasts without measured values.
@@ -215,18 +208,15 @@ fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
         let own = [horizon.steps.to_string()];
         own.into_iter().chain(numbers).chain([horizon.trained.to_string()]).collect()
     };
-    let rows: Vec<Vec<String>> =
-        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
-    write_table(out, &rows, 0)
+    write_table(out, &heads, output.horizons.iter().map(line), 0)
 }
 
 fn horizon_json(horizon: &HorizonForecast) -> Value {
     let p = &horizon.at_origin;
-    let score = horizon.score.map(|s| {
-        json!({
-            "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
-            "mean_width_95": s.mean_width_95, "persistence_rmse": horizon.persistence_rmse,
-        })
+    let score = horizon.score.as_ref().map(|score| {
+        let mut score = score_json(score);
+        score.insert("persistence_rmse".to_owned(), json!(horizon.persistence_rmse));
+        score
     });
     json!({
         "steps": horizon.steps, "trained": horizon.trained, "calibrated": horizon.calibrated,

@@ -4,10 +4,10 @@ use std::io::{self, Write};
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
-use super::super::score::write_table;
+use crate::cli::output::{print_json, progress_bar, write_table};
 use crate::lab::gpr::{ColumnTable, TrainedModel, CrossValidation, peak_kib};
 use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
 
@@ -16,38 +16,25 @@ pub(super) const VERSION: u32 = 1;
 /// Parts of a fold in the progress bar.
 const TICKS: usize = 100;
 
-/// Progress on standard error, when that is a terminal.
-pub(super) struct Bar(ProgressBar);
+/// A progress bar over a number of fits.
+pub(super) fn fit_bar(fits: usize) -> ProgressBar {
+    progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
+}
 
-impl Bar {
-    /// Creates a bar over a number of fits.
-    pub(super) fn new(fits: usize) -> Self {
-        let bar = ProgressBar::with_draw_target(Some((fits * TICKS) as u64), ProgressDrawTarget::stderr_with_hz(5));
-        let template = "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}";
-        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Self(bar)
-    }
+/// Shows a step of a search; `before` fits were done before this cross-validation.
+pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
+    let part = (p.search - 1) * p.max_iterations + p.iteration;
+    let whole = (p.searches * p.max_iterations).max(1);
+    let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
+    bar.set_position(done as u64);
+    bar.set_message(format!("{what}, fold {} of {}, step {}", p.fold, p.folds, p.iteration));
+    ControlFlow::Continue(())
+}
 
-    /// Shows a step of a search; `before` fits were done before this cross-validation.
-    pub(super) fn show(&self, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
-        let part = (p.search - 1) * p.max_iterations + p.iteration;
-        let whole = (p.searches * p.max_iterations).max(1);
-        let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
-        self.0.set_position(done as u64);
-        self.0.set_message(format!("{what}, fold {} of {}, step {}", p.fold, p.folds, p.iteration));
-        ControlFlow::Continue(())
-    }
-
-    /// Sets the number of finished fits.
-    pub(super) fn done(&self, fits: usize, what: &str) {
-        self.0.set_position((fits * TICKS) as u64);
-        self.0.set_message(what.to_owned());
-    }
-
-    /// Removes the bar.
-    pub(super) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
+/// Sets the number of finished fits.
+pub(super) fn show_fits(bar: &ProgressBar, fits: usize, what: &str) {
+    bar.set_position((fits * TICKS) as u64);
+    bar.set_message(what.to_owned());
 }
 
 /// A form in words.
@@ -87,11 +74,15 @@ fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
     all.iter().map(|h| (h.name.clone(), json!(h.value))).collect()
 }
 
-/// Writes one JSON document.
-pub(super) fn write_json(document: &Value) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, document)?;
-    writeln!(out)
+/// Errors of predictions.
+pub(super) fn score_json(s: &Score) -> Map<String, Value> {
+    let values = [
+        ("rmse", s.rmse),
+        ("mean_absolute_error", s.mean_absolute_error),
+        ("coverage_95", s.coverage_95),
+        ("mean_width_95", s.mean_width_95),
+    ];
+    values.map(|(name, value)| (name.to_owned(), json!(value))).into_iter().collect()
 }
 
 /// A number with four digits that matter.
@@ -101,7 +92,7 @@ pub(super) fn short(value: f64) -> String {
 }
 
 /// A cross-validation.
-pub(super) struct Cv<'a> {
+pub(super) struct CvReport<'a> {
     pub(super) table: &'a ColumnTable,
     pub(super) settings: &'a Settings,
     pub(super) folds: usize,
@@ -122,7 +113,7 @@ fn jitter(validated: &CrossValidation) -> Jitter {
     })
 }
 
-impl Cv<'_> {
+impl CvReport<'_> {
     fn inputs(&self) -> &[String] {
         &self.table.names[..self.table.width() - 1]
     }
@@ -160,9 +151,7 @@ impl Cv<'_> {
                 validated.folds.predictions.len().to_string(),
             ]
         };
-        let rows: Vec<Vec<String>> =
-            std::iter::once(heads.map(str::to_owned).to_vec()).chain(self.all.iter().map(line)).collect();
-        write_table(&mut out, &rows, 1)?;
+        write_table(&mut out, &heads, self.all.iter().map(line), 1)?;
         for validated in self.all {
             let jitter = jitter(validated);
             if jitter.matrices > 0 {
@@ -193,7 +182,7 @@ impl Cv<'_> {
                 "folds": validated.folds.folds.iter().map(fold).collect::<Vec<_>>(),
             })
         };
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": self.output(), "inputs": self.inputs(), "rows": self.table.len(),
             "skipped": self.table.skipped, "folds": self.folds, "seed": self.settings.seed,
             "form": form(self.settings.form), "basis": basis(self.settings), "threads": self.settings.threads,
@@ -203,14 +192,14 @@ impl Cv<'_> {
 }
 
 /// A model that was trained.
-pub(super) struct Train<'a> {
+pub(super) struct TrainReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,
     pub(super) seconds: f64,
     pub(super) default_form: bool,
 }
 
-impl Train<'_> {
+impl TrainReport<'_> {
     /// Prints tables.
     pub(super) fn table(&self, path: &Path) -> io::Result<()> {
         let mut out = io::stdout().lock();
@@ -242,7 +231,7 @@ impl Train<'_> {
     /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let (trained, model) = (self.trained, &self.trained.model);
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": trained.output, "inputs": trained.inputs, "rows": model.rows(),
             "skipped": self.table.skipped, "kernel": model.kernel().to_string(), "form": form(model.form()),
             "basis": format!("{:?}", model.basis()).to_lowercase(),
@@ -255,14 +244,14 @@ impl Train<'_> {
 }
 
 /// Predictions of a saved model.
-pub(super) struct Predict<'a> {
+pub(super) struct PredictReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,
     pub(super) known: usize,
     pub(super) score: Option<Score>,
 }
 
-impl Predict<'_> {
+impl PredictReport<'_> {
     /// Prints a summary, on standard error when the rows go to standard output.
     pub(super) fn text(&self, to_stderr: bool) -> io::Result<()> {
         let mut text = Vec::new();
@@ -282,15 +271,9 @@ impl Predict<'_> {
 
     /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
-        let score = self.score.map(|s| {
-            json!({
-                "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
-                "mean_width_95": s.mean_width_95,
-            })
-        });
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": self.trained.output, "rows": self.table.len(), "known": self.known,
-            "skipped": self.table.skipped, "score": score,
+            "skipped": self.table.skipped, "score": self.score.as_ref().map(score_json),
         }))
     }
 }

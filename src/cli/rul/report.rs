@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::super::score::write_table;
+use crate::cli::output::{print_json, write_table};
 use crate::health::{Axis, Remaining};
 use crate::lab::rul::{self, ForecastScore, CurrentForecast, HistoryScore, ScoreTotal, WORST_ERROR};
 
@@ -32,18 +32,12 @@ const INTERVAL: [f64; 2] = [0.05, 0.95];
 
 /// Prints forecasts at the end of the histories as JSON.
 pub(super) fn now_json(forecasts: &[CurrentForecast]) -> io::Result<()> {
-    json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
+    print_json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
 }
 
 /// Prints scored forecasts as JSON.
 pub(super) fn scored_json(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
-    json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
-}
-
-fn json(document: &impl Serialize) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, document)?;
-    writeln!(out)
+    print_json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
 }
 
 /// Prints forecasts at the end of the histories as a table.
@@ -51,8 +45,7 @@ pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
     writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the recent rate of use\n")?;
     let heads = ["file", "end of life", "readings", "capacity", "loss per unit", "cycles", "days"];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    rows.extend(forecasts.iter().map(|now| {
+    let rows = forecasts.iter().map(|now| {
         let life = now.remaining;
         vec![
             now.name.clone(),
@@ -63,8 +56,8 @@ pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
             amount(life.and_then(|life| life.cycles)),
             amount(life.and_then(|life| life.days)),
         ]
-    }));
-    write_table(&mut out, &rows, 2)?;
+    });
+    write_table(&mut out, &heads, rows, 2)?;
     for now in forecasts {
         if let Some(why) = &now.refused {
             writeln!(out, "{}, {:.3} Ah: no forecast: {why}", now.name, now.threshold_ah)?;
@@ -79,28 +72,14 @@ pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()>
     let percent = 100.0 * alpha;
     writeln!(out, "remaining: median (5 to 95 %); passes when the median is within {percent:.0} % of the truth")?;
     writeln!(out, "errors are |median - truth| as a part of the life, at most {:.0} %\n", 100.0 * WORST_ERROR)?;
+    #[rustfmt::skip]
     let heads = [
-        "file",
-        "end of life",
-        "at",
-        "readings",
-        "unit",
-        "truth",
-        "forecast",
-        "alpha",
-        "interval",
-        "error",
-        "line",
-        "error",
-        "double exp.",
-        "error",
+        "file", "end of life", "at", "readings", "unit", "truth", "forecast", "alpha", "interval", "error", "line", "error",
+        "double exp.", "error",
     ];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    for file in files {
-        rows.extend(file.judged.iter().map(|judged| judged_row(file, judged)));
-    }
-    if rows.len() > 1 {
-        write_table(&mut out, &rows, 2)?;
+    let rows: Vec<_> = files.iter().flat_map(|file| file.judged.iter().map(|score| judged_row(file, score))).collect();
+    if !rows.is_empty() {
+        write_table(&mut out, &heads, rows, 2)?;
         writeln!(out)?;
     }
     notes(&mut out, files)?;

@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use serde::Serialize;
 
 use crate::alarm::{Rule, Severity};
-use crate::cli::score::write_table;
+use crate::cli::output::write_table;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
 use crate::lab::fleet::whatif::{ThresholdScore, EndOfLife, LogResult, WhatifSettings};
@@ -105,9 +105,7 @@ impl WhatifReport<'_> {
             self.row((summary.rule, summary.severity), summary.setting, own)
         };
         writeln!(out)?;
-        let mut rows = vec![self.heads(SUMMARY_HEADS)];
-        rows.extend(self.summaries().iter().map(row));
-        write_table(out, &rows, 2)
+        write_table(out, &self.heads(SUMMARY_HEADS), self.summaries().iter().map(row), 2)
     }
 
     fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
@@ -119,9 +117,7 @@ impl WhatifReport<'_> {
         };
         let (name, by) = (log.log.display(), log.judged_by.words());
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
-        let mut rows = vec![self.heads(LOG_HEADS)];
-        rows.extend(self.rows(log).map(|row| self.log_row(log, row)));
-        write_table(out, &rows, 2)
+        write_table(out, &self.heads(LOG_HEADS), self.rows(log).map(|row| self.log_row(log, row)), 2)
     }
 
     fn log_row(&self, log: &LogResult, row: &ThresholdScore) -> Vec<String> {
