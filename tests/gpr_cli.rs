@@ -7,7 +7,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
-use packwatch::lab::gpr::{MissingPolicy, PartColumn, ColumnTable, TrainedModel, ColumnSelection};
+use packwatch::lab::gpr::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn, TrainedModel};
 use packwatch::regress::{Form, Settings};
 use serde_json::Value;
 

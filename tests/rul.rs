@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use packwatch::config;
 use packwatch::health::Axis;
-use packwatch::lab::rul::{self, History, CapacityReading, HistoryScore, Threshold};
+use packwatch::lab::rul::{self, CapacityReading, History, HistoryScore, Threshold};
 use packwatch::monitor::EventKind;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};

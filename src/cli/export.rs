@@ -8,10 +8,10 @@ use serde_json::json;
 use super::Failure;
 use super::fleet::LogArgs;
 use super::numbers::within;
-use super::output::{print_json, unless_closed, write_table};
+use super::output::{failure, print_json, unless_closed, write_table};
 use crate::config::{self, Config};
 use crate::lab::fleet::LogAccess;
-use crate::lab::fleet::export::{self, ExportResult, TableFormat, ExportSettings};
+use crate::lab::fleet::export::{self, ExportResult, ExportSettings, TableFormat};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
@@ -80,9 +80,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let bar = args.logs.bar(1);
     let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.inc(bytes));
     bar.finish_and_clear();
-    let (good, failed): (Vec<_>, Vec<_>) = results.map_err(Failure::new)?.into_iter().partition(Result::is_ok);
+    let (good, failed): (Vec<_>, Vec<_>) = results.map_err(failure)?.into_iter().partition(Result::is_ok);
     let good: Vec<ExportResult> = good.into_iter().flatten().collect();
-    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).collect();
+    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).map(|error| error.0).collect();
     unless_closed(match args.json {
         true => print_json(&json!({ "version": VERSION, "logs": good, "failed": failed })),
         false => table(&good),

@@ -4,7 +4,6 @@
 
 mod report;
 
-use std::io::Write as _;
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -12,7 +11,7 @@ use super::Failure;
 use super::numbers::{above_0, finite, share};
 use super::output::{failure, unless_closed};
 use crate::cell::MAX_BRANCHES;
-use crate::io::result_file::ResultFile;
+use crate::lab;
 use crate::lab::fit::{self, FitRequest};
 
 /// Arguments of `fit`.
@@ -101,7 +100,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let result = fit::run(&request, |progress| report::show(&bar, progress));
     bar.finish_and_clear();
     let outcome = result.map_err(failure)?;
-    write_model(args, &fit::text(&request, &outcome)).map_err(failure)?;
+    lab::write_file(&args.out, fit::text(&request, &outcome).as_bytes()).map_err(failure)?;
     if let Some(path) = &args.plot {
         fit::write_plot(path, &outcome).map_err(failure)?;
     }
@@ -126,10 +125,4 @@ fn request(args: &Args) -> FitRequest {
         first_cycles: args.first_cycles,
         files: args.files.clone(),
     }
-}
-
-fn write_model(args: &Args, text: &str) -> std::io::Result<()> {
-    let mut file = ResultFile::create(&args.out)?;
-    file.write_all(text.as_bytes())?;
-    file.finish()
 }

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
-use crate::lab::gpr::{self, PartColumn, ColumnTable, TrainedModel, ColumnSelection};
+use crate::lab::gpr::{self, ColumnSelection, ColumnTable, PartColumn, TrainedModel};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs, whole};
 

@@ -2,7 +2,6 @@
 
 use std::cell::RefCell;
 use std::fs;
-use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
@@ -10,12 +9,13 @@ use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config::{self, Config};
-use crate::replay::{self, Settings, Sinks, Summary, Watch};
-use crate::store::Reader;
 use crate::io::log::LogSource;
-use crate::io::result_file::{ResultFile, check_place};
+use crate::io::result_file::check_place;
+use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
+use crate::replay::{self, Settings, Sinks, Summary, Watch};
+use crate::store::Reader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
@@ -69,7 +69,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         reference: reference.unwrap_or_default(),
         provenance,
     };
-    unless_closed(write(&args.out, &report::page(&data, &context)))?;
+    unless_closed(lab::write_file(&args.out, report::page(&data, &context).as_bytes()))?;
     let Some(folder) = &args.plots else { return Ok(()) };
     create_folder(folder)?;
     report::write_plots(folder, &data, &context).map(drop).map_err(failure)
@@ -88,12 +88,6 @@ impl Args {
         let more = if self.logs.len() > 1 { format!(" and {} more", self.logs.len() - 1) } else { String::new() };
         self.title.clone().unwrap_or_else(|| name.unwrap_or_else(|| "Battery".to_owned()) + &more)
     }
-}
-
-fn write(path: &Path, page: &str) -> io::Result<()> {
-    let mut file = ResultFile::create(path)?;
-    file.write_all(page.as_bytes())?;
-    file.finish()
 }
 
 /// Lines of the provenance: name and value.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use super::Failure;
 use super::fleet::LogArgs;
 use super::numbers::{above_0, percent};
-use super::output::unless_closed;
+use super::output::{failure, unless_closed};
 use crate::alarm::Rule;
 use crate::config::Config;
 use crate::io::result_file::check_place;
@@ -16,7 +16,7 @@ use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
 use crate::lab::fleet::variants::{self, Choice};
-use crate::lab::fleet::whatif::{self, WhatifJob, LogResult, WhatifSettings};
+use crate::lab::fleet::whatif::{self, LogResult, WhatifJob, WhatifSettings};
 
 /// Capacity at the end of life.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -101,8 +101,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let bar = args.logs.bar(grid.replays);
     let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.inc(bytes));
     bar.finish_and_clear();
-    let results = results.map_err(Failure::new)?;
-    let failed = results.iter().filter_map(|result| result.as_ref().err().cloned()).collect();
+    let results = results.map_err(failure)?;
+    let failed = results.iter().filter_map(|result| Some(result.as_ref().err()?.0.clone())).collect();
     let rules = args.rules(&grid);
     let good: Vec<&LogResult> = results.iter().filter_map(|result| result.as_ref().ok()).collect();
     let shown = report::WhatifReport { grid: &grid, settings: &settings, rated_ah, rules: &rules, logs: &good, failed };
@@ -130,8 +130,11 @@ impl Args {
     fn jobs(&self) -> Vec<WhatifJob> {
         let found = truth::find_next_to(&self.logs.logs);
         let logs = self.logs.logs.iter().zip(found).enumerate();
-        logs.map(|(index, (log, found))| WhatifJob { log: log.clone(), truth: self.truth.get(index).cloned().or(found) })
-            .collect()
+        logs.map(|(index, (log, found))| WhatifJob {
+            log: log.clone(),
+            truth: self.truth.get(index).cloned().or(found),
+        })
+        .collect()
     }
 
     /// Rules in the table.
@@ -155,7 +158,9 @@ impl Args {
 fn end_of_life(text: &str) -> Result<EndOfLifeArg, String> {
     match text.trim().strip_suffix('%') {
         Some(digits) => percent(digits).map(|percent| EndOfLifeArg::Part(percent / 100.0)),
-        None => above_0(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned()),
+        None => {
+            above_0(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned())
+        }
     }
 }
 

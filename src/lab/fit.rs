@@ -10,18 +10,20 @@ mod toml;
 
 use std::path::PathBuf;
 
+use rayon::prelude::*;
+
 pub use picture::write as write_plot;
 pub use toml::text;
 
 use super::measured::MeasuredFile;
 use crate::cell::Thermal;
+use crate::error::LabError;
 use crate::ident::error_table::WeightedRecord;
-use crate::ident::fit::{FittedTables, Residual, FitSettings};
+use crate::ident::fit::{FitSettings, FittedTables, Residual};
 use crate::ident::grid::Grid;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{error_table, fit, thermal};
-use crate::io::table::TableError;
 
 /// Least share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
@@ -125,29 +127,18 @@ pub struct FitOutcome {
     pub notes: Vec<String>,
 }
 
-/// Why there is no model.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{0}")]
-pub struct FitFailure(pub String);
-
-impl From<TableError> for FitFailure {
-    fn from(error: TableError) -> Self {
-        Self(error.0)
-    }
-}
-
 /// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
 /// Files that cannot be read or used, and data that do not support a fit: one line each.
-pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, FitFailure> {
+pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     let (files, slow) = read_all(request, &mut progress)?;
     let prepared = prepare::prepare(request, &files, &slow)?;
     let settings = settings(request, &prepared)?;
     let (records, scale) = prepared.records(&settings.grid);
     check_range(&records)?;
     let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(FitProgress::Pass(pass, cost)));
-    let fitted = fitted.map_err(|error| FitFailure(error.to_string()))?;
+    let fitted = fitted?;
     let energy_wh = prepared.capacity_ah * fitted.mean_ocv_v();
     let thermal = thermal::fit(&records, &fitted.tables, energy_wh);
     let file_of_record: Vec<usize> = prepared.sources.iter().map(|source| source.file).collect();
@@ -181,30 +172,25 @@ fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<WeightedRe
 fn read_all(
     request: &FitRequest,
     progress: &mut impl FnMut(FitProgress),
-) -> Result<(Vec<MeasuredFile>, Vec<MeasuredFile>), FitFailure> {
+) -> Result<(Vec<MeasuredFile>, Vec<MeasuredFile>), LabError> {
     let paths: Vec<&PathBuf> = request.files.iter().chain(&request.ocv).collect();
     let workers = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let mut read = Vec::with_capacity(paths.len());
     for some in paths.chunks(workers) {
-        let results: Vec<_> = std::thread::scope(|scope| {
-            let jobs: Vec<_> = some.iter().map(|path| scope.spawn(|| MeasuredFile::read(path))).collect();
-            jobs.into_iter().map(|job| job.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
-        });
-        for result in results {
-            read.push(result?);
-        }
+        let files: Result<Vec<_>, _> = some.par_iter().map(|path| MeasuredFile::read(path)).collect();
+        read.extend(files?);
         progress(FitProgress::Read(read.len(), paths.len()));
     }
     let slow = read.split_off(request.files.len());
     Ok((read, slow))
 }
 
-fn settings(request: &FitRequest, prepared: &prepare::FitInputs<'_>) -> Result<FitSettings, FitFailure> {
+fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSettings, LabError> {
     let ageing = request.first_cycles.is_some();
     let tau_s = match (&request.tau_s, request.branches) {
         (Some(tau_s), Some(branches)) if tau_s.len() != branches => {
             let found = tau_s.len();
-            return Err(FitFailure(format!("--tau has {found} values, --branches is {branches}: must agree")));
+            return Err(LabError(format!("--tau has {found} values, --branches is {branches}: must agree")));
         }
         (Some(tau_s), _) => tau_s.clone(),
         (None, branches) => TAU_S[branches.unwrap_or(if ageing { 1 } else { 2 }) - 1].to_vec(),
@@ -230,7 +216,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs<'_>) -> Result<F
 /// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
 const AGEING_SLOPE_V: [(f64, f64); 2] = [(0.0, 0.2), (0.9, 1.0)];
 
-fn check_range(records: &[Record]) -> Result<(), FitFailure> {
+fn check_range(records: &[Record]) -> Result<(), LabError> {
     let judged = records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
     let (low, high) =
         judged.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), row| (low.min(row.soc), high.max(row.soc)));
@@ -238,12 +224,12 @@ fn check_range(records: &[Record]) -> Result<(), FitFailure> {
         return Ok(());
     }
     let found = if high > low { format!("SOC {:.2} to {:.2}", low, high) } else { "no usable row".to_owned() };
-    Err(FitFailure(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
+    Err(LabError(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
 }
 
 fn by_file(
     files: &[&MeasuredFile],
-    prepared: &prepare::FitInputs<'_>,
+    prepared: &prepare::FitInputs,
     records: &[Record],
     fitted: &FittedTables,
 ) -> Vec<FileResidual> {

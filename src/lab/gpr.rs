@@ -9,40 +9,16 @@ mod pictures;
 mod table;
 mod trained;
 
-use std::io::Write as _;
 use std::path::Path;
 use std::time::Instant;
 
 pub use pictures::{write_cross_validation, write_forecast};
-pub use table::{MissingPolicy, PartColumn, ColumnTable, ColumnSelection};
+pub use table::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn};
 pub use trained::{TrainedModel, write_predictions};
 
+use crate::error::LabError;
 use crate::io::result_file::ResultFile;
-use crate::io::table::TableError;
-use crate::regress::{self, Folds, Rows, Score, Settings, Watcher};
-
-/// Why there is no regression.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct GprError(pub String);
-
-impl From<regress::Fault> for GprError {
-    fn from(fault: regress::Fault) -> Self {
-        Self(fault.to_string())
-    }
-}
-
-impl From<TableError> for GprError {
-    fn from(error: TableError) -> Self {
-        Self(error.0)
-    }
-}
-
-impl From<csv::Error> for GprError {
-    fn from(error: csv::Error) -> Self {
-        Self(error.to_string())
-    }
-}
+use crate::regress::{self, Folds, Prediction, Rows, Score, Settings, Watcher};
 
 /// Cross-validation of one kernel.
 #[derive(Debug, Clone)]
@@ -75,7 +51,7 @@ pub fn cross_validate(
     settings: &Settings,
     folds: usize,
     watcher: &mut Watcher<'_>,
-) -> Result<CrossValidation, GprError> {
+) -> Result<CrossValidation, LabError> {
     let (inputs, targets) = split(table);
     let rows = Rows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
     reset_peak();
@@ -90,39 +66,35 @@ pub fn cross_validate(
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write_validated(path: &Path, table: &ColumnTable, all: &[CrossValidation]) -> Result<(), GprError> {
+pub fn write_validated(path: &Path, table: &ColumnTable, all: &[CrossValidation]) -> Result<(), LabError> {
     let output = &table.names[table.width() - 1];
-    let mut out = csv::Writer::from_writer(create(path)?);
     let own = ["kernel", "file", "line", "fold"].map(str::to_owned);
     let named = ["mean", "std", "low_95", "high_95"].map(|word| table::derived(output, word));
-    out.write_record(own.iter().chain([output]).chain(&named))?;
-    for validated in all {
-        for (row, p) in validated.folds.predictions.iter().enumerate() {
-            let truth = table.row(row)[table.width() - 1];
-            let numbers = [truth, p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
-            let file = table.file_of(row).display().to_string();
-            let fold = (validated.folds.fold_of_row[row] + 1).to_string();
-            let own = [validated.kernel.clone(), file, table.lines[row].to_string(), fold];
-            out.write_record(own.into_iter().chain(numbers.map(|number| number.to_string())))?;
-        }
+    let rows = all.iter().flat_map(|validated| (0..table.len()).map(move |row| (validated, row)));
+    let rows = rows.map(|(validated, row)| {
+        let file = table.file_of(row).display().to_string();
+        let fold = (validated.folds.fold_of_row[row] + 1).to_string();
+        let truth = table.row(row)[table.width() - 1].to_string();
+        let own = [validated.kernel.clone(), file, table.lines[row].to_string(), fold, truth];
+        own.into_iter().chain(interval(&validated.folds.predictions[row])).collect()
+    });
+    write_csv(path, own.into_iter().chain([output.clone()]).chain(named).collect(), rows)
+}
+
+/// Writes a CSV file completely or not at all.
+fn write_csv(path: &Path, heads: Vec<String>, rows: impl Iterator<Item = Vec<String>>) -> Result<(), LabError> {
+    let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
+    out.write_record(heads)?;
+    for row in rows {
+        out.write_record(row)?;
     }
-    finish(out)
+    let file = out.into_inner().map_err(|error| LabError(error.error().to_string()))?;
+    Ok(file.finish()?)
 }
 
-fn create(path: &Path) -> Result<ResultFile, GprError> {
-    ResultFile::create(path).map_err(|error| GprError(error.to_string()))
-}
-
-fn finish(out: csv::Writer<ResultFile>) -> Result<(), GprError> {
-    let file = out.into_inner().map_err(|error| GprError(error.error().to_string()))?;
-    file.finish().map_err(|error| GprError(error.to_string()))
-}
-
-/// Writes a text completely or not at all.
-fn write_text(path: &Path, text: &str) -> Result<(), GprError> {
-    let mut file = create(path)?;
-    file.write_all(text.as_bytes()).map_err(|error| GprError(error.to_string()))?;
-    file.finish().map_err(|error| GprError(error.to_string()))
+/// The interval of a prediction: mean, standard deviation and both ends.
+fn interval(p: &Prediction) -> [String; 4] {
+    [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(|number| number.to_string())
 }
 
 /// Resets the kernel's record of the peak memory, so that the next peak belongs to the next kernel. Where that fails, peaks

@@ -33,6 +33,15 @@ impl MeasuredPart {
         self.time_s.len()
     }
 
+    /// Adds a row.
+    pub(crate) fn push(&mut self, time_s: f64, current_a: f64, voltage_v: f64, temperature_c: f64, discharged_ah: f64) {
+        self.time_s.push(time_s);
+        self.current_a.push(current_a);
+        self.voltage_v.push(voltage_v);
+        self.temperature_c.push(temperature_c);
+        self.discharged_ah.push(discharged_ah);
+    }
+
     /// Whether it has no rows.
     pub fn is_empty(&self) -> bool {
         self.time_s.is_empty()
@@ -116,11 +125,7 @@ impl Columns {
             parts.push(MeasuredPart { key: key.into_owned(), kind, ..MeasuredPart::default() });
         }
         let Some(part) = parts.last_mut() else { return Ok(()) };
-        part.time_s.push(time_s);
-        part.current_a.push(current_a);
-        part.voltage_v.push(voltage_v);
-        part.temperature_c.push(temperature_c);
-        part.discharged_ah.push(discharged_ah);
+        part.push(time_s, current_a, voltage_v, temperature_c, discharged_ah);
         Ok(())
     }
 }
@@ -150,7 +155,10 @@ mod tests {
     #[test]
     fn a_fault_names_its_line_and_what_was_found() {
         let found = read("time_s,current_a,voltage_v\n0,1,3.5\n1,x,3.5\n");
-        assert_eq!(found, Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into()));
+        assert_eq!(
+            found,
+            Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into())
+        );
         let found = read("time_s,voltage_v\n0,3.5\n");
         assert_eq!(found, Err("cell.csv:1: no column current_a, found time_s,voltage_v".into()));
         assert_eq!(read("time_s,current_a,voltage_v\n"), Err("cell.csv: no rows after the header".into()));

@@ -15,7 +15,7 @@ mod trace;
 
 use std::path::Path;
 
-pub use data::{Data, Origin, DataSource};
+pub use data::{Data, DataSource, Origin};
 pub use html::page;
 pub use reference::{Reference, read as read_reference};
 

@@ -18,7 +18,7 @@ use serde::Serialize;
 pub use history::{CapacityReading, History};
 pub use truth::end_of_life;
 
-use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
+use crate::health::{Axis, Forecast, InsufficientData, Reading, RemainingLife, Usage};
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not dominate a mean.
 pub const WORST_ERROR: f64 = 1.0;
@@ -196,7 +196,9 @@ fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) ->
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
-    let error = |forecast: Option<f64>| forecast.map_or(WORST_ERROR, |forecast| ((forecast - truth).abs() / end).min(WORST_ERROR));
+    let error = |forecast: Option<f64>| {
+        forecast.map_or(WORST_ERROR, |forecast| ((forecast - truth).abs() / end).min(WORST_ERROR))
+    };
     ForecastScore {
         at,
         readings: known.len(),

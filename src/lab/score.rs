@@ -18,17 +18,16 @@ mod soc;
 mod window;
 
 use std::path::PathBuf;
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
 
 pub use case::{Case, CaseScore, Start};
 pub use cycles::CycleTable;
 pub use life::{DischargeScore, LifeScore};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
-use super::chart::PlotError;
 use super::measured::MeasuredFile;
-use crate::io::table::TableError;
+use crate::error::LabError;
 use crate::monitor::MonitorConfig;
 
 /// Half-width of a Gaussian's 95 % interval in standard deviations.
@@ -83,20 +82,6 @@ pub struct ScoreJob {
     pub name: String,
 }
 
-/// Why there is no score.
-#[derive(Debug, thiserror::Error)]
-pub enum ScoreError {
-    /// A file cannot be read.
-    #[error(transparent)]
-    Table(#[from] TableError),
-    /// A plot cannot be written.
-    #[error(transparent)]
-    Plot(#[from] PlotError),
-    /// A file, a table or a setting does not fit: place, found, allowed.
-    #[error("{0}")]
-    Unfit(String),
-}
-
 /// Scores every file in every case, files in parallel; in the order of `jobs`, and within a file of `cases`.
 /// `progress` receives the file's index and the share of its work just done (fraction).
 ///
@@ -107,31 +92,20 @@ pub fn run(
     cases: &[Case],
     settings: &ScoreSettings,
     progress: &(dyn Fn(usize, f64) + Sync),
-) -> Result<Vec<CaseScore>, ScoreError> {
-    let next = AtomicUsize::new(0);
-    let results: Vec<OnceLock<Outcome>> = jobs.iter().map(|_| OnceLock::new()).collect();
-    let work = || {
-        while let Some((index, job)) = Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|i| Some((i, jobs.get(i)?)))
-        {
-            let outcome = score_file(job, cases, settings, &|part| progress(index, part));
-            // Each index is taken once, so the cell is empty.
-            let _ = results[index].set(outcome);
-        }
-    };
-    let workers = std::thread::available_parallelism().map_or(1, usize::from).min(jobs.len());
-    std::thread::scope(|scope| (0..workers).for_each(|_| drop(scope.spawn(work))));
-    let lists: Result<Vec<_>, _> = results.into_iter().filter_map(OnceLock::into_inner).collect();
+) -> Result<Vec<CaseScore>, LabError> {
+    let score = |(index, job)| score_file(job, cases, settings, &|part| progress(index, part));
+    // One by one: files differ much in length.
+    let lists: Vec<_> = jobs.par_iter().enumerate().with_max_len(1).map(score).collect();
+    let lists: Result<Vec<_>, _> = lists.into_iter().collect();
     Ok(lists?.into_iter().flatten().collect())
 }
-
-type Outcome = Result<Vec<CaseScore>, ScoreError>;
 
 fn score_file(
     job: &ScoreJob,
     cases: &[Case],
     settings: &ScoreSettings,
     progress: &dyn Fn(f64),
-) -> Result<Vec<CaseScore>, ScoreError> {
+) -> Result<Vec<CaseScore>, LabError> {
     let file = MeasuredFile::read(&job.path)?;
     let share = 1.0 / cases.len().max(1) as f64;
     cases.iter().map(|case| case::run(job, &file, case, settings, &|part| progress(part * share))).collect()

@@ -7,12 +7,15 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use super::super::Failure;
-use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
-use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
-use super::{PartColumn, ColumnTable, ColumnSelection, failure, make_folder, quiet, read};
-use crate::lab::gpr::forecast::{self, TableForecast, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, ForecastPlan, RowSpacing, horizons};
+use super::report::{VERSION, fit_bar, form, jitter_json, mebibytes, score_json, short, show_fits, skipped};
+use super::{ColumnSelection, ColumnTable, PartColumn, read};
+use crate::cli::Failure;
+use crate::cli::numbers::percent;
+use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
+use crate::lab::gpr::forecast::{
+    self, ForecastPlan, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, RowSpacing, TableForecast, horizons,
+};
 use crate::lab::gpr::{self, peak_kib};
 use crate::regress::Kernel;
 

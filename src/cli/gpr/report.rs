@@ -8,7 +8,7 @@ use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
 use crate::cli::output::{print_json, progress_bar, write_table};
-use crate::lab::gpr::{ColumnTable, TrainedModel, CrossValidation, peak_kib};
+use crate::lab::gpr::{ColumnTable, CrossValidation, TrainedModel, peak_kib};
 use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
 
 /// Version of the JSON documents.

@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use crate::cli::output::{print_json, write_table};
 use crate::health::{Axis, Remaining};
-use crate::lab::rul::{self, ForecastScore, CurrentForecast, HistoryScore, ScoreTotal, WORST_ERROR};
+use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
 
 /// Version of the JSON documents.
 const VERSION: u32 = 1;

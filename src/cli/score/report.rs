@@ -8,7 +8,7 @@ use serde::Serialize;
 use crate::cli::output::{print_json, progress_bar, write_table};
 use crate::config::Config;
 use crate::lab::score::{
-    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, ScoreJob, LifeScore, ScoreSettings, SocScore, Start,
+    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore, Start,
 };
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.

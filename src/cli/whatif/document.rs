@@ -11,7 +11,7 @@ use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::Variant;
-use crate::lab::fleet::whatif::{ThresholdScore, LogResult};
+use crate::lab::fleet::whatif::{LogResult, ThresholdScore};
 use crate::quantity::Timestamp;
 
 /// Version of the JSON document.

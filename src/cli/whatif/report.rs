@@ -8,7 +8,7 @@ use crate::alarm::{Rule, Severity};
 use crate::cli::output::write_table;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::VariantGrid;
-use crate::lab::fleet::whatif::{ThresholdScore, EndOfLife, LogResult, WhatifSettings};
+use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
 /// Columns of a table in addition to the alarm and the values set.
 const OWN_COLUMNS: usize = 9;

@@ -1,6 +1,5 @@
 //! Writes pictures as files: self-contained SVG, light or dark as the viewer prefers, and PNG.
 
-use std::io::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -9,7 +8,6 @@ use resvg::usvg::{Options, Tree, fontdb};
 
 use super::style::{fixed, variables};
 use super::{Picture, Size, escape};
-use crate::io::result_file::ResultFile;
 
 /// Space around a picture in a file, pixels.
 const MARGIN: f64 = 14.0;
@@ -51,11 +49,7 @@ pub fn write_stack(path: &Path, pictures: &[Picture], format: Format) -> Result<
         Format::Svg => document(pictures, &variables()).into_bytes(),
         Format::Png => png(&document(pictures, &fixed())).map_err(failed)?,
     };
-    let written = ResultFile::create(path).and_then(|mut file| {
-        file.write_all(&bytes)?;
-        file.finish()
-    });
-    written.map_err(|error| failed(error.to_string()))
+    crate::write_file(path, &bytes).map_err(|error| failed(error.to_string()))
 }
 
 /// An SVG document.

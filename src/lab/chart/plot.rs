@@ -2,7 +2,7 @@
 
 use super::axis::Axis;
 use super::style::Ink;
-use super::svg::{Svg, PathBuilder, short, text_width};
+use super::svg::{PathBuilder, Svg, short, text_width};
 use super::{Size, thin};
 
 /// Font size of ticks and legend, pixels, as the style sheet has it.

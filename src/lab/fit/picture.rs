@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use super::{FitFailure, FitOutcome};
-use crate::ident::pass::residuals;
+use super::FitOutcome;
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use crate::error::LabError;
+use crate::ident::pass::residuals;
 
 /// Most panels: a longer page is not read.
 const MAX_PANELS: usize = 40;
@@ -13,9 +14,9 @@ const MAX_PANELS: usize = 40;
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), FitFailure> {
+pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
     let panels: Vec<Picture> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
-    chart::write_stack(path, &panels, Format::Svg).map_err(|error| FitFailure(error.to_string()))
+    Ok(chart::write_stack(path, &panels, Format::Svg)?)
 }
 
 /// One file; its stretches follow each other.

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 
 use crate::config::Config;
+use crate::error::LabError;
 use crate::io::log::{LogCounts, LogSource, Record};
 use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
@@ -55,9 +56,9 @@ pub fn drive(
     mut monitor: Monitor,
     mut out: Outputs,
     sleep_gap_s: f64,
-    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), String>,
+    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), LabError>,
     report: &dyn Fn(u64),
-) -> Result<DriveSummary, String> {
+) -> Result<DriveSummary, LabError> {
     let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
     let (mut driven, mut records, mut reported) = (DriveSummary::default(), 0_u64, 0);
     driven.notes.extend(note);
@@ -66,11 +67,11 @@ pub fn drive(
             monitor.handle(Input::Tick { time }, &mut out);
             each(monitor, &mut out)?;
         }
-        let Some(input) = input else { return Ok(()) };
+        let Some(input) = input else { return Ok::<(), LabError>(()) };
         monitor.handle(input, &mut out);
         each(monitor, &mut out)
     };
-    while let Some(record) = source.next_record().map_err(|error| error.to_string())? {
+    while let Some(record) = source.next_record()? {
         driven.note(&record);
         if matches!(record, Record::UnknownGap { .. }) || source.carries_ticks() {
             ticks.sleep();
@@ -99,9 +100,9 @@ impl DriveSummary {
     ///
     /// # Errors
     /// The log held no record; the error includes the notes.
-    pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+    pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), LabError> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
-        self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
+        self.span.ok_or_else(|| LabError(format!("{}: holds no record{}", log.display(), why())))
     }
 
     fn note(&mut self, record: &Record) {
@@ -125,10 +126,8 @@ impl DriveSummary {
             self.notes.push(format!("{} bad lines left out, the first: {first}", counts.bad_lines));
         }
         if counts.unknown_gaps > 0 {
-            self.notes.push(format!(
-                "{} gaps of unknown length: fewer days are counted than passed",
-                counts.unknown_gaps
-            ));
+            self.notes
+                .push(format!("{} gaps of unknown length: fewer days are counted than passed", counts.unknown_gaps));
         }
         if counts.frames == 0 {
             let others: Vec<_> = counts.foreign.keys().map(String::as_str).collect();

@@ -20,12 +20,12 @@ use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
 use crate::config::Config;
+use crate::error::LabError;
 use crate::fields::Fields;
-use crate::status::document::ConfigFile;
-use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
+use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 
@@ -89,7 +89,7 @@ pub fn run(
     logs: &[PathBuf],
     settings: &ExportSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Vec<Result<ExportResult, String>>, String> {
+) -> Result<Vec<Result<ExportResult, LabError>>, LabError> {
     let names = names(logs);
     super::in_parallel(logs, settings.jobs, |index, log| export(config, log, &names[index], settings, report))
 }
@@ -100,9 +100,10 @@ fn export(
     name: &str,
     settings: &ExportSettings<'_>,
     report: &dyn Fn(u64),
-) -> Result<ExportResult, String> {
+) -> Result<ExportResult, LabError> {
     let folder = settings.out.join(name);
-    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be created: {error}", folder.display()))?;
+    std::fs::create_dir_all(&folder)
+        .map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
     let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
     let source = (settings.access.open)(config, log);
@@ -125,10 +126,10 @@ fn export(
 
 /// Removes the `about.json` of an earlier export, since its tables are replaced one by one; returns a note when they were
 /// those of another log.
-fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
+fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join("about.json");
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
-    std::fs::remove_file(&path).map_err(|error| format!("{}: cannot be removed: {error}", path.display()))?;
+    std::fs::remove_file(&path).map_err(|error| LabError(format!("{}: cannot be removed: {error}", path.display())))?;
     let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
     let other = about["metadata"]["packwatch.log"].as_str().filter(|other| Path::new(other) != log);
     Ok(other.map(|other| format!("replaced the tables of {other}")))
@@ -153,7 +154,11 @@ fn metadata(
     ]
 }
 
-fn write_about(exported: &ExportResult, driven: &DriveSummary, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
+fn write_about(
+    exported: &ExportResult,
+    driven: &DriveSummary,
+    metadata: Vec<(&'static str, String)>,
+) -> Result<(), LabError> {
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
@@ -163,9 +168,7 @@ fn write_about(exported: &ExportResult, driven: &DriveSummary, metadata: Vec<(&'
         "log": driven.counts,
         "notes": exported.notes,
     });
-    let mut file = ResultFile::create(&exported.folder.join("about.json")).map_err(|error| error.to_string())?;
-    serde_json::to_writer_pretty(&mut file, &document).map_err(|error| error.to_string())?;
-    file.finish().map_err(|error| error.to_string())
+    Ok(crate::write_file(&exported.folder.join("about.json"), &serde_json::to_vec_pretty(&document)?)?)
 }
 
 /// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before
@@ -218,7 +221,7 @@ struct LogTables {
 }
 
 impl LogTables {
-    fn create(config: &Config, name: &str, folder: &Path, settings: &ExportSettings<'_>) -> Result<Self, String> {
+    fn create(config: &Config, name: &str, folder: &Path, settings: &ExportSettings<'_>) -> Result<Self, LabError> {
         let cells = usize::from(config.monitor.sample.cells);
         let (form, ending) = (settings.format, settings.format.ending());
         let path = |table: &str| folder.join(format!("{table}.{ending}"));
@@ -236,7 +239,7 @@ impl LogTables {
         })
     }
 
-    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), String> {
+    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), LabError> {
         for estimate in &out.estimates {
             let since_ns = self.since_ns(estimate.time);
             let Some(last) = self.periods.get_mut(estimate.cell.index()) else { continue };
@@ -253,7 +256,7 @@ impl LogTables {
         out.events.iter().try_for_each(|event| self.take_event(monitor, event))
     }
 
-    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), String> {
+    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), LabError> {
         let (log, time) = (self.log.clone(), event.time);
         let since_s = self.since_ns(time) as f64 * 1e-9;
         match event.kind {
@@ -290,7 +293,7 @@ impl LogTables {
     }
 
     /// Completes the files with their metadata; returns the rows of each.
-    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, String> {
+    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, LabError> {
         Ok(BTreeMap::from([
             ("estimates", self.estimates.finish(metadata)?),
             ("half_cycles", self.half_cycles.finish(metadata)?),

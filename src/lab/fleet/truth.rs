@@ -177,7 +177,10 @@ mod tests {
 
     #[test]
     fn a_fault_names_its_line() {
-        assert_eq!(read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"), "t.csv:2: column capacity_ah: found \"x\", must be 0 Ah or more");
+        assert_eq!(
+            read("time_s,cell,capacity_ah\n1,0,x\n").expect_err("bad"),
+            "t.csv:2: column capacity_ah: found \"x\", must be 0 Ah or more"
+        );
         assert_eq!(
             read("time_s,cell,capacity_ah\n5,0,2\n4,0,2\n").expect_err("bad"),
             "t.csv:3: column time_s: found \"4\", must be no earlier than the row before"

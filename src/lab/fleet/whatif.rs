@@ -9,13 +9,14 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::drive::{DriveSummary, LogAccess, drive};
-use super::judge::{Horizon, AlarmScore, LogLife, judge};
-use super::variant_batch::VariantBatch;
+use super::judge::{AlarmScore, Horizon, LogLife, judge};
 use super::track::{CapacityKind, Track};
 use super::truth::{Truth, TruthKind};
+use super::variant_batch::VariantBatch;
 use super::variants::VariantGrid;
 use crate::alarm::{Rule, Severity};
 use crate::config::Config;
+use crate::error::LabError;
 use crate::monitor::{Monitor, Outputs};
 
 /// A log and its truth.
@@ -141,7 +142,7 @@ pub fn run(
     jobs: &[WhatifJob],
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Vec<Result<LogResult, String>>, String> {
+) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
     // The replays of one log are independent too: a fleet of one log still uses all cores.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
@@ -150,7 +151,7 @@ pub fn run(
     let mut replays = replays.into_iter();
     let of_job = |job: &WhatifJob| {
         // Takes all of them, also after one that failed: the next job's results follow them.
-        let own: Vec<Result<ReplayResult, String>> = replays.by_ref().take(grid.replays).collect();
+        let own: Vec<Result<ReplayResult, LabError>> = replays.by_ref().take(grid.replays).collect();
         judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
@@ -174,12 +175,11 @@ fn replay(
     job: &WhatifJob,
     settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<ReplayResult, String> {
+) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
     // Before the replay, which may take hours: a table that cannot be read is reported at once.
-    let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read);
-    let truth = truth.transpose().map_err(|error| error.to_string())?;
+    let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
     let (mut batch, _) = watch(grid, number);
     let mut engines = batch.engines(monitor.sample.cells);
@@ -198,16 +198,21 @@ fn replay(
     Ok(ReplayResult { driven, track, batch, truth })
 }
 
-fn judge_log(grid: &VariantGrid, job: &WhatifJob, replays: Vec<ReplayResult>, settings: &WhatifSettings<'_>) -> Result<LogResult, String> {
+fn judge_log(
+    grid: &VariantGrid,
+    job: &WhatifJob,
+    replays: Vec<ReplayResult>,
+    settings: &WhatifSettings<'_>,
+) -> Result<LogResult, LabError> {
     let plain = replays.first().ok_or("no replay")?;
     let truth = plain.truth.as_ref();
     let span = plain.driven.span_of(&job.log)?;
     if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
-        return Err(format!(
+        return Err(LabError(format!(
             "{file}: covers {a} to {b} s, must overlap the log's {c} to {d} s (--start-times dates a CSV)"
-        ));
+        )));
     }
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
     let mut notes = plain.driven.notes.clone();

@@ -17,9 +17,10 @@ mod windows;
 use std::path::Path;
 use std::time::Instant;
 
-pub use windows::{RowSpacing, LagWindows};
+pub use windows::{LagWindows, RowSpacing};
 
-use super::{GprError, ColumnTable, create, finish};
+use super::{ColumnTable, interval, write_csv};
+use crate::error::LabError;
 use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
 use spread::Spread;
 
@@ -128,12 +129,12 @@ pub fn run(
     plan: &ForecastPlan,
     watcher: &mut Watcher<'_>,
     done: &mut dyn FnMut(usize, usize),
-) -> Result<TableForecast, GprError> {
+) -> Result<TableForecast, LabError> {
     check(plan)?;
     let windows = LagWindows::new(table, plan.lags);
     let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
     let from = windows.last_before(origin).ok_or_else(|| {
-        GprError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
+        LabError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
     })?;
     let list = horizons(plan.steps);
     let mut outputs = Vec::new();
@@ -152,15 +153,15 @@ pub fn run(
     Ok(TableForecast { origin, from, outputs })
 }
 
-fn check(plan: &ForecastPlan) -> Result<(), GprError> {
+fn check(plan: &ForecastPlan) -> Result<(), LabError> {
     let range = |what: &str, found: usize, most: usize| match (1..=most).contains(&found) {
         true => Ok(()),
-        false => Err(GprError(format!("{what} = {found}, must be 1 to {most}"))),
+        false => Err(LabError(format!("{what} = {found}, must be 1 to {most}"))),
     };
     range("lags", plan.lags, MAX_LAGS)?;
     range("steps", plan.steps, MAX_STEPS)?;
     if !(plan.origin > 0.0 && plan.origin <= 1.0) {
-        return Err(GprError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
+        return Err(LabError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
     }
     Ok(())
 }
@@ -175,11 +176,11 @@ struct HorizonTask<'a> {
 }
 
 impl HorizonTask<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(HorizonForecast, Model), GprError> {
+    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(HorizonForecast, Model), LabError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
-            GprError(format!(
+            LabError(format!(
                 "fewer than {fewest} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
                  least as many: give fewer lags or steps, a later origin or more rows"
             ))
@@ -219,7 +220,7 @@ impl HorizonTask<'_> {
         start: &[f64],
         fixed: Option<&[f64]>,
         watcher: &mut Watcher<'_>,
-    ) -> Result<Option<(Model, usize)>, GprError> {
+    ) -> Result<Option<(Model, usize)>, LabError> {
         let known = self.windows.between(0, end, self.steps);
         if known.len() < self.fewest() {
             return Ok(None);
@@ -240,7 +241,7 @@ impl HorizonTask<'_> {
     }
 
     /// From forecasts of block after block by what came before it.
-    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, GprError> {
+    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, LabError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
@@ -266,7 +267,7 @@ impl HorizonTask<'_> {
     }
 
     /// Forecasts of the value itself from some rows.
-    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, GprError> {
+    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());
         }
@@ -298,25 +299,22 @@ impl HorizonTask<'_> {
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), GprError> {
-    let mut out = csv::Writer::from_writer(create(path)?);
-    out.write_record(["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"])?;
-    for output in &forecast.outputs {
-        for horizon in &output.horizons {
-            let at_origin = (forecast.from, horizon.at_origin);
-            let later = horizon.held_out.iter().filter(|(row, _)| *row != forecast.from).copied();
-            for (row, p) in std::iter::once(at_origin).chain(later) {
-                let place = [data.file_of(row).display().to_string(), data.lines[row].to_string()];
-                let own = [output.name.clone(), horizon.steps.to_string()].into_iter().chain(place);
-                let value = data.row(row)[output.column];
-                let numbers = [value, p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
-                let truth = data.after(row, horizon.steps).map(|later| data.row(later)[output.column]);
-                let truth = truth.map(|truth| truth.to_string()).unwrap_or_default();
-                out.write_record(own.chain(numbers.map(|number| number.to_string())).chain([truth]))?;
-            }
-        }
-    }
-    finish(out)
+pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), LabError> {
+    let heads = ["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"];
+    let horizons = forecast.outputs.iter().flat_map(|output| output.horizons.iter().map(move |h| (output, h)));
+    let rows = horizons.flat_map(|(output, horizon)| {
+        let later = horizon.held_out.iter().filter(|(row, _)| *row != forecast.from).copied();
+        let forecasts = std::iter::once((forecast.from, horizon.at_origin)).chain(later);
+        forecasts.map(move |(row, prediction)| {
+            let value = |row: usize| data.row(row)[output.column].to_string();
+            let file = data.file_of(row).display().to_string();
+            let (ahead, line) = (horizon.steps.to_string(), data.lines[row].to_string());
+            let truth = data.after(row, horizon.steps).map(value).unwrap_or_default();
+            let own = [output.name.clone(), ahead, file, line, value(row)];
+            own.into_iter().chain(interval(&prediction)).chain([truth]).collect()
+        })
+    });
+    write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
 /// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs from stretch to

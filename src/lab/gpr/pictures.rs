@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::forecast::{TableForecast, HorizonForecast, OutputForecast};
+use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
 use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
 
@@ -150,11 +150,7 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let fan = output.horizons.iter().map(|h| (at(h), h.at_origin.low_95, h.at_origin.high_95));
     let mean = output.horizons.iter().map(|h| (at(h), h.at_origin.mean));
     Chart {
-        title: format!(
-            "{}: forecast from row {} without any later data",
-            stem(&output.name),
-            from + 1
-        ),
+        title: format!("{}: forecast from row {} without any later data", stem(&output.name), from + 1),
         x: Axis::number("rows from the origin"),
         y: Axis::number(&table::label(&output.name)),
         layers: vec![

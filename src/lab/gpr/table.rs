@@ -6,7 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::GprError;
+use crate::error::LabError;
 use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
 /// Endings of column names that are units: `voltage` finds `voltage_v`.
@@ -85,7 +85,7 @@ impl ColumnTable {
     /// # Errors
     /// A file cannot be read, a column is unknown or ambiguous, a value is missing or no number, there are too many rows:
     /// with file, line, column, what was found and what is allowed.
-    pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, GprError> {
+    pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
             table.read_file(path, wanted, part)?;
@@ -209,7 +209,8 @@ impl ColumnTable {
         }
         if first {
             let requested = wanted.columns.iter().chain(wanted.optional);
-            let name = |(found, requested): (&Option<usize>, &String)| found.map_or(requested, |at| &header[at]).clone();
+            let name =
+                |(found, requested): (&Option<usize>, &String)| found.map_or(requested, |at| &header[at]).clone();
             self.names = columns.iter().zip(requested).map(name).collect();
         }
         Ok(columns)

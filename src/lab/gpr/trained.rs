@@ -7,7 +7,8 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{GprError, ColumnTable, create, finish, split, table, write_text};
+use super::{ColumnTable, interval, split, table, write_csv};
+use crate::error::LabError;
 use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
 
 /// Format name in the first line.
@@ -42,7 +43,7 @@ impl TrainedModel {
     ///
     /// # Errors
     /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
-    pub fn fit(table: &ColumnTable, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
+    pub fn fit(table: &ColumnTable, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, LabError> {
         let (inputs, targets) = split(table);
         let width = table.width();
         let rows = Rows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
@@ -54,23 +55,23 @@ impl TrainedModel {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn save(&self, path: &Path) -> Result<(), GprError> {
+    pub fn save(&self, path: &Path) -> Result<(), LabError> {
         let names = ModelHeader {
             format: FORMAT.to_owned(),
             version: VERSION,
             output: self.output.clone(),
             inputs: self.inputs.clone(),
         };
-        let names = serde_json::to_string(&names).map_err(|error| GprError(error.to_string()))?;
-        write_text(path, &format!("{names}\n{}", self.model.save()?))
+        let names = serde_json::to_string(&names)?;
+        Ok(crate::write_file(path, format!("{names}\n{}", self.model.save()?).as_bytes())?)
     }
 
     /// Reads a model that works with `threads` threads.
     ///
     /// # Errors
     /// The file cannot be read, is no such model, is damaged, or is of another version.
-    pub fn load(path: &Path, threads: usize) -> Result<Self, GprError> {
-        let fail = |what: String| GprError(format!("{}: {what}", path.display()));
+    pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
+        let fail = |what: String| LabError(format!("{}: {what}", path.display()));
         let size = std::fs::metadata(path).map_err(|error| fail(error.to_string()))?.len();
         if size > MAX_BYTES {
             return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
@@ -96,7 +97,7 @@ impl TrainedModel {
     ///
     /// # Errors
     /// A covariance matrix that is not positive definite.
-    pub fn predict(&self, table: &ColumnTable) -> Result<Vec<Prediction>, GprError> {
+    pub fn predict(&self, table: &ColumnTable) -> Result<Vec<Prediction>, LabError> {
         let d = self.inputs.len();
         let inputs: Vec<f64> = table.values.chunks_exact(table.width()).flat_map(|row| &row[..d]).copied().collect();
         Ok(self.model.predict(&inputs)?)
@@ -112,17 +113,14 @@ pub fn write_predictions(
     trained: &TrainedModel,
     table: &ColumnTable,
     predictions: &[Prediction],
-) -> Result<(), GprError> {
-    let mut out = csv::Writer::from_writer(create(path)?);
+) -> Result<(), LabError> {
     let output = &trained.output;
     let named = ["mean", "std", "low_95", "high_95"].map(|word| table::derived(output, word));
-    let own = ["file".to_owned(), "line".to_owned()];
-    out.write_record(own.iter().chain(&trained.inputs).chain([output]).chain(&named))?;
-    for (row, p) in predictions.iter().enumerate() {
+    let heads = ["file".to_owned(), "line".to_owned()].into_iter().chain(trained.inputs.clone());
+    let rows = predictions.iter().enumerate().map(|(row, prediction)| {
         let own = [table.file_of(row).display().to_string(), table.lines[row].to_string()];
         let known = table.row(row).iter().map(|value| if value.is_nan() { String::new() } else { value.to_string() });
-        let found = [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
-        out.write_record(own.into_iter().chain(known).chain(found.map(|number| number.to_string())))?;
-    }
-    finish(out)
+        own.into_iter().chain(known).chain(interval(prediction)).collect()
+    });
+    write_csv(path, heads.chain([output.clone()]).chain(named).collect(), rows)
 }

@@ -1,9 +1,11 @@
 //! Runs the whole fit: starting values, prior, passes over all records in parallel, residuals, nodes without data.
 
+use rayon::prelude::*;
+
 use super::grid::{Grid, GridPoint, arrhenius, interpolate};
 use super::parameters::{Layout, ParameterTables};
 use super::pass::{NormalEquations, accumulate, residuals, visits};
-use super::prior::{PriorDeviations, Prior, per_node};
+use super::prior::{Prior, PriorDeviations, per_node};
 use super::record::Record;
 use super::solve::{Space, minimise};
 
@@ -172,15 +174,10 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
         }
         normal
     };
-    std::thread::scope(|scope| {
-        let workers: Vec<_> = groups.iter().map(|group| scope.spawn(move || of_group(group))).collect();
-        let mut sum = NormalEquations::new(layout.len());
-        for worker in workers {
-            match worker.join() {
-                Ok(normal) => sum.add_all(&normal),
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
-        }
+    // Added in the order of the groups: the sum does not depend on the threads.
+    let sums: Vec<NormalEquations> = groups.par_iter().map(of_group).collect();
+    sums.iter().fold(NormalEquations::new(layout.len()), |mut sum, group| {
+        sum.add_all(group);
         sum
     })
 }

@@ -8,7 +8,7 @@
 
 use super::grid::Corners;
 use super::parameters::{Layout, ParameterTables};
-use super::record::{Record, FitRow};
+use super::record::{FitRow, Record};
 
 /// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage's resolution.
 const FADED_V: f64 = 1e-6;
@@ -156,7 +156,13 @@ pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
 }
 
 /// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights.
-pub fn accumulate(record: &Record, scale: f64, layout: &Layout, tables: &ParameterTables, normal: &mut NormalEquations) {
+pub fn accumulate(
+    record: &Record,
+    scale: f64,
+    layout: &Layout,
+    tables: &ParameterTables,
+    normal: &mut NormalEquations,
+) {
     let mut branches: Vec<_> = (0..layout.branches).map(|_| BranchRun::new(layout.nodes)).collect();
     let (mut index, mut j) = (Vec::with_capacity(128), Vec::with_capacity(128));
     for row in &record.rows {

@@ -5,10 +5,10 @@
 
 use std::collections::BTreeMap;
 
-use super::data::{Data, CapacityRecord};
+use super::data::{CapacityRecord, Data};
 use super::{PageContext, pictures};
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, Usage, Reading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{Axis, Forecast, InsufficientData, Reading, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
 /// Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
@@ -93,7 +93,8 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
     let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let gain_std = context.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
-    let learned: BTreeMap<_, &CapacityRecord> = data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
+    let learned: BTreeMap<_, &CapacityRecord> =
+        data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
     let rated_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);
     let mut cells = vec![Forecast::new(Axis::Cycles, rated_ah); data.cells()];
     let mut before_s: Option<f64> = None;

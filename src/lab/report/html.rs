@@ -298,9 +298,11 @@ fn estimator(data: &Data) -> Markup {
         ("Mean normalised innovation squared (1 = as expected)".to_owned(), format!("{nis:.2}")),
         ("Beyond the gate: not used".to_owned(), grouped(health.gated)),
     ];
-    rows.extend(worst.map(|(cell, share)| {
-        ("Least covered cell".to_owned(), format!("cell {}: {:.1} %", cell + 1, 100.0 * share))
-    }));
+    rows.extend(
+        worst.map(|(cell, share)| {
+            ("Least covered cell".to_owned(), format!("cell {}: {:.1} %", cell + 1, 100.0 * share))
+        }),
+    );
     pairs(&rows)
 }
 

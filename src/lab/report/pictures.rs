@@ -3,10 +3,10 @@
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
 use super::series::{self, CellStep};
-use super::trace::{TraceBin, OF_95};
+use super::trace::{OF_95, TraceBin};
 use super::{PageContext, summary};
 use crate::alarm::Rule;
-use crate::chart::{Axis, Chart, Heat, Ink, StateBand, StateBands, Layer, Picture, Point, Scale, Shape, Span};
+use crate::chart::{Axis, Chart, Heat, Ink, Layer, Picture, Point, Scale, Shape, Span, StateBand, StateBands};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
@@ -132,7 +132,12 @@ fn moment(data: &Data, time_s: f64) -> String {
 }
 
 /// Bins of a trace as a band and, where cells differ or bins are long, the range within.
-fn range(bins: &[(f64, &TraceBin)], clock: &TimeAxis, pick: fn(&TraceBin) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
+fn range(
+    bins: &[(f64, &TraceBin)],
+    clock: &TimeAxis,
+    pick: fn(&TraceBin) -> (f64, f64),
+    factor: f64,
+) -> Vec<(f64, f64, f64)> {
     let band = bins.iter().map(|(time_s, bin)| {
         let (low, high) = pick(bin);
         (clock.x(*time_s), factor * low, factor * high)

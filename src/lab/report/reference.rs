@@ -135,8 +135,12 @@ mod tests {
     #[test]
     fn a_fault_names_its_line() {
         assert!(of("a,b\n1,2\n").unwrap_err().contains("r.csv:1: no column capacity_ah or capacity_ah_source or soc"));
-        assert!(of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"NaN\""));
+        assert!(
+            of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"NaN\"")
+        );
         assert!(of("time_s,capacity_ah\nsoon,2\n").unwrap_err().contains("r.csv:2: column time_s: found \"soon\""));
-        assert!(of("time_s,soc\n1,57\n").unwrap_err().contains("r.csv:2: column soc: found \"57\", must be a fraction"));
+        assert!(
+            of("time_s,soc\n1,57\n").unwrap_err().contains("r.csv:2: column soc: found \"57\", must be a fraction")
+        );
     }
 }

@@ -1,6 +1,6 @@
 //! Series over the life of a pack: its worst cell, the range over its cells, every cell in columns of time.
 
-use super::data::{Data, CapacityRecord};
+use super::data::{CapacityRecord, Data};
 
 /// Columns of a heat map.
 pub(super) const COLUMNS: usize = 120;

@@ -236,7 +236,12 @@ fn since(data: &Data, battery: &[&ActiveAlarm<'_>], measuring: &[&ActiveAlarm<'_
     }
 }
 
-fn what(verdict: Condition, worst: Option<&ActiveAlarm<'_>>, measuring: &[&ActiveAlarm<'_>], knows_limits: bool) -> String {
+fn what(
+    verdict: Condition,
+    worst: Option<&ActiveAlarm<'_>>,
+    measuring: &[&ActiveAlarm<'_>],
+    knows_limits: bool,
+) -> String {
     let advice = worst.and_then(|raised| rule(&raised.row.rule)).map(|rule| match rule {
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
@@ -270,7 +275,12 @@ fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> T
     Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into() }
 }
 
-fn tiles(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>, raised: &[ActiveAlarm<'_>]) -> Vec<Tile> {
+fn tiles(
+    data: &Data,
+    context: &PageContext<'_>,
+    outlook: &Result<Outlook, String>,
+    raised: &[ActiveAlarm<'_>],
+) -> Vec<Tile> {
     let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
     let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let of_cell =
@@ -285,7 +295,8 @@ fn tiles(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, Strin
         (Some(rated), Some(step)) => format!("of {rated} Ah rated{}", of_cell(&step)),
     };
     let note = |step: Option<series::CellStep>, none: &str| {
-        let std = |step: series::CellStep| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
+        let std =
+            |step: series::CellStep| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
         step.map_or_else(|| none.to_owned(), std)
     };
     vec![
@@ -336,7 +347,16 @@ mod tests {
 
     fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRecord {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());
-        AlarmRecord { time_s, rule, severity, cell: Some(2), change, is_active, value: Some(1.38), threshold: Some(1.4) }
+        AlarmRecord {
+            time_s,
+            rule,
+            severity,
+            cell: Some(2),
+            change,
+            is_active,
+            value: Some(1.38),
+            threshold: Some(1.4),
+        }
     }
 
     fn summary(alarms: Vec<AlarmRecord>) -> Summary {

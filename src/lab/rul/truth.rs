@@ -39,7 +39,11 @@ mod tests {
     use crate::health::Axis;
 
     fn history(capacities: &[f64]) -> History {
-        let row = |(index, &capacity_ah): (u32, &f64)| CapacityReading { used: f64::from(index), capacity_ah, ..CapacityReading::default() };
+        let row = |(index, &capacity_ah): (u32, &f64)| CapacityReading {
+            used: f64::from(index),
+            capacity_ah,
+            ..CapacityReading::default()
+        };
         History { axis: Axis::Cycles, rows: (0..).zip(capacities).map(row).collect() }
     }
 

@@ -8,7 +8,8 @@ use serde::Serialize;
 use super::feed::Feeder;
 use super::life::{LifeRecorder, LifeScore};
 use super::soc::{self, SocSample, SocScore};
-use super::{ScoreJob, ScoreError, ScoreSettings, picture, window};
+use super::{ScoreJob, ScoreSettings, picture, window};
+use crate::error::LabError;
 use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
@@ -88,7 +89,7 @@ pub(super) fn run(
     case: &Case,
     settings: &ScoreSettings,
     progress: &dyn Fn(f64),
-) -> Result<CaseScore, ScoreError> {
+) -> Result<CaseScore, LabError> {
     let begin = CaseStart::find(job, file, case, settings)?;
     let config = configure(job, case, settings, begin.truth)?;
     let mut run = CaseRun::new(job, settings, config, case.current_offset_a);
@@ -116,8 +117,8 @@ struct CaseStart {
 }
 
 impl CaseStart {
-    fn find(job: &ScoreJob, file: &MeasuredFile, case: &Case, settings: &ScoreSettings) -> Result<Self, ScoreError> {
-        let unfit = |what: String| Err(ScoreError::Unfit(format!("{}: {what}", job.path.display())));
+    fn find(job: &ScoreJob, file: &MeasuredFile, case: &Case, settings: &ScoreSettings) -> Result<Self, LabError> {
+        let unfit = |what: String| Err(LabError(format!("{}: {what}", job.path.display())));
         let truths = || {
             let rows =
                 file.parts.iter().enumerate().flat_map(|(p, part)| (0..part.len()).map(move |row| (p, row, part)));
@@ -133,7 +134,9 @@ impl CaseStart {
                 (Start::Middle, _) => {
                     unfit("no column discharged_ah with values: a start in the middle cannot be found".into())
                 }
-                (_, Some(_)) => unfit("no column discharged_ah with values: an initial SOC with an error cannot be derived".into()),
+                (_, Some(_)) => {
+                    unfit("no column discharged_ah with values: an initial SOC with an error cannot be derived".into())
+                }
                 _ => Ok(Self { part: 0, row: 0, truth: f64::NAN }),
             };
         };
@@ -157,14 +160,14 @@ fn truth(part: &MeasuredPart, row: usize, settings: &ScoreSettings) -> f64 {
 }
 
 /// Returns the monitor's configuration for the case.
-fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) -> Result<MonitorConfig, ScoreError> {
+fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) -> Result<MonitorConfig, LabError> {
     let mut config = settings.monitor.clone();
     let estimator = &mut config.estimator;
     if let Some(points) = case.soc_error_points {
         let initial = truth + points / 100.0;
         if !(-SOC_SLACK..=1.0 + SOC_SLACK).contains(&initial) {
             let (path, truth) = (job.path.display(), 100.0 * truth);
-            return Err(ScoreError::Unfit(format!(
+            return Err(LabError(format!(
                 "{path}: initial SOC is {truth:.1} % and {points:+} points: {:.1} %, must be 0 to 100 %",
                 100.0 * initial
             )));
@@ -252,13 +255,15 @@ impl<'a> CaseRun<'a> {
         self.feeder.out.clear();
         self.last = estimate.or(self.last);
         match estimate {
-            Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => self.samples.push(SocSample {
-                time_s: time.since(began),
-                truth,
-                soc: e.soc,
-                soc_std: e.soc_std,
-                nis: (e.innovation_v / e.innovation_std_v).powi(2),
-            }),
+            Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => {
+                self.samples.push(SocSample {
+                    time_s: time.since(began),
+                    truth,
+                    soc: e.soc,
+                    soc_std: e.soc_std,
+                    nis: (e.innovation_v / e.innovation_std_v).powi(2),
+                })
+            }
             _ => self.left_out += 1,
         }
     }
@@ -272,7 +277,7 @@ impl<'a> CaseRun<'a> {
         }
     }
 
-    fn finish(mut self, case: &Case) -> Result<CaseScore, ScoreError> {
+    fn finish(mut self, case: &Case) -> Result<CaseScore, LabError> {
         if let Some((_, latest)) = self.span {
             self.feeder.finish(latest);
             self.take_events();

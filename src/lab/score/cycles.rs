@@ -91,7 +91,10 @@ mod tests {
             Err("cycles.csv:2: column start: found \"soon\", must be like 2008-04-02T13:08:17.921 or seconds".into())
         );
         let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,1,-1\n");
-        assert_eq!(fault, Err("cycles.csv:2: column capacity_ah_source: found \"-1\", must be a number above 0 or nothing".into()));
+        assert_eq!(
+            fault,
+            Err("cycles.csv:2: column capacity_ah_source: found \"-1\", must be a number above 0 or nothing".into())
+        );
         let fault = read("cycle,type,start\n1,discharge,1\n");
         assert_eq!(fault, Err("cycles.csv:1: no column capacity_ah_source, found cycle,type,start".into()));
         let fault = read("cycle,type,start,capacity_ah_source\n1,charge,1,\n");

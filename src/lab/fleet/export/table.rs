@@ -15,7 +15,8 @@ use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use parquet::schema::parser::parse_message_type;
 
 use super::TableFormat;
-use super::columns::{Column, FieldValue, ColumnType};
+use super::columns::{Column, ColumnType, FieldValue};
+use crate::error::LabError;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 
@@ -54,16 +55,16 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be created; the message names it.
-    pub(super) fn create(path: &Path, format: TableFormat, columns: &'static [Column<R>]) -> Result<Self, String> {
-        let file = ResultFile::create(path).map_err(|error| error.to_string())?;
+    pub(super) fn create(path: &Path, format: TableFormat, columns: &'static [Column<R>]) -> Result<Self, LabError> {
+        let file = ResultFile::create(path)?;
         let writer = match format {
             TableFormat::Csv => {
                 let mut out = Box::new(csv::Writer::from_writer(file));
-                out.write_record(columns.iter().map(|column| column.name)).map_err(|error| error.to_string())?;
+                out.write_record(columns.iter().map(|column| column.name))?;
                 TableWriter::Csv { out, record: csv::StringRecord::new() }
             }
             TableFormat::Parquet => {
-                let schema = parse_message_type(&schema(columns)).map_err(|error| error.to_string())?;
+                let schema = parse_message_type(&schema(columns))?;
                 let properties = WriterProperties::builder()
                     .set_compression(Compression::SNAPPY)
                     .set_created_by(format!("packwatch {}", env!("CARGO_PKG_VERSION")))
@@ -81,22 +82,19 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be written, or a value is not of its column's type.
-    pub(super) fn push(&mut self, row: &R) -> Result<(), String> {
+    pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
             TableWriter::Csv { out, record } => {
                 record.clear();
                 self.columns.iter().for_each(|column| record.push_field(&csv_field(&(column.get)(row))));
-                out.write_record(&*record).map_err(|error| error.to_string())
+                Ok(out.write_record(&*record)?)
             }
             TableWriter::Parquet { out, group, rows } => {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
                     if !values.push((column.get)(row), column.optional) {
-                        return Err(format!(
-                            "{}: {} has no value, or one of another type",
-                            self.path.display(),
-                            column.name
-                        ));
+                        let (file, name) = (self.path.display(), column.name);
+                        return Err(LabError(format!("{file}: {name} has no value, or one of another type")));
                     }
                 }
                 *rows += 1;
@@ -113,10 +111,10 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, String> {
+    pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, LabError> {
         let Self { path, columns, rows, writer } = self;
         let file = match writer {
-            TableWriter::Csv { out, .. } => out.into_inner().map_err(|error| error.error().to_string())?,
+            TableWriter::Csv { out, .. } => out.into_inner().map_err(|error| LabError(error.error().to_string()))?,
             TableWriter::Parquet { mut out, mut group, rows } => {
                 let failed = |error: ParquetError| named_error(&path, &error);
                 if rows > 0 {
@@ -129,7 +127,7 @@ impl<R> TableFile<R> {
                 out.into_inner().map_err(failed)?
             }
         };
-        file.finish().map_err(|error| error.to_string())?;
+        file.finish()?;
         Ok(rows)
     }
 }
@@ -145,9 +143,9 @@ fn schema<R>(columns: &[Column<R>]) -> String {
 }
 
 /// Returns the error with the file's name; an error of the operating system already has it.
-fn named_error(path: &Path, error: &ParquetError) -> String {
+fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
-    if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") }
+    LabError(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
 }
 
 fn csv_field(field: &FieldValue<'_>) -> String {
@@ -182,7 +180,9 @@ impl ColumnBuffer {
                 put(list, value.map(|value| i32::try_from(value).unwrap_or(i32::MAX)))
             }
             (ColumnValues::Flags(list), FieldValue::Flag(value)) => put(list, Some(value)),
-            (ColumnValues::Words(list), FieldValue::Word(value)) => put(list, value.map(|word| ByteArray::from(word.as_ref()))),
+            (ColumnValues::Words(list), FieldValue::Word(value)) => {
+                put(list, value.map(|word| ByteArray::from(word.as_ref())))
+            }
             _ => return false,
         };
         self.present.push(i16::from(present));

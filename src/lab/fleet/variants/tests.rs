@@ -105,7 +105,11 @@ fn combinations_that_are_no_configuration_are_left_out_and_reported() {
 fn an_unknown_key_is_rejected_with_a_suggestion() {
     let faults = |choice: &str| made(&[choice]).expect_err("means nothing").join("; ");
     assert!(faults("capacity_low.treshold=1").contains("must be threshold, info, warning, severe"));
-    assert!(faults("capacity_lo.warning=1").contains("did you mean capacity_low"), "{}", faults("capacity_lo.warning=1"));
+    assert!(
+        faults("capacity_lo.warning=1").contains("did you mean capacity_low"),
+        "{}",
+        faults("capacity_lo.warning=1")
+    );
     assert!(faults("nothing.at_all=1").contains("no rule (rules: capacity_low, "), "{}", faults("nothing.at_all=1"));
     assert!(faults("estimator.nois=1").contains("estimator.nois is not a known key"));
     assert!(faults("interface[3].name=a").contains("the configuration has 1 of them"));

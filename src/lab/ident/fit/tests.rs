@@ -48,8 +48,13 @@ fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) ->
         socs.push(soc);
     }
     let temperatures = vec![temperature_c; time_s.len()];
-    let raw =
-        RawRows { time_s: &time_s, current_a: &current_a, voltage_v: &voltage_v, temperature_c: &temperatures, soc: &socs };
+    let raw = RawRows {
+        time_s: &time_s,
+        current_a: &current_a,
+        voltage_v: &voltage_v,
+        temperature_c: &temperatures,
+        soc: &socs,
+    };
     Record::prepare(&raw, &[], grid, &LIMITS)
 }
 
