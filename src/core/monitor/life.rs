@@ -6,7 +6,9 @@
 
 use super::{CellSlot, Event, EventKind, Monitor, MonitorConfig, Outputs};
 use crate::alarm::{Observation, Rule};
-use crate::health::{Axis, CapacityUpdate, Forecast, HalfCycle, Usage, Reading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{
+    Axis, CapacityUpdate, Forecast, HalfCycle, InsufficientData, Reading, Remaining, RemainingLife, Usage,
+};
 use crate::quantity::CellIndex;
 
 /// Deviations of a normal distribution between its median and its 5 % quantile.
