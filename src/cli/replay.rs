@@ -13,15 +13,15 @@ pub(crate) use report::Bar;
 use super::Failure;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::replay::{self, ReplayError, Settings, Sinks, Summary};
-use crate::io::snapshot_file;
-use crate::store::Recorder;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
+use crate::io::snapshot_file;
 use crate::io::socket::CanSender;
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplayError, Settings, Sinks, Summary};
 use crate::sample::VoltageSource;
+use crate::store::Recorder;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

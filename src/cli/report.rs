@@ -9,12 +9,12 @@ use std::rc::Rc;
 use super::Failure;
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config::{self, Config};
-use crate::replay::{self, Settings, Sinks, Summary, Watch};
-use crate::store::Reader;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::report::{self, Data, Origin, Setting};
 use crate::monitor::Monitor;
+use crate::replay::{self, Settings, Sinks, Summary, Watch};
+use crate::store::Reader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]

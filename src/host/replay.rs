@@ -15,9 +15,9 @@ mod intake;
 mod rows;
 mod summary;
 
-use crate::io::event_log;
 use super::store::Recorder;
 use crate::can::Frame;
+use crate::io::event_log;
 use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;

@@ -27,10 +27,10 @@ use super::status::StatusServer;
 use super::status::collect::Identity;
 use super::status::document::ConfigFile;
 use super::store::StateSetting;
-use crate::io::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
+use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 

@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::replay::{Progress, ProtectedSummary, Summary};
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
+use crate::replay::{Progress, ProtectedSummary, Summary};
 
 /// Alarms listed for people; JSON has more.
 const MAX_SHOWN_ALARMS: usize = 20;

@@ -134,7 +134,7 @@ impl Monitor {
     fn input_state(&self, channel: Channel) -> InputState {
         let silence_s = self.sampler.silence_s(channel, self.now);
         // Since waking nothing may have come yet: that is neither silence nor its end.
-        let heard = self.sampler.heard_since_waking(channel);
+        let heard = self.sampler.has_input_since_waking(channel);
         let beyond = |silence: &f64| heard || self.config.missing_after_s().is_some_and(|limit| *silence > limit);
         // The share of what came before the silence says nothing about what does not come.
         let share = self.sampler.bad_share(channel).filter(|_| heard && !self.sampler.is_silent(channel, self.now));
@@ -222,7 +222,7 @@ impl Monitor {
         for cell in (0..self.config.sample.cells).map(CellIndex) {
             let is_fresh = self.sampler.is_fresh(self.voltage_channel(cell), self.now);
             // A voltage that came before the first current says nothing yet.
-            let is_present = is_fresh && !self.estimators.is_of_before(cell.index());
+            let is_present = is_fresh && !self.estimators.is_carried_over(cell.index());
             let Some(soc) = self.estimators.soc(cell.index()).filter(|_| is_present) else { continue };
             known += 1;
             spread = Some(match spread {

@@ -378,7 +378,7 @@ impl Monitor {
                 self.step_waiting(was_away_briefly, out);
             }
             let config = self.config.estimator;
-            self.estimators.change_all(|estimator| estimator.note_away(&config, away_s));
+            self.estimators.change_all(|estimator| estimator.note_downtime(&config, away_s));
         }
         if taken != Taken::Nothing {
             self.restate_known(was_away_briefly, out);
@@ -450,7 +450,7 @@ impl Monitor {
         self.observe_current(None, out);
         self.tell_alarms(AlarmInput::Gap, out);
         self.recharge.interrupt();
-        self.estimators.change_all(CellEstimator::note_asleep);
+        self.estimators.change_all(CellEstimator::note_sleep);
         self.forget_pack();
     }
 

@@ -7,7 +7,7 @@ use super::alarms::take_show_due;
 use super::{Consumed, Event, EventKind, Monitor, Outputs};
 use crate::alarm::{Observation, Rule};
 use crate::cell::{CellStep, EstimatorBank};
-use crate::health::CellEnd;
+use crate::health::CellCondition;
 use crate::quantity::CellIndex;
 use crate::sample::CellSample;
 
@@ -205,6 +205,6 @@ impl Monitor {
 }
 
 /// Where a half-cycle that begins or ends now would begin or end for a cell.
-pub(super) fn end_state(estimators: &EstimatorBank, index: usize) -> CellEnd {
-    CellEnd { soc: estimators.filtered_soc(index), load_v: estimators.load_v(index) }
+pub(super) fn end_state(estimators: &EstimatorBank, index: usize) -> CellCondition {
+    CellCondition { soc: estimators.filtered_soc(index), load_v: estimators.load_v(index) }
 }

@@ -426,7 +426,8 @@ mod tests {
     #[test]
     fn unknown_interfaces_are_left_to_the_full_grammar() {
         let line = |name: &str| format!("(1700000000.123456) {name} 123#11\n{MORE}");
-        let mut reader = FastLineParser::new(&["can1".to_owned(), "a name".to_owned(), "vcan10".to_owned(), String::new()]);
+        let mut reader =
+            FastLineParser::new(&["can1".to_owned(), "a name".to_owned(), "vcan10".to_owned(), String::new()]);
         let mut bus = |name: &str| reader.parse(line(name).as_bytes()).map(|usual| usual.bus);
         assert_eq!((bus("can1"), bus("vcan10")), (Some(BusIndex(0)), Some(BusIndex(2))));
         for name in ["can0", "can", "can10", "vcan1", "vcan100", "a name", "a", "", "can1\n"] {

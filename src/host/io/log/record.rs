@@ -1,7 +1,7 @@
 //! What a log is made of: [`Record`], an input that owns its frame, and [`Batch`], many of them at once.
 
 use crate::can::Frame;
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// What a slot holds before a record.
