@@ -18,7 +18,7 @@ pub enum AlarmInput {
         /// Of which cell; `None` = of the pack.
         cell: Option<CellIndex>,
         /// The value.
-        seen: Observation,
+        observation: Observation,
     },
     /// [`AlarmEngine::set_inputs_valid`].
     InputsValid {
@@ -45,7 +45,7 @@ impl AlarmEngine {
     /// Takes one input at `now`; the outcome is that of a command.
     pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> Outcome {
         match *input {
-            AlarmInput::Observe { rule, cell, seen } => self.observe(now, rule, cell, &seen, changes),
+            AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),
             AlarmInput::InputsValid { rule, cell, valid } => self.set_inputs_valid(now, rule, cell, valid, changes),
             AlarmInput::Poll => self.poll(now, changes),
             AlarmInput::Gap => self.handle_gap(),

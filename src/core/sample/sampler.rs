@@ -177,6 +177,11 @@ impl Sampler {
         }
     }
 
+    /// The settings.
+    pub fn config(&self) -> &SampleConfig {
+        &self.config
+    }
+
     /// Other limits for the same signals.
     ///
     /// # Panics

@@ -170,7 +170,7 @@ mod tests {
             let (rule, cell) = (Rule::CapacityLow, Some(CellIndex(0)));
             let seen = Observation::new(Some(value)).with_std(0.1);
             let time = Timestamp::from_secs(f64::from(second));
-            engines.take(&[(time, AlarmInput::Observe { rule, cell, seen })], &mut lanes);
+            engines.take(&[(time, AlarmInput::Observe { rule, cell, observation: seen })], &mut lanes);
         }
         let seconds = |number: usize| {
             let history = lanes.history(number).expect("watched");
