@@ -3,7 +3,7 @@
 
 mod rig;
 
-use packwatch::alarm::{Change, Rule, Selector, State};
+use packwatch::alarm::{Change, Rule, Selector, AlarmState};
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{BusEvent, Command, EventKind, Input, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
@@ -179,7 +179,7 @@ fn another_pack_starts_from_what_is_configured_and_its_predecessor_is_told() {
     assert_eq!(told, Some(old_ah));
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Forgotten, Change::Forgotten]);
     let alarm = rig.monitor.alarms().get(Rule::CapacityLow, Some(CellIndex(0))).unwrap();
-    assert_eq!((alarm.state, alarm.occurrences, rig.monitor.alarms().count()), (State::Unknown, 0, 0));
+    assert_eq!((alarm.state, alarm.occurrences, rig.monitor.alarms().count()), (AlarmState::Unknown, 0, 0));
     rig.seconds(2);
     assert_eq!((rig.unknown_rules(), rig.monitor.capacity(CellIndex(0)).mean), (2, 2.6));
 }

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::input::{BusEvent, Command, Source};
-use crate::alarm::{Change, Rule, Severity, State};
+use crate::alarm::{Change, Rule, Severity, AlarmState};
 use crate::can::CanId;
 use crate::can::decode::Channel;
 use crate::can::e2e::Status;
@@ -44,7 +44,7 @@ pub enum EventKind {
     Capacity {
         /// Which cell.
         cell: CellIndex,
-        /// What the half-cycle alone says, Ah; `None` = it carried no information.
+        /// Measurement by the half-cycle alone, Ah; `None` = it carried no information.
         measured_ah: Option<f64>,
         /// Its standard deviation, Ah.
         measured_std_ah: Option<f64>,
@@ -61,8 +61,8 @@ pub enum EventKind {
         /// Its standard deviation.
         resistance_ratio_std: f64,
     },
-    /// A half-cycle is over: what remains of the life of the cell whose life ends first. Told while it is known, and once
-    /// when it no longer is (nothing in it, then).
+    /// Remaining life after a half-cycle, of the cell whose life ends first. Sent while it is known, and once, without any
+    /// value, when it no longer is.
     RemainingLife {
         /// Which cell.
         cell: Option<CellIndex>,
@@ -72,14 +72,14 @@ pub enum EventKind {
         cycles_low: Option<f64>,
         /// 95 % quantile.
         cycles_high: Option<f64>,
-        /// Days, if it goes on being used as of late, median.
+        /// Days, with the use of the recent past, median.
         days: Option<f64>,
         /// 5 % quantile.
         days_low: Option<f64>,
         /// 95 % quantile.
         days_high: Option<f64>,
     },
-    /// A charge is over that covered the recharge window, or enough of it to be told.
+    /// End of a charge that covered the recharge window, or enough of it.
     RechargePeriod {
         /// Seconds between the two configured SOC values; `None` = it did not cover the whole window in one go.
         seconds: Option<f64>,
@@ -89,16 +89,16 @@ pub enum EventKind {
         /// Its standard deviation, s.
         normalised_std_s: Option<f64>,
     },
-    /// Something became of an alarm.
+    /// An alarm changed.
     Alarm {
         /// Which rule.
         rule: Rule,
         /// Which cell; `None` = the pack.
         cell: Option<CellIndex>,
-        /// What.
+        /// The change.
         change: Change,
-        /// Where it is in its life now.
-        state: State,
+        /// Its state now.
+        state: AlarmState,
         /// Whether it is raised now.
         active: bool,
         /// Its severity.
@@ -111,26 +111,26 @@ pub enum EventKind {
         threshold: f64,
         /// Times it was raised.
         occurrences: u32,
-        /// Whether somebody has seen it since.
+        /// Whether it has been acknowledged since.
         acknowledged: bool,
     },
-    /// Somebody asked for something.
+    /// A command was executed.
     Command {
-        /// Who.
+        /// Its origin.
         source: Source,
-        /// What.
+        /// The command.
         #[serde(rename = "request")]
         command: Command,
         /// Alarms changed.
         changed: u32,
-        /// What could not be done: alarms that are not healthy, a test without output.
+        /// What was refused: alarms that are not healthy, a test without output.
         refused: u32,
     },
-    /// A command frame was not obeyed.
+    /// A command frame was rejected.
     BadCommand {
         /// Interface it came on.
         bus: BusIndex,
-        /// Its protection was in order, what it asks has no meaning; otherwise it failed its check.
+        /// Its protection was in order, but its content has no meaning; otherwise it failed its check.
         intact: bool,
     },
     /// A test of a rule's alarm frame began or ended.
@@ -140,14 +140,14 @@ pub enum EventKind {
         /// It began.
         running: bool,
     },
-    /// Another pack is connected. What was learned of the old one, for the records.
+    /// Another pack is connected. Last values learned of the old one, for the records.
     PackReplaced {
         /// Capacity of its weakest cell, Ah; `None` = nothing was learned.
         capacity_ah: Option<f64>,
         /// Its standard deviation, Ah.
         capacity_std_ah: Option<f64>,
     },
-    /// The configuration is another one from here on.
+    /// Another configuration holds from here on.
     Reconfigured {
         /// Alarms, raised or past, that ended because no threshold watches them any more.
         alarms_ended: u32,
@@ -165,7 +165,7 @@ pub enum EventKind {
         /// Times it was raised.
         occurrences: u32,
     },
-    /// Which pack is connected is known, for the first time or anew.
+    /// The identity of the connected pack is known, for the first time or after a change.
     PackIdentity {
         /// As the signal says it.
         identity: f64,
@@ -175,7 +175,7 @@ pub enum EventKind {
         /// They can.
         works: bool,
     },
-    /// A signal turned bad (told once per change, then counted).
+    /// A signal turned bad (reported once per change, then counted).
     SignalBad {
         /// Which signal.
         channel: Channel,
@@ -189,7 +189,7 @@ pub enum EventKind {
         /// Bad readings in between.
         bad_readings: u64,
     },
-    /// A protected message turned from usable to failing, or back (told on change, then counted). A first frame, and as many
+    /// A protected message turned from usable to failing, or back (reported on change, then counted). A first frame, and as many
     /// missing ones as its check allows to be lost, turn nothing.
     Protection {
         /// Which interface.
@@ -203,7 +203,7 @@ pub enum EventKind {
         /// Checks without a usable frame since it was last usable: so far, or when it is back, all of them.
         count: u64,
     },
-    /// More frames of one identifier come than are taken in; or no more.
+    /// More frames of one identifier come than the limit allows; or no more.
     Flood {
         /// Which interface.
         bus: BusIndex,
@@ -218,15 +218,15 @@ pub enum EventKind {
     Bus {
         /// Which interface.
         bus: BusIndex,
-        /// What.
+        /// Its report.
         what: BusEvent,
     },
-    /// The J1939 node's address or what it tells changed.
+    /// The J1939 node's address or its trouble codes changed.
     J1939 {
-        /// What.
+        /// The change.
         what: NodeEvent,
     },
-    /// Nobody measured for this long (asleep, or the log has a hole).
+    /// Nothing was measured for this long (asleep, or the log has a hole).
     Gap {
         /// Seconds; `None` = unknown.
         seconds: Option<f64>,
@@ -236,7 +236,7 @@ pub enum EventKind {
         /// By how much, s.
         seconds: f64,
     },
-    /// A cell's filter could not go on and started again from its voltage.
+    /// A cell's filter failed and started again from its voltage.
     FilterReset {
         /// Which cell.
         cell: CellIndex,
@@ -257,7 +257,7 @@ pub enum EventKind {
 pub struct Event {
     /// Time of the input that caused it.
     pub time: Timestamp,
-    /// What.
+    /// The event.
     #[serde(flatten)]
     pub kind: EventKind,
 }

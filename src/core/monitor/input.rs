@@ -6,7 +6,7 @@ use crate::alarm::{Rule, Selector};
 use crate::can::Frame;
 use crate::quantity::{BusIndex, Timestamp};
 
-/// What an interface reports besides data frames.
+/// Report of an interface, in addition to data frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "bus_event")]
 pub enum BusEvent {
@@ -33,7 +33,7 @@ pub enum BusEvent {
     },
 }
 
-/// One thing that happened, with the driver's time. Inputs come in the order in which they happened; a
+/// One input, with the driver's time. Inputs come in the order in which they happened; a
 /// time a little before the latest one ([`MERGE_TOLERANCE_NS`]: buses merge out of order) is counted and treated as the
 /// latest; further back, the clock was set back and how much time passed is unknown.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,9 +42,9 @@ pub enum Input<'a> {
     Frame {
         /// When the kernel received it.
         time: Timestamp,
-        /// Where.
+        /// Interface it came on.
         bus: BusIndex,
-        /// What.
+        /// The frame.
         frame: &'a Frame,
     },
     /// Time passed. The driver ticks every [`TICK_PERIOD_MS`] while awake; cyclic frames and time-outs follow from ticks.
@@ -56,24 +56,24 @@ pub enum Input<'a> {
     Bus {
         /// When.
         time: Timestamp,
-        /// Which.
+        /// Which interface.
         bus: BusIndex,
-        /// What.
+        /// Its report.
         event: BusEvent,
     },
     /// The record continues at `time`, but how much time really passed is unknown (a log without stamps between its parts).
     UnknownGap {
-        /// The stamp from which the record goes on.
+        /// Stamp of its continuation.
         time: Timestamp,
     },
-    /// Somebody on this computer asks for something. Commands of the bus are frames.
+    /// A command from this computer. Commands of the bus are frames.
     Command {
         /// When.
         time: Timestamp,
-        /// What.
+        /// The command.
         command: Command,
     },
-    /// Whether the files that keep what is learned and recorded can be written.
+    /// Whether the files of the learned state and the records can be written.
     Store {
         /// When.
         time: Timestamp,
@@ -86,12 +86,12 @@ pub enum Input<'a> {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Downtime {
     /// As long as the two stamps say. A state that was taken after "now" ([`MERGE_TOLERANCE_NS`] aside) has another clock's
-    /// stamp: then nobody knows.
+    /// stamp: then the downtime is unknown.
     #[default]
     AsStamped,
     /// This long, s.
     Seconds(f64),
-    /// Nobody knows: as after [`Input::UnknownGap`].
+    /// Unknown: as after [`Input::UnknownGap`].
     Unknown,
 }
 
@@ -106,7 +106,7 @@ impl std::fmt::Display for Downtime {
     }
 }
 
-/// What is neither of the three.
+/// A text that is none of the three.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("must be seconds, 0 or more, or unknown")]
 pub struct DowntimeParseError;
@@ -123,15 +123,15 @@ impl std::str::FromStr for Downtime {
     }
 }
 
-/// What people may ask of the daemon.
+/// A command to the daemon.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "command")]
 pub enum Command {
-    /// The alarms were seen.
+    /// Acknowledge alarms.
     Acknowledge(Selector),
-    /// Latched alarms end, past ones are forgotten; nothing learned is.
+    /// End latched alarms and forget past ones; learned values stay.
     Clear(Selector),
-    /// Another pack is connected: what was learned of the old one does not hold for it.
+    /// Another pack is connected: forget the values learned of the old one.
     PackReplaced,
     /// Send a rule's alarm frame, marked as a test, for a while.
     Test {
@@ -142,11 +142,11 @@ pub enum Command {
     },
 }
 
-/// Who asked.
+/// Origin of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Source {
-    /// Somebody on this computer.
+    /// This computer.
     Local,
     /// A frame.
     Bus(BusIndex),

@@ -12,11 +12,11 @@ use crate::quantity::{BusIndex, CellIndex, Timestamp};
 pub struct Transmit {
     /// Time of the input that caused it.
     pub time: Timestamp,
-    /// Where to.
+    /// Interface to send on.
     pub bus: BusIndex,
-    /// What.
+    /// The frame.
     pub frame: Frame,
-    /// It tells what was learned or what became of an alarm: health, alarm and J1939 frames, all of them, so that frames of
+    /// It announces a learned value or a change of an alarm: true for all health, alarm and J1939 frames, so that frames of
     /// one identifier, and the parts of one transfer, are all of one kind.
     pub announces: bool,
 }
@@ -71,7 +71,7 @@ pub struct Estimate {
     pub temperature_c: f64,
 }
 
-/// Where the Monitor puts what came out; the caller empties it. Reused from input to input, so that the
+/// Outputs of the monitor; the caller empties it. Reused from input to input, so that the
 /// steady state allocates nothing.
 #[derive(Debug, Default)]
 pub struct Outputs {
@@ -81,16 +81,16 @@ pub struct Outputs {
     pub events: Vec<Event>,
     /// Estimates, only when `want_estimates`.
     pub estimates: Vec<Estimate>,
-    /// Whether anybody wants `estimates`.
+    /// Whether the caller wants `estimates`.
     pub want_estimates: bool,
-    /// What the alarm engine was told, only when `want_alarm_inputs`; not what a restore or another configuration did to it.
+    /// Inputs of the alarm engine, only when `want_alarm_inputs`; without changes by a restore or another configuration.
     pub alarm_inputs: Vec<(Timestamp, AlarmInput)>,
-    /// Whether anybody wants `alarm_inputs`.
+    /// Whether the caller wants `alarm_inputs`.
     pub want_alarm_inputs: bool,
 }
 
 impl Outputs {
-    /// Whether nothing has come out.
+    /// Whether there is no output.
     pub fn is_empty(&self) -> bool {
         self.events.is_empty() && self.frames.is_empty() && self.estimates.is_empty() && self.alarm_inputs.is_empty()
     }

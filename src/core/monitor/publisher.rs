@@ -6,7 +6,7 @@
 use super::alarming::Alarming;
 use super::sender::Sender;
 use super::{Event, EventKind, Outputs};
-use crate::alarm::{Alarm, AlarmChange, AlarmInput, Observation, Outcome, Rule};
+use crate::alarm::{Alarm, AlarmChange, AlarmInput, Observation, CommandOutcome, Rule};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -31,7 +31,7 @@ impl Publisher<'_> {
     }
 
     /// Passes an input to the alarm engine; changes wait for [`publish_alarms`](Self::publish_alarms).
-    pub(super) fn apply(&mut self, input: AlarmInput) -> Outcome {
+    pub(super) fn apply(&mut self, input: AlarmInput) -> CommandOutcome {
         if self.out.want_alarm_inputs {
             self.out.alarm_inputs.push((self.now, input));
         }

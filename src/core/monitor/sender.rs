@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::j1939::J1939;
 use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
-use crate::alarm::{Alarm, AlarmEngine, Rule, Severity, State};
+use crate::alarm::{Alarm, AlarmEngine, Rule, Severity, AlarmState};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
@@ -243,7 +243,7 @@ impl Sender {
         (rule, severity, cell): (Rule, Severity, Option<CellIndex>),
         out: &mut Outputs,
     ) {
-        let (rule, state, severity) = (rule as u8, Some(State::Unknown.wire_code()), Some(severity as u8));
+        let (rule, state, severity) = (rule as u8, Some(AlarmState::Unknown.wire_code()), Some(severity as u8));
         self.send_alarm_fields(now, &AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
     }
 
@@ -296,21 +296,21 @@ impl Sender {
             self.end_test(now, engine, out);
         } else if take_due(&mut test.next, now, TEST_PERIOD_S) {
             let rule = test.rule;
-            self.send_test(now, rule, State::Active, out);
+            self.send_test(now, rule, AlarmState::Active, out);
         }
     }
 
     /// Ends a running test.
     pub(super) fn end_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
         let Some(AlarmTest { rule, .. }) = self.test.take() else { return };
-        self.send_test(now, rule, State::Inactive, out);
+        self.send_test(now, rule, AlarmState::Inactive, out);
         out.events.push(Event { time: now, kind: EventKind::Test { rule, running: false } });
         self.update_trouble_codes(now, engine);
         self.poll_j1939(now, out);
     }
 
     /// Sends no value and no threshold, so that no part of a test can be taken for a measurement.
-    fn send_test(&mut self, now: Timestamp, rule: Rule, state: State, out: &mut Outputs) {
+    fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
     }

@@ -15,7 +15,7 @@ use super::sampling::Identity;
 use super::sender::Schedule;
 use super::stages::Stages;
 use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
-use crate::alarm::{AlarmState, StoredAlarm};
+use crate::alarm::{AlarmSnapshot, StoredAlarm};
 use crate::cell::{CellEstimator, CellModel, CellState};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, HealthConfig, PackState};
@@ -43,7 +43,7 @@ pub struct Snapshot {
     /// For earlier programs; this one counts the cells that have reported.
     updated_cells: usize,
     time_backwards: u64,
-    alarms: AlarmState,
+    alarms: AlarmSnapshot,
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
@@ -243,7 +243,7 @@ impl Stages {
     }
 
     /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmState, out: &mut Outputs) {
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, out: &mut Outputs) {
         self.alarming.knows_all_valid = false;
         for orphan in self.alarming.engine.restore(state) {
             let StoredAlarm { rule, severity, cell, .. } = orphan;

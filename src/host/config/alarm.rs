@@ -7,7 +7,7 @@ use super::convert::Raw;
 use super::document::Faults;
 use super::keys::{Alarm, Recharge};
 use super::setting::{Allowed, Setting, Wrong};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
+use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, Comparison};
 use crate::health::RechargeAlarm;
 
 /// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.
@@ -60,7 +60,7 @@ impl Setting for Threshold {
     }
 }
 
-impl Setting for When {
+impl Setting for Comparison {
     const KIND: &'static str = "\"mean\", or { probability = ... } above 0 and below 1";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
@@ -72,9 +72,9 @@ impl Setting for When {
     }
 }
 
-fn probability(table: &DeTable<'_>) -> Option<When> {
+fn probability(table: &DeTable<'_>) -> Option<Comparison> {
     let level = f64::read(table.get("probability")?, &Allowed::Any).ok()?;
-    (level > 0.0 && level < 1.0).then_some(When::Probability(level))
+    (level > 0.0 && level < 1.0).then_some(Comparison::Probability(level))
 }
 
 /// What relative thresholds are relative to.
@@ -96,7 +96,7 @@ impl Rated {
 
     /// What 100 % means for a rule; `None` = nothing.
     fn whole(&self, rule: Rule) -> Option<f64> {
-        match (rule, rule.row().unit) {
+        match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
             (Rule::RechargePeriodLow, _) => Some(self.recharge_period_s),
             (Rule::ResistanceHigh, _) | (_, Unit::Fraction) => Some(1.0),
@@ -162,7 +162,7 @@ fn lasts_only_while_there(rule: Rule) -> bool {
 
 /// 1 where larger values are worse, -1 where smaller ones are.
 fn beyond_sign(rule: Rule) -> f64 {
-    match rule.row().direction {
+    match rule.spec().direction {
         Direction::Below => -1.0,
         Direction::Above => 1.0,
     }
@@ -205,7 +205,7 @@ fn check_needs(alarm: &Alarm, raw: &Raw, faults: &mut Faults) {
     }
     let is_raw_period = alarm.rule == Rule::RechargePeriodLow
         && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
-    if alarm.when != When::Mean && (!alarm.rule.row().has_deviation || is_raw_period) {
+    if alarm.when != Comparison::Mean && (!alarm.rule.spec().has_deviation || is_raw_period) {
         let what = if is_raw_period {
             "must be \"mean\" with recharge.alarm_on = \"raw\": that period has no standard deviation"
         } else {
@@ -253,7 +253,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold:
         return;
     }
     let Some(clear) = alarm.clear(rated, set, threshold) else { return };
-    let (low, high) = match alarm.rule.row().unit {
+    let (low, high) = match alarm.rule.spec().unit {
         Unit::Fraction => (0.0, 1.0),
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
@@ -271,7 +271,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold:
 
 /// A percent written without its sign would be a threshold that is never or always passed.
 fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
-    if alarm.rule.row().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
+    if alarm.rule.spec().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
         alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
     }
 }

@@ -10,7 +10,7 @@ use super::schema::Presence::{Default, Optional, Required};
 use super::schema::{SectionInfo, section};
 use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
-use crate::alarm::{Rule, When};
+use crate::alarm::{Rule, Comparison};
 use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;
@@ -451,7 +451,7 @@ section! {
         /// Cleared when the value is back on the healthy side by this much, where the threshold does not say `clear`. Without it: 2 % of the threshold.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
         /// What is compared: "mean" the value itself; `{ probability = 0.95 }` raises when the probability that the truth is beyond the threshold passes that level (and clears when the probability that it is beyond the clear threshold is at most that level, and at most one half). A level above one half raises later and seldom wrongly, one below it earlier.
-        when: When, "", Any, Default("\"mean\"");
+        when: Comparison, "", Any, Default("\"mean\"");
         /// Must hold this long before it is raised, and be healthy this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
         /// Must hold for this many new values before it is raised or cleared.

@@ -101,7 +101,7 @@ pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Ju
     let verdicts: Vec<(Verdict, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
     // Of a life that was over before there was a log nobody can tell what was missed.
-    let is_ageing = config.rule.row().is_learned && life.end.is_none_or(|end| end > life.span.0);
+    let is_ageing = config.rule.spec().is_learned && life.end.is_none_or(|end| end > life.span.0);
     let first_true = verdicts.iter().find(|(verdict, _)| *verdict == Verdict::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
     Judged {
@@ -159,7 +159,7 @@ impl Life<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Severity, When};
+    use crate::alarm::{Severity, Comparison};
     use crate::fleet::track::Learned;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};
@@ -195,7 +195,7 @@ mod tests {
             severity: Severity::Warning,
             threshold: 0.8,
             clear: 0.9,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,

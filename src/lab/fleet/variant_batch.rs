@@ -133,7 +133,7 @@ fn concerns(input: &AlarmInput, watches: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, When};
+    use crate::alarm::{Observation, Comparison};
 
     fn low(rule: Rule, threshold: f64) -> RuleConfig {
         RuleConfig {
@@ -141,7 +141,7 @@ mod tests {
             severity: Severity::Warning,
             threshold,
             clear: threshold * 1.02,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,

@@ -154,7 +154,7 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "value" Real "unit" null, "the value that decided", |row| maybe(row.alarm.value);
     "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| maybe(row.alarm.probability);
     "threshold" Real "unit", "what it is compared with", |row| real(row.alarm.threshold);
-    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.alarm.rule.row().unit.symbol());
+    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.alarm.rule.spec().unit.symbol());
     "occurrences" Whole "", "times it was raised", |row| Field::Whole(Some(row.alarm.occurrences));
     "acknowledged" Flag "", "whether somebody has seen it since", |row| Field::Flag(row.alarm.acknowledged);
 };

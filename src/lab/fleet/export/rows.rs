@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::alarm::{Change, Rule, Severity, State};
+use crate::alarm::{Change, Rule, Severity, AlarmState};
 use crate::health::RemainingLife;
 use crate::monitor::{Estimate, EventKind};
 use crate::quantity::{CellIndex, Mode, Timestamp};
@@ -115,7 +115,7 @@ pub(super) struct Alarm {
     /// `None` = the pack.
     pub(super) cell: Option<CellIndex>,
     pub(super) change: Change,
-    pub(super) state: State,
+    pub(super) state: AlarmState,
     pub(super) active: bool,
     pub(super) severity: Severity,
     pub(super) value: Option<f64>,
