@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::Failure;
 use super::control_args::{ControlArgs, print};
-use crate::alarm::{Alarm, Rule, Severity, AlarmState, Unit};
+use crate::alarm::{Alarm, AlarmState, Rule, Severity, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;

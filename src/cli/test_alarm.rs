@@ -10,7 +10,7 @@ use std::time::Duration;
 use super::Failure;
 use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
-use crate::alarm::{Rule, AlarmState};
+use crate::alarm::{AlarmState, Rule};
 use crate::config;
 use crate::control::test_alarm::{self, ChannelReport, Real};
 use crate::io::stamp;
@@ -95,8 +95,15 @@ fn protection(report: &ChannelReport) -> String {
 }
 
 /// States with a code of their own on the wire.
-const ON_THE_WIRE: [AlarmState; 7] =
-    [AlarmState::Inactive, AlarmState::Active, AlarmState::Cleared, AlarmState::Pending, AlarmState::Latched, AlarmState::Suppressed, AlarmState::Unknown];
+const ON_THE_WIRE: [AlarmState; 7] = [
+    AlarmState::Inactive,
+    AlarmState::Active,
+    AlarmState::Cleared,
+    AlarmState::Pending,
+    AlarmState::Latched,
+    AlarmState::Suppressed,
+    AlarmState::Unknown,
+];
 
 /// What else was on the channel.
 fn push_notes(text: &mut String, report: &ChannelReport) {

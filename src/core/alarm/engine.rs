@@ -10,8 +10,8 @@ use std::ops::Range;
 use serde::{Deserialize, Serialize};
 
 use super::limit::LimitCheck;
-use super::machine::{Change, Machine, Refusal, IndexEntry, AlarmState};
-use super::{Observation, CommandOutcome, Rule, RuleConfig, Scope, Selector, Severity};
+use super::machine::{AlarmState, Change, IndexEntry, Machine, Refusal};
+use super::{CommandOutcome, Observation, Rule, RuleConfig, Scope, Selector, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// An alarm as it is now.

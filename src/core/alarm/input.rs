@@ -5,7 +5,7 @@
 //! monitor with those thresholds would have done (except `input_missing`: its strictest threshold decides whether a
 //! silence is passed to the engine at all).
 
-use super::{AlarmChange, AlarmEngine, Observation, CommandOutcome, Rule, Selector};
+use super::{AlarmChange, AlarmEngine, CommandOutcome, Observation, Rule, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
 /// One input of an engine.

@@ -386,7 +386,14 @@ impl Machine {
                 self.state = AlarmState::Clearing;
                 Some(Change::Resumed)
             }
-            (AlarmState::Unknown | AlarmState::Inactive | AlarmState::Pending | AlarmState::Cleared | AlarmState::Latched, true) => {
+            (
+                AlarmState::Unknown
+                | AlarmState::Inactive
+                | AlarmState::Pending
+                | AlarmState::Cleared
+                | AlarmState::Latched,
+                true,
+            ) => {
                 self.raise(now);
                 Some(Change::Raised)
             }

@@ -19,7 +19,7 @@ pub mod selector;
 
 pub use engine::{Alarm, AlarmChange, AlarmEngine, AlarmSnapshot, StoredAlarm, ThresholdState};
 pub use input::AlarmInput;
-pub use limit::{Observation, RuleConfig, Comparison};
-pub use machine::{Change, Refusal, AlarmState};
+pub use limit::{Comparison, Observation, RuleConfig};
+pub use machine::{AlarmState, Change, Refusal};
 pub use rule::{Direction, Rule, Scope, Severity, Unit};
 pub use selector::{CommandOutcome, Selector};

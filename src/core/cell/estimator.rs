@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 use super::circuit::{self, BranchAt};
 use super::config::{CapacityState, EstimatorConfig};
 use super::model::{CellModel, MAX_BRANCHES};
-use crate::filter::{ScalarGaussian, FilterError, Gaussian, Spread, Update};
+use crate::filter::{FilterError, Gaussian, ScalarGaussian, Spread, Update};
 
 /// A variance that stands for "known": small against any noise, large against rounding.
 const KNOWN_VARIANCE: f64 = 1e-12;
@@ -141,8 +141,8 @@ macro_rules! each {
     };
 }
 
-mod downtime;
 mod bank;
+mod downtime;
 mod noise;
 mod state;
 

@@ -1,8 +1,8 @@
 //! Kalman filters as pure numbers: they know no battery.
 
-pub mod simd;
 pub mod linear;
+pub mod simd;
 pub mod unscented;
 
-pub use linear::{ScalarGaussian, Measurement};
+pub use linear::{Measurement, ScalarGaussian};
 pub use unscented::{FilterError, Gaussian, Noise, Spread, Update};

@@ -12,7 +12,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::CapacityConfig;
-use crate::filter::{ScalarGaussian, Measurement};
+use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 
 /// The offset walks by this part of its first standard deviation in a full cycle: sensors drift with temperature.

@@ -12,7 +12,7 @@ pub mod usable;
 pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
-pub use forecast::{Axis, Forecast, Usage, Reading, Remaining, RemainingLife, InsufficientData};
+pub use forecast::{Axis, Forecast, InsufficientData, Reading, Remaining, RemainingLife, Usage};
 pub use learner::{CapacityUpdate, CellEnd, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
 pub use recharge::{Charged, RechargeTimer};

@@ -28,7 +28,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RechargeConfig;
 use crate::filter::ScalarGaussian;
-use crate::quantity::{Mode, Timestamp, InvalidState};
+use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Watches the pack's SOC during charges.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -114,7 +114,10 @@ impl RechargeTimer {
 /// Seconds a charger that holds the reference current needs for the window of a pack of `capacity` (Ah).
 pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> ScalarGaussian {
     let seconds_per_ah = 3600.0 * (config.to_soc - config.from_soc) / config.reference_current_a;
-    ScalarGaussian { mean: seconds_per_ah * capacity.mean, variance: seconds_per_ah * seconds_per_ah * capacity.variance }
+    ScalarGaussian {
+        mean: seconds_per_ah * capacity.mean,
+        variance: seconds_per_ah * seconds_per_ah * capacity.variance,
+    }
 }
 
 /// When the line between two points rises through `level`.

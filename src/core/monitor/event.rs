@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::input::{BusEvent, Command, Source};
-use crate::alarm::{Change, Rule, Severity, AlarmState};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::can::CanId;
 use crate::can::decode::Channel;
 use crate::can::e2e::Status;

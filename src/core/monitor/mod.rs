@@ -39,9 +39,7 @@ mod watch;
 
 pub use config::MonitorConfig;
 pub use event::{Event, EventKind};
-pub use input::{
-    BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS,
-};
+pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
 pub use intake::CommandConfig;
 pub use j1939::{AlarmCode, J1939Config};
 pub use outputs::{Estimate, Outputs, Transmit, Validity};
@@ -73,12 +71,7 @@ pub struct Monitor {
 impl Monitor {
     /// A monitor without any knowledge of its pack.
     pub fn new(config: MonitorConfig) -> Self {
-        Self {
-            clock: Clock::default(),
-            intake: Intake::new(&config),
-            stages: Stages::new(&config),
-            pending: None,
-        }
+        Self { clock: Clock::default(), intake: Intake::new(&config), stages: Stages::new(&config), pending: None }
     }
 
     /// Takes one input; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a

@@ -6,7 +6,7 @@
 use super::alarming::Alarming;
 use super::sender::Sender;
 use super::{Event, EventKind, Outputs};
-use crate::alarm::{Alarm, AlarmChange, AlarmInput, Observation, CommandOutcome, Rule};
+use crate::alarm::{Alarm, AlarmChange, AlarmInput, CommandOutcome, Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Timestamp};
 

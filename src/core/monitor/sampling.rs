@@ -88,7 +88,12 @@ impl Sampling {
     /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
     /// [`handle_reading`](Self::handle_reading) has still to take it.
     #[inline]
-    pub(super) fn take_ordinary_voltage(&mut self, now: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
+    pub(super) fn take_ordinary_voltage(
+        &mut self,
+        now: Timestamp,
+        cell: CellIndex,
+        voltage_v: f64,
+    ) -> Option<CellSample> {
         let sample = self.sampler.take_ordinary_voltage(now, cell, voltage_v)?;
         self.has_usable_reading = true;
         Some(sample)

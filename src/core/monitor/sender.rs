@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::j1939::J1939;
 use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
-use crate::alarm::{Alarm, AlarmEngine, Rule, Severity, AlarmState};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
@@ -82,8 +82,7 @@ impl Schedule {
 
     /// Other periods; a shorter one begins now, not when the longer one is over.
     fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
-        let periods_s =
-            |output: &OutputConfig| [output.status_period_s, output.health_period_s, output.alarm_period_s];
+        let periods_s = |output: &OutputConfig| [output.status_period_s, output.health_period_s, output.alarm_period_s];
         let dues = [&mut self.status, &mut self.health, &mut self.alarm];
         for (due, (before_s, after_s)) in dues.into_iter().zip(periods_s(before).into_iter().zip(periods_s(after))) {
             if before_s != after_s {

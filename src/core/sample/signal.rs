@@ -13,7 +13,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::config::Limits;
-use crate::quantity::{Fault, Timestamp, InvalidState};
+use crate::quantity::{Fault, InvalidState, Timestamp};
 
 /// Readings in a row that must agree on a new level: two could be one disturbance seen twice.
 pub const ACCEPT_AFTER: u32 = 3;

@@ -7,7 +7,7 @@ use super::convert::Raw;
 use super::document::Faults;
 use super::keys::{Alarm, Recharge};
 use super::setting::{Allowed, Setting, Wrong};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, Comparison};
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 
 /// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.

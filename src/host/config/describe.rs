@@ -8,7 +8,7 @@ use super::convert::Raw;
 use super::keys::TemperatureInput;
 use super::resolve::{Resolved, channel_words};
 use super::{Config, InterfaceConfig, protect};
-use crate::alarm::{Direction, Rule, RuleConfig, Unit, Comparison};
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};

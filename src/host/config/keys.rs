@@ -10,7 +10,7 @@ use super::schema::Presence::{Default, Optional, Required};
 use super::schema::{SectionInfo, section};
 use super::setting::Allowed::{Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
-use crate::alarm::{Rule, Comparison};
+use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;

@@ -14,7 +14,7 @@ use super::resolve::{self, Databases, Resolved};
 use super::{Config, ConfigFaults, beside, cell_model, load, protect, read_file, read_text};
 use crate::can::decode::{Binding, InputMap};
 use crate::cell::CellModel;
-use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, Plan, SignalPlan};
+use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{BusIndex, CellIndex, Channel, MAX_CELLS};
 
 /// What could be read.
@@ -73,22 +73,23 @@ fn read(path: &Path, config: Option<Config>, told: Vec<String>, faults: &mut Fau
     };
     let pack_ah =
         model.as_ref().map_or(50.0, |m| m.rated_capacity_ah) * raw.pack.as_ref().map_or(1.0, |p| f64::from(p.strings));
+    let dead_band_a = raw.transition.as_ref().map(|keys| convert::transition(keys, pack_ah).dead_band_a);
+    let pack = PackPlan {
+        cells: raw.pack.as_ref().map_or_else(|| cells_of(&found), |pack| pack.cells),
+        is_total: raw.voltages_written.1,
+        strings: raw.pack.as_ref().map_or(1, |pack| pack.strings),
+        capacity_ah: capacity_ah(&raw, model.as_ref()),
+        model,
+        ambient_c: raw.pack.as_ref().map_or(25.0, |pack| pack.ambient_c),
+        dead_band_a: dead_band_a.unwrap_or(pack_ah / 50.0),
+        voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+    };
     let plan = Plan {
         interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
         more_cells: more_cells(&raw, &databases),
         messages: messages(&found, &signals),
         signals,
-        cells: raw.pack.as_ref().map_or_else(|| cells_of(&found), |pack| pack.cells),
-        is_pack_total: raw.voltages_written.1,
-        strings: raw.pack.as_ref().map_or(1, |pack| pack.strings),
-        capacity_ah: capacity_ah(&raw, model.as_ref()),
-        model,
-        ambient_c: raw.pack.as_ref().map_or(25.0, |pack| pack.ambient_c),
-        dead_band_a: raw
-            .transition
-            .as_ref()
-            .map_or(pack_ah / 50.0, |keys| convert::transition(keys, pack_ah).dead_band_a),
-        voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+        pack,
         limits: config.as_ref().map(limits).unwrap_or_default(),
         ages: ages(&raw),
         guards,

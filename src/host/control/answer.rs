@@ -2,7 +2,7 @@
 
 use super::MAX_LISTED;
 use super::protocol::{AlarmList, Answer, Done, UnknownAlarms};
-use crate::alarm::{Alarm, AlarmEngine, Selector, AlarmState};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
 use crate::monitor::{Command, Event, EventKind, Source};
 use crate::quantity::Timestamp;
 
@@ -23,7 +23,12 @@ pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList
 fn needs_eyes(alarm: &Alarm) -> bool {
     match alarm.state {
         AlarmState::Inactive | AlarmState::Unknown => alarm.occurrences > 0 && !alarm.is_acknowledged,
-        AlarmState::Pending | AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed | AlarmState::Latched | AlarmState::Cleared => true,
+        AlarmState::Pending
+        | AlarmState::Active
+        | AlarmState::Clearing
+        | AlarmState::Suppressed
+        | AlarmState::Latched
+        | AlarmState::Cleared => true,
     }
 }
 
@@ -96,7 +101,7 @@ pub fn refusal(alarm: &Alarm) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, Rule, RuleConfig, Severity, Comparison};
+    use crate::alarm::{Comparison, Observation, Rule, RuleConfig, Severity};
     use crate::quantity::CellIndex;
 
     fn engine(cells: u16) -> AlarmEngine {

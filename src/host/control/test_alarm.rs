@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep};
 
 use super::client::ControlClient;
 use super::protocol::{Done, Request};
-use crate::alarm::{Rule, AlarmState};
+use crate::alarm::{AlarmState, Rule};
 use crate::can::dbc::Message;
 use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::j1939::{Dm1Receiver, HeardDm1, TroubleCode};

@@ -5,7 +5,7 @@ use super::document::{
     Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
     StatusCount, Store, VERSION,
 };
-use crate::alarm::{Alarm, Rule, Severity, AlarmState};
+use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::LinkState;
 use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};

@@ -4,7 +4,7 @@ use rusqlite::types::Value;
 use serde::Serialize;
 
 use super::stamp::Stamp;
-use crate::alarm::{Rule, Severity, AlarmState};
+use crate::alarm::{AlarmState, Rule, Severity};
 use crate::monitor::EventKind;
 use crate::quantity::CellIndex;
 

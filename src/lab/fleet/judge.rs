@@ -159,7 +159,7 @@ impl Life<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Severity, Comparison};
+    use crate::alarm::{Comparison, Severity};
     use crate::fleet::track::Learned;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};

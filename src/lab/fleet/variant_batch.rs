@@ -133,7 +133,7 @@ fn concerns(input: &AlarmInput, watches: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, Comparison};
+    use crate::alarm::{Comparison, Observation};
 
     fn low(rule: Rule, threshold: f64) -> RuleConfig {
         RuleConfig {

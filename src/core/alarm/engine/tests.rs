@@ -3,7 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::super::{Direction, Comparison};
+use super::super::{Comparison, Direction};
 use super::*;
 
 fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_events: u32) -> RuleConfig {

@@ -1,6 +1,6 @@
 //! Every state with every input, and what the table cannot express: counting, past, suspension.
 
-use super::super::{Rule, Severity, Comparison};
+use super::super::{Comparison, Rule, Severity};
 use super::*;
 
 const STATES: [AlarmState; 8] = [
@@ -91,9 +91,13 @@ fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, 
         (Unknown, MachineInput::Check(LimitCheck::Unknown)) => stay,
         (Inactive | Cleared, MachineInput::Check(LimitCheck::Unknown)) => (Unknown, Unknown, None),
         (Pending | Suppressed | Latched, MachineInput::Check(LimitCheck::Unknown)) => stay,
-        (Active | Clearing, MachineInput::Check(LimitCheck::Unknown)) => (Suppressed, Suppressed, Some(Change::Suppressed)),
+        (Active | Clearing, MachineInput::Check(LimitCheck::Unknown)) => {
+            (Suppressed, Suppressed, Some(Change::Suppressed))
+        }
         (Unknown | Inactive | Pending, MachineInput::Acknowledge | MachineInput::Clear) => stay,
-        (Active | Clearing | Suppressed | Latched, MachineInput::Acknowledge) => (state, state, Some(Change::Acknowledged)),
+        (Active | Clearing | Suppressed | Latched, MachineInput::Acknowledge) => {
+            (state, state, Some(Change::Acknowledged))
+        }
         (Cleared, MachineInput::Acknowledge) => (Inactive, Inactive, Some(Change::Acknowledged)),
         (Active | Clearing | Suppressed, MachineInput::Clear) => stay,
         (Latched, MachineInput::Clear) => (Inactive, Inactive, Some(Change::Cleared)),
@@ -117,7 +121,10 @@ fn every_state_and_input_leads_where_the_table_says() {
             let (mut machine, rule) = machine_in(state);
             assert_eq!(apply(&mut machine, &rule, 101.0, input), change, "{state:?} {input:?}");
             assert_eq!(machine.state, early, "{state:?} {input:?}");
-            assert_eq!(machine.is_known, !matches!(input, MachineInput::Check(LimitCheck::Unknown)) && is_known_in(state, input));
+            assert_eq!(
+                machine.is_known,
+                !matches!(input, MachineInput::Check(LimitCheck::Unknown)) && is_known_in(state, input)
+            );
             apply(&mut machine, &rule, 120.0, input);
             assert_eq!(machine.state, late, "{state:?} {input:?}, again");
         }
@@ -128,7 +135,9 @@ fn every_state_and_input_leads_where_the_table_says() {
 fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
     match input {
         MachineInput::Check(_) => true,
-        MachineInput::Acknowledge | MachineInput::Clear => !matches!(state, AlarmState::Unknown | AlarmState::Suppressed),
+        MachineInput::Acknowledge | MachineInput::Clear => {
+            !matches!(state, AlarmState::Unknown | AlarmState::Suppressed)
+        }
     }
 }
 
@@ -218,9 +227,10 @@ fn time_alone_or_values_alone_do_not_raise() {
 
 #[test]
 fn time_beside_an_unknown_value_does_not_count_and_takes_nothing_away() {
-    for (state, check, change) in
-        [(AlarmState::Pending, LimitCheck::Beyond, Change::Raised), (AlarmState::Clearing, LimitCheck::Healthy, Change::Cleared)]
-    {
+    for (state, check, change) in [
+        (AlarmState::Pending, LimitCheck::Beyond, Change::Raised),
+        (AlarmState::Clearing, LimitCheck::Healthy, Change::Cleared),
+    ] {
         let (mut machine, rule) = machine_in(state);
         look(&mut machine, &rule, 104.0, check);
         look(&mut machine, &rule, 105.0, LimitCheck::Unknown);
@@ -261,7 +271,9 @@ fn a_learned_value_whose_inputs_are_lost_is_suppressed_and_stands_when_they_are_
 
 #[test]
 fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_raised() {
-    for (value, change, state) in [(1.2, Change::Resumed, AlarmState::Active), (1.6, Change::Cleared, AlarmState::Cleared)] {
+    for (value, change, state) in
+        [(1.2, Change::Resumed, AlarmState::Active), (1.6, Change::Cleared, AlarmState::Cleared)]
+    {
         let (mut machine, rule) = machine_in(AlarmState::Active);
         let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
         assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));

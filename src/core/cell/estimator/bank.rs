@@ -15,7 +15,7 @@ mod tables;
 use std::array::from_fn;
 
 use input::BlockInput;
-use kernel::{Constants, INFORMATION_S, DecayFactors, LOAD_A, MEAN_NIS, REST_S, State, at};
+use kernel::{Constants, DecayFactors, INFORMATION_S, LOAD_A, MEAN_NIS, REST_S, State, at};
 use nalgebra::{SMatrix, SVector};
 use tables::{Around, Tables};
 
@@ -23,7 +23,7 @@ use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, S
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, MAX_BRANCHES};
 use crate::filter::simd::Lanes;
-use crate::filter::{ScalarGaussian, Gaussian};
+use crate::filter::{Gaussian, ScalarGaussian};
 
 /// Cells of a block: one of AVX-512's vectors, two of AVX2's (4 and 16 were measured, too: slower with either).
 const WIDTH: usize = 8;

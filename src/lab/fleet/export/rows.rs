@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::alarm::{Change, Rule, Severity, AlarmState};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::health::RemainingLife;
 use crate::monitor::{Estimate, EventKind};
 use crate::quantity::{CellIndex, Mode, Timestamp};

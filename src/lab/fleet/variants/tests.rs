@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use super::*;
-use crate::alarm::{Severity, Comparison};
+use crate::alarm::{Comparison, Severity};
 
 const ALARMS: &str = "
 [[alarm]]

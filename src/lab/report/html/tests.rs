@@ -1,7 +1,7 @@
 //! What a page of a long life weighs, and what a page of nothing says.
 
 use super::*;
-use crate::alarm::{Change, Rule, Severity, AlarmState};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 

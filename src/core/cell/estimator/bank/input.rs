@@ -2,7 +2,7 @@
 //!
 //! In: steps, lane by lane. Out: the kernel's inputs, or a step again where the kernel did not make it.
 
-use super::kernel::{Input, DecayFactors, Outcome};
+use super::kernel::{DecayFactors, Input, Outcome};
 use super::{Cell, WIDTH};
 use crate::cell::{CellStep, StepResult};
 use crate::filter::Update;
