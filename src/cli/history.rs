@@ -6,10 +6,10 @@ use serde_json::{Map, Value, json};
 
 use super::Failure;
 use super::control_args::print;
-use crate::store::{self, HistoryEntry, HistoryQuery, HistoryTable, HistoryReader};
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
+use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
@@ -292,9 +292,7 @@ fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
     }
     match &verdict.broken {
         None if args.json => Ok(()),
-        None => {
-            print(&format!("{} rows, none changed; the hash of the last is {}\n", verdict.rows, verdict.head))
-        }
+        None => print(&format!("{} rows, none changed; the hash of the last is {}\n", verdict.rows, verdict.head)),
         Some(broken) => {
             let place = if broken.table.is_empty() { String::new() } else { format!(" ({})", broken.table) };
             Err(Failure::new(format!(

@@ -22,8 +22,10 @@ const EXIT_ALARM: u8 = 4;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Exit codes: 0 no alarm is raised, 3 no daemon reports its status, 4 an alarm is raised, 1 any \
-    other failure, 2 wrong usage. With --watch: 0 after quitting.")]
+#[command(
+    after_help = "Exit codes: 0 no alarm is raised, 3 no daemon reports its status, 4 an alarm is raised, 1 any \
+    other failure, 2 wrong usage. With --watch: 0 after quitting."
+)]
 pub(crate) struct Args {
     /// Lists every cell; without it, of more than 16 cells, their range and the outliers
     #[arg(long)]

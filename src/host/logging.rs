@@ -61,7 +61,8 @@ pub fn start(filter: Option<&str>) -> Result<(), String> {
 fn targets(text: &str) -> Result<Targets, String> {
     let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
     let modules = filter.iter().filter_map(|(target, level)| Some((target.strip_prefix("packwatch::")?, level)));
-    let members = modules.flat_map(|(module, level)| MEMBER_CRATES.map(|member| (format!("{member}::{module}"), level)));
+    let members =
+        modules.flat_map(|(module, level)| MEMBER_CRATES.map(|member| (format!("{member}::{module}"), level)));
     let members: Vec<_> = members.collect();
     Ok(filter.with_targets(members))
 }
@@ -90,7 +91,9 @@ mod tests {
             assert_eq!(filter.would_enable(target, &level), expected, "{target} {level}");
         }
         let all = targets("packwatch=debug").unwrap();
-        assert!(all.would_enable("packwatch_host::service", &Level::DEBUG) && !all.would_enable("hyper", &Level::ERROR));
+        assert!(
+            all.would_enable("packwatch_host::service", &Level::DEBUG) && !all.would_enable("hyper", &Level::ERROR)
+        );
         assert!(targets("packwatch::io=loud").unwrap_err().starts_with("log filter 'packwatch::io=loud': "));
     }
 }

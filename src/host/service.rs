@@ -27,10 +27,10 @@ use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
 use super::store::StateSetting;
-use crate::io::unix_socket::SocketSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
+use crate::io::socket::{Link, LinkConfig, LinkMessage, LinkOutput};
+use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
@@ -40,7 +40,7 @@ use reload::Reload;
 use status_publisher::StatusPublisher;
 pub(super) use stop::Stop;
 
-/// Received frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
+/// LinkMessage frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
 /// Threads for work that would block the loop: reading a configuration, long answers. More would only wait for the disk.
@@ -160,7 +160,7 @@ impl Service {
         ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
-    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
         let mut links = JoinSet::new();
         let mut outputs = Vec::new();
         for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {

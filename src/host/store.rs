@@ -40,19 +40,19 @@ use std::thread::JoinHandle;
 
 use tokio::sync::watch;
 
-use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::config::StoreConfig;
+use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::monitor::{Downtime, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::StateDocument;
 use folder::{Folder, OpenedDatabase, SET_ASIDE};
-use history_filter::{HistoryFilter, CommitDecision};
+use history_filter::{CommitDecision, HistoryFilter};
 use reader::MAX_DAEMON_COPY_BYTES;
-use rows::{RowBatch, HistoryRow};
+use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp, WallClock};
-use writer::{WriteQueue, Retry, Writer};
+use writer::{Retry, WriteQueue, Writer};
 
 pub use folder::with_suffix;
 pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
@@ -191,7 +191,8 @@ impl Store {
         let path = folder.path().to_owned();
         let runtime_file = first_folder("RUNTIME_DIRECTORY").map(|folder| folder.join(runtime::FILE_NAME));
         let mut retry = Retry::default();
-        let mut found = StoredStates { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
+        let mut found =
+            StoredStates { states: Vec::new(), works: opening.as_ref().is_some_and(|opening| opening.is_sound) };
         let mut reset_ns = None;
         let (database, rows, state, aside, is_unreadable) = match opening {
             Some(OpenedDatabase { database, rows, state, aside, is_unreadable, .. }) => {
@@ -370,7 +371,12 @@ fn running_state(file: &Path, folder: &Path) -> Option<StateDocument> {
 }
 
 /// Both states, the newer first.
-fn candidates(running: Option<StateDocument>, stored: Option<StateDocument>, now: &Stamp, wall: WallClock) -> Vec<StateCandidate> {
+fn candidates(
+    running: Option<StateDocument>,
+    stored: Option<StateDocument>,
+    now: &Stamp,
+    wall: WallClock,
+) -> Vec<StateCandidate> {
     let is_older = |running: &StateDocument, stored: &StateDocument| {
         running.stamp.same_boot(&stored.stamp) && running.stamp.boottime_ns < stored.stamp.boottime_ns
     };

@@ -5,9 +5,9 @@ use std::fmt::Write as _;
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
 use crate::cli::alarms::{cell as cell_name, state_name, with_unit};
-use crate::status::counters::LATENCY_BOUNDS_S;
-use crate::status::document::{CellStatus, StatusDocument, PackStatus};
 use crate::io::stamp;
+use crate::status::counters::LATENCY_BOUNDS_S;
+use crate::status::document::{CellStatus, PackStatus, StatusDocument};
 
 /// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;

@@ -299,12 +299,18 @@ mod tests {
 
     #[test]
     fn an_answer_is_its_contents_or_its_error() {
-        let done = CommandOutcome { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
+        let done =
+            CommandOutcome { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
         assert_eq!(contents::<CommandOutcome>(&Answer::Outcome(done.clone()).to_line()), Ok(done.clone()));
-        assert_eq!(contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()), Err("no \"way\"".to_owned()));
+        assert_eq!(
+            contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()),
+            Err("no \"way\"".to_owned())
+        );
         let unlike = contents::<AlarmList>(&Answer::Outcome(done).to_line()).unwrap_err();
         assert!(unlike.contains("missing field `thresholds`"), "{unlike}");
-        assert!(contents::<CommandOutcome>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1"));
+        assert!(
+            contents::<CommandOutcome>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1")
+        );
     }
 
     proptest! {

@@ -12,7 +12,7 @@ use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
 use super::{ControlSetting, MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
-use crate::io::unix_socket::{BindError, Bound, SocketFile, bind};
+use crate::io::unix_socket::{BindError, BoundSocket, SocketFile, bind};
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -38,7 +38,10 @@ impl ControlServer {
     ///
     /// # Errors
     /// When another daemon uses it, or a requested one cannot be created.
-    pub async fn start(setting: &ControlSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
+    pub async fn start(
+        setting: &ControlSetting,
+        requests: mpsc::Sender<PendingRequest>,
+    ) -> Result<Option<Self>, String> {
         let (path, is_needed) = match setting {
             ControlSetting::Off => return Ok(None),
             ControlSetting::At(path) => (path.clone(), true),
@@ -60,7 +63,11 @@ impl ControlServer {
         }
     }
 
-    fn serve(bound: Bound, requests: mpsc::Sender<PendingRequest>, max_silence: Duration) -> std::io::Result<Self> {
+    fn serve(
+        bound: BoundSocket,
+        requests: mpsc::Sender<PendingRequest>,
+        max_silence: Duration,
+    ) -> std::io::Result<Self> {
         // The daemon's own user as the kernel reports it, in the same form as a peer's.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");

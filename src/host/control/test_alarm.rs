@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep};
 
 use super::client::ControlClient;
 use super::protocol::{CommandOutcome, Request};
-use crate::alarm::{Rule, State};
+use crate::alarm::{AlarmState, Rule};
 use crate::can::dbc::Message;
 use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::j1939::{Dm1Receiver, HeardDm1, TroubleCode};
@@ -142,7 +142,7 @@ struct AlarmReader {
 impl AlarmReader {
     fn new(message: &Message) -> Option<Self> {
         let plan = |name| message.signal(name).and_then(|signal| signal.layout.plan().ok());
-        Some(Self { rule: plan("Rule")?, state: plan("State")?, test: plan("Test")? })
+        Some(Self { rule: plan("Rule")?, state: plan("AlarmState")?, test: plan("Test")? })
     }
 
     /// Rule, state and marker; `None` = the frame is too short, or the number of its rule is too high.
@@ -199,7 +199,7 @@ impl ObservedFrames {
             Some((rule, _, true)) if rule != wanted as u8 => self.foreign += 1,
             Some((_, state, true)) => {
                 self.note_test(time);
-                self.ended = state == State::Inactive.wire_code();
+                self.ended = state == AlarmState::Inactive.wire_code();
             }
         }
     }
@@ -266,7 +266,11 @@ fn open(config: &Config) -> Result<Vec<MonitoredChannel>, String> {
     Ok(channels)
 }
 
-fn open_alarms(interface: &InterfaceConfig, message: &Message, reader: AlarmReader) -> Result<MonitoredChannel, String> {
+fn open_alarms(
+    interface: &InterfaceConfig,
+    message: &Message,
+    reader: AlarmReader,
+) -> Result<MonitoredChannel, String> {
     let listener = CanListener::open(&interface.name, interface.fd, &[message.id], &[]);
     let listener = listener.map_err(|error| error.to_string())?;
     let check = message.e2e.map(|protection| (CheckConfig::new(protection), Receiver::default()));
@@ -286,7 +290,12 @@ fn open_dm1(interface: &InterfaceConfig, j1939: &J1939Config) -> Result<Monitore
     Ok(MonitoredChannel { listener, reader: ChannelReader::Dm1 { receiver, test_code: j1939.test_code }, report })
 }
 
-async fn watch(channels: &mut [MonitoredChannel], client: &ControlClient, rule: Rule, duration: Duration) -> Result<(), String> {
+async fn watch(
+    channels: &mut [MonitoredChannel],
+    client: &ControlClient,
+    rule: Rule,
+    duration: Duration,
+) -> Result<(), String> {
     let handler = |kind| signal(kind).map_err(|error| format!("cannot handle signals: {error}"));
     let (mut interrupt, mut terminate) = (handler(SignalKind::interrupt())?, handler(SignalKind::terminate())?);
     send_test(client, rule, duration.as_secs_f64())?;
@@ -334,7 +343,8 @@ mod tests {
         observed.note(rule, at(6.0), Some((8, 0, true)));
         let genuine = [8, 4].map(|rule| (GenuineAlarm::Alarm { rule, state: 1 }, 1)).into();
         let (first, last) = (Some(at(1.0)), Some(at(6.0)));
-        let expected = ObservedFrames { tests: 2, first, last, ended: true, foreign: 1, genuine, without_code: 0, unreadable: 1 };
+        let expected =
+            ObservedFrames { tests: 2, first, last, ended: true, foreign: 1, genuine, without_code: 0, unreadable: 1 };
         assert_eq!(observed, expected);
     }
 
@@ -359,7 +369,8 @@ mod tests {
         let genuine = [(520_196, 9, 2), (524_286, 2, 1)];
         let genuine = genuine.map(|(spn, fmi, count)| (GenuineAlarm::Code { spn, fmi }, count)).into();
         let (first, last) = (Some(at(3.0)), Some(at(6.0)));
-        let expected = ObservedFrames { tests: 3, first, last, ended: true, foreign: 0, genuine, without_code: 4, unreadable: 1 };
+        let expected =
+            ObservedFrames { tests: 3, first, last, ended: true, foreign: 0, genuine, without_code: 4, unreadable: 1 };
         assert_eq!(observed, expected);
     }
 

@@ -9,18 +9,18 @@ use tokio::time::Instant;
 use super::readiness::{Readiness, describe_restored};
 use super::{Service, ServiceError};
 use crate::io::background_file::BackgroundFile;
-use crate::io::event_log::{self, EventLog};
-use crate::io::snapshot_file;
-use crate::status::collect::RecentEvents;
-use crate::status::document::StoreStatus;
-use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{StateCandidate, DATABASE_SOURCE, StoreProgress, Store, with_suffix};
 use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
+use crate::io::event_log::{self, EventLog};
 use crate::io::journal::JournalWriter;
+use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
 use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
+use crate::status::collect::RecentEvents;
+use crate::status::document::StoreStatus;
+use crate::store::commit_barrier::CommitBarrier;
+use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress, with_suffix};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]

@@ -16,8 +16,8 @@ use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
 use crate::config::{self, Config, InterfaceConfig, StoreConfig};
-use crate::status::document::ConfigFile;
 use crate::monitor::{MonitorConfig, Reconfigured};
+use crate::status::document::ConfigFile;
 
 /// Least time between two readings of the file.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
@@ -178,7 +178,8 @@ mod tests {
     use std::path::Path;
 
     fn example() -> Config {
-        config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml")).expect("the example is good")
+        config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml"))
+            .expect("the example is good")
     }
 
     #[test]
@@ -193,7 +194,9 @@ mod tests {
         let (old, mut new) = (example(), example());
         new.store.checkpoint_s *= 2.0;
         assert!(
-            FixedSettings::of(&old).check(&new).is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
+            FixedSettings::of(&old)
+                .check(&new)
+                .is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
         );
     }
 

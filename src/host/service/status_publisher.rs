@@ -3,14 +3,14 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
+use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::monitor::TICK_PERIOD_MS;
+use crate::quantity::Timestamp;
 use crate::status::PERIOD;
 use crate::status::StatusServer;
 use crate::status::collect::{CounterBaseline, ServiceIdentity, Sources};
 use crate::status::counters::{Latency, ServiceCounters};
 use crate::status::document::ConfigFile;
-use crate::io::socket::{LinkOutput, Received, LinkEvent};
-use crate::monitor::TICK_PERIOD_MS;
-use crate::quantity::Timestamp;
 
 /// See the module.
 #[derive(Debug)]
@@ -36,7 +36,7 @@ impl StatusPublisher {
     }
 
     /// Counts the frames of a batch, which have their estimates at `now`.
-    pub(super) fn note_frames(&mut self, batch: &[Received], now: Timestamp) {
+    pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
         frames.for_each(|received| self.latency.record(now.since(received.time)));
     }

@@ -17,7 +17,7 @@ use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::document::{CellStatus, StatusDocument, PackStatus};
+use super::document::{CellStatus, PackStatus, StatusDocument};
 use crate::alarm::Severity;
 use crate::io::socket::LinkState;
 use crate::monitor::Validity;
@@ -227,19 +227,19 @@ fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
         ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
         ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
-        (
-            "pack_temperature_max",
-            "celsius",
-            "Highest temperature, while all sensors are fresh",
-            pack.temperature_max_c,
-        ),
+        ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),
         ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
-        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", pack.remaining.remaining_cycles),
+        (
+            "pack_remaining_cycles",
+            "",
+            "Equivalent full cycles until its end of life, median",
+            pack.remaining.remaining_cycles,
+        ),
         (
             "pack_remaining_cycles_low",
             "",
@@ -295,7 +295,9 @@ const CELL_ROWS: &[CellRow] = &[
     ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
     ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
-    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| cell.remaining.remaining_cycles),
+    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| {
+        cell.remaining.remaining_cycles
+    }),
     ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| {
         cell.remaining.remaining_cycles_low
     }),

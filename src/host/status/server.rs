@@ -17,7 +17,7 @@ use tokio::time::{Instant, timeout};
 use super::counters::ClientCounts;
 use super::document::StatusDocument;
 use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, standard_path, stream_path};
-use crate::io::unix_socket::{BindError, Bound, SocketSetting, bind};
+use crate::io::unix_socket::{BindError, BoundSocket, SocketSetting, bind};
 use crate::monitor::Event;
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
@@ -165,7 +165,12 @@ struct ClientContext {
 }
 
 /// Runs the thread.
-fn run(path: PathBuf, context: ClientContext, drafts: mpsc::Receiver<Box<Draft>>, ready: &SyncSender<Result<(), BindError>>) {
+fn run(
+    path: PathBuf,
+    context: ClientContext,
+    drafts: mpsc::Receiver<Box<Draft>>,
+    ready: &SyncSender<Result<(), BindError>>,
+) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let served = runtime.map_err(BindError::Io).and_then(|runtime| {
         runtime.block_on(async {
@@ -182,7 +187,7 @@ fn run(path: PathBuf, context: ClientContext, drafts: mpsc::Receiver<Box<Draft>>
 }
 
 /// Serves until the loop drops the channel.
-async fn serve([once, stream]: [Bound; 2], context: &ClientContext, mut drafts: mpsc::Receiver<Box<Draft>>) {
+async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut drafts: mpsc::Receiver<Box<Draft>>) {
     let (published, latest) = watch::channel(None);
     let mut clients = JoinSet::new();
     let mut refusals = RefusalLog::default();
@@ -260,7 +265,8 @@ async fn admit(
 
 /// Sends one fresh document.
 async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
-    let fresh = latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
+    let fresh =
+        latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
     let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
         // The loop makes none, or has ended.
@@ -274,7 +280,8 @@ async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: 
 /// Sends every document from here on; a slow client misses some.
 async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     while latest.changed().await.is_ok() {
-        let fresh = latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < context.limits.stale);
+        let fresh =
+            latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < context.limits.stale);
         let line = fresh.map(|published| published.line);
         if let Some(line) = line
             && !send_line(&mut client, &line, &context).await

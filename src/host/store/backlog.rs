@@ -140,6 +140,9 @@ mod tests {
         backlog.put_back(taken);
         let again = backlog.take(&Stamp::replayed(Timestamp::ZERO));
         let rows: Vec<&HistoryRow> = again.iter().flat_map(|batch| &batch.rows).collect();
-        assert_eq!(rows, [1, 2].map(|cell| HistoryRow::Event(capacity(cell, Some(2.0), 2.0))).iter().collect::<Vec<_>>());
+        assert_eq!(
+            rows,
+            [1, 2].map(|cell| HistoryRow::Event(capacity(cell, Some(2.0), 2.0))).iter().collect::<Vec<_>>()
+        );
     }
 }

@@ -17,7 +17,9 @@ use super::row_sql::write_batch;
 use super::rows::{HistoryRow, RowBatch};
 use super::schema::{self, MIGRATIONS};
 use super::stamp::{BootId, Stamp};
-use super::state_slots::{ASIDE, STATE, StateRecord, StoredState, read_base, read_document, read_state, set_aside, write_state};
+use super::state_slots::{
+    ASIDE, STATE, StateRecord, StoredState, read_base, read_document, read_state, set_aside, write_state,
+};
 use crate::monitor::EventKind;
 
 /// Bytes of a page: a checkpoint changes few bytes, and whole pages are written.

@@ -130,7 +130,8 @@ impl Folder {
             match self.open_good(&path, now) {
                 Err(OpenError::Damaged(why)) => self.damaged = Some(why),
                 result => {
-                    return result.map(|opening| OpenedDatabase { is_sound: opening.is_sound && !was_replaced, ..opening });
+                    return result
+                        .map(|opening| OpenedDatabase { is_sound: opening.is_sound && !was_replaced, ..opening });
                 }
             }
         }

@@ -149,8 +149,10 @@ impl HistoryFilter {
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
             // Half of the interval's lower part: a little less than a standard deviation.
-            return self
-                .is_life_worth_writing(cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))), now);
+            return self.is_life_worth_writing(
+                cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
+                now,
+            );
         }
         let EventKind::Capacity {
             cell, measured_ah, capacity_ah, capacity_std_ah, usable_capacity_ah: usable_ah, ..

@@ -135,7 +135,12 @@ impl HistoryReader {
     ///
     /// # Errors
     /// When the file cannot be read.
-    pub fn for_each(&self, kind: HistoryTable, filter: &HistoryQuery, take: &mut dyn FnMut(HistoryEntry)) -> Result<(), String> {
+    pub fn for_each(
+        &self,
+        kind: HistoryTable,
+        filter: &HistoryQuery,
+        take: &mut dyn FnMut(HistoryEntry),
+    ) -> Result<(), String> {
         self.read(kind, filter, "ASC", take).map_err(|error| self.named(&error))
     }
 

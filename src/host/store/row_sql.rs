@@ -82,7 +82,8 @@ pub(super) fn write_row(
     let chained: Vec<Value> = moment.iter().chain(values).cloned().collect();
     meta.head.append(table, &chained);
     let own = [Value::Integer(meta.head.count), Value::Blob(meta.head.hash.to_vec())];
-    let sql = format!("INSERT INTO {} (seq, hash, moment, {columns}) VALUES (?1, ?2, ?3, {})", table.name(), placeholders(4));
+    let sql =
+        format!("INSERT INTO {} (seq, hash, moment, {columns}) VALUES (?1, ?2, ?3, {})", table.name(), placeholders(4));
     let bound = own.iter().chain(moment.iter().take(1)).chain(values);
     connection.prepare_cached(&sql)?.execute(rusqlite::params_from_iter(bound)).map(drop)
 }
@@ -96,7 +97,5 @@ fn replace_pack(connection: &Connection, meta: &mut Meta, stamp: &Stamp) -> rusq
     meta.pack += 1;
     // A state of the old pack must not come back.
     state_slots::forget_aside(connection)?;
-    connection
-        .execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns])
-        .map(drop)
+    connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns]).map(drop)
 }

@@ -302,7 +302,11 @@ impl Copier<'_> {
             Some((before, _)) if seq <= before => return Evidence::Refused,
             Some((before, before_hash)) if seq - 1 == before => {
                 let chained: Vec<Value> = row.moment.iter().chain(&row.values).cloned().collect();
-                if chain::link(&before_hash, table, seq, &chained) == hash { Evidence::Verified } else { Evidence::Refused }
+                if chain::link(&before_hash, table, seq, &chained) == hash {
+                    Evidence::Verified
+                } else {
+                    Evidence::Refused
+                }
             }
             _ => Evidence::Unchecked,
         };
@@ -338,7 +342,8 @@ impl Copier<'_> {
 
     /// Writes a row for every pack, unchanged where it can be read.
     fn copy_packs(&self, packs: &[PackRow]) -> rusqlite::Result<()> {
-        for PackRow { id, opened_ns, closed_ns, reason, identity } in packs.iter().filter(|pack| self.is_pack(pack.id)) {
+        for PackRow { id, opened_ns, closed_ns, reason, identity } in packs.iter().filter(|pack| self.is_pack(pack.id))
+        {
             self.connection.execute(
                 "INSERT OR REPLACE INTO pack (id, opened_ns, closed_ns, reason, identity) VALUES (?1, ?2, ?3, ?4, ?5)",
                 params![id, opened_ns, closed_ns, reason, identity],

@@ -36,7 +36,9 @@ fn a_failing_store_and_late_estimates_are_shown() {
     document.latency.frames += 100;
     let text = table(&document, false);
     assert!(
-        text.contains("store      CANNOT BE WRITTEN, 21 commits, 0.1 MB, 3 failed, 2 announced before they were stored\n"),
+        text.contains(
+            "store      CANNOT BE WRITTEN, 21 commits, 0.1 MB, 3 failed, 2 announced before they were stored\n"
+        ),
         "{text}"
     );
     assert!(text.contains("99 % of estimates within more than 1 s\n"), "{text}");

@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
+use crate::quantity::Timestamp;
 use crate::status::STALE;
 use crate::status::document::StatusDocument;
-use crate::quantity::Timestamp;
 
 /// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
@@ -154,7 +154,9 @@ impl App {
     /// Advances the time; drops a stale document.
     pub(super) fn poll(&mut self, now: Timestamp) {
         self.now = now;
-        if self.document.is_some() && self.received_at.is_some_and(|received_at| now.since(received_at) > STALE.as_secs_f64()) {
+        if self.document.is_some()
+            && self.received_at.is_some_and(|received_at| now.since(received_at) > STALE.as_secs_f64())
+        {
             self.lose("it sends no document".to_owned());
         }
     }
@@ -187,8 +189,10 @@ impl App {
                 points.pop_front();
             }
             // The plots are a few dots high, so single precision suffices.
-            points
-                .push_back(CellPoint { soc: cell.soc.map(|soc| soc as f32), voltage_v: cell.voltage_v.map(|v| v as f32) });
+            points.push_back(CellPoint {
+                soc: cell.soc.map(|soc| soc as f32),
+                voltage_v: cell.voltage_v.map(|v| v as f32),
+            });
         }
     }
 

@@ -7,11 +7,11 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::style::Color;
 
-use super::app::{HISTORY, FeedUpdate, Page};
+use super::app::{FeedUpdate, HISTORY, Page};
 use super::*;
-use crate::status::document::StatusDocument;
 use crate::cli::status::sample::sample;
 use crate::quantity::Timestamp;
+use crate::status::document::StatusDocument;
 
 fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)

@@ -1,16 +1,16 @@
 //! A sample document for tests: every value is present, except a few that are unknown.
 
-use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
-use crate::status::document::{
-    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
-    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
-};
-use crate::alarm::{Alarm, Rule, Severity, State};
+use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::LinkState;
 use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
+use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
+use crate::status::document::{
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
+    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
+};
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
 pub fn sample(cells: u16) -> StatusDocument {
@@ -149,7 +149,7 @@ fn alarms() -> AlarmStatus {
         rule: Rule::CapacityLow,
         severity: Severity::Severe,
         cell: Some(CellIndex(0)),
-        state: State::Active,
+        state: AlarmState::Active,
         value: Some(2.412),
         probability: Some(0.973),
         threshold: 2.5,
@@ -159,7 +159,8 @@ fn alarms() -> AlarmStatus {
         raised_value: Some(2.42),
         is_acknowledged: false,
     };
-    let past = Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: State::Cleared, ..raised };
+    let past =
+        Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: AlarmState::Cleared, ..raised };
     let past = Alarm { value: Some(0.632), threshold: 0.1, probability: None, is_acknowledged: true, ..past };
     AlarmStatus {
         thresholds: 4,

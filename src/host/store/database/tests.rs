@@ -19,7 +19,11 @@ fn batch(seconds: f64, kinds: &[EventKind]) -> RowBatch {
 }
 
 fn state(numbers: &[f64]) -> StateRecord {
-    StateRecord { parts: JsonParts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
+    StateRecord {
+        parts: JsonParts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(),
+        exact: false,
+        sets_aside: false,
+    }
 }
 
 fn open(folder: &Path) -> Database {
@@ -144,8 +148,10 @@ fn another_pack_closes_one_history_and_opens_the_next() {
         .collect();
     assert_eq!(packs, [(1, Some(9_000_000_000_000_000)), (2, None)]);
     drop(database);
-    let entries =
-        HistoryReader::open(folder.path()).unwrap().entries(&HistoryQuery { limit: Some(2), ..HistoryQuery::default() }).unwrap();
+    let entries = HistoryReader::open(folder.path())
+        .unwrap()
+        .entries(&HistoryQuery { limit: Some(2), ..HistoryQuery::default() })
+        .unwrap();
     assert_eq!(
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
         [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]

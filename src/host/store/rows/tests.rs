@@ -1,7 +1,7 @@
 //! Events as the tests of the store write them, and the rows they make.
 
 use super::*;
-use crate::alarm::{Change, Rule, Severity, State};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::quantity::{CellIndex, Mode};
 
 /// A capacity of a cell, measured or not.
@@ -52,7 +52,7 @@ pub(in crate::store) fn alarm(change: Change) -> EventKind {
         rule: Rule::SocLow,
         cell: None,
         change,
-        state: State::Active,
+        state: AlarmState::Active,
         active: true,
         severity: Severity::Warning,
         value: Some(0.05),
@@ -118,7 +118,17 @@ fn values_have_the_types_of_their_columns() {
         };
         let (threshold, occurrences, acknowledged) = (f64::NAN, 1, false);
         let kind = EventKind::Alarm {
-            rule, cell, change, state, active, severity, value, probability, threshold, occurrences, acknowledged,
+            rule,
+            cell,
+            change,
+            state,
+            active,
+            severity,
+            value,
+            probability,
+            threshold,
+            occurrences,
+            acknowledged,
         };
         let row = values(kind);
         assert_eq!((&row[1], &row[8]), (&text(rule.name()), &Value::Null), "SQLite has no NaN");

@@ -2,7 +2,7 @@
 
 use super::super::folder::DATABASE;
 use super::super::rows::tests::{capacity, half_cycle};
-use super::super::rows::{RowBatch, HistoryRow};
+use super::super::rows::{HistoryRow, RowBatch};
 use super::*;
 use crate::monitor::EventKind;
 
