@@ -15,6 +15,7 @@ use super::charge::{ChargeCounter, ChargeTotals};
 use super::config::{Limits, SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::signal::Signal;
+
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
 /// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
@@ -174,6 +175,11 @@ impl Sampler {
             bad_signals: 0,
             shared: SharedInputs::default(),
         }
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &SampleConfig {
+        &self.config
     }
 
     /// Replaces the limits of the same signals.
