@@ -1,7 +1,7 @@
 //! packwatch: streaming battery health monitoring over SocketCAN.
 //!
 //! # Map
-//! A lower layer never names a higher one; `tests/layering.rs` holds the code to this table.
+//! A lower layer never names a higher one; `tests/integration/layering.rs` holds the code to this table.
 //!
 //! | layer | module | what lives there |
 //! | --- | --- | --- |
@@ -18,7 +18,7 @@
 //! | 3 | [`doctor`] | what is probably wrong with the wiring or the configuration, from what comes over the bus |
 //! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
 //! | 4 | [`config`] | TOML to checked settings, all faults at once |
-//! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
+//! | 5 | [`io`], [`store`], [`status`], [`service`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
 //! | 5 | `lab` | measured files against truth, remaining life of capacity histories, Gaussian processes on files, plots (feature `lab`) |
 //! | 6 | [`cli`] | one file per command |
 //!
