@@ -18,15 +18,15 @@ pub use table::{Missing, PartColumn, Table, Wanted};
 pub use trained::{Trained, write_predictions};
 
 use crate::io::result_file::ResultFile;
-use crate::regress::{self, Folds, Rows, Score, Settings, Watcher};
+use crate::regress::{self, Folds, GprSettings, PredictionScore, ProgressCallback, TrainingRows};
 
 /// Why there is no regression.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct GprError(pub String);
 
-impl From<regress::Fault> for GprError {
-    fn from(fault: regress::Fault) -> Self {
+impl From<regress::RegressionError> for GprError {
+    fn from(fault: regress::RegressionError) -> Self {
         Self(fault.to_string())
     }
 }
@@ -45,7 +45,7 @@ pub struct Validated {
     /// Predictions of all rows, and the folds.
     pub folds: Folds,
     /// Errors over all rows.
-    pub score: Score,
+    pub score: PredictionScore,
     /// Time of the whole experiment with this kernel, s.
     pub seconds: f64,
     /// Most memory the process held meanwhile, KiB; `None` where the system does not say.
@@ -65,12 +65,12 @@ pub fn split(table: &Table) -> (Vec<f64>, Vec<f64>) {
 /// Too few rows for the folds, settings out of range, or the watcher gave up.
 pub fn cross_validate(
     table: &Table,
-    settings: &Settings,
+    settings: &GprSettings,
     folds: usize,
-    watcher: &mut Watcher<'_>,
+    watcher: &mut ProgressCallback<'_>,
 ) -> Result<Validated, GprError> {
     let (inputs, targets) = split(table);
-    let rows = Rows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
+    let rows = TrainingRows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
     forget_peak();
     let begin = Instant::now();
     let folds = regress::cross_validate(&rows, settings, folds, &|| begin.elapsed().as_secs_f64(), watcher)?;

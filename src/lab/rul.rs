@@ -17,10 +17,10 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, RemainingLife, Usage};
+
 pub use history::{History, HistoryError, Row};
 pub use truth::end_of_life;
-
-use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not decide a mean.
 pub const WORST_ERROR: f64 = 1.0;
@@ -241,7 +241,7 @@ fn fed(history: &History, moment: f64) -> Forecast {
             forecast.update(Usage { cycles, days, rest_days }, None);
             break;
         }
-        let reading = Reading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        let reading = CapacityReading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
         forecast.update(passed, Some(reading));
         before = *row;
     }

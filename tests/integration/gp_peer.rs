@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
-use packwatch::regress::{Basis, Form, Model, Rows, Settings, fit};
+use packwatch::regress::{Basis, Form, GprSettings, Model, TrainingRows, fit};
 
 /// Rows and what our fit may take of scikit-learn's time.
 const BARS: [(usize, f64, usize); 2] = [(2000, 0.8, 7), (5000, 0.6, 3)];
@@ -88,11 +88,11 @@ fn case(oracle: &mut Oracle, rows: usize, folder: &Path) -> Case {
 
 /// The oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
 fn ours(case: &Case, threads: usize) -> Model {
-    let mut settings = Settings::new("exponential".parse().unwrap(), case.targets.len());
+    let mut settings = GprSettings::new("exponential".parse().unwrap(), case.targets.len());
     (settings.basis, settings.form, settings.threads) = (Basis::Zero, Form::Exact, threads);
     (settings.standardise, settings.calibrate, settings.max_iterations) = (false, false, 0);
     settings.start = vec![1.5, 1.0, 0.1];
-    let rows = Rows { inputs: &case.inputs, dimensions: 3, targets: &case.targets, lines: &[] };
+    let rows = TrainingRows { inputs: &case.inputs, dimensions: 3, targets: &case.targets, lines: &[] };
     fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 

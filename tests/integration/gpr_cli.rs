@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
 use packwatch::lab::gpr::{Missing, PartColumn, Table, Trained, Wanted};
-use packwatch::regress::{Form, Settings};
+use packwatch::regress::{Form, GprSettings};
 use serde_json::Value;
 
 fn gpr(folder: &Path, args: &[&str]) -> std::process::Output {
@@ -126,7 +126,7 @@ fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
         let wanted = Wanted { columns: &columns, optional: &[], missing: Missing::Refused };
         Table::read(&[folder.join(name)], &wanted, &PartColumn::None).unwrap()
     };
-    let mut settings = Settings::new("matern32".parse().unwrap(), 200);
+    let mut settings = GprSettings::new("matern32".parse().unwrap(), 200);
     settings.form = match form {
         "exact" => Form::Exact,
         "nearest" => Form::Nearest { neighbours: 40 },

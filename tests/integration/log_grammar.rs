@@ -392,7 +392,7 @@ fn csv_rows_become_frames_and_bad_fields_are_reported_with_their_column() {
     assert_eq!((counts.lines, counts.frames, counts.bad_lines), (6, 3, 3));
     let first = counts.first_bad_line.expect("shown");
     assert!(
-        first.ends_with("a.csv:4: column current_a: found \"NaN\", expected a finite number or an empty field"),
+        first.ends_with("a.csv:4: column current_a: found \"NaN\", must be a finite number or an empty field"),
         "{first}"
     );
     let data = |record: &Record| match record {

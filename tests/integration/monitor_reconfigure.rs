@@ -4,7 +4,7 @@ use crate::support::rig::{Rig, learned, load};
 use packwatch::alarm::{AlarmState, Change, Rule, Severity};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
-use packwatch::health::{Axis, Forecast, Reading, Usage};
+use packwatch::health::{Axis, CapacityReading, Forecast, Usage};
 use packwatch::monitor::{Command, Downtime, EventKind, Input, Monitor, MonitorConfig};
 use packwatch::quantity::CellIndex;
 
@@ -118,7 +118,7 @@ fn another_end_of_life_is_not_judged_by_the_remaining_life_to_the_old_one() {
     for cycle in 0..60 {
         let passed = Usage { cycles: 1.0, days: 0.5, rest_days: 0.0 };
         let capacity_ah = 2.6 - 0.004 * f64::from(cycle);
-        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+        forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
     }
     let mut stored = serde_json::to_value(rig.monitor.snapshot()).unwrap();
     (0..2).for_each(|cell| stored["cells"][cell]["forecast"] = serde_json::to_value(&forecast).unwrap());

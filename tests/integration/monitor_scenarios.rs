@@ -61,7 +61,7 @@ impl Bench {
     }
     fn truth(&mut self, i: f64, dt: f64) -> f64 {
         self.soc = circuit::soc_after(self.soc, i * dt, self.capacity_ah);
-        let place = self.config.model.place(self.soc, 25.0);
+        let place = self.config.model.grid_position(self.soc, 25.0);
         let b = circuit::BranchAt::new(&self.config.model, 0, &place, 1.0);
         self.u1 = b.voltage_after(Discretisation::Exact, self.u1, i, dt);
         circuit::terminal_v(&self.config.model, &place, 1.0, self.u1, i)

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use super::super::score::write_table;
 use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
-use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
+use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
@@ -29,7 +29,7 @@ impl Bar {
     }
 
     /// A step of a search; `before` fits are done beside those of this cross-validation.
-    pub(super) fn show(&self, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
+    pub(super) fn show(&self, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
         let part = (p.search - 1) * p.max_iterations + p.iteration;
         let whole = (p.searches * p.max_iterations).max(1);
         let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
@@ -64,7 +64,7 @@ fn form_note(of: Form, default_form: bool) -> String {
     format!("form {}{why}", form(of))
 }
 
-fn basis(settings: &Settings) -> String {
+fn basis(settings: &GprSettings) -> String {
     format!("{:?}", settings.basis).to_lowercase()
 }
 
@@ -103,7 +103,7 @@ pub(super) fn short(value: f64) -> String {
 /// A cross-validation.
 pub(super) struct Cv<'a> {
     pub(super) table: &'a Table,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a GprSettings,
     pub(super) folds: usize,
     pub(super) all: &'a [Validated],
     pub(super) default_form: bool,
@@ -259,7 +259,7 @@ pub(super) struct Predict<'a> {
     pub(super) trained: &'a Trained,
     pub(super) table: &'a Table,
     pub(super) known: usize,
-    pub(super) score: Option<Score>,
+    pub(super) score: Option<PredictionScore>,
 }
 
 impl Predict<'_> {

@@ -9,7 +9,7 @@ use super::batch::CellBatch;
 use super::{Estimate, MonitorConfig};
 use crate::cell::{CellStep, EstimatorBank};
 use crate::filter::ScalarGaussian;
-use crate::health::{CellEnd, Learner};
+use crate::health::{CellCondition, Learner};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::sample::CellSample;
 
@@ -221,6 +221,6 @@ pub(super) fn resistance(bank: &EstimatorBank, index: usize) -> ScalarGaussian {
 }
 
 /// Where a half-cycle that begins or ends now begins or ends for a cell.
-pub(super) fn end_state(bank: &EstimatorBank, index: usize) -> CellEnd {
-    CellEnd { soc: bank.filtered_soc(index), load_v: bank.load_v(index) }
+pub(super) fn end_state(bank: &EstimatorBank, index: usize) -> CellCondition {
+    CellCondition { soc: bank.filtered_soc(index), load_v: bank.load_v(index) }
 }

@@ -15,7 +15,7 @@ use crate::can::encode::HealthFields;
 use crate::cell::{CellEstimator, CellModel, EstimatorBank};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
-use crate::health::transition::Observed;
+use crate::health::transition::TransitionOutcome;
 use crate::health::usable::usable_capacity;
 use crate::health::{
     CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
@@ -124,7 +124,7 @@ impl Learning {
     }
 
     /// Takes the pack current into the mode detector; `None` = stale.
-    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>) -> Observed {
+    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
         self.state.detector.observe(&self.config.transition, now, current_a)
     }
 

@@ -10,7 +10,8 @@ use super::publisher::Publisher;
 use crate::alarm::{Observation, Rule};
 use crate::cell::CellModel;
 use crate::health::{
-    Axis, CapacityUpdate, Forecast, HalfCycle, HealthConfig, InsufficientData, Reading, Remaining, RemainingLife, Usage,
+    Axis, CapacityReading, CapacityUpdate, Forecast, HalfCycle, HealthConfig, InsufficientData, Remaining,
+    RemainingLife, Usage,
 };
 use crate::quantity::CellIndex;
 
@@ -48,7 +49,11 @@ impl CellLife {
         let reading = update.and_then(|update| {
             let z = update.measurement?;
             let gain_ah = config.capacity.current_gain_std * update.capacity.mean;
-            Some(Reading { capacity_ah: z.value, variance_ah2: z.variance, shared_variance_ah2: gain_ah * gain_ah })
+            Some(CapacityReading {
+                capacity_ah: z.value,
+                variance_ah2: z.variance,
+                shared_variance_ah2: gain_ah * gain_ah,
+            })
         });
         self.forecast.update(usage, reading);
         self.restate(config);

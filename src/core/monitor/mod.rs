@@ -192,7 +192,7 @@ impl Monitor {
                 stages.step_waiting(taken, was_brief, out);
             }
             let config = *stages.estimation.bank.config();
-            stages.estimation.bank.change_all(|estimator| estimator.note_away(&config, away_s));
+            stages.estimation.bank.change_all(|estimator| estimator.note_downtime(&config, away_s));
         }
         if beginning != Beginning::New {
             stages.restate_known(taken, was_brief, out);

@@ -223,7 +223,7 @@ impl Stages {
         self.observe_current(now, None, out);
         self.publisher(now, out).apply(AlarmInput::Gap);
         self.learning.state.recharge.interrupt();
-        self.estimation.bank.change_all(crate::cell::CellEstimator::note_asleep);
+        self.estimation.bank.change_all(crate::cell::CellEstimator::note_sleep);
         self.forget_pack_state();
     }
 

@@ -116,7 +116,7 @@ impl Stages {
         let sampler = &self.sampling.sampler;
         let silence_s = sampler.silence_s(channel, now);
         // Without a reading since waking there is neither silence nor its end.
-        let has_reading = sampler.heard_since_waking(channel);
+        let has_reading = sampler.has_input_since_waking(channel);
         let is_missing = |silence: &f64| self.alarming.missing_after_s.is_some_and(|limit| *silence > limit);
         // The share before a silence says nothing about what is missing now.
         let share = sampler.bad_share(channel).filter(|_| has_reading && !sampler.is_silent(channel, now));
@@ -198,7 +198,7 @@ impl Stages {
         for cell in self.estimation.cell_indices() {
             let is_fresh = self.sampling.sampler.is_fresh(self.sampling.voltage_channel(cell), now);
             // A voltage that came before the first current says nothing yet.
-            let is_present = is_fresh && !bank.is_of_before(cell.index());
+            let is_present = is_fresh && !bank.is_carried_over(cell.index());
             let Some(soc) = bank.soc(cell.index()).filter(|_| is_present) else { continue };
             known += 1;
             spread = Some(match spread {

@@ -20,7 +20,9 @@ use std::time::Instant;
 pub use windows::{Steps, Windows};
 
 use super::{GprError, Table, create, finish};
-use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
+use crate::regress::{
+    GprSettings, Jitter, Model, Prediction, PredictionScore, ProgressCallback, TrainingRows, fit, score,
+};
 use spread::Spread;
 
 /// Most lagged values of a column.
@@ -56,7 +58,7 @@ pub struct Plan {
     /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
     pub rows: usize,
     /// Kernel and search.
-    pub settings: Settings,
+    pub settings: GprSettings,
 }
 
 /// What came of it.
@@ -101,7 +103,7 @@ pub struct Horizon {
     /// Rows after the origin from which forecasts were made, and the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
     /// Their errors; `None` when nothing comes after the origin.
-    pub score: Option<Score>,
+    pub score: Option<PredictionScore>,
     /// Root of the mean squared error of "it stays as it is" over the same rows.
     pub persistence_rmse: Option<f64>,
 }
@@ -126,7 +128,7 @@ pub fn horizons(steps: usize) -> Vec<usize> {
 pub fn run(
     table: &Table,
     plan: &Plan,
-    watcher: &mut Watcher<'_>,
+    watcher: &mut ProgressCallback<'_>,
     done: &mut dyn FnMut(usize, usize),
 ) -> Result<Forecast, GprError> {
     check(plan)?;
@@ -175,7 +177,12 @@ struct Task<'a> {
 }
 
 impl Task<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(Horizon, Model), GprError> {
+    fn run(
+        &self,
+        start: &[f64],
+        from: usize,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<(Horizon, Model), GprError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
@@ -218,7 +225,7 @@ impl Task<'_> {
         end: usize,
         start: &[f64],
         fixed: Option<&[f64]>,
-        watcher: &mut Watcher<'_>,
+        watcher: &mut ProgressCallback<'_>,
     ) -> Result<Option<(Model, usize)>, GprError> {
         let known = self.windows.between(0, end, self.steps);
         if known.len() < self.fewest() {
@@ -227,7 +234,7 @@ impl Task<'_> {
         let rows = chosen(&known, self.plan.rows);
         let inputs = self.windows.features(&rows);
         let targets: Vec<f64> = rows.iter().map(|row| self.windows.change(*row, self.column, self.steps)).collect();
-        let mut settings = Settings { calibrate: false, ..self.plan.settings.clone() };
+        let mut settings = GprSettings { calibrate: false, ..self.plan.settings.clone() };
         if let Some(fixed) = fixed {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
@@ -235,12 +242,12 @@ impl Task<'_> {
             settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
             settings.restarts = 0;
         }
-        let rows = Rows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
+        let rows = TrainingRows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
     /// From forecasts of block after block by what came before it.
-    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, GprError> {
+    fn spread(&self, model: &Model, watcher: &mut ProgressCallback<'_>) -> Result<Spread, GprError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
@@ -281,7 +288,7 @@ impl Task<'_> {
         Ok(rows.iter().zip(windows).zip(found).map(value).collect())
     }
 
-    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<Score>, Option<f64>) {
+    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<PredictionScore>, Option<f64>) {
         if held_out.is_empty() {
             return (None, None);
         }

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::{GprError, Table, create, finish, split, table, write_text};
-use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
+use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
 
 /// What the first line says it is.
 const FORMAT: &str = "packwatch gpr";
@@ -42,10 +42,10 @@ impl Trained {
     ///
     /// # Errors
     /// Too few rows, settings out of range, no positive definite matrix, or the watcher gave up.
-    pub fn fit(table: &Table, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
+    pub fn fit(table: &Table, settings: &GprSettings, watcher: &mut ProgressCallback<'_>) -> Result<Self, GprError> {
         let (inputs, targets) = split(table);
         let width = table.width();
-        let rows = Rows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
+        let rows = TrainingRows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
         let model = fit(&rows, settings, watcher)?;
         Ok(Self { output: table.names[width - 1].clone(), inputs: table.names[..width - 1].to_vec(), model })
     }

@@ -7,8 +7,9 @@ use std::collections::BTreeMap;
 
 use super::data::{Data, Learned};
 use super::{Setting, pictures};
+
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, Usage, Reading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
 /// Deviation of the current sensor's gain where no configuration tells one: what `capacity.current_gain_std` is by default.
@@ -111,10 +112,10 @@ pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
     cells
 }
 
-fn reading(row: &Learned, gain_std: f64) -> Option<Reading> {
+fn reading(row: &Learned, gain_std: f64) -> Option<CapacityReading> {
     let (capacity_ah, std_ah) = row.measured_ah.zip(row.measured_std_ah)?;
     let gain_ah = gain_std * row.capacity_ah.0;
-    Some(Reading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
+    Some(CapacityReading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
 /// From the last half-cycle until the last moment the end of life may come, within reason.

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use std::sync::{LazyLock, Mutex};
 
 use assert_cmd::Command;
-use packwatch::config;
 use packwatch::diagnosis::{self, Interrupt};
 use packwatch::doctor::{Doctor, Report};
 use packwatch::io::csv_log::CsvOptions;
@@ -233,14 +232,14 @@ impl Broken {
     /// One that has heard nothing yet.
     pub(crate) fn doctor(&self) -> Doctor {
         let folder = tempfile::tempdir().unwrap();
-        Doctor::new(config::survey(&self.write(folder.path())).unwrap().plan)
+        Doctor::new(diagnosis::survey(&self.write(folder.path())).unwrap().plan)
     }
 
     /// What the doctor says.
     pub(crate) fn report(&self) -> Report {
         let folder = tempfile::tempdir().unwrap();
         let path = self.write(folder.path());
-        let survey = config::survey(&path).unwrap();
+        let survey = diagnosis::survey(&path).unwrap();
         let logs = [folder.path().join("pack.log")];
         let (report, _) =
             diagnosis::replay(&survey, &logs, CsvOptions::default(), None, &Interrupt::default(), &mut |_| {}).unwrap();
