@@ -4,7 +4,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::setting::{Setting, ValueFault, ValueRange};
-use crate::alarm::When;
+use crate::alarm::Comparison;
 
 /// A value to compare with: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
