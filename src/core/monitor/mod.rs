@@ -37,6 +37,15 @@ mod statistics;
 mod view;
 mod watch;
 
+use clock::{ASLEEP_S, Clock, TimeJump};
+use intake::Intake;
+use snapshot::{Beginning, PendingRestore};
+use stages::Stages;
+use watch::HOUSEKEEPING_S;
+
+use crate::can::Frame;
+use crate::quantity::{BusIndex, Reading, Timestamp};
+
 pub use config::MonitorConfig;
 pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
@@ -48,15 +57,6 @@ pub use sender::{MAX_TEST_S, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
 pub use statistics::{AlarmCounts, BusStatistics, Statistics};
 pub use view::{CellView, PackView};
-
-use clock::{ASLEEP_S, Clock, TimeJump};
-use intake::Intake;
-use snapshot::{Beginning, PendingRestore};
-use stages::Stages;
-use watch::HOUSEKEEPING_S;
-
-use crate::can::Frame;
-use crate::quantity::{BusIndex, Reading, Timestamp};
 
 /// The pure core.
 #[derive(Debug)]

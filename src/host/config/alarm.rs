@@ -4,6 +4,7 @@ use super::document::Faults;
 use super::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
 use super::tables::RawTables;
 use super::threshold::{Level, Threshold};
+
 use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 

@@ -14,6 +14,7 @@ use super::schema::section;
 use super::setting::ValueRange::{self, Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
 use super::threshold::Threshold;
+
 use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
