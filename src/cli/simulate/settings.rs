@@ -1,4 +1,4 @@
-//! What the command line changes in a scenario's settings.
+//! Changes of a scenario's settings by the command line.
 
 use crate::cli::Failure;
 use crate::sim::{Hysteresis, Scenario, Settings};
@@ -27,8 +27,8 @@ impl From<Name> for Scenario {
     }
 }
 
-/// Every change; what is not given stays as the scenario has it. Amounts of a scenario (currents, losses) are stated
-/// for its source's cell and scale with the capacity.
+/// All changes; without one the scenario's setting applies. Amounts of a scenario (currents, losses) are stated for its
+/// source's cell and scale with the capacity.
 #[derive(Debug, clap::Args)]
 pub(super) struct Changes {
     /// Seed of all randomness
@@ -109,7 +109,7 @@ pub(super) struct Changes {
 }
 
 impl Changes {
-    /// Changes `settings` as told.
+    /// Applies the changes to `settings`.
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);

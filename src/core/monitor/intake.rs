@@ -36,8 +36,8 @@ impl Intake {
     /// Other bounds and checks for the same messages: what is counted and under way goes on.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
-        self.gate = new.gate.going_on_from(&self.gate);
-        self.guards = new.guards.going_on_from(&self.guards);
+        self.gate = new.gate.inheriting(&self.gate);
+        self.guards = new.guards.inheriting(&self.guards);
     }
 
     /// `None` = the frame is dropped; otherwise whether its readings may be used.

@@ -6,21 +6,21 @@
 use std::fmt::Write as _;
 
 use super::attributes::{
-    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FRAME_FORMAT, FRAME_FORMATS, NO_YES,
-    profile_index,
+    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FIRST_FD_FORMAT, FRAME_FORMAT, FRAME_FORMATS,
+    NO_YES, profile_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
 use crate::can::signal::{ByteOrder, ValueType};
 
-/// What stands for no node.
-const NOBODY: &str = "Vector__XXX";
+/// Name of no node.
+const NO_NODE: &str = "Vector__XXX";
 
 /// Longest cycle time an editor will accept, ms: an hour.
 const MAX_CYCLE_TIME_MS: u32 = 3_600_000;
 
 impl Database {
-    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as those that were read do.
+    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as after reading.
     pub fn to_dbc(&self) -> String {
         let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_:");
         for node in &self.nodes {
@@ -42,11 +42,11 @@ impl Database {
         text
     }
 
-    /// The DBC as bytes: one per character, as DBC tools expect, unless a character or their sequence forbids it.
+    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 where Latin-1 cannot hold the text.
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        // Bytes that happen to be good UTF-8 would be read as that.
+        // Latin-1 bytes that happen to be valid UTF-8 would be read as UTF-8.
         latin
             .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
             .unwrap_or_else(|| text.into_bytes())
@@ -61,7 +61,7 @@ impl Database {
             let _ = writeln!(text, "CM_ \"{}\";", quoted(comment));
         }
         for message in &self.messages {
-            let id = number(message.id);
+            let id = message.id.dbc_number();
             for signal in &message.signals {
                 if let Some(comment) = &signal.comment {
                     let _ = writeln!(text, "CM_ SG_ {id} {} \"{}\";", signal.name, quoted(comment));
@@ -81,7 +81,7 @@ impl Database {
         let formats = format!("ENUM {}", words(&FRAME_FORMATS));
         list.add(FRAME_FORMAT, &formats, &words(&FRAME_FORMATS[..1]), |m| {
             let (extended, fd) = (matches!(m.id, CanId::Extended(_)), is_fd(m));
-            has_format(m).then(|| (usize::from(extended) + if fd { 14 } else { 0 }).to_string())
+            has_format(m).then(|| (usize::from(extended) + if fd { FIRST_FD_FORMAT } else { 0 }).to_string())
         });
         list.add(BIT_RATE_SWITCH, &format!("ENUM {}", words(&NO_YES)), &words(&NO_YES[..1]), |m| match m.format {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
@@ -101,7 +101,7 @@ impl Database {
 
     fn value_tables(&self, text: &mut String) {
         for (message, signal) in self.signals().filter(|(_, signal)| !signal.values.is_empty()) {
-            let _ = write!(text, "VAL_ {} {}", number(message.id), signal.name);
+            let _ = write!(text, "VAL_ {} {}", message.id.dbc_number(), signal.name);
             for (code, name) in &signal.values {
                 let _ = write!(text, " {code} \"{}\"", quoted(name));
             }
@@ -116,12 +116,12 @@ impl Database {
                 ValueType::Float32 => 1,
                 ValueType::Float64 => 2,
             };
-            let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", number(message.id), signal.name);
+            let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", message.id.dbc_number(), signal.name);
         }
     }
 }
 
-/// Writes attributes that some message has.
+/// Writes the attributes that a message has.
 struct Attributes<'a> {
     messages: &'a [Message],
     text: &'a mut String,
@@ -129,7 +129,7 @@ struct Attributes<'a> {
 
 impl Attributes<'_> {
     fn add(&mut self, name: &str, kind: &str, default: &str, value: impl Fn(&Message) -> Option<String>) {
-        let values = self.messages.iter().filter_map(|message| Some((number(message.id), value(message)?)));
+        let values = self.messages.iter().filter_map(|message| Some((message.id.dbc_number(), value(message)?)));
         let values: Vec<_> = values.collect();
         if values.is_empty() {
             return;
@@ -146,15 +146,7 @@ fn words(words: &[&str]) -> String {
     quoted.join(",")
 }
 
-/// The identifier as a DBC writes it: bit 31 says extended.
-fn number(id: CanId) -> u32 {
-    match id {
-        CanId::Standard(id) => u32::from(id),
-        CanId::Extended(id) => id | 0x8000_0000,
-    }
-}
-
-/// A text that no quote ends too early. A text that was read has its quotes escaped already.
+/// The text with its quotes escaped. A text that was read has escaped quotes already.
 fn quoted(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -170,8 +162,8 @@ fn quoted(text: &str) -> String {
 }
 
 fn write_message(message: &Message, text: &mut String) {
-    let sender = message.sender.as_deref().unwrap_or(NOBODY);
-    let _ = writeln!(text, "BO_ {} {}: {} {sender}", number(message.id), message.name, message.len_bytes);
+    let sender = message.sender.as_deref().unwrap_or(NO_NODE);
+    let _ = writeln!(text, "BO_ {} {}: {} {sender}", message.id.dbc_number(), message.name, message.len_bytes);
     for signal in &message.signals {
         let layout = &signal.layout;
         let order = match layout.byte_order {
@@ -182,7 +174,7 @@ fn write_message(message: &Message, text: &mut String) {
             ValueType::Unsigned => '+',
             ValueType::Signed | ValueType::Float32 | ValueType::Float64 => '-',
         };
-        let receivers = if signal.receivers.is_empty() { NOBODY.to_owned() } else { signal.receivers.join(",") };
+        let receivers = if signal.receivers.is_empty() { NO_NODE.to_owned() } else { signal.receivers.join(",") };
         let _ = writeln!(
             text,
             " SG_ {}{} : {}|{}@{order}{sign} ({},{}) [{}|{}] \"{}\" {receivers}",
@@ -210,7 +202,7 @@ fn indicator(signal: &Signal) -> String {
     }
 }
 
-/// Whether `m3` does not say all: ranges, nested multiplexors, or several side by side.
+/// Whether `m3` is not sufficient: ranges, nested multiplexors, or several next to each other.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.multiplex.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.multiplex.conditions.is_empty());
@@ -227,7 +219,7 @@ fn write_ranges(message: &Message, text: &mut String) {
         let Some(condition) = signal.multiplex.conditions.last() else { continue };
         let Some(selector) = message.signals.get(condition.selector) else { continue };
         let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| format!("{low}-{high}")).collect();
-        let (id, ranges) = (number(message.id), ranges.join(", "));
+        let (id, ranges) = (message.id.dbc_number(), ranges.join(", "));
         let _ = writeln!(text, "SG_MUL_VAL_ {id} {} {} {ranges};", signal.name, selector.name);
     }
 }
