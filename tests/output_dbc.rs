@@ -13,8 +13,8 @@ use packwatch::alarm::Rule;
 use packwatch::can::dbc::Database;
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
-    AlarmFields, LayoutBase, Command, CommandPlan, E2eSetting, HealthFields, LayoutSettings, MessageSettings, OutputPlan,
-    SendCounters, StatusFields, layout,
+    AlarmFields, Command, CommandPlan, E2eSetting, HealthFields, LayoutBase, LayoutSettings, MessageSettings,
+    OutputPlan, SendCounters, StatusFields, layout,
 };
 use packwatch::can::{CanId, Frame, FrameKind};
 use packwatch::quantity::{CellIndex, Mode};

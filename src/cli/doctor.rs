@@ -15,9 +15,9 @@ use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 use crate::config::{self, Survey};
 use crate::diagnosis::{self, Interrupt};
-use crate::replay::Progress;
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
+use crate::replay::Progress;
 
 /// Longest time to listen, s: a day.
 const MAX_SECONDS: f64 = 86_400.0;

@@ -131,7 +131,7 @@ impl Sink {
 
 /// The scenario's defaults for the configured cell, with what the command line changes.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
-    let capacity_ah = args.changes.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
+    let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
     let mut settings = Settings::of(args.scenario.into(), capacity_ah);
     let series = cells_in_series(&config.monitor.sample);
     settings.pack.cells = series;

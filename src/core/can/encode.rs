@@ -18,24 +18,3 @@ pub use layout::{
 };
 pub use output::{AlarmFields, HealthFields, OutputPlan, PlanFaults, SendCounters, StatusFields};
 pub use protector::InputProtector;
-
-use crate::can::{CanId, Frame, MAX_DATA};
-
-/// Payload lengths of CAN FD above 8 bytes.
-const FD_STEPS: [usize; 7] = [12, 16, 20, 24, 32, 48, 64];
-
-/// Whether a frame, classic or FD, can have exactly this length.
-fn is_frame_length(len: usize) -> bool {
-    len <= 8 || FD_STEPS.contains(&len)
-}
-
-/// An FD frame of at least `len` bytes, rounded up to a length FD has. `None` beyond 64.
-fn fd_frame(id: CanId, brs: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Frame> {
-    let step = if len <= 8 { len } else { FD_STEPS.into_iter().find(|step| *step >= len)? };
-    Frame::fd(id, brs, false, payload.get(..step)?)
-}
-
-/// A frame of at least `len` bytes: classic up to 8, FD above. `None` beyond 64.
-fn frame_of(id: CanId, len: usize, payload: &[u8; MAX_DATA]) -> Option<Frame> {
-    if len <= 8 { Frame::classic(id, payload.get(..len)?) } else { fd_frame(id, false, len, payload) }
-}

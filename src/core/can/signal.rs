@@ -90,22 +90,22 @@ pub enum LayoutFault {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalPlan {
     /// First byte of the eight-byte window that is loaded.
-    window: u8,
+    pub(crate) window: u8,
     /// Bytes the payload must have.
     bytes_needed: u8,
     /// The signal touches nine bytes: the window is widened to sixteen.
     wide: bool,
-    byte_order: ByteOrder,
+    pub(crate) byte_order: ByteOrder,
     value_type: ValueType,
     /// Shift that brings the signal's top bit to the word's top.
-    up: u8,
+    pub(crate) up: u8,
     /// Shift that then brings its lowest bit to the word's bottom; 64 - length.
-    down: u8,
-    factor: f64,
-    offset: f64,
+    pub(crate) down: u8,
+    pub(crate) factor: f64,
+    pub(crate) offset: f64,
     /// Physical limits widened by half a code, so that rounding in factor and offset never rejects a code on the limit.
-    low: f64,
-    high: f64,
+    pub(crate) low: f64,
+    pub(crate) high: f64,
     /// Codes (sign-extended) within both the DBC's range and the bits.
     low_code: i128,
     high_code: i128,
@@ -273,20 +273,16 @@ impl SignalPlan {
         usize::from(self.bytes_needed)
     }
 
-    /// Compact form for reading: integers of at most 63 bits within eight bytes; `None` for any other signal.
-    pub(crate) fn shifts(&self) -> Option<Shifts> {
+    /// Whether it is an integer of at most 63 bits within eight bytes.
+    pub(crate) fn is_simple(&self) -> bool {
         let is_integer = matches!(self.value_type, ValueType::Unsigned | ValueType::Signed);
-        (is_integer && !self.wide && self.down > 0).then_some(Shifts {
-            window: self.window,
-            is_big_endian: self.byte_order == ByteOrder::BigEndian,
-            is_signed: self.value_type == ValueType::Signed,
-            up: self.up,
-            down: self.down,
-            factor: self.factor,
-            offset: self.offset,
-            low: self.low,
-            high: self.high,
-        })
+        is_integer && !self.wide && self.down > 0
+    }
+
+    /// Smallest and largest code the bits of a simple signal can hold.
+    pub(crate) fn codes(&self) -> (i64, i64) {
+        let highest = (u64::MAX >> self.down).cast_signed();
+        if self.value_type == ValueType::Signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 
     /// Length of the signal in bits, 1 to 64.
@@ -485,32 +481,6 @@ impl SignalPlan {
         };
         let bytes = changed(padded(payload, from));
         payload.iter_mut().skip(from).zip(bytes).for_each(|(to, byte)| *to = byte);
-    }
-}
-
-/// Position and meaning of an integer signal of at most 63 bits within eight bytes.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Shifts {
-    /// First of the eight bytes.
-    pub(crate) window: u8,
-    pub(crate) is_big_endian: bool,
-    pub(crate) is_signed: bool,
-    /// Brings the signal's top bit to the word's top.
-    pub(crate) up: u8,
-    /// Then brings its lowest bit to the word's bottom.
-    pub(crate) down: u8,
-    pub(crate) factor: f64,
-    pub(crate) offset: f64,
-    /// Smallest and largest physical value in the DBC's unit.
-    pub(crate) low: f64,
-    pub(crate) high: f64,
-}
-
-impl Shifts {
-    /// Smallest and largest code the bits can hold.
-    pub(crate) fn codes(&self) -> (i64, i64) {
-        let highest = (u64::MAX >> self.down).cast_signed();
-        if self.is_signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 }
 

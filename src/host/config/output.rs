@@ -11,7 +11,7 @@ use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::{Profile, Protection};
-use crate::can::encode::{LayoutBase, E2eSetting, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, layout};
+use crate::can::encode::{E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, layout};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;

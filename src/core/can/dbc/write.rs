@@ -75,28 +75,49 @@ impl Database {
 
     fn attributes(&self, text: &mut String) {
         let is_fd = |message: &Message| message.format != FrameFormat::Classic;
-        let has_format = |message: &Message| is_fd(message) || matches!(message.id, CanId::Extended(_));
-        let mut list = Attributes { messages: &self.messages, text };
-        list.add(CYCLE_TIME, &format!("INT 0 {MAX_CYCLE_TIME_MS}"), "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()));
-        let formats = format!("ENUM {}", words(&FRAME_FORMATS));
-        list.add(FRAME_FORMAT, &formats, &words(&FRAME_FORMATS[..1]), |m| {
-            let (extended, fd) = (matches!(m.id, CanId::Extended(_)), is_fd(m));
-            has_format(m).then(|| (usize::from(extended) + if fd { FIRST_FD_FORMAT } else { 0 }).to_string())
-        });
-        list.add(BIT_RATE_SWITCH, &format!("ENUM {}", words(&NO_YES)), &words(&NO_YES[..1]), |m| match m.format {
+        let format = |m: &Message| {
+            let place = usize::from(matches!(m.id, CanId::Extended(_))) + if is_fd(m) { FIRST_FD_FORMAT } else { 0 };
+            (place > 0).then(|| place.to_string())
+        };
+        let rate = |m: &Message| match m.format {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
-        });
-        let profiles = format!("ENUM {}", words(&E2E_PROFILES));
-        list.add(E2E_PROFILE, &profiles, &words(&E2E_PROFILES[..1]), |m| {
-            m.e2e.map(|e2e| profile_index(e2e.profile).to_string())
-        });
-        list.add(E2E_DATA_ID, "INT 0 65535", "0", |m| m.e2e.map(|e2e| e2e.data_id.to_string()));
+        };
+        let cycle_time = format!("INT 0 {MAX_CYCLE_TIME_MS}");
+        self.attribute(CYCLE_TIME, &cycle_time, "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()), text);
+        self.choice(FRAME_FORMAT, &FRAME_FORMATS, format, text);
+        self.choice(BIT_RATE_SWITCH, &NO_YES, rate, text);
+        self.choice(E2E_PROFILE, &E2E_PROFILES, |m| Some(profile_index(m.e2e?.profile).to_string()), text);
+        self.attribute(E2E_DATA_ID, "INT 0 65535", "0", |m| Some(m.e2e?.data_id.to_string()), text);
         if self.messages.iter().any(is_fd) {
             text.push_str(
                 "BA_DEF_ \"BusType\" STRING ;\nBA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_ \"BusType\" \"CAN FD\";\n",
             );
         }
+    }
+
+    /// Defines an attribute and writes its values, if a message has one.
+    fn attribute(
+        &self,
+        name: &str,
+        kind: &str,
+        default: &str,
+        value: impl Fn(&Message) -> Option<String>,
+        text: &mut String,
+    ) {
+        let values = self.messages.iter().filter_map(|message| Some((message.id.dbc_number(), value(message)?)));
+        for (index, (id, value)) in values.enumerate() {
+            if index == 0 {
+                let _ = writeln!(text, "BA_DEF_ BO_ \"{name}\" {kind};\nBA_DEF_DEF_ \"{name}\" {default};");
+            }
+            let _ = writeln!(text, "BA_ \"{name}\" BO_ {id} {value};");
+        }
+    }
+
+    /// An attribute with a choice between words; the first is the default.
+    fn choice(&self, name: &str, words: &[&str], value: impl Fn(&Message) -> Option<String>, text: &mut String) {
+        let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
+        self.attribute(name, &format!("ENUM {}", quoted.join(",")), &quoted[0], value, text);
     }
 
     fn value_tables(&self, text: &mut String) {
@@ -119,31 +140,6 @@ impl Database {
             let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", message.id.dbc_number(), signal.name);
         }
     }
-}
-
-/// Writes the attributes that a message has.
-struct Attributes<'a> {
-    messages: &'a [Message],
-    text: &'a mut String,
-}
-
-impl Attributes<'_> {
-    fn add(&mut self, name: &str, kind: &str, default: &str, value: impl Fn(&Message) -> Option<String>) {
-        let values = self.messages.iter().filter_map(|message| Some((message.id.dbc_number(), value(message)?)));
-        let values: Vec<_> = values.collect();
-        if values.is_empty() {
-            return;
-        }
-        let _ = writeln!(self.text, "BA_DEF_ BO_ \"{name}\" {kind};\nBA_DEF_DEF_ \"{name}\" {default};");
-        for (id, value) in values {
-            let _ = writeln!(self.text, "BA_ \"{name}\" BO_ {id} {value};");
-        }
-    }
-}
-
-fn words(words: &[&str]) -> String {
-    let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
-    quoted.join(",")
 }
 
 /// The text with its quotes escaped. A text that was read has escaped quotes already.

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use super::{Binding, Channel, MuxTest, Reading};
 use crate::can::Frame;
 use crate::can::id_table::IdTable;
-use crate::can::signal::{Shifts, SignalPlan, float_of_signed};
+use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::quantity::{BusIndex, Fault};
 
 /// Most codes of a selector with a table: ten bits. Selectors have 4 to 8.
@@ -74,10 +74,10 @@ struct BitPosition {
 }
 
 impl BitPosition {
-    fn new(shifts: &Shifts) -> Self {
-        let order = u8::from(shifts.is_big_endian);
-        let word = if shifts.window == 0 { order } else { FAR + order };
-        Self { word, window: shifts.window, up: shifts.up, down: shifts.down }
+    fn new(plan: &SignalPlan) -> Self {
+        let order = u8::from(plan.byte_order == ByteOrder::BigEndian);
+        let word = if plan.window == 0 { order } else { FAR + order };
+        Self { word, window: plan.window, up: plan.up, down: plan.down }
     }
 }
 
@@ -246,11 +246,11 @@ impl PageTable {
         let selector = runs.iter().flat_map(tests).map(|test| test.plan).max_by_key(|plan| dependents(*plan))?;
         let highest = runs.iter().flat_map(tests).filter(|test| test.plan == selector).flat_map(|test| &test.ranges);
         let codes = highest.map(|(_, high)| high.saturating_add(1)).max()?;
-        if codes > MAX_CODES {
+        if codes > MAX_CODES || !selector.is_simple() {
             return None;
         }
         let mut pages = Self {
-            selector: BitPosition::new(&selector.shifts()?),
+            selector: BitPosition::new(&selector),
             bytes_needed: runs.iter().flat_map(tests).map(|test| test.plan.bytes_needed()).max()?,
             codes: Vec::new(),
             groups: Vec::new(),
@@ -303,21 +303,21 @@ impl FastSignal {
             shift,
         };
         let is_regular = scale.is_finite() && scale != 0.0 && shift.is_finite();
-        let Some(shifts) = binding.plan.shifts().filter(|_| is_regular) else { return nothing };
-        let limits = [shifts.low, shifts.high, binding.range.0, binding.range.1];
-        if limits.iter().any(|limit| limit.is_nan()) {
+        let plan = &binding.plan;
+        let limits = [plan.low, plan.high, binding.range.0, binding.range.1];
+        if !is_regular || !plan.is_simple() || limits.iter().any(|limit| limit.is_nan()) {
             return nothing;
         }
-        let sign = if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 };
-        let good = good_codes(binding, &shifts).and_then(|good| available_codes(binding, sign, good));
+        let sign = if plan.value_type() == ValueType::Signed { 1 << (63 - plan.down) } else { 0 };
+        let good = good_codes(binding).and_then(|good| available_codes(binding, sign, good));
         let Some((first, last)) = good else { return nothing };
         Self {
-            position: BitPosition::new(&shifts),
+            position: BitPosition::new(plan),
             sign,
             first_good: first.cast_unsigned().wrapping_add(sign),
             more_good: first.abs_diff(last),
-            factor: shifts.factor,
-            offset: shifts.offset,
+            factor: plan.factor,
+            offset: plan.offset,
             ..nothing
         }
     }
@@ -347,15 +347,15 @@ fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> O
 
 /// The first and the last code with a value within both ranges. Every step from the code to the value keeps the order (or
 /// reverses it), rounding included, so that the good codes are neighbours and bisection finds their ends exactly.
-fn good_codes(binding: &Binding, shifts: &Shifts) -> Option<(i64, i64)> {
-    let physical = |code: i64| float_of_signed(code) * shifts.factor + shifts.offset;
+fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
+    let plan = &binding.plan;
+    let physical = |code: i64| float_of_signed(code) * plan.factor + plan.offset;
     let value = |code: i64| physical(code) * binding.scale + binding.offset;
-    let (lowest, highest) = shifts.codes();
+    let (lowest, highest) = plan.codes();
     let is_rising = |of: &dyn Fn(i64) -> f64| of(lowest) <= of(highest);
     let mut good = (lowest, highest);
     type Map<'a> = &'a dyn Fn(i64) -> f64;
-    let both: [(Map<'_>, f64, f64); 2] =
-        [(&physical, shifts.low, shifts.high), (&value, binding.range.0, binding.range.1)];
+    let both: [(Map<'_>, f64, f64); 2] = [(&physical, plan.low, plan.high), (&value, binding.range.0, binding.range.1)];
     for (of, low, high) in both {
         // Along rising values: first not below the lower limit, then above the upper one.
         let (first, end) = if is_rising(of) {

@@ -8,7 +8,6 @@
 
 use std::collections::BTreeMap;
 
-use super::frame_of;
 use crate::can::decode::{Binding, Channel, InputMap};
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
@@ -134,7 +133,7 @@ impl InputPage {
             let code = field.code(given.get(&field.channel).copied().flatten())?;
             field.plan.encode_raw(&mut payload, code).ok()?;
         }
-        frame_of(self.id, self.len, &payload)
+        Frame::padded(self.id, self.len, &payload)
     }
 }
 

@@ -10,10 +10,9 @@
 
 use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Signal};
 use crate::can::e2e::{Profile, Protection};
+use crate::can::frame::is_frame_length;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
-
-use super::is_frame_length;
 
 /// Names of the signals that the protection writes; no value of the daemon has one of these.
 pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble"];

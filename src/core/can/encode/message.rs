@@ -4,11 +4,11 @@
 
 use crate::can::dbc::{Database, FrameFormat, Message, Signal};
 use crate::can::e2e::Protection;
+use crate::can::frame::is_frame_length;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
 use super::layout::{DEFAULT_PERIOD_MS, HEADER_SIGNALS};
-use super::{fd_frame, is_frame_length};
 
 /// One message to send.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,7 +109,7 @@ impl OutputMessage {
         }
         let frame = match self.format {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
-            FrameFormat::Fd { brs } => fd_frame(self.id, brs, self.len, &payload),
+            FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, self.len, &payload),
         };
         frame.unwrap_or_else(|| empty_frame(self.id))
     }
