@@ -8,8 +8,8 @@
 //! Half the interval is factor x spread x standard deviation. Held-out rows are not used. Too few rows give the Gaussian
 //! interval.
 
-use super::nearest::StandardisedRows;
 use super::kd_tree::Tree;
+use super::scale::StandardisedRows;
 
 /// Nominal coverage of the interval.
 pub(super) const LEVEL: f64 = 0.95;
@@ -90,7 +90,7 @@ fn inverse_deviations(inputs: &[f64], data: &StandardisedRows) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Basis;
+    use crate::basis::Basis;
 
     fn data(rows: usize) -> StandardisedRows {
         let inputs = (0..rows).map(|k| k as f64).collect();

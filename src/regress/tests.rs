@@ -2,7 +2,8 @@
 
 use std::ops::ControlFlow;
 
-use super::nearest::{StandardisedRows, ConditionalFactors};
+use super::nearest::ConditionalFactors;
+use super::scale::StandardisedRows;
 use super::plan::Plan;
 use super::*;
 
