@@ -8,8 +8,8 @@
 mod axis;
 mod files;
 mod heat;
-mod state_bands;
 mod plot;
+mod state_bands;
 mod style;
 mod svg;
 mod thin;
@@ -17,8 +17,8 @@ mod thin;
 pub use axis::{Axis, Scale};
 pub use files::{Format, PlotError, write, write_stack};
 pub use heat::Heat;
-pub use state_bands::{Lane, Lanes, Span};
 pub use plot::{Chart, Layer, Point, Shape};
+pub use state_bands::{Lane, Lanes, Span};
 pub use style::{Ink, variables};
 pub use svg::escape;
 

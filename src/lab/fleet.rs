@@ -7,9 +7,9 @@
 pub mod drive;
 pub mod export;
 pub mod judge;
-mod variant_batch;
 mod track;
 pub mod truth;
+mod variant_batch;
 pub mod variants;
 pub mod whatif;
 

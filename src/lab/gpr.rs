@@ -18,7 +18,7 @@ pub use table::{Missing, PartColumn, Table, Wanted};
 pub use trained::{Trained, write_predictions};
 
 use crate::io::result_file::ResultFile;
-use crate::regress::{self, Folds, TrainingRows, PredictionScore, GprSettings, ProgressCallback};
+use crate::regress::{self, Folds, GprSettings, PredictionScore, ProgressCallback, TrainingRows};
 
 /// Why there is no regression.
 #[derive(Debug, thiserror::Error)]

@@ -17,10 +17,10 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, RemainingLife, Usage};
+
 pub use history::{History, HistoryError, Row};
 pub use truth::end_of_life;
-
-use crate::health::{Axis, Forecast, Usage, CapacityReading, RemainingLife, InsufficientData};
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not decide a mean.
 pub const WORST_ERROR: f64 = 1.0;

@@ -99,7 +99,12 @@ struct Block {
 }
 
 impl Posterior {
-    pub(super) fn new(data: &StandardisedRows, plan: &Plan, theta: &[f64], points: &[f64]) -> Result<Self, RegressionError> {
+    pub(super) fn new(
+        data: &StandardisedRows,
+        plan: &Plan,
+        theta: &[f64],
+        points: &[f64],
+    ) -> Result<Self, RegressionError> {
         let values = plan.values(theta);
         let (d, m) = (data.dimensions, points.len() / data.dimensions);
         let columns = by_column(points, d);
@@ -346,7 +351,12 @@ fn add_square(b: &mut [f64], v: &[f64], m: usize) {
 }
 
 /// Factor of `k(Z, Z)`, and the jitter on its diagonal, as part of it.
-fn factor_of_points(plan: &Plan, values: &Values, points: &[f64], columns: &[f64]) -> Result<(Vec<f64>, f64), RegressionError> {
+fn factor_of_points(
+    plan: &Plan,
+    values: &Values,
+    points: &[f64],
+    columns: &[f64],
+) -> Result<(Vec<f64>, f64), RegressionError> {
     let d = plan.dimensions;
     let m = points.len() / d;
     let mut matrix = vec![0.0; m * m];

@@ -33,6 +33,7 @@ mod exact;
 mod folds;
 mod inducing;
 mod jitter;
+mod kd_tree;
 mod kernel;
 mod linear_algebra;
 mod minimise;

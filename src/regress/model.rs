@@ -137,7 +137,11 @@ impl Posterior {
 }
 
 /// Fits a process to rows. Calls `watcher` after every step; it can end the fit.
-pub fn fit(rows: &TrainingRows, settings: &GprSettings, watcher: &mut ProgressCallback) -> Result<Model, RegressionError> {
+pub fn fit(
+    rows: &TrainingRows,
+    settings: &GprSettings,
+    watcher: &mut ProgressCallback,
+) -> Result<Model, RegressionError> {
     check(rows)?;
     let job = FitJob::new(rows, settings)?;
     let (theta, iterations) = if settings.max_iterations == 0 { (job.first_start()?, 0) } else { job.search(watcher)? };
@@ -191,7 +195,9 @@ impl<'a> FitJob<'a> {
         if given.len() != count || given.iter().any(|value| !(value.is_finite() && *value > 0.0)) {
             return Err(RegressionError::range("start", format!("{given:?}"), format!("{count} positive numbers")));
         }
-        let unit = |role| if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 };
+        let unit = |role| {
+            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
+        };
         Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / unit(p.role)).ln()).collect())
     }
 
@@ -296,7 +302,8 @@ impl<'a> FitJob<'a> {
                 Ok((Posterior::Exact(Box::new(posterior)), value, jitter))
             }
             Form::Nearest { neighbours } => {
-                let factors = ConditionalFactors::new(&data, evenly_spaced(data.len(), usize::MAX), &metric, neighbours);
+                let factors =
+                    ConditionalFactors::new(&data, evenly_spaced(data.len(), usize::MAX), &metric, neighbours);
                 let sums = factors.sums(&data, &plan, &theta, false)?;
                 let posterior = nearest::Posterior::new(data, plan, &theta, sums.coefficients, neighbours);
                 Ok((Posterior::Nearest(Box::new(posterior)), sums.value, sums.jitter))
@@ -345,7 +352,10 @@ pub(super) fn threads(count: usize) -> Result<ThreadPool, RegressionError> {
     if count == 0 || count > MAX_THREADS {
         return Err(RegressionError::range("threads", count, format!("1 to {MAX_THREADS}")));
     }
-    rayon::ThreadPoolBuilder::new().num_threads(count).build().map_err(|error| RegressionError::Threads(error.to_string()))
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(count)
+        .build()
+        .map_err(|error| RegressionError::Threads(error.to_string()))
 }
 
 fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionError> {
@@ -353,9 +363,11 @@ fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionE
         return Err(RegressionError::range("restarts", settings.restarts, format!("at most {MAX_RESTARTS}")));
     }
     match settings.form {
-        Form::Exact if rows > MAX_EXACT_ROWS => {
-            Err(RegressionError::range("rows of an exact fit", rows, format!("at most {MAX_EXACT_ROWS}; take a sparse form")))
-        }
+        Form::Exact if rows > MAX_EXACT_ROWS => Err(RegressionError::range(
+            "rows of an exact fit",
+            rows,
+            format!("at most {MAX_EXACT_ROWS}; take a sparse form"),
+        )),
         Form::Nearest { neighbours } if neighbours == 0 || neighbours > MAX_NEIGHBOURS => {
             Err(RegressionError::range("neighbours", neighbours, format!("1 to {MAX_NEIGHBOURS}")))
         }
@@ -383,7 +395,11 @@ impl Model {
             // The square of a very distant input overflows.
             if let Some(row) = found.iter().position(|(mean, variance)| !mean.is_finite() || !variance.is_finite()) {
                 let far = format!("{:?}", &inputs[row * d..(row + 1) * d]);
-                return Err(RegressionError::range(&format!("inputs of row {}", row + 1), far, "nearer to the model's rows"));
+                return Err(RegressionError::range(
+                    &format!("inputs of row {}", row + 1),
+                    far,
+                    "nearer to the model's rows",
+                ));
             }
             let rows = queries.par_chunks_exact(d).with_min_len(64);
             Ok(found
@@ -412,7 +428,9 @@ impl Model {
     /// Fitted hyperparameters; the noise is the last. The same order serves as a start ([`GprSettings::start`]).
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
-        let unit = |role| if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 };
+        let unit = |role| {
+            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
+        };
         let named = plan.parameters.into_iter().zip(&self.theta);
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * unit(p.role) }).collect()
     }

@@ -72,7 +72,13 @@ impl ConditionalFactors {
     }
 
     /// Minus the log density of the rows given their neighbours, its gradient (if requested) and the coefficients.
-    pub(super) fn sums(&self, data: &StandardisedRows, plan: &Plan, theta: &[f64], with_gradient: bool) -> Result<LikelihoodSums, RegressionError> {
+    pub(super) fn sums(
+        &self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        theta: &[f64],
+        with_gradient: bool,
+    ) -> Result<LikelihoodSums, RegressionError> {
         let values = plan.values(theta);
         let size = data.basis.size(data.dimensions);
         let width = size + 1;
@@ -96,7 +102,14 @@ impl ConditionalFactors {
         Ok(LikelihoodSums { value, gradient, coefficients, jitter })
     }
 
-    fn gradient(&self, data: &StandardisedRows, plan: &Plan, values: &Values, factors: &[Vec<ConditionalFactor>], beta: &[f64]) -> Vec<f64> {
+    fn gradient(
+        &self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        values: &Values,
+        factors: &[Vec<ConditionalFactor>],
+        beta: &[f64],
+    ) -> Vec<f64> {
         let count = plan.parameters.len();
         let parts: Vec<Vec<f64>> = (self.neighbours.par_chunks(CHUNK))
             .zip(self.rows.par_chunks(CHUNK).zip(factors))
@@ -167,7 +180,14 @@ impl Scratch {
         Ok(part)
     }
 
-    fn factor(&mut self, data: &StandardisedRows, plan: &Plan, values: &Values, row: u32, near: &[u32]) -> Result<ConditionalFactor, RegressionError> {
+    fn factor(
+        &mut self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        values: &Values,
+        row: u32,
+        near: &[u32],
+    ) -> Result<ConditionalFactor, RegressionError> {
         self.gather(data, row, near);
         let n = self.rows.len();
         let kernel = plan.evaluate(values, &self.squares, n * (n - 1) / 2 + 1, &mut self.work);
@@ -188,7 +208,14 @@ impl Scratch {
         Ok(ConditionalFactor { q, a, jitter })
     }
 
-    fn add_gradient(&mut self, plan: &Plan, values: &Values, factor: &ConditionalFactor, beta: &[f64], gradient: &mut [f64]) {
+    fn add_gradient(
+        &mut self,
+        plan: &Plan,
+        values: &Values,
+        factor: &ConditionalFactor,
+        beta: &[f64],
+        gradient: &mut [f64],
+    ) {
         let (q, n) = (&factor.q, factor.q.len());
         let mut a = factor.a[..n].to_vec();
         for (k, coefficient) in beta.iter().enumerate() {
@@ -289,14 +316,24 @@ pub(super) struct Posterior {
 }
 
 impl Posterior {
-    pub(super) fn new(data: StandardisedRows, plan: Plan, theta: &[f64], coefficients: Coefficients, neighbours: usize) -> Self {
+    pub(super) fn new(
+        data: StandardisedRows,
+        plan: Plan,
+        theta: &[f64],
+        coefficients: Coefficients,
+        neighbours: usize,
+    ) -> Self {
         let values = plan.values(theta);
         let tree = Tree::new(&data.inputs, &plan.metric(&values));
         Self { data, plan, values, coefficients, neighbours, tree }
     }
 
     /// Mean and variance of the function at standardised rows; row `excluded[k]` is left out of query `k`.
-    pub(super) fn predict(&self, queries: &[f64], excluded: Option<&[u32]>) -> Result<Vec<(f64, f64)>, RegressionError> {
+    pub(super) fn predict(
+        &self,
+        queries: &[f64],
+        excluded: Option<&[u32]>,
+    ) -> Result<Vec<(f64, f64)>, RegressionError> {
         let d = self.data.dimensions;
         let parts: Vec<Result<Vec<(f64, f64)>, RegressionError>> = (queries.par_chunks(CHUNK * d).enumerate())
             .map_init(Scratch::default, |scratch, (chunk, rows)| {

@@ -95,9 +95,9 @@ impl Plan {
             Node::Sum(children) => {
                 PlanStep::Sum(children.iter().enumerate().map(|(k, child)| self.add(child, scaled || k > 0)).collect())
             }
-            Node::Product(children) => {
-                PlanStep::Product(children.iter().enumerate().map(|(k, child)| self.add(child, scaled && k == 0)).collect())
-            }
+            Node::Product(children) => PlanStep::Product(
+                children.iter().enumerate().map(|(k, child)| self.add(child, scaled && k == 0)).collect(),
+            ),
         };
         self.steps.push(step);
         self.steps.len() - 1

@@ -104,7 +104,10 @@ impl Model {
         }
         if header.version != VERSION {
             let newer = if header.version > VERSION { "; a newer packwatch wrote it" } else { "" };
-            return Err(RegressionError::Saved(format!("line 1: version = {}, must be {VERSION}{newer}", header.version)));
+            return Err(RegressionError::Saved(format!(
+                "line 1: version = {}, must be {VERSION}{newer}",
+                header.version
+            )));
         }
         let body = rest.trim_end_matches(['\n', '\r']);
         let found = checksum(body);

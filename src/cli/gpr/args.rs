@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::cli::Failure;
 use crate::io::result_file::check_place;
 use crate::lab::gpr::Missing;
-use crate::regress::{Basis, Form, Kernel, MAX_INDUCING, MAX_NEIGHBOURS, GprSettings};
+use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
 
 /// Below the options.
 pub(super) const GRAMMAR: &str = "\

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use super::super::score::write_table;
 use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
-use crate::regress::{Fold, Form, Hyperparameter, Jitter, FitProgress, PredictionScore, GprSettings};
+use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;

@@ -42,13 +42,25 @@ impl BranchAt {
 }
 
 /// Terminal voltage under `current_a` with the branches' voltages summed in `branches_v`.
-pub fn terminal_v(model: &CellModel, position: &GridPosition, resistance_ratio: f64, branches_v: f64, current_a: f64) -> f64 {
+pub fn terminal_v(
+    model: &CellModel,
+    position: &GridPosition,
+    resistance_ratio: f64,
+    branches_v: f64,
+    current_a: f64,
+) -> f64 {
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
 /// Terminal voltage of a cell at `state` = (SOC, resistance ratio, capacity in Ah) whose open-circuit curve has shifted
 /// with the lost capacity ([`CellModel::ocv_soc`]).
-pub fn aged_terminal_v(model: &CellModel, state: (f64, f64, f64), temperature: &TemperaturePosition, branches_v: f64, current_a: f64) -> f64 {
+pub fn aged_terminal_v(
+    model: &CellModel,
+    state: (f64, f64, f64),
+    temperature: &TemperaturePosition,
+    branches_v: f64,
+    current_a: f64,
+) -> f64 {
     let (soc, resistance_ratio, capacity_ah) = state;
     let position = model.grid_position_at(temperature, soc);
     if model.ocv_ageing_shift == 0.0 {

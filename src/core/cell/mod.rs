@@ -11,4 +11,6 @@ pub mod model;
 
 pub use config::{CapacityState, Discretisation, EstimatorConfig};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
-pub use model::{Branch, CellModel, ERROR_WINDOW_S, MAX_BRANCHES, GridPosition, TemperaturePosition, Table, Thermal, arrhenius};
+pub use model::{
+    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
+};

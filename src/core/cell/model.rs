@@ -188,7 +188,8 @@ impl CellModel {
     /// Slope of the open-circuit voltage over SOC, V per unit of SOC.
     pub fn ocv_slope_v(&self, position: &GridPosition) -> f64 {
         let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
-        position.temperature.between(position.temperature.along_t, rise) / (self.soc[position.s + 1] - self.soc[position.s])
+        position.temperature.between(position.temperature.along_t, rise)
+            / (self.soc[position.s + 1] - self.soc[position.s])
     }
 
     /// Series resistance of a new cell, ohm.

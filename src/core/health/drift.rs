@@ -13,7 +13,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::CapacityConfig;
-use crate::filter::{ScalarGaussian, Measurement};
+use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 
 /// Random walk of the offset in a full cycle, part of its first standard deviation: sensors drift with temperature.

@@ -17,8 +17,8 @@ use serde::{Deserialize, Serialize};
 use super::drift::DriftFilter;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
-use crate::filter::{ScalarGaussian, Measurement};
-use crate::quantity::{Mode, Timestamp, InvalidState};
+use crate::filter::{Measurement, ScalarGaussian};
+use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Smallest swing in the variance of a half-cycle's ends: below it the measurement has no use.
 const MIN_WEIGHED_SWING: f64 = 0.02;
@@ -453,7 +453,8 @@ mod tests {
         let mut config = config();
         (config.end_error_v, config.end_load_error, config.ageing_shift_error) = (0.004, 0.1, 0.5);
         let model = small_model();
-        let mark = |soc, load_v| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v, ..CellMark::default() };
+        let mark =
+            |soc, load_v| CellMark { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v, ..CellMark::default() };
         let moved = half_cycle(1.0, 3600.0, &mark(0.9, 0.03), &mark(0.4, 0.0));
         // Slopes at 25 C, 5/8 between the rows of 0 and 40 C: 1.075 V above 0.5, 1.325 V below. A tenth of 2 Ah is lost.
         let (start_v2, end_v2) = (0.004 * 0.004 + 0.003 * 0.003, 0.004 * 0.004);

@@ -16,7 +16,7 @@ pub mod usable;
 pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
-pub use forecast::{Axis, Forecast, Usage, CapacityReading, Remaining, RemainingLife, InsufficientData};
+pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 pub use learner::{CapacityUpdate, CellCondition, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
 pub use recharge::{ChargeRecord, RechargeTimer};

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use super::RechargeConfig;
 use crate::filter::ScalarGaussian;
-use crate::quantity::{Mode, Timestamp, InvalidState};
+use crate::quantity::{InvalidState, Mode, Timestamp};
 
 /// Times the pack's SOC through the window during charges.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -117,7 +117,10 @@ impl RechargeTimer {
 /// Time that the reference current needs for the window of a pack of `capacity` (Ah), s.
 pub fn normalised_period(config: &RechargeConfig, capacity: ScalarGaussian) -> ScalarGaussian {
     let seconds_per_ah = 3600.0 * (config.to_soc - config.from_soc) / config.reference_current_a;
-    ScalarGaussian { mean: seconds_per_ah * capacity.mean, variance: seconds_per_ah * seconds_per_ah * capacity.variance }
+    ScalarGaussian {
+        mean: seconds_per_ah * capacity.mean,
+        variance: seconds_per_ah * seconds_per_ah * capacity.variance,
+    }
 }
 
 /// Time at which the line between two points rises through `level`.

@@ -181,7 +181,12 @@ fn half_cycle_event(cell: CellIndex, half_cycle: &HalfCycle) -> EventKind {
     }
 }
 
-fn capacity_event(cell: CellIndex, usable: Option<ScalarGaussian>, resistance: ScalarGaussian, update: &CapacityUpdate) -> EventKind {
+fn capacity_event(
+    cell: CellIndex,
+    usable: Option<ScalarGaussian>,
+    resistance: ScalarGaussian,
+    update: &CapacityUpdate,
+) -> EventKind {
     EventKind::Capacity {
         cell,
         measured_ah: update.measurement.map(|z| z.value),

@@ -5,8 +5,11 @@
 //! goes in as the shared part of the deviation.
 
 use super::{CellSlot, Event, EventKind, Monitor, MonitorConfig, Outputs};
+
 use crate::alarm::{Observation, Rule};
-use crate::health::{Axis, CapacityUpdate, Forecast, HalfCycle, Usage, CapacityReading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{
+    Axis, CapacityReading, CapacityUpdate, Forecast, HalfCycle, InsufficientData, Remaining, RemainingLife, Usage,
+};
 use crate::quantity::CellIndex;
 
 /// Deviations of a normal distribution between its median and its 5 % quantile.
@@ -44,7 +47,11 @@ impl CellLife {
         let reading = update.and_then(|update| {
             let z = update.measurement?;
             let gain_ah = config.health.capacity.current_gain_std * update.capacity.mean;
-            Some(CapacityReading { capacity_ah: z.value, variance_ah2: z.variance, shared_variance_ah2: gain_ah * gain_ah })
+            Some(CapacityReading {
+                capacity_ah: z.value,
+                variance_ah2: z.variance,
+                shared_variance_ah2: gain_ah * gain_ah,
+            })
         });
         self.forecast.update(passed, reading);
         self.restate(config);

@@ -9,13 +9,13 @@ use super::intake::IntakeState;
 use super::life::CellLife;
 use super::steps::CellBatch;
 use super::{
-    Downtime, CellSlot, Consumed, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, MonitorConfig, Outputs, Statistics,
+    CellSlot, Consumed, Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, MonitorConfig, Outputs, Statistics,
 };
 use crate::alarm::{AlarmState, StoredAlarm};
 use crate::cell::{CellEstimator, CellState};
 use crate::filter::ScalarGaussian;
 use crate::health::{Axis, Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
-use crate::quantity::{Timestamp, InvalidState};
+use crate::quantity::{InvalidState, Timestamp};
 use crate::sample::{CellSample, SamplerState};
 
 /// Layout version of [`Snapshot`].

@@ -121,7 +121,12 @@ impl std::str::FromStr for Downtime {
         match text {
             "-" => Ok(Self::AsStamped),
             "unknown" => Ok(Self::Unknown),
-            _ => text.parse().ok().filter(|s: &f64| s.is_finite() && *s >= 0.0).map(Self::Seconds).ok_or(DowntimeParseError),
+            _ => text
+                .parse()
+                .ok()
+                .filter(|s: &f64| s.is_finite() && *s >= 0.0)
+                .map(Self::Seconds)
+                .ok_or(DowntimeParseError),
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{Monitor, Statistics, Validity};
 use crate::filter::ScalarGaussian;
-use crate::health::{RemainingLife, InsufficientData};
+use crate::health::{InsufficientData, RemainingLife};
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 

@@ -11,7 +11,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::quantity::{Timestamp, InvalidState};
+use crate::quantity::{InvalidState, Timestamp};
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -79,7 +79,8 @@ impl ChargeCounter {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let ChargeTotals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
         let all = [charge_as, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
-        all.into_iter().try_for_each(|found| InvalidState::unless_number("the counted charge, a time or its current", found))
+        all.into_iter()
+            .try_for_each(|found| InvalidState::unless_number("the counted charge, a time or its current", found))
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {

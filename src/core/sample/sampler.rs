@@ -15,7 +15,7 @@ use super::charge::{ChargeCounter, ChargeTotals};
 use super::config::{Limits, SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::signal::Signal;
-use crate::quantity::{CellIndex, Channel, Fault, Reading, SensorIndex, Timestamp, InvalidState};
+use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
 /// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
 /// sensor at rest, below any load under which a voltage or temperature has to move.

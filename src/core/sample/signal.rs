@@ -15,7 +15,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::config::Limits;
-use crate::quantity::{Fault, Timestamp, InvalidState};
+use crate::quantity::{Fault, InvalidState, Timestamp};
 
 /// Consecutive readings that must agree on a new level: two could be one disturbance.
 pub const ACCEPT_AFTER: u32 = 3;

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::{FitFailure, Outcome};
-use crate::ident::pass::residuals;
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use crate::ident::pass::residuals;
 
 /// Most panels; a page of more is not looked at.
 const MAX_PANELS: usize = 40;

@@ -20,11 +20,11 @@ use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned}
 use self::table::TableFile;
 use super::drive::{Driven, Reading, drive};
 use crate::config::Config;
-use crate::status::document::ConfigFile;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
+use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 

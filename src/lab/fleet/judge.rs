@@ -18,9 +18,9 @@
 
 use serde::Serialize;
 
-use super::variant_batch::{AlarmHistory, Raise};
 use super::track::Track;
 use super::truth::{Truth, TruthKind};
+use super::variant_batch::{AlarmHistory, Raise};
 use crate::alarm::{Rule, RuleConfig};
 use crate::quantity::Timestamp;
 

@@ -11,8 +11,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::io::{lines, stamp};
-use crate::score::CycleTable;
 use crate::quantity::{CellIndex, Timestamp};
+use crate::score::CycleTable;
 
 /// A change of the capacity smaller than this part of it is not kept.
 const KEPT_CHANGE: f64 = 2e-4;

@@ -10,9 +10,9 @@ use serde::Serialize;
 
 use super::drive::{Driven, Reading, drive};
 use super::judge::{Horizon, Judged, Life, judge};
-use super::variant_batch::Lanes;
 use super::track::{Learned, Track};
 use super::truth::{Truth, TruthKind};
+use super::variant_batch::Lanes;
 use super::variants::Grid;
 use crate::alarm::{Rule, Severity};
 use crate::config::Config;

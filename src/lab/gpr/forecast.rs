@@ -20,7 +20,9 @@ use std::time::Instant;
 pub use windows::{Steps, Windows};
 
 use super::{GprError, Table, create, finish};
-use crate::regress::{Jitter, Model, Prediction, TrainingRows, PredictionScore, GprSettings, ProgressCallback, fit, score};
+use crate::regress::{
+    GprSettings, Jitter, Model, Prediction, PredictionScore, ProgressCallback, TrainingRows, fit, score,
+};
 use spread::Spread;
 
 /// Most lagged values of a column.
@@ -175,7 +177,12 @@ struct Task<'a> {
 }
 
 impl Task<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut ProgressCallback<'_>) -> Result<(Horizon, Model), GprError> {
+    fn run(
+        &self,
+        start: &[f64],
+        from: usize,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<(Horizon, Model), GprError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());

@@ -8,7 +8,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::{GprError, Table, create, finish, split, table, write_text};
-use crate::regress::{Model, Prediction, TrainingRows, GprSettings, ProgressCallback, fit};
+use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
 
 /// What the first line says it is.
 const FORMAT: &str = "packwatch gpr";

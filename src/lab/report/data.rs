@@ -3,9 +3,9 @@
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
 use super::trace::Trace;
-use crate::store::{Entry, Filter, Kind, Reader};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
+use crate::store::{Entry, Filter, Kind, Reader};
 
 /// Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
 const FIRST_DATE_S: f64 = 3.0e8;

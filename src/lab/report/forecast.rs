@@ -7,8 +7,9 @@ use std::collections::BTreeMap;
 
 use super::data::{Data, Learned};
 use super::{Setting, pictures};
+
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, Usage, CapacityReading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
 /// Deviation of the current sensor's gain where no configuration tells one: what `capacity.current_gain_std` is by default.

@@ -129,8 +129,8 @@ fn score(each: Vec<DischargeScore>, table: &CycleTable, threshold_ah: f64, skip:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::score::cycles::CycleTable;
     use crate::quantity::{CellIndex, Timestamp};
+    use crate::score::cycles::CycleTable;
 
     fn table() -> CycleTable {
         let folder = tempfile::tempdir().expect("a folder");

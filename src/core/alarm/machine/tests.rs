@@ -91,9 +91,13 @@ fn expected(state: State, told: MachineInput) -> (State, State, Option<Change>) 
         (Unknown, MachineInput::Verdict(Verdict::Unknown)) => stay,
         (Inactive | Cleared, MachineInput::Verdict(Verdict::Unknown)) => (Unknown, Unknown, None),
         (Pending | Suppressed | Latched, MachineInput::Verdict(Verdict::Unknown)) => stay,
-        (Active | Clearing, MachineInput::Verdict(Verdict::Unknown)) => (Suppressed, Suppressed, Some(Change::Suppressed)),
+        (Active | Clearing, MachineInput::Verdict(Verdict::Unknown)) => {
+            (Suppressed, Suppressed, Some(Change::Suppressed))
+        }
         (Unknown | Inactive | Pending, MachineInput::Acknowledge | MachineInput::Clear) => stay,
-        (Active | Clearing | Suppressed | Latched, MachineInput::Acknowledge) => (state, state, Some(Change::Acknowledged)),
+        (Active | Clearing | Suppressed | Latched, MachineInput::Acknowledge) => {
+            (state, state, Some(Change::Acknowledged))
+        }
         (Cleared, MachineInput::Acknowledge) => (Inactive, Inactive, Some(Change::Acknowledged)),
         (Active | Clearing | Suppressed, MachineInput::Clear) => stay,
         (Latched, MachineInput::Clear) => (Inactive, Inactive, Some(Change::Cleared)),
@@ -117,7 +121,10 @@ fn every_state_and_everything_told_leads_where_the_table_says() {
             let (mut machine, rule) = machine_in(state);
             assert_eq!(tell(&mut machine, &rule, 101.0, told), change, "{state:?} {told:?}");
             assert_eq!(machine.state, early, "{state:?} {told:?}");
-            assert_eq!(machine.is_known, !matches!(told, MachineInput::Verdict(Verdict::Unknown)) && is_known_in(state, told));
+            assert_eq!(
+                machine.is_known,
+                !matches!(told, MachineInput::Verdict(Verdict::Unknown)) && is_known_in(state, told)
+            );
             tell(&mut machine, &rule, 120.0, told);
             assert_eq!(machine.state, late, "{state:?} {told:?}, again");
         }

@@ -183,7 +183,10 @@ impl EstimatorBank {
         has_filter.then(|| {
             let soc = self.marginal(cell, 0);
             let downtime_std = memory.downtime_std_if_any();
-            ScalarGaussian { variance: downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std)), ..soc }
+            ScalarGaussian {
+                variance: downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std)),
+                ..soc
+            }
         })
     }
 

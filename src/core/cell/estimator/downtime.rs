@@ -41,8 +41,9 @@ pub(super) fn update_after_downtime<const N: usize>(
     let mut used = used_prior(x, config, downtime_std);
     // Predicted variance of the voltage for a prior that wide; the copy is discarded.
     let predicted = update(&mut used.clone(), model, config, reading)?.innovation_variance;
-    let drop_v =
-        reading.current_a * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc)) * libm::exp(x.mean[LOG_RESISTANCE]);
+    let drop_v = reading.current_a
+        * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc))
+        * libm::exp(x.mean[LOG_RESISTANCE]);
     let reach = 3.0_f64.sqrt() * downtime_std;
     let soc = model.soc_of_ocv_at(&reading.temperature, reading.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.

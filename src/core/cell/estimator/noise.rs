@@ -48,7 +48,12 @@ pub(super) struct VoltageReading {
 
 impl VoltageReading {
     /// Measurement noise of this reading for a cell at state `x`.
-    pub(super) fn noise<const N: usize>(&self, x: &Gaussian<N>, model: &CellModel, config: &EstimatorConfig) -> MeasurementNoise {
+    pub(super) fn noise<const N: usize>(
+        &self,
+        x: &Gaussian<N>,
+        model: &CellModel,
+        config: &EstimatorConfig,
+    ) -> MeasurementNoise {
         let position = model.grid_position_at(&self.temperature, x.mean[0]);
         let slope_v = model.ocv_slope_v(&position);
         let ratio = libm::exp(x.mean[LOG_RESISTANCE]);

@@ -92,7 +92,8 @@ fn the_axis_of_days_gives_days_alone() {
     let mut forecast = Forecast::new(Axis::Days, 2.0);
     for day in 0..12 {
         let days = if day == 0 { 0.0 } else { 5.0 };
-        let reading = CapacityReading { capacity_ah: 2.0 - 0.05 * f64::from(day), variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        let reading =
+            CapacityReading { capacity_ah: 2.0 - 0.05 * f64::from(day), variance_ah2: 0.0, shared_variance_ah2: 0.0 };
         forecast.update(Usage { days, ..Usage::default() }, Some(reading));
     }
     let life = forecast.remaining(1.2).expect("enough is known");
@@ -178,7 +179,8 @@ fn the_forecast_is_continuous_through_the_threshold() {
     let mut before: Option<Remaining> = None;
     for efc in 101..300 {
         let capacity_ah = 2.0 - 0.002 * f64::from(efc);
-        forecast.update(passed(1.0), Some(CapacityReading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+        forecast
+            .update(passed(1.0), Some(CapacityReading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
         let now = forecast.remaining(1.6).unwrap_or_else(|why| panic!("after {efc} cycles: {why}"));
         let now = now.cycles.expect("cycles");
         if let Some(before) = before {
@@ -223,7 +225,8 @@ fn a_long_rest_does_not_count_as_recent_use() {
 fn one_outlier_moves_the_forecast_little() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let before = forecast.rate_ah().0;
-    forecast.update(passed(1.0), Some(CapacityReading { capacity_ah: 0.9, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+    forecast
+        .update(passed(1.0), Some(CapacityReading { capacity_ah: 0.9, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
     assert!((1.7..1.85).contains(&forecast.level_ah().0), "{:?}", forecast.level_ah());
     assert!((forecast.rate_ah().0 / before - 1.0).abs() < 0.5, "{:?} {before}", forecast.rate_ah());
 }

@@ -99,7 +99,11 @@ impl<const W: usize> Tables<W> {
 
     /// Slot of the rows of a temperature, valid until the next call; `hint` is the slot of the last call.
     fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
-        if self.temperatures_c[hint % MAX_ISOTHERMS] == temperature_c { hint % MAX_ISOTHERMS } else { self.find(temperature_c) }
+        if self.temperatures_c[hint % MAX_ISOTHERMS] == temperature_c {
+            hint % MAX_ISOTHERMS
+        } else {
+            self.find(temperature_c)
+        }
     }
 
     /// Finds the rows of a temperature in the cache, or computes them.
@@ -137,7 +141,11 @@ impl<const W: usize> Tables<W> {
 
     /// Brings the lines of `cache` to these temperatures.
     #[inline(always)]
-    pub(super) fn refresh_temperatures<const L: usize>(&mut self, cache: &mut LineCache<L, W>, temperature_c: &Lanes<L>) {
+    pub(super) fn refresh_temperatures<const L: usize>(
+        &mut self,
+        cache: &mut LineCache<L, W>,
+        temperature_c: &Lanes<L>,
+    ) {
         let same = (0..L).fold(true, |same, lane| same & (cache.temperature_c[lane] == temperature_c.0[lane]));
         if !same {
             self.reload_temperatures(cache, temperature_c);

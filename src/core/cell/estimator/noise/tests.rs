@@ -26,7 +26,14 @@ fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
     let mut x = Gaussian::<4> { mean: nalgebra::SVector::zeros(), covariance: SMatrix::identity() };
     (x.mean[0], x.mean[3], x.mean[2]) = (0.5, 0.05, 2.0);
     let of = |model: &CellModel, load_a: f64, current_a: f64, information_s: f64| {
-        VoltageReading { voltage_v: 3.6, current_a, load_a, temperature: model.temperature_position(0.0), information_s }.noise(&x, model, &config)
+        VoltageReading {
+            voltage_v: 3.6,
+            current_a,
+            load_a,
+            temperature: model.temperature_position(0.0),
+            information_s,
+        }
+        .noise(&x, model, &config)
     };
     let at = |load_a: f64, current_a: f64, information_s: f64| of(&model, load_a, current_a, information_s);
     // At 0 C and a SOC of 0.5: 60 + 20 mohm.

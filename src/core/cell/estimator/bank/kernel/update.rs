@@ -149,7 +149,8 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
 
     // Measurement noise: see `noise::VoltageReading`.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
-    let model = predicted.base_variance + predicted.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
+    let model =
+        predicted.base_variance + predicted.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
     let total = variance + (model / information_s + c.sensor_variance);
     let innovation_v = input.voltage_v - (predicted.centre_v + shift_v);
     let gate = variance + (predicted.slope_v.square() * c.gate_soc_variance + c.gate_variance);
