@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-
 /// Mean function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

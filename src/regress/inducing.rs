@@ -152,9 +152,8 @@ impl Posterior {
 
     fn block(&self, rows: &[f64]) -> Block {
         let v = self.projected(rows);
-        let own = |column: &[f64]| {
-            (self.values.prior_variance - dot(column, column)).max(0.0) + self.values.noise_variance
-        };
+        let own =
+            |column: &[f64]| (self.values.prior_variance - dot(column, column)).max(0.0) + self.values.noise_variance;
         let l = v.chunks(self.count()).map(own).collect();
         Block { v, l }
     }

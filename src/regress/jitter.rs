@@ -6,7 +6,6 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-
 /// Jitter of successive tries, as part of the signal variance.
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];
 pub(super) const LAST: f64 = 1e-4;

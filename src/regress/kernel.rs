@@ -23,7 +23,6 @@ use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
 
-
 /// Deepest nesting of brackets: text is read by recursion.
 const MAX_DEPTH: usize = 16;
 /// Most shapes in one kernel: each has parameters of its own.

@@ -34,6 +34,7 @@ mod folds;
 mod inducing;
 mod jitter;
 mod kd_tree;
+mod kd_tree;
 mod kernel;
 mod linear_algebra;
 mod minimise;
@@ -45,7 +46,6 @@ mod saved;
 mod scale;
 mod search;
 mod settings;
-mod kd_tree;
 mod vector_math;
 
 #[cfg(test)]
@@ -58,5 +58,6 @@ pub use jitter::Jitter;
 pub use kernel::{Kernel, Shape};
 pub use model::{Hyperparameter, Model, Prediction, fit};
 pub use settings::{
-    FitProgress, Form, GprSettings, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback, TrainingRows,
+    FitProgress, Form, GprSettings, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback,
+    TrainingRows,
 };

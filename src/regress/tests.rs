@@ -3,8 +3,8 @@
 use std::ops::ControlFlow;
 
 use super::nearest::ConditionalFactors;
-use super::scale::StandardisedRows;
 use super::plan::Plan;
+use super::scale::StandardisedRows;
 use super::*;
 
 /// Numbers between -1 and 1.

@@ -43,7 +43,11 @@ pub(super) struct LearnedState {
 }
 
 /// The state at a start: SOC and branches new, the rest as learned.
-pub(super) fn initial_state<const N: usize>(soc: ScalarGaussian, branch_variance: f64, kept: &LearnedState) -> Gaussian<N> {
+pub(super) fn initial_state<const N: usize>(
+    soc: ScalarGaussian,
+    branch_variance: f64,
+    kept: &LearnedState,
+) -> Gaussian<N> {
     let mut mean = SVector::zeros();
     let mut variance = SVector::<f64, N>::repeat(branch_variance);
     (mean[0], variance[0]) = (soc.mean, soc.variance);

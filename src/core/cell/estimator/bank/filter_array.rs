@@ -159,7 +159,12 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
         Some((ends.0.0, ends.1.0))
     }
 
-    pub(super) fn filter(&self, block: usize, lane: usize, make: fn(Gaussian<N>) -> Filter) -> (Filter, [f64; kernel::MEMORY]) {
+    pub(super) fn filter(
+        &self,
+        block: usize,
+        lane: usize,
+        make: fn(Gaussian<N>) -> Filter,
+    ) -> (Filter, [f64; kernel::MEMORY]) {
         let state = FilterState::of_lane(&self.blocks[block], lane);
         let mean = SVector::from_fn(|i, _| state.mean[i].0[0]);
         let covariance = SMatrix::from_fn(|i, j| state.covariance[at(i.max(j), i.min(j))].0[0]);

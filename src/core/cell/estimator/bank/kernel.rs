@@ -23,7 +23,8 @@ mod update;
 
 use predict::predict;
 pub(super) use types::{
-    DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY, REST_S, StepInput, StepOutcome, at,
+    DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, MEMORY, REST_S, StepInput,
+    StepOutcome, at,
 };
 use update::update;
 

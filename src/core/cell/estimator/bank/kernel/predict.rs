@@ -3,7 +3,7 @@
 //! In: the state before, charge (A s) and time (s). Out: mean and covariance after it, in the units of the states, and
 //! where the covariance before was positive definite.
 
-use super::points::{COLUMNS, PartialCholesky, OddEvenParts, ResistanceRatios, sum};
+use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
 use super::types::{FilterState, KernelConstants, StepInput, at};
 use crate::cell::estimator::bank::tables::{LineCache, TablePoint, Tables};
 use crate::cell::estimator::noise::MAX_WALK_S;

@@ -61,7 +61,8 @@ pub(in crate::cell::estimator::bank) struct DecayFactors<const L: usize> {
 
 impl<const L: usize> DecayFactors<L> {
     /// No decay.
-    pub(in crate::cell::estimator::bank) const NONE: Self = Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
+    pub(in crate::cell::estimator::bank) const NONE: Self =
+        Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
 
     #[inline(always)]
     pub(in crate::cell::estimator::bank) fn after(c: &KernelConstants, time_s: Lanes<L>) -> Self {

@@ -3,9 +3,9 @@
 //! In: the state before it, and the reading, V. Out: the state after it, innovation, V, its variance, V^2, and the test
 //! ratio, which is 1 for an innovation of one standard deviation. A lane outside the gate is marked as not usable.
 
-use super::points::{COLUMNS, PartialCholesky, OddEvenParts, ResistanceRatios};
+use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
 use super::types::{FilterState, KernelConstants, LOAD_A, StepInput, StepOutcome, at};
-use crate::cell::estimator::bank::tables::{LineCache, ERROR_V, Tables, branch};
+use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
 use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY};
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
