@@ -8,7 +8,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::RegressionError;
+use super::error::RegressionError;
 
 /// Mean function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

@@ -9,7 +9,7 @@
 //! interval.
 
 use super::kd_tree::Tree;
-use super::nearest::StandardisedRows;
+use super::scale::StandardisedRows;
 
 /// Nominal coverage of the interval.
 pub(super) const LEVEL: f64 = 0.95;
@@ -90,7 +90,7 @@ fn inverse_deviations(inputs: &[f64], data: &StandardisedRows) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Basis;
+    use crate::basis::Basis;
 
     fn data(rows: usize) -> StandardisedRows {
         let inputs = (0..rows).map(|k| k as f64).collect();

@@ -11,18 +11,17 @@ use std::f64::consts::TAU;
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
-use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
-use faer::{MatMut, MatRef, Par};
+use faer::{MatMut, MatRef};
 use rayon::prelude::*;
 
-use super::RegressionError;
 use super::basis::Coefficients;
+use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
-use super::nearest::StandardisedRows;
+use super::linear_algebra::{cholesky, dot, parallelism, solve_lower, solve_upper};
+use super::pairs::{BLOCK_PAIRS, by_column, cross, squares};
 use super::plan::{Plan, Values, Work};
+use super::scale::StandardisedRows;
 
-/// Pairs evaluated at a time: their memory fits the near cache.
-const BLOCK_PAIRS: usize = 1024;
 /// Queries of one block of a prediction.
 const BLOCK_QUERIES: usize = 256;
 /// Columns one thread takes at a time.
@@ -48,56 +47,6 @@ pub(super) struct Posterior {
     pub jitter: Jitter,
     /// Jitter on the diagonal, as part of the prior variance.
     used_jitter: f64,
-}
-
-/// Parallelism of the present thread pool, for faer.
-pub(super) fn parallelism() -> Par {
-    match rayon::current_num_threads() {
-        0 | 1 => Par::Seq,
-        threads => Par::rayon(threads),
-    }
-}
-
-/// Row-major to column-major.
-pub(super) fn by_column(inputs: &[f64], dimensions: usize) -> Vec<f64> {
-    (0..dimensions).flat_map(|d| inputs.iter().skip(d).step_by(dimensions).copied()).collect()
-}
-
-/// Kernel of one point with the rows `first..` of `columns` (which has `n` rows), into `out`.
-#[expect(clippy::too_many_arguments, reason = "one flat loop of arithmetic")]
-pub(super) fn cross(
-    plan: &Plan,
-    values: &Values,
-    columns: &[f64],
-    n: usize,
-    first: usize,
-    point: &[f64],
-    scratch: &mut (Vec<f64>, Work),
-    out: &mut [f64],
-) {
-    for (block, part) in out.chunks_mut(BLOCK_PAIRS).enumerate() {
-        let (from, count) = (first + block * BLOCK_PAIRS, part.len());
-        squares(columns, n, from, count, point, &mut scratch.0);
-        part.copy_from_slice(plan.evaluate(values, &scratch.0, count, &mut scratch.1));
-    }
-}
-
-pub(super) fn squares(columns: &[f64], n: usize, from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
-    out.resize(count * point.len(), 0.0);
-    for (d, x) in point.iter().enumerate() {
-        let column = &columns[d * n + from..][..count];
-        out[d * count..][..count].iter_mut().zip(column).for_each(|(square, c)| *square = (c - x) * (c - x));
-    }
-}
-
-/// Factorises in place; `false` = not positive definite.
-pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
-    let par = parallelism();
-    let mut memory = MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default()));
-    let matrix = MatMut::from_column_major_slice_mut(matrix, n, n);
-    let done =
-        llt::factor::cholesky_in_place(matrix, Default::default(), par, MemStack::new(&mut memory), Default::default());
-    done.is_ok()
 }
 
 impl Posterior {
@@ -136,20 +85,12 @@ impl Posterior {
         for k in 0..size {
             right.extend((0..n).map(|row| data.basis.value(data.row(row), k)));
         }
-        let l = MatRef::from_column_major_slice(&self.factor, n, n);
         let width = size + 1;
-        solve_lower_triangular_in_place(l, MatMut::from_column_major_slice_mut(&mut right, n, width), parallelism());
-        let dot = |a: usize, b: usize| -> f64 {
-            right[a * n..][..n].iter().zip(&right[b * n..][..n]).map(|(x, y)| x * y).sum()
-        };
-        let g: Vec<f64> = (0..width * width).map(|at| dot(at / width, at % width)).collect();
+        solve_lower(&self.factor, n, &mut right);
+        let column = |k: usize| &right[k * n..][..n];
+        let g: Vec<f64> = (0..width * width).map(|at| dot(column(at / width), column(at % width))).collect();
         self.coefficients = Coefficients::solve(&g, size)?;
-        let upper = l.transpose();
-        solve_upper_triangular_in_place(
-            upper,
-            MatMut::from_column_major_slice_mut(&mut right, n, width),
-            parallelism(),
-        );
+        solve_upper(&self.factor, n, &mut right);
         self.alpha = right[..n].to_vec();
         for (k, beta) in self.coefficients.beta.iter().enumerate() {
             self.alpha.iter_mut().zip(&right[(k + 1) * n..]).for_each(|(a, h)| *a -= beta * h);
@@ -213,11 +154,10 @@ impl Posterior {
             });
             let means: Vec<(f64, Vec<f64>)> =
                 block.par_chunks(n).zip(rows.par_chunks(d)).map(|(column, row)| self.mean(row, column)).collect();
-            let l = MatRef::from_column_major_slice(&self.factor, n, n);
-            solve_lower_triangular_in_place(l, MatMut::from_column_major_slice_mut(block, n, count), parallelism());
+            solve_lower(&self.factor, n, block);
             all.extend(means.into_iter().zip(block.chunks(n)).map(|((mean, rest), column)| {
-                let explained: f64 = column.iter().map(|v| v * v).sum();
-                (mean, (self.values.prior_variance - explained).max(0.0) + self.coefficients.variance(&rest))
+                let own = (self.values.prior_variance - dot(column, column)).max(0.0);
+                (mean, own + self.coefficients.variance(&rest))
             }));
         }
         all
@@ -226,10 +166,9 @@ impl Posterior {
     /// Mean at a row, and the part of its basis that the rows do not explain.
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
-        let dot = |a: &[f64]| a.iter().zip(cross).map(|(x, y)| x * y).sum::<f64>();
-        let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n]);
+        let rest = |k: usize| self.data.basis.value(row, k) - dot(&self.basis_solved[k * n..][..n], cross);
         let rest = (0..self.coefficients.beta.len()).map(rest).collect();
-        (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha), rest)
+        (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha, cross), rest)
     }
 
     /// For some rows: residual and variance of the measurement, predicted from all other rows (with the present coefficients).
@@ -239,11 +178,9 @@ impl Posterior {
         for some in rows.chunks(BLOCK_QUERIES) {
             let mut units = vec![0.0; n * some.len()];
             some.iter().enumerate().for_each(|(k, row)| units[k * n + *row as usize] = 1.0);
-            let l = MatRef::from_column_major_slice(&self.factor, n, n);
-            let right = MatMut::from_column_major_slice_mut(&mut units, n, some.len());
-            solve_lower_triangular_in_place(l, right, parallelism());
+            solve_lower(&self.factor, n, &mut units);
             all.extend(some.iter().zip(units.chunks(n)).map(|(row, column)| {
-                let precision: f64 = column.iter().map(|v| v * v).sum();
+                let precision = dot(column, column);
                 (self.alpha[*row as usize] / precision, 1.0 / precision)
             }));
         }

@@ -7,10 +7,12 @@ use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
+use super::calibration::GAUSSIAN;
+use super::error::RegressionError;
 use super::jitter::Jitter;
 use super::model::{Hyperparameter, Prediction, fit};
 use super::scale::check;
-use super::{GprSettings, ProgressCallback, RegressionError, TrainingRows};
+use super::settings::{FitProgress, GprSettings, ProgressCallback, TrainingRows};
 
 /// Most folds.
 const MAX_FOLDS: usize = 1000;
@@ -71,7 +73,7 @@ pub fn score(predictions: &[Prediction], targets: &[f64]) -> PredictionScore {
         mean_absolute_error: mean(&|p, y| (y - p.mean).abs()),
         coverage_95: mean(&|p, y| if (p.low_95..=p.high_95).contains(&y) { 1.0 } else { 0.0 }),
         gaussian_coverage_95: mean(&|p, y| {
-            let inside = (y - p.mean).abs() <= super::calibration::GAUSSIAN * p.measurement_variance.sqrt();
+            let inside = (y - p.mean).abs() <= GAUSSIAN * p.measurement_variance.sqrt();
             if inside { 1.0 } else { 0.0 }
         }),
         mean_width_95: mean(&|p, _| p.high_95 - p.low_95),
@@ -105,7 +107,7 @@ pub fn cross_validate(
     let mut predictions = vec![None; n];
     let mut done = Vec::with_capacity(folds);
     for fold in 0..folds {
-        let mut watch = |mut progress: super::FitProgress| {
+        let mut watch = |mut progress: FitProgress| {
             (progress.fold, progress.folds) = (fold + 1, folds);
             watcher(progress)
         };

@@ -18,20 +18,21 @@ use std::f64::consts::TAU;
 
 use faer::linalg::matmul::matmul;
 use faer::linalg::matmul::triangular::{self, BlockStructure};
-use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::linalg::triangular_solve::solve_upper_triangular_in_place;
 use faer::{Accum, MatMut, MatRef};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::RegressionError;
 use super::basis::Coefficients;
-use super::exact::{by_column, cholesky, cross, parallelism, squares};
+use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::kd_tree::Tree;
-use super::nearest::StandardisedRows;
+use super::linear_algebra::{cholesky, dot, parallelism, solve_lower, solve_upper};
+use super::pairs::{BLOCK_PAIRS, by_column, cross, squares};
 use super::plan::{Plan, Values, Work};
+use super::scale::StandardisedRows;
 
 /// Rows of a block.
 const BLOCK: usize = 512;
@@ -39,8 +40,6 @@ const BLOCK: usize = 512;
 const NUGGET: f64 = 1e-8;
 /// Passes of k-means.
 const MEANS_PASSES: usize = 10;
-/// Points evaluated at a time.
-const BLOCK_PAIRS: usize = 1024;
 
 /// State for predictions.
 #[derive(Debug, Clone)]
@@ -147,17 +146,14 @@ impl Posterior {
         v.par_chunks_mut(m).zip(rows.par_chunks(d)).for_each_init(Default::default, |scratch, (out, row)| {
             cross(&self.plan, &self.values, &self.columns, m, 0, row, scratch, out);
         });
-        let l = MatRef::from_column_major_slice(&self.l, m, m);
-        solve_lower_triangular_in_place(l, MatMut::from_column_major_slice_mut(&mut v, m, count), parallelism());
+        solve_lower(&self.l, m, &mut v);
         v
     }
 
     fn block(&self, rows: &[f64]) -> Block {
         let v = self.projected(rows);
-        let own = |column: &[f64]| {
-            let left = self.values.prior_variance - column.iter().map(|x| x * x).sum::<f64>();
-            left.max(0.0) + self.values.noise_variance
-        };
+        let own =
+            |column: &[f64]| (self.values.prior_variance - dot(column, column)).max(0.0) + self.values.noise_variance;
         let l = v.chunks(self.count()).map(own).collect();
         Block { v, l }
     }
@@ -194,22 +190,12 @@ impl Posterior {
             return Err(RegressionError::NotPositiveDefinite { jitter: self.added });
         }
         self.b = b;
-        let factor = MatRef::from_column_major_slice(&self.b, m, m);
-        solve_lower_triangular_in_place(
-            factor,
-            MatMut::from_column_major_slice_mut(&mut right, m, width),
-            parallelism(),
-        );
+        solve_lower(&self.b, m, &mut right);
         for at in 0..width * width {
-            let (x, y) = (&right[at / width * m..][..m], &right[at % width * m..][..m]);
-            g[at] -= x.iter().zip(y).map(|(x, y)| x * y).sum::<f64>();
+            g[at] -= dot(&right[at / width * m..][..m], &right[at % width * m..][..m]);
         }
         self.coefficients = Coefficients::solve(&g, size)?;
-        solve_upper_triangular_in_place(
-            factor.transpose(),
-            MatMut::from_column_major_slice_mut(&mut right, m, width),
-            parallelism(),
-        );
+        solve_upper(&self.b, m, &mut right);
         self.c = right[..m].to_vec();
         for (k, beta) in self.coefficients.beta.iter().enumerate() {
             self.c.iter_mut().zip(&right[(k + 1) * m..]).for_each(|(c, h)| *c -= beta * h);
@@ -222,16 +208,13 @@ impl Posterior {
 
     /// `B^-1/2 v` (lower factor) of a block.
     fn through_b(&self, v: &[f64]) -> Vec<f64> {
-        let m = self.count();
-        let (mut t, count) = (v.to_vec(), v.len() / m);
-        let factor = MatRef::from_column_major_slice(&self.b, m, m);
-        solve_lower_triangular_in_place(factor, MatMut::from_column_major_slice_mut(&mut t, m, count), parallelism());
+        let mut t = v.to_vec();
+        solve_lower(&self.b, self.count(), &mut t);
         t
     }
 
     /// `a_i` and `v_i' B^-1 v_i` of a row.
     fn weight(&self, row: usize, v: &[f64], t: &[f64], l: f64) -> (f64, f64) {
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         let mean = self.coefficients.mean(self.data.basis, self.data.row(row)) + dot(v, &self.c);
         ((self.data.targets[row] - mean) / l, dot(t, t))
     }
@@ -241,7 +224,6 @@ impl Posterior {
         let (m, d) = (self.count(), self.data.dimensions);
         let parameters = self.plan.parameters.len();
         let (mut gradient, mut by_points, mut by_rows) = (vec![0.0; parameters], vec![0.0; m * m], 0.0);
-        let (l, b) = (MatRef::from_column_major_slice(&self.l, m, m), MatRef::from_column_major_slice(&self.b, m, m));
         for (at, rows) in self.data.inputs.chunks(BLOCK * d).enumerate() {
             let block = self.block(rows);
             let count = block.l.len();
@@ -254,11 +236,7 @@ impl Posterior {
                 })
                 .collect();
             by_rows += weights.iter().map(|(_, w)| w).sum::<f64>();
-            solve_upper_triangular_in_place(
-                b.transpose(),
-                MatMut::from_column_major_slice_mut(&mut y, m, count),
-                parallelism(),
-            );
+            solve_upper(&self.b, m, &mut y);
             for (k, column) in y.chunks_mut(m).enumerate() {
                 let ((a, w), half) = (weights[k], 0.5 / block.l[k]);
                 let others = block.v[k * m..][..m].iter().zip(&self.c);
@@ -268,11 +246,7 @@ impl Posterior {
             let (left, right) =
                 (MatRef::from_column_major_slice(&y, m, count), MatRef::from_column_major_slice(&block.v, m, count));
             matmul(product, Accum::Add, left, right.transpose(), -1.0, parallelism());
-            solve_upper_triangular_in_place(
-                l.transpose(),
-                MatMut::from_column_major_slice_mut(&mut y, m, count),
-                parallelism(),
-            );
+            solve_upper(&self.l, m, &mut y);
             y.iter_mut().for_each(|p| *p *= 2.0);
             self.add_columns(rows, &y, &mut gradient);
         }
@@ -325,7 +299,6 @@ impl Posterior {
     pub(super) fn predict(&self, queries: &[f64]) -> Vec<(f64, f64)> {
         let (m, d) = (self.count(), self.data.dimensions);
         let mut all = Vec::with_capacity(queries.len() / d);
-        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
         for rows in queries.chunks(BLOCK * d) {
             let v = self.projected(rows);
             let t = self.through_b(&v);

@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::RegressionError;
+use super::error::RegressionError;
 
 /// Jitter of successive tries, as part of the signal variance.
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];

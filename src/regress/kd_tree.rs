@@ -5,6 +5,8 @@
 //! Distances are Euclidean in weighted inputs. Of two rows at equal distance the one with the lower number is taken, so
 //! that the result does not depend on the layout of the tree.
 
+use std::collections::BinaryHeap;
+
 /// Largest number of rows of a leaf.
 const LEAF_ROWS: usize = 16;
 
@@ -31,35 +33,21 @@ struct TreeNode {
 
 /// Heap of the nearest rows so far, the farthest on top.
 struct NearestHeap {
-    heap: Vec<(f64, u32)>,
+    /// Bits of the squared distance, which order as the distances do (none is negative), and the row.
+    heap: BinaryHeap<(u64, u32)>,
     wanted: usize,
 }
 
 impl NearestHeap {
     fn worst(&self) -> f64 {
-        if self.heap.len() < self.wanted { f64::INFINITY } else { self.heap[0].0 }
+        let full = self.heap.peek().filter(|_| self.heap.len() == self.wanted);
+        full.map_or(f64::INFINITY, |(bits, _)| f64::from_bits(*bits))
     }
 
-    fn offer(&mut self, candidate: (f64, u32)) {
-        if self.heap.len() < self.wanted {
-            self.heap.push(candidate);
-            let mut at = self.heap.len() - 1;
-            while at > 0 && self.heap[at] > self.heap[(at - 1) / 2] {
-                self.heap.swap(at, (at - 1) / 2);
-                at = (at - 1) / 2;
-            }
-        } else if candidate < self.heap[0] {
-            self.heap[0] = candidate;
-            let mut at = 0;
-            loop {
-                let larger = [2 * at + 1, 2 * at + 2].into_iter().filter(|c| *c < self.heap.len());
-                let Some(child) = larger.reduce(|a, b| if self.heap[b] > self.heap[a] { b } else { a }) else { break };
-                if self.heap[child] <= self.heap[at] {
-                    break;
-                }
-                self.heap.swap(at, child);
-                at = child;
-            }
+    fn offer(&mut self, distance: f64, row: u32) {
+        self.heap.push((distance.to_bits(), row));
+        if self.heap.len() > self.wanted {
+            self.heap.pop();
         }
     }
 }
@@ -108,12 +96,11 @@ impl Tree {
         let point: Vec<f64> = point.iter().zip(&self.weights).map(|(x, w)| x * w).collect();
         let before = u32::try_from(before).unwrap_or(u32::MAX);
         let excluded = excluded.and_then(|row| u32::try_from(row).ok());
-        let mut found = NearestHeap { heap: Vec::with_capacity(wanted), wanted };
+        let mut found = NearestHeap { heap: BinaryHeap::with_capacity(wanted + 1), wanted };
         if wanted > 0 {
             self.visit(0, &point, before, excluded, &mut found);
         }
-        found.heap.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        found.heap.into_iter().map(|(_, row)| row).collect()
+        found.heap.into_sorted_vec().into_iter().map(|(_, row)| row).collect()
     }
 
     fn visit(&self, at: usize, point: &[f64], before: u32, excluded: Option<u32>, found: &mut NearestHeap) {
@@ -138,7 +125,7 @@ impl Tree {
             let row = self.numbers[place];
             if row < before && Some(row) != excluded {
                 let squares = self.points[place * d..][..d].iter().zip(point).map(|(a, b)| (a - b) * (a - b));
-                found.offer((squares.sum(), row));
+                found.offer(squares.sum(), row);
             }
         }
     }

@@ -21,7 +21,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::RegressionError;
+use super::error::RegressionError;
 
 /// Deepest nesting of brackets: text is read by recursion.
 const MAX_DEPTH: usize = 16;

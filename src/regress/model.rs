@@ -10,17 +10,18 @@ use rayon::ThreadPool;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use super::basis::Basis;
 use super::calibration::{Calibration, ROWS};
+use super::error::RegressionError;
 use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
 use super::minimise::Minimum;
-use super::nearest::{ConditionalFactors, StandardisedRows};
+use super::nearest::ConditionalFactors;
 use super::plan::{ParameterRole, Plan};
-use super::scale::{Scale, check};
+use super::scale::{Scale, StandardisedRows, check};
 use super::search::{SearchMonitor, descend, first_start, log_bounds, random_start};
-use super::{
-    Basis, FitProgress, Form, GprSettings, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback,
-    RegressionError, TrainingRows,
+use super::settings::{
+    FitProgress, Form, GprSettings, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback, TrainingRows,
 };
 use super::{exact, inducing, nearest};
 
@@ -71,17 +72,7 @@ pub struct Model {
     pub(super) posterior: Posterior,
     pub(super) outcome: FitOutcome,
     pub(super) calibration: Calibration,
-    pool: ThreadPool,
-}
-
-/// A model without its threads.
-pub(super) struct ModelContents {
-    pub spec: ModelSpec,
-    pub scale: Scale,
-    pub theta: Vec<f64>,
-    pub posterior: Posterior,
-    pub outcome: FitOutcome,
-    pub calibration: Calibration,
+    pub(super) pool: ThreadPool,
 }
 
 /// Structure of a model, without its numbers.
@@ -388,11 +379,6 @@ fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionE
 }
 
 impl Model {
-    pub(super) fn assemble(contents: ModelContents, pool: ThreadPool) -> Self {
-        let ModelContents { spec, scale, theta, posterior, outcome, calibration } = contents;
-        Self { spec, scale, theta, posterior, outcome, calibration, pool }
-    }
-
     /// Predicts rows of inputs, row after row.
     pub fn predict(&self, inputs: &[f64]) -> Result<Vec<Prediction>, RegressionError> {
         let d = self.spec.dimensions;

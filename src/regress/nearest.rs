@@ -22,33 +22,15 @@ use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
-use super::RegressionError;
-use super::basis::{Basis, Coefficients};
+use super::basis::Coefficients;
+use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::kd_tree::Tree;
 use super::plan::{Plan, Values, Work};
+use super::scale::StandardisedRows;
 
 /// Rows per task; sums are the same for any number of threads.
 const CHUNK: usize = 64;
-
-/// Standardised rows in the order of conditioning.
-#[derive(Debug, Clone)]
-pub(super) struct StandardisedRows {
-    pub dimensions: usize,
-    pub inputs: Vec<f64>,
-    pub targets: Vec<f64>,
-    pub basis: Basis,
-}
-
-impl StandardisedRows {
-    pub(super) fn row(&self, at: usize) -> &[f64] {
-        &self.inputs[at * self.dimensions..][..self.dimensions]
-    }
-
-    pub(super) fn len(&self) -> usize {
-        self.targets.len()
-    }
-}
 
 /// Factors: rows and their neighbours.
 #[derive(Debug, Clone)]

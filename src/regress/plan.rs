@@ -165,7 +165,9 @@ impl Plan {
         let count = weights.len();
         self.forward(values, squares, count, work, true);
         work.adjoints.resize_with(self.steps.len(), Vec::new);
-        self.set_adjoint(self.steps.len() - 1, weights, work);
+        let root = &mut work.adjoints[self.steps.len() - 1];
+        root.clear();
+        root.extend_from_slice(weights);
         for at in (0..self.steps.len()).rev() {
             match &self.steps[at] {
                 PlanStep::Leaf(leaf) => self.leaf_gradient(at, *leaf, values, squares, work, gradient),
@@ -178,11 +180,6 @@ impl Plan {
                 PlanStep::Product(children) => product_adjoints(at, children, work),
             }
         }
-    }
-
-    fn set_adjoint(&self, at: usize, weights: &[f64], work: &mut Work) {
-        work.adjoints[at].clear();
-        work.adjoints[at].extend_from_slice(weights);
     }
 
     fn leaf_gradient(

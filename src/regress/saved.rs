@@ -8,11 +8,12 @@ use serde::{Deserialize, Serialize};
 
 use super::basis::Coefficients;
 use super::calibration::Calibration;
-use super::model::{FitOutcome, Model, ModelContents, ModelSpec, Posterior, threads};
-use super::nearest::StandardisedRows;
+use super::error::RegressionError;
+use super::model::{FitOutcome, Model, ModelSpec, Posterior, threads};
 use super::plan::Plan;
-use super::scale::Scale;
-use super::{Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, RegressionError, exact, inducing, nearest};
+use super::scale::{Scale, StandardisedRows};
+use super::settings::{Form, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS};
+use super::{exact, inducing, nearest};
 
 /// Format name in the header.
 const FORMAT: &str = "packwatch gaussian process";
@@ -126,7 +127,7 @@ impl Body {
         let same = |what: &str, found: usize, expected: usize| {
             if found == expected { Ok(()) } else { Err(damaged(format!("{what} = {found}, must be {expected}"))) }
         };
-        if d == 0 || d > super::MAX_DIMENSIONS || n == 0 {
+        if d == 0 || d > MAX_DIMENSIONS || n == 0 {
             return Err(damaged(format!("{n} rows of {d} inputs")));
         }
         same("ratios", self.ratios.len(), self.left_out.len())?;
@@ -189,7 +190,6 @@ impl Body {
             0 => Calibration::none(),
             _ => Calibration::new(posterior.data(), self.left_out, self.ratios),
         };
-        let contents = ModelContents { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration };
-        Ok(Model::assemble(contents, pool))
+        Ok(Model { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration, pool })
     }
 }

@@ -4,7 +4,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Basis, MAX_DIMENSIONS, RegressionError, TrainingRows};
+use super::basis::Basis;
+use super::error::RegressionError;
+use super::settings::{MAX_DIMENSIONS, TrainingRows};
 
 /// Shift and scale of every input and of the target.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -56,6 +58,25 @@ fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
     let flat = deviation.is_nan() || deviation <= 1e-12 * mean.abs().max(f64::MIN_POSITIVE);
     (mean, if flat { 1.0 } else { deviation })
+}
+
+/// Standardised rows in the order of conditioning.
+#[derive(Debug, Clone)]
+pub(super) struct StandardisedRows {
+    pub dimensions: usize,
+    pub inputs: Vec<f64>,
+    pub targets: Vec<f64>,
+    pub basis: Basis,
+}
+
+impl StandardisedRows {
+    pub(super) fn row(&self, at: usize) -> &[f64] {
+        &self.inputs[at * self.dimensions..][..self.dimensions]
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.targets.len()
+    }
 }
 
 impl Scale {

@@ -8,9 +8,10 @@ use std::ops::ControlFlow;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::error::RegressionError;
 use super::minimise::{Evaluation, Minimum, SearchLimits, minimise};
 use super::plan::{Parameter, ParameterRole, Plan};
-use super::{FitProgress, ProgressCallback, RegressionError};
+use super::settings::{FitProgress, ProgressCallback};
 
 /// Decrease of the negative log likelihood per row below which a search ends, twice in succession.
 const CONVERGED_PER_ROW: f64 = 5e-6;
@@ -98,10 +99,10 @@ pub(super) fn descend(
     monitor: &mut SearchMonitor,
     mut objective: impl FnMut(&[f64]) -> Result<(f64, Vec<f64>), RegressionError>,
 ) -> Result<Option<Minimum>, RegressionError> {
-    let limits = SearchLimits { low, high, max_iterations, tolerance: CONVERGED_PER_ROW * monitor.rows as f64 };
-    // The search works per row, so that a first step of the gradient's length is a sensible one.
-    let scale = 1.0 / monitor.rows as f64;
-    let limits = SearchLimits { tolerance: limits.tolerance * scale, ..limits };
+    // The search works per row, so that the first step has the length of the gradient.
+    let rows = monitor.rows as f64;
+    let scale = 1.0 / rows;
+    let limits = SearchLimits { low, high, max_iterations, tolerance: CONVERGED_PER_ROW * rows * scale };
     let evaluate = |theta: &[f64]| -> Result<Evaluation, RegressionError> {
         match objective(theta) {
             Ok((value, gradient)) => Ok(Some((value * scale, gradient.iter().map(|g| g * scale).collect()))),
@@ -109,6 +110,5 @@ pub(super) fn descend(
             Err(other) => Err(other),
         }
     };
-    let rows = monitor.rows as f64;
     minimise(start, &limits, evaluate, |at| monitor.report(at.iterations, at.value * rows))
 }

@@ -2,8 +2,9 @@
 
 use std::ops::ControlFlow;
 
-use super::nearest::{ConditionalFactors, StandardisedRows};
+use super::nearest::ConditionalFactors;
 use super::plan::Plan;
+use super::scale::StandardisedRows;
 use super::*;
 
 /// Numbers between -1 and 1.

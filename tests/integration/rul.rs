@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::support::simulated_cell;
 use packwatch::config;
 use packwatch::health::Axis;
-use packwatch::lab::rul::{self, CapacityReading, History, HistoryScore, Threshold};
+use packwatch::lab::rul::{self, History, HistoryScore, MeasuredCapacity, Threshold};
 use packwatch::monitor::EventKind;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
@@ -100,7 +100,7 @@ fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (wander_std, relaxation) = (dice.between(0.002, 0.012), dice.between(4.0, 12.0));
     let (bump, every) = (dice.between(0.01, 0.05), dice.between(25.0, 60.0));
     let kept = (-1.0 / relaxation).exp();
-    let (mut wander, mut recovered, mut row, mut rows) = (0.0, 0.0, CapacityReading::default(), Vec::new());
+    let (mut wander, mut recovered, mut row, mut rows) = (0.0, 0.0, MeasuredCapacity::default(), Vec::new());
     while row.used < 1.4 * readings * if axis == Axis::Cycles { 1.0 } else { days_each } {
         let unit = if axis == Axis::Cycles { 1.0 } else { days_each };
         wander = kept * wander + wander_std * (1.0 - kept * kept).sqrt() * dice.normal();

@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::buses::Buses;
 use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
+
 use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
 use crate::can::decode::InputMap;
@@ -84,8 +85,8 @@ impl Intake {
     /// Other limits and checks for the same messages: counts, and floods under way, stay.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
-        self.gate = new.gate.going_on_from(&self.gate);
-        self.guards = new.guards.going_on_from(&self.guards);
+        self.gate = new.gate.inheriting(&self.gate);
+        self.guards = new.guards.inheriting(&self.guards);
         self.config = new.config;
     }
 

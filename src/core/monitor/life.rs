@@ -7,7 +7,6 @@
 use super::EventKind;
 use super::learning::{CellHealth, Learning};
 use super::publisher::Publisher;
-
 use crate::alarm::{Observation, Rule};
 use crate::cell::CellModel;
 use crate::health::{

@@ -15,7 +15,6 @@ use super::charge::{ChargeCounter, ChargeTotals};
 use super::config::{Limits, SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::signal::Signal;
-
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
 /// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
@@ -177,7 +176,7 @@ impl Sampler {
         }
     }
 
-    /// The settings.
+    /// Returns the settings.
     pub fn config(&self) -> &SampleConfig {
         &self.config
     }

@@ -16,7 +16,7 @@ use super::protocol::{CommandOutcome, Request};
 use crate::alarm::{AlarmState, Rule};
 use crate::can::dbc::Message;
 use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
-use crate::can::j1939::{Dm1Receiver, HeardDm1, TroubleCode};
+use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
@@ -205,8 +205,8 @@ impl ObservedFrames {
     }
 
     /// Notes a DM1. The test has ended when its code, once seen, is absent again.
-    fn note_dm1(&mut self, test_code: TroubleCode, time: Timestamp, message: &HeardDm1) {
-        let HeardDm1::Codes(codes) = message else {
+    fn note_dm1(&mut self, test_code: TroubleCode, time: Timestamp, message: &ReceivedDm1) {
+        let ReceivedDm1::Codes(codes) = message else {
             self.unreadable += 1;
             return;
         };
@@ -252,7 +252,7 @@ fn open(config: &Config) -> Result<Vec<MonitoredChannel>, String> {
     let nothing = || format!("{path}: nothing is sent, must have a table [output] that is enabled");
     let output = config.monitor.output.as_ref().ok_or_else(nothing)?;
     let layout = config.output_layout.as_ref().ok_or_else(nothing)?;
-    let message = layout.message(crate::can::encode::LaidOut::Alarm.message()).ok_or_else(nothing)?;
+    let message = layout.message(crate::can::encode::LayoutMessage::Alarm.message()).ok_or_else(nothing)?;
     let reader = AlarmReader::new(message).ok_or_else(nothing)?;
     let interfaces = output.buses.iter().filter_map(|bus| config.interfaces.get(bus.index()));
     let channels: Result<Vec<MonitoredChannel>, String> =
@@ -355,7 +355,7 @@ mod tests {
         let at = |seconds: f64| Timestamp::from_secs(seconds);
         let mut observed = ObservedFrames::default();
         let mut note = |seconds, codes: &[TroubleCode]| {
-            observed.note_dm1(test_code, at(seconds), &HeardDm1::Codes(codes.to_vec()));
+            observed.note_dm1(test_code, at(seconds), &ReceivedDm1::Codes(codes.to_vec()));
             observed.ended
         };
         assert!(!note(1.0, &[]), "not begun is not ended");
@@ -365,7 +365,7 @@ mod tests {
         assert!(note(5.0, &[other]));
         assert!(!note(6.0, &[test_code]), "it came back");
         assert!(note(7.0, &[]));
-        observed.note_dm1(test_code, at(8.0), &HeardDm1::Unreadable);
+        observed.note_dm1(test_code, at(8.0), &ReceivedDm1::Unreadable);
         let genuine = [(520_196, 9, 2), (524_286, 2, 1)];
         let genuine = genuine.map(|(spn, fmi, count)| (GenuineAlarm::Code { spn, fmi }, count)).into();
         let (first, last) = (Some(at(3.0)), Some(at(6.0)));

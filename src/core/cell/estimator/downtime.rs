@@ -19,42 +19,15 @@
 
 use nalgebra::SMatrix;
 
+use super::filter::update;
 use super::noise::VoltageReading;
-use super::{BRANCHES, CellEstimator, LOG_RESISTANCE, Memory, square, update, widened};
+use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::CellModel;
 use crate::filter::{FilterError, Gaussian, Update};
 
 /// Prior probability that the cell was used during downtime.
 const USED_PRIOR: f64 = 0.2;
-
-/// Deviation of the SOC below which downtime is ignored, fraction.
-const NEGLIGIBLE_STD: f64 = 0.002;
-
-impl CellEstimator {
-    /// Notes a sleep: until a voltage has been used, the SOC is the one from before.
-    pub fn note_sleep(&mut self) {
-        self.memory.is_unseen = self.filter.is_some();
-    }
-
-    /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
-    pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
-        let most = config.away_use_per_s * downtime_s;
-        self.memory.downtime_std = (self.memory.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
-    }
-
-    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
-    pub fn is_carried_over(&self) -> bool {
-        self.memory.is_unseen || self.memory.downtime_std_if_any().is_some()
-    }
-}
-
-impl Memory {
-    /// Standard deviation of the SOC change during downtime until a voltage has been used; `None` when it is negligible.
-    pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
-        (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
-    }
-}
 
 /// Updates with the first reading after a downtime.
 pub(super) fn update_after_downtime<const N: usize>(

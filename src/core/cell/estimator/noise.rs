@@ -1,4 +1,4 @@
-//! Process noise of a step, measurement noise of a voltage reading, and the memory of rest and load behind them.
+//! Process noise of a step, and measurement noise of a voltage reading.
 //!
 //! In: steps and readings (V, A, s, degrees C). Out: variances in the units of the states, V^2 for the voltage. Inputs are
 //! not checked: a NaN gives a variance that the filter rejects.
@@ -11,50 +11,13 @@
 
 use nalgebra::SMatrix;
 
-use super::{BRANCHES, CellEstimator, CellStep, LOG_RESISTANCE, square};
+use super::state_vector::{BRANCHES, LOG_RESISTANCE, square};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, ERROR_WINDOW_S, GridPosition, TemperaturePosition};
 use crate::filter::{Gaussian, MeasurementNoise};
 
-/// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
-pub(super) const REST_REPEATS_S: f64 = 1000.0;
-
 /// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.
 pub(super) const MAX_WALK_S: f64 = 600.0;
-
-/// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
-const GAP_LOAD_PER_H: f64 = 1.0;
-
-impl CellEstimator {
-    /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
-    pub(super) fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
-        let elapsed_s = step.measured_s + step.unmeasured_s;
-        if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
-            self.memory.rest_s = 0.0;
-            return elapsed_s;
-        }
-        let before_s = self.memory.rest_s;
-        self.memory.rest_s += elapsed_s;
-        REST_REPEATS_S * libm::log((REST_REPEATS_S + self.memory.rest_s) / (REST_REPEATS_S + before_s))
-    }
-
-    /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
-    pub(super) fn update_load_memory(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
-        let memory = &mut self.memory;
-        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
-        if step.measured_s > 0.0 {
-            let mean_a = step.charge_as.abs() / step.measured_s;
-            memory.load_a = mean_a + (memory.load_a - mean_a) * keep(step.measured_s);
-        }
-        if step.unmeasured_s > 0.0 {
-            memory.load_a *= keep(step.unmeasured_s);
-            let adjacent_a = memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-            if adjacent_a > config.rest_current_a {
-                memory.load_a = memory.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
-            }
-        }
-    }
-}
 
 /// Covariance that the random walks gain in `dt_s`; the capacity's is added at transitions.
 pub(super) fn process<const N: usize>(

@@ -6,7 +6,10 @@
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
 
-use super::{BRANCHES, CAPACITY, CellEstimator, Filter, LOG_RESISTANCE, Memory};
+use super::cell_estimator::CellEstimator;
+use super::filter::{Filter, each};
+use super::memory::{Memory, check_log_resistance};
+use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
 use crate::filter::Gaussian;
 use crate::quantity::InvalidState;
 
@@ -70,26 +73,6 @@ impl CellState {
         check_log_resistance(log_resistance)?;
         InvalidState::unless_capacity("the capacity of a cell's filter", capacity_ah)
     }
-}
-
-impl Memory {
-    fn check(&self) -> Result<(), InvalidState> {
-        InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
-        check_log_resistance(self.log_resistance.mean)?;
-        for variance in [self.capacity.variance, self.log_resistance.variance] {
-            InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
-        }
-        for signed in [self.temperature_c.unwrap_or(0.0), self.last_current_a] {
-            InvalidState::unless_number("a cell's last temperature or current", signed)?;
-        }
-        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
-        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("a cell's load, consistency or a time", x))
-    }
-}
-
-/// No cell has a thousand times the resistance of a new one, or a thousandth.
-fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
-    InvalidState::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
 }
 
 fn document<const N: usize>(x: &Gaussian<N>) -> (Vec<f64>, Vec<f64>) {

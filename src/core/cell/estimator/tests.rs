@@ -2,9 +2,12 @@
 
 mod robust;
 
-use super::*;
-use crate::cell::Discretisation;
+use super::state_vector::UNKNOWN_SOC_VARIANCE;
+use super::{CellEstimator, CellStep};
+use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
+use crate::cell::{CapacityState, CellModel, Discretisation, EstimatorConfig};
+use crate::filter::ScalarGaussian;
 
 pub(crate) fn config() -> EstimatorConfig {
     EstimatorConfig {

@@ -4,11 +4,28 @@
 //! is not usable.
 
 use super::kernel::{DecayFactors, StepInput, StepOutcome};
-use super::{CellSlot, WIDTH};
-
-use crate::cell::{CellStep, StepResult};
+use crate::cell::estimator::memory::Memory;
+use crate::cell::estimator::step::{CellStep, StepResult};
 use crate::filter::Update;
 use crate::filter::simd::{Lanes, Mask};
+
+/// Cells of a block: one AVX-512 vector, two AVX2 vectors (4 and 16 cells measured slower).
+pub(super) const WIDTH: usize = 8;
+
+/// State of a cell in addition to its lane.
+#[derive(Debug, Clone)]
+pub(super) struct CellSlot {
+    /// Load, consistency, information and rest are in the lane, not here.
+    pub(super) memory: Memory,
+    pub(super) has_filter: bool,
+}
+
+impl CellSlot {
+    /// Whether a step that measured the current all the time can be an ordinary one.
+    pub(super) fn is_ordinary(&self) -> bool {
+        self.has_filter && self.memory.rejected == 0 && self.memory.downtime_std_if_any().is_none()
+    }
+}
 
 /// The inputs of a block's cells.
 #[derive(Debug, Clone, Copy)]

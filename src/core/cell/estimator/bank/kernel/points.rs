@@ -3,8 +3,8 @@
 //! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN
 //! where the covariance has no factor.
 
-use super::{KernelConstants, at};
-use crate::cell::estimator::LOG_RESISTANCE;
+use super::types::{KernelConstants, at};
+use crate::cell::estimator::state_vector::LOG_RESISTANCE;
 use crate::filter::simd::{Lanes, Mask};
 
 /// Columns of the factor that move more than branch voltages.

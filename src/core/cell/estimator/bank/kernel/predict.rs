@@ -4,10 +4,10 @@
 //! where the covariance before was positive definite.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios, sum};
-use super::{FilterState, KernelConstants, StepInput, at};
+use super::types::{FilterState, KernelConstants, StepInput, at};
 use crate::cell::estimator::bank::tables::{LineCache, TablePoint, Tables};
 use crate::cell::estimator::noise::MAX_WALK_S;
-use crate::cell::estimator::{BRANCHES, CAPACITY, LOG_RESISTANCE};
+use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::{Lanes, Mask};
 
 /// A branch at L table points, over the measured time.

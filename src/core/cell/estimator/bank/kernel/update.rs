@@ -4,9 +4,9 @@
 //! ratio, which is 1 for an innovation of one standard deviation. A lane outside the gate is marked as not usable.
 
 use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
-use super::{FilterState, KernelConstants, LOAD_A, StepInput, StepOutcome, at};
+use super::types::{FilterState, KernelConstants, LOAD_A, StepInput, StepOutcome, at};
 use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
-use crate::cell::estimator::{BRANCHES, CAPACITY};
+use crate::cell::estimator::state_vector::{BRANCHES, CAPACITY};
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
 

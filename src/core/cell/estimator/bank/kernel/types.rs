@@ -1,0 +1,192 @@
+//! State, inputs, outcome and constants of the kernel.
+//!
+//! In: the estimator's settings and the cell model. Out: numbers in the units of the states, lane by lane.
+
+use std::array::from_fn;
+
+use crate::cell::config::{Discretisation, EstimatorConfig};
+use crate::cell::estimator::state_vector::square;
+use crate::cell::model::CellModel;
+use crate::filter::simd::{Lanes, Mask};
+
+/// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::cell::estimator::bank) struct FilterState<const L: usize, const N: usize, const T: usize> {
+    /// Means in the order of the estimator's state.
+    pub(in crate::cell::estimator::bank) mean: [Lanes<L>; N],
+    /// Covariance, row by row to the diagonal.
+    pub(in crate::cell::estimator::bank) covariance: [Lanes<L>; T],
+    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`REST_S`].
+    pub(in crate::cell::estimator::bank) memory: [Lanes<L>; MEMORY],
+}
+
+/// Number of memory values that every step changes.
+pub(in crate::cell::estimator::bank) const MEMORY: usize = 4;
+/// |current| low-passed, A.
+pub(in crate::cell::estimator::bank) const LOAD_A: usize = 0;
+/// Mean normalised innovation squared.
+pub(in crate::cell::estimator::bank) const MEAN_NIS: usize = 1;
+/// Time that the next reading stands for, s.
+pub(in crate::cell::estimator::bank) const INFORMATION_S: usize = 2;
+/// Time at rest, s.
+pub(in crate::cell::estimator::bank) const REST_S: usize = 3;
+
+/// Index of the covariance of `i` and `j` <= `i`.
+pub(in crate::cell::estimator::bank) const fn at(i: usize, j: usize) -> usize {
+    i * (i + 1) / 2 + j
+}
+
+/// Inputs of L cells since their last step.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::cell::estimator::bank) struct StepInput<const L: usize> {
+    pub(in crate::cell::estimator::bank) measured_s: Lanes<L>,
+    pub(in crate::cell::estimator::bank) charge_as: Lanes<L>,
+    pub(in crate::cell::estimator::bank) current_a: Lanes<L>,
+    pub(in crate::cell::estimator::bank) voltage_v: Lanes<L>,
+    pub(in crate::cell::estimator::bank) temperature_c: Lanes<L>,
+    /// Decay of the memories over the measured time.
+    pub(in crate::cell::estimator::bank) decay: DecayFactors<L>,
+}
+
+/// Decay factors of a step time.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::cell::estimator::bank) struct DecayFactors<const L: usize> {
+    /// Of the load's low-pass.
+    pub(super) load: Lanes<L>,
+    /// Of the consistency monitor.
+    pub(super) consistency: Lanes<L>,
+    /// 1 / time, 1/s; 0 where no time passed.
+    pub(super) per_s: Lanes<L>,
+}
+
+impl<const L: usize> DecayFactors<L> {
+    /// No decay.
+    pub(in crate::cell::estimator::bank) const NONE: Self =
+        Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
+
+    #[inline(always)]
+    pub(in crate::cell::estimator::bank) fn after(c: &KernelConstants, time_s: Lanes<L>) -> Self {
+        Self {
+            load: (-(time_s / c.load_memory_s)).exp(),
+            consistency: (-(time_s.at_least(1e-3) / c.consistency_window_s)).exp(),
+            per_s: time_s.reciprocal().or_else(time_s.above_number(0.0), Lanes::splat(0.0)),
+        }
+    }
+
+    /// The same factors in every lane.
+    pub(in crate::cell::estimator::bank) fn splat(one: &DecayFactors<1>) -> Self {
+        let splat = |x: &Lanes<1>| Lanes::splat(x.0[0]);
+        Self { load: splat(&one.load), consistency: splat(&one.consistency), per_s: splat(&one.per_s) }
+    }
+
+    pub(in crate::cell::estimator::bank) fn lane(&self, lane: usize) -> DecayFactors<1> {
+        let take = |x: &Lanes<L>| Lanes([x.0[lane]]);
+        DecayFactors { load: take(&self.load), consistency: take(&self.consistency), per_s: take(&self.per_s) }
+    }
+}
+
+/// Outcome of a step.
+#[derive(Debug, Clone, Copy)]
+pub(in crate::cell::estimator::bank) struct StepOutcome<const L: usize> {
+    /// Whether the new state is usable.
+    pub(in crate::cell::estimator::bank) is_usable: Mask<L>,
+    pub(in crate::cell::estimator::bank) innovation_v: Lanes<L>,
+    pub(in crate::cell::estimator::bank) innovation_variance: Lanes<L>,
+    pub(in crate::cell::estimator::bank) test_ratio: Lanes<L>,
+}
+
+/// Settings in the form that the kernel uses.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::cell::estimator::bank) struct KernelConstants {
+    /// s: spread of the sigma points.
+    pub(super) scale: f64,
+    /// beta - alpha^2.
+    pub(super) excess: f64,
+    pub(super) euler: bool,
+    pub(super) soc_variance_per_s: f64,
+    pub(super) charge_variance_per_soc: f64,
+    pub(super) branch_variance_per_s: f64,
+    pub(super) log_resistance_variance_per_s: f64,
+    pub(super) sensor_variance: f64,
+    /// One-second variance of the model's error, V^2, where the tables state none.
+    pub(super) model_variance: f64,
+    pub(super) drop_variance: f64,
+    pub(super) load_variance: f64,
+    pub(super) gate_variance: f64,
+    pub(super) gate_soc_variance: f64,
+    pub(super) gate_limit: f64,
+    pub(super) rest_current_a: f64,
+    pub(super) load_memory_s: f64,
+    pub(super) max_information_s: f64,
+    pub(super) consistency_window_s: f64,
+    pub(super) ocv_ageing_shift: f64,
+    pub(super) new_capacity_ah: f64,
+}
+
+impl KernelConstants {
+    pub(in crate::cell::estimator::bank) fn new<const N: usize>(model: &CellModel, config: &EstimatorConfig) -> Self {
+        Self {
+            scale: (square(config.alpha) * (N as f64 + config.kappa)).sqrt(),
+            excess: config.beta - square(config.alpha),
+            euler: config.discretisation == Discretisation::Euler,
+            soc_variance_per_s: square(config.soc_noise_per_sqrt_s),
+            charge_variance_per_soc: square(config.charge_noise_per_sqrt_soc),
+            branch_variance_per_s: square(config.branch_noise_v_per_sqrt_s),
+            log_resistance_variance_per_s: square(config.log_resistance_noise_per_sqrt_s),
+            sensor_variance: square(config.voltage_noise_v),
+            model_variance: square(config.model_error_v_sqrt_s),
+            drop_variance: square(config.drop_error_sqrt_s),
+            load_variance: square(config.load_error_sqrt_s),
+            gate_variance: square(config.voltage_noise_v) + square(config.gate_model_error_v),
+            gate_soc_variance: square(config.gate_soc_error),
+            gate_limit: square(config.gate_sigma),
+            rest_current_a: config.rest_current_a,
+            load_memory_s: config.load_memory_s,
+            max_information_s: config.max_information_s,
+            consistency_window_s: config.consistency_window_s,
+            ocv_ageing_shift: model.ocv_ageing_shift,
+            new_capacity_ah: model.capacity_ah,
+        }
+    }
+}
+
+impl<const N: usize, const T: usize> FilterState<1, N, T> {
+    /// Copies the states of one lane.
+    pub(in crate::cell::estimator::bank) fn of_lane<const L: usize>(all: &FilterState<L, N, T>, lane: usize) -> Self {
+        let take = |x: &Lanes<L>| Lanes([x.0[lane]]);
+        Self {
+            mean: from_fn(|i| take(&all.mean[i])),
+            covariance: from_fn(|i| take(&all.covariance[i])),
+            memory: from_fn(|i| take(&all.memory[i])),
+        }
+    }
+}
+
+impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
+    /// Puts the state of one cell into a lane.
+    pub(in crate::cell::estimator::bank) fn set_lane(&mut self, lane: usize, one: &FilterState<1, N, T>) {
+        for i in 0..N {
+            self.mean[i].0[lane] = one.mean[i].0[0];
+        }
+        for i in 0..T {
+            self.covariance[i].0[lane] = one.covariance[i].0[0];
+        }
+        for i in 0..MEMORY {
+            self.memory[i].0[lane] = one.memory[i].0[0];
+        }
+    }
+
+    /// Takes the new state where the mask is true.
+    #[inline(always)]
+    pub(in crate::cell::estimator::bank) fn take_where(&mut self, mask: Mask<L>, new: &Self) {
+        for i in 0..N {
+            self.mean[i] = new.mean[i].or_else(mask, self.mean[i]);
+        }
+        for i in 0..T {
+            self.covariance[i] = new.covariance[i].or_else(mask, self.covariance[i]);
+        }
+        for i in 0..MEMORY {
+            self.memory[i] = new.memory[i].or_else(mask, self.memory[i]);
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! The estimator of one cell: steps its filter, restarts it, and reads its state.
+//!
+//! In: one [`CellStep`] per voltage reading. Out: a [`StepResult`], and estimates with their variances. A reading beyond
+//! the gate leaves the state unchanged; a step that cannot be computed restarts the filter.
+
+use super::downtime::update_after_downtime;
+use super::filter::{Filter, LearnedState, each, initial_state, predict, update};
+use super::memory::Memory;
+use super::noise::VoltageReading;
+use super::state_vector::{
+    BRANCHES, CAPACITY, KNOWN_VARIANCE, LOG_RESISTANCE, UNKNOWN_SOC_VARIANCE, marginal, square, widened,
+};
+use super::step::{CellStep, StepResult};
+use crate::cell::circuit;
+use crate::cell::config::EstimatorConfig;
+use crate::cell::model::{CellModel, MAX_BRANCHES};
+use crate::filter::{FilterError, ScalarGaussian, Update};
+
+/// The estimator of one cell.
+#[derive(Debug, Clone)]
+pub struct CellEstimator {
+    pub(super) filter: Option<Filter>,
+    pub(super) memory: Memory,
+}
+
+impl CellEstimator {
+    /// An estimator before its first measurement.
+    pub fn new(config: &EstimatorConfig) -> Self {
+        Self { filter: None, memory: Memory::new(config) }
+    }
+
+    /// Predicts over the time since the last reading, then updates with the voltage.
+    pub fn step(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) -> StepResult {
+        self.memory.temperature_c = Some(self.temperature(model, step));
+        let result = self.try_step(model, config, step);
+        let reset = result.is_err() || self.memory.has_lost_cell(config);
+        if reset {
+            self.start(model, config, step);
+            if result.is_err() {
+                // The correlation may have prevented the factorisation.
+                self.forget_correlation();
+            }
+        }
+        StepResult { update: result.unwrap_or(None), reset }
+    }
+
+    fn try_step(
+        &mut self,
+        model: &CellModel,
+        config: &EstimatorConfig,
+        step: &CellStep,
+    ) -> Result<Option<Update>, FilterError> {
+        let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
+        if self.filter.is_none() {
+            self.start(model, config, step);
+        } else if let Some(filter) = &mut self.filter {
+            let gap_load_a = self.memory.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            each!(filter, x => predict(x, model, config, step, temperature_c, gap_load_a))?;
+        }
+        self.memory.update_load(model, config, step);
+        self.memory.information_s += self.memory.new_information_s(config, step);
+        self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
+        let downtime_std = self.memory.downtime_std_if_any();
+        let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
+        let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
+        let load_a = self.memory.load_a;
+        let temperature = model.temperature_position(temperature_c);
+        let reading = VoltageReading { voltage_v: step.voltage_v, current_a, load_a, temperature, information_s };
+        let update = match downtime_std {
+            None => each!(filter, x => update(x, model, config, &reading))?,
+            Some(std) => each!(filter, x => update_after_downtime(x, model, config, &reading, std))?,
+        };
+        (self.memory.downtime_std, self.memory.is_unseen) = (0.0, false);
+        self.memory.record_update(config, step, &update);
+        Ok(Some(update))
+    }
+
+    /// Starts SOC and branches from the voltage; keeps the learned resistance and capacity.
+    fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
+        let first = self.filter.is_none();
+        if let Some(filter) = &self.filter {
+            self.memory.capacity = each!(filter, x => marginal(x, CAPACITY));
+            self.memory.log_resistance = each!(filter, x => marginal(x, LOG_RESISTANCE));
+        }
+        self.memory.reset_unusable(config);
+        let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
+        let configured = config.initial_soc.filter(|_| first);
+        let soc = configured.unwrap_or_else(|| {
+            let guess = model.grid_position(0.5, temperature_c);
+            let load_v =
+                model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
+            model.soc_of_ocv(step.voltage_v + load_v, temperature_c)
+        });
+        let soc = ScalarGaussian { mean: soc, variance: square(config.initial_soc_std).max(KNOWN_VARIANCE) };
+        let branch_variance = square(config.initial_branch_std_v).max(KNOWN_VARIANCE);
+        let kept = LearnedState {
+            log_resistance: self.memory.log_resistance,
+            capacity: self.memory.capacity,
+            covariance: self.capacity_resistance_covariance(),
+        };
+        self.filter = Some(match model.branches.len() {
+            1 => Filter::One(initial_state(soc, branch_variance, &kept)),
+            2 => Filter::Two(initial_state(soc, branch_variance, &kept)),
+            _ => Filter::Three(initial_state(soc, branch_variance, &kept)),
+        });
+        // Trust returns through the window, not by a restart.
+        self.memory.mean_nis = self.memory.mean_nis.min(config.consistency_limit * std::f64::consts::E);
+        (self.memory.information_s, self.memory.downtime_std) = (config.max_information_s, 0.0);
+        (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
+    }
+
+    fn forget_correlation(&mut self) {
+        if let Some(filter) = &mut self.filter {
+            each!(filter, x => {
+                let (r, c) = (LOG_RESISTANCE, CAPACITY);
+                (x.covariance[(r, c)], x.covariance[(c, r)]) = (0.0, 0.0);
+            });
+        }
+    }
+
+    /// The sensor's value, or the thermal model's prediction from the last known one, degrees C.
+    fn temperature(&self, model: &CellModel, step: &CellStep) -> f64 {
+        step.temperature_c.unwrap_or_else(|| {
+            let soc = self.soc().map_or(0.5, |soc| soc.mean);
+            thermal_c(model, self.memory.temperature_c, soc, self.log_resistance().mean, step)
+        })
+    }
+
+    /// Handles a gap of unknown length: the SOC becomes unknown, the branches may have relaxed.
+    pub fn handle_unknown_gap(&mut self) {
+        (self.memory.rest_s, self.memory.downtime_std, self.memory.is_unseen) = (0.0, 0.0, true);
+        let Some(filter) = &mut self.filter else { return };
+        each!(filter, x => {
+            x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], UNKNOWN_SOC_VARIANCE);
+            for i in BRANCHES..x.mean.len() {
+                x.mean[i] *= 0.5;
+                x.covariance[(i, i)] += square(x.mean[i]);
+            }
+        });
+    }
+
+    /// State of charge; `None` before the first voltage.
+    pub fn soc(&self) -> Option<ScalarGaussian> {
+        let soc = self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, 0)))?;
+        let variance = self.memory.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
+        Some(ScalarGaussian { variance, ..soc })
+    }
+
+    /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
+    pub fn branch_v(&self) -> [f64; MAX_BRANCHES] {
+        let mut branch_v = [f64::NAN; MAX_BRANCHES];
+        if let Some(filter) = &self.filter {
+            each!(filter, x => for i in BRANCHES..x.mean.len() { branch_v[i - BRANCHES] = x.mean[i]; });
+        }
+        branch_v
+    }
+
+    /// ln of the resistance relative to new.
+    pub fn log_resistance(&self) -> ScalarGaussian {
+        self.filter
+            .as_ref()
+            .map_or(self.memory.log_resistance, |filter| each!(filter, x => marginal(x, LOG_RESISTANCE)))
+    }
+
+    /// Capacity in the filter's present state, Ah.
+    pub fn capacity(&self) -> ScalarGaussian {
+        self.filter.as_ref().map_or(self.memory.capacity, |filter| each!(filter, x => marginal(x, CAPACITY)))
+    }
+
+    /// Covariance of capacity (Ah) and ln(resistance).
+    pub fn capacity_resistance_covariance(&self) -> f64 {
+        self.filter.as_ref().map_or(0.0, |filter| each!(filter, x => x.covariance[(LOG_RESISTANCE, CAPACITY)]))
+    }
+
+    /// Voltage that the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
+    pub fn load_v(&self, model: &CellModel) -> f64 {
+        let Some(soc) = self.soc() else { return 0.0 };
+        let position = model.grid_position(soc.mean, self.memory.temperature_c.unwrap_or(25.0));
+        model.settled_ohm(&position) * libm::exp(self.log_resistance().mean) * self.memory.load_a
+    }
+
+    /// Replaces the capacity estimate (at transitions only).
+    ///
+    /// The filter's variance never falls by that: the evidence since the last call may have counted for too much.
+    pub fn restate_capacity(&mut self, capacity: ScalarGaussian) {
+        self.memory.capacity = capacity;
+        if let Some(filter) = &mut self.filter {
+            each!(filter, x => {
+                x.mean[CAPACITY] = capacity.mean;
+                // A smaller variance would not fit the covariances with the other states.
+                let variance = &mut x.covariance[(CAPACITY, CAPACITY)];
+                *variance = variance.max(capacity.variance);
+            });
+        }
+    }
+
+    /// Sets the capacity that the filter uses ([`CapacityState::Held`]), Ah.
+    pub fn hold_capacity(&mut self, capacity_ah: f64) {
+        self.memory.capacity.mean = capacity_ah;
+        if let Some(filter) = &mut self.filter {
+            each!(filter, x => x.mean[CAPACITY] = capacity_ah);
+        }
+    }
+
+    /// Mean normalised innovation squared over the consistency window: about 1 or less when the filter is
+    /// consistent.
+    pub fn mean_nis(&self) -> f64 {
+        self.memory.mean_nis
+    }
+
+    /// Temperature that the filter uses, degrees C.
+    pub fn temperature_c(&self) -> Option<f64> {
+        self.memory.temperature_c
+    }
+
+    /// Notes a sleep: until a voltage has been used, the SOC is the one from before.
+    pub fn note_sleep(&mut self) {
+        self.memory.is_unseen = self.filter.is_some();
+    }
+
+    /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
+    pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
+        let most = config.away_use_per_s * downtime_s;
+        self.memory.downtime_std = (self.memory.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
+    }
+
+    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
+    pub fn is_carried_over(&self) -> bool {
+        self.memory.is_unseen || self.memory.downtime_std_if_any().is_some()
+    }
+}
+
+/// Predicts the temperature of a cell without a sensor value, degrees C, from the last known one.
+pub(super) fn thermal_c(model: &CellModel, last_c: Option<f64>, soc: f64, log_resistance: f64, step: &CellStep) -> f64 {
+    let (Some(last_c), Some(thermal)) = (last_c, &model.thermal) else { return last_c.unwrap_or(step.ambient_c) };
+    let mean_current_a = if step.measured_s > 0.0 { step.charge_as / step.measured_s } else { 0.0 };
+    let ohm = model.settled_ohm(&model.grid_position(soc, last_c)) * libm::exp(log_resistance);
+    let loaded_c =
+        circuit::temperature_after(thermal, last_c, step.ambient_c, square(mean_current_a) * ohm, step.measured_s);
+    circuit::temperature_after(thermal, loaded_c, step.ambient_c, 0.0, step.unmeasured_s)
+}

@@ -1,0 +1,188 @@
+//! The estimator's memory: rest, load, consistency, rejected readings, and what survives a restart of the filter.
+//!
+//! In: steps (A, s) and the outcomes of updates. Out: the time that a reading stands for, s, the load, A, and whether the
+//! filter must restart. Stored numbers are checked ([`Memory::check`]).
+
+use serde::{Deserialize, Serialize};
+
+use super::state_vector::{KNOWN_VARIANCE, square};
+use super::step::CellStep;
+use crate::cell::config::{CapacityState, EstimatorConfig};
+use crate::cell::model::CellModel;
+use crate::filter::{ScalarGaussian, Update};
+use crate::quantity::InvalidState;
+
+/// Rest after which a cell's voltage adds little information, s: what still relaxes then is slower than the branches.
+pub(super) const REST_REPEATS_S: f64 = 1000.0;
+
+/// Assumed load in a gap that has a load next to it, per rated capacity: 1 C.
+const GAP_LOAD_PER_H: f64 = 1.0;
+
+/// Consecutive readings beyond the gate before the filter may restart: one or two can be glitches.
+const MIN_REJECTED: u32 = 3;
+
+/// Consecutive readings beyond the gate before a restart when the first one follows a gap: the record is incomplete.
+const MIN_REJECTED_AFTER_GAP: u32 = 2;
+
+/// Deviation of the SOC below which downtime is ignored, fraction.
+const NEGLIGIBLE_STD: f64 = 0.002;
+
+/// State of the estimator in addition to its filter.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Memory {
+    /// Capacity, Ah, before the first voltage and across a restart.
+    pub(super) capacity: ScalarGaussian,
+    pub(super) log_resistance: ScalarGaussian,
+    pub(super) temperature_c: Option<f64>,
+    pub(super) last_current_a: f64,
+    /// |current| low-passed over `load_memory_s`, A: the load that still drives slow diffusion.
+    #[serde(default)]
+    pub(super) load_a: f64,
+    /// Mean normalised innovation squared over the consistency window.
+    pub(super) mean_nis: f64,
+    /// Time that the next voltage reading stands for, s: since the last one used.
+    pub(super) information_s: f64,
+    /// How long the cell has rested, s.
+    #[serde(default)]
+    pub(super) rest_s: f64,
+    /// Standard deviation of the SOC change during downtime, until a voltage has been used.
+    #[serde(default, rename = "away_std")]
+    pub(super) downtime_std: f64,
+    /// No voltage has been used since the last sleep or unknown gap.
+    #[serde(default)]
+    pub(super) is_unseen: bool,
+    /// Consecutive readings beyond the gate.
+    pub(super) rejected: u32,
+    /// Duration of that run, s.
+    pub(super) rejected_s: f64,
+    /// Whether the first of that run followed a gap: then the gap is the cause, not the sensor.
+    pub(super) rejected_after_gap: bool,
+}
+
+impl Memory {
+    /// The memory before the first measurement.
+    pub(super) fn new(config: &EstimatorConfig) -> Self {
+        let (capacity, log_resistance) = configured(config);
+        Self {
+            capacity,
+            log_resistance,
+            temperature_c: None,
+            last_current_a: 0.0,
+            load_a: 0.0,
+            mean_nis: 0.0,
+            information_s: config.max_information_s,
+            rest_s: 0.0,
+            downtime_std: 0.0,
+            is_unseen: false,
+            rejected: 0,
+            rejected_s: 0.0,
+            rejected_after_gap: false,
+        }
+    }
+
+    /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
+    pub(super) fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
+        let elapsed_s = step.measured_s + step.unmeasured_s;
+        if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
+            self.rest_s = 0.0;
+            return elapsed_s;
+        }
+        let before_s = self.rest_s;
+        self.rest_s += elapsed_s;
+        REST_REPEATS_S * libm::log((REST_REPEATS_S + self.rest_s) / (REST_REPEATS_S + before_s))
+    }
+
+    /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
+    pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
+        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
+        if step.measured_s > 0.0 {
+            let mean_a = step.charge_as.abs() / step.measured_s;
+            self.load_a = mean_a + (self.load_a - mean_a) * keep(step.measured_s);
+        }
+        if step.unmeasured_s > 0.0 {
+            self.load_a *= keep(step.unmeasured_s);
+            let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
+            if adjacent_a > config.rest_current_a {
+                self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
+            }
+        }
+    }
+
+    /// Standard deviation of the SOC change during downtime until a voltage has been used; `None` when it is negligible.
+    pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
+        (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
+    }
+
+    /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
+    pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
+        let elapsed_s = step.measured_s + step.unmeasured_s;
+        let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency_window_s);
+        self.mean_nis += forget * (update.test_ratio - self.mean_nis);
+        if update.accepted {
+            (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
+        } else {
+            // The time before the first rejected reading is not part of the run.
+            if self.rejected == 0 {
+                (self.rejected_s, self.rejected_after_gap) = (0.0, step.unmeasured_s > 0.0);
+            } else {
+                self.rejected_s += elapsed_s;
+            }
+            self.rejected += 1;
+        }
+    }
+
+    /// Whether the filter must restart: too many consecutive readings were beyond the gate.
+    pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
+        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
+        long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
+    }
+
+    /// Resets an unusable capacity or resistance to its configured value: the filter would otherwise restart at every
+    /// reading.
+    pub(super) fn reset_unusable(&mut self, config: &EstimatorConfig) {
+        let (capacity, log_resistance) = configured(config);
+        let is_usable = |x: &ScalarGaussian| x.mean.is_finite() && x.variance.is_finite() && x.variance > 0.0;
+        if !is_usable(&self.capacity) || self.capacity.mean <= 0.0 {
+            self.capacity = capacity;
+        }
+        if !is_usable(&self.log_resistance) {
+            self.log_resistance = log_resistance;
+        }
+    }
+
+    /// Checks stored numbers; the error is the first impossible one.
+    pub(super) fn check(&self) -> Result<(), InvalidState> {
+        InvalidState::unless_capacity("the capacity a cell's reset keeps", self.capacity.mean)?;
+        check_log_resistance(self.log_resistance.mean)?;
+        for variance in [self.capacity.variance, self.log_resistance.variance] {
+            InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
+        }
+        for signed in [self.temperature_c.unwrap_or(0.0), self.last_current_a] {
+            InvalidState::unless_number("a cell's last temperature or current", signed)?;
+        }
+        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
+        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("a cell's load, consistency or a time", x))
+    }
+}
+
+/// No cell has a thousand times the resistance of a new one, or a thousandth.
+pub(super) fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
+    InvalidState::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
+}
+
+/// Configured initial capacity (Ah) and ln(resistance).
+fn configured(config: &EstimatorConfig) -> (ScalarGaussian, ScalarGaussian) {
+    let capacity_variance = match config.capacity_state {
+        CapacityState::Joint => square(config.initial_capacity_std_ah),
+        CapacityState::Held => KNOWN_VARIANCE,
+    };
+    let log_variance = square(config.initial_log_resistance_std);
+    (
+        ScalarGaussian { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
+        ScalarGaussian { mean: 0.0, variance: log_variance.max(KNOWN_VARIANCE) },
+    )
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,32 @@
+//! Layout of the estimator's state vector, and small helpers on its numbers.
+//!
+//! In and out: means and variances in the units of the states. Inputs are not checked.
+
+use crate::filter::{Gaussian, ScalarGaussian};
+
+/// Variance of a known value: small against any noise, large against rounding.
+pub(super) const KNOWN_VARIANCE: f64 = 1e-12;
+
+/// Variance of an unknown SOC: uniform over 0 to 1.
+pub(super) const UNKNOWN_SOC_VARIANCE: f64 = 1.0 / 12.0;
+
+/// Index of ln rho in the state.
+pub(super) const LOG_RESISTANCE: usize = 1;
+/// Index of the capacity in the state.
+pub(super) const CAPACITY: usize = 2;
+/// Index of the first branch voltage in the state.
+pub(super) const BRANCHES: usize = 3;
+
+pub(super) fn square(x: f64) -> f64 {
+    x * x
+}
+
+/// A SOC variance grown by `by`, at most to that of an unknown SOC.
+pub(super) fn widened(variance: f64, by: f64) -> f64 {
+    variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
+}
+
+/// Mean and variance of state `i`.
+pub(super) fn marginal<const N: usize>(x: &Gaussian<N>, i: usize) -> ScalarGaussian {
+    ScalarGaussian { mean: x.mean[i], variance: x.covariance[(i, i)] }
+}

@@ -1,0 +1,31 @@
+//! Input and outcome of one step of the estimator.
+
+use crate::filter::Update;
+
+/// A voltage reading, and charge and time since the reading before.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CellStep {
+    /// Time with a measured current, s.
+    pub measured_s: f64,
+    /// Charge taken out in that time, A s.
+    pub charge_as: f64,
+    /// Time without a current measurement, s (asleep, sensor lost).
+    pub unmeasured_s: f64,
+    /// Cell current at the reading, A; `None` = unknown, then the voltage is not used.
+    pub current_a: Option<f64>,
+    /// Cell temperature, degrees C; `None` = unknown, then the thermal model predicts it.
+    pub temperature_c: Option<f64>,
+    /// Temperature of the surroundings for the thermal model, degrees C.
+    pub ambient_c: f64,
+    /// Terminal voltage, V.
+    pub voltage_v: f64,
+}
+
+/// Outcome of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepResult {
+    /// The measurement update; `None` without a known current.
+    pub update: Option<Update>,
+    /// The filter has restarted from the voltage.
+    pub reset: bool,
+}

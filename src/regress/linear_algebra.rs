@@ -1,0 +1,45 @@
+//! Dense linear algebra on slices, column after column, with the threads of the present pool.
+//!
+//! In and out: plain numbers. A matrix that is not positive definite is reported by [`cholesky`]; NaN stays NaN.
+
+use faer::dyn_stack::{MemBuffer, MemStack};
+use faer::linalg::cholesky::llt;
+use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_upper_triangular_in_place};
+use faer::{MatMut, MatRef, Par};
+
+/// Parallelism of the present thread pool, for faer.
+pub(super) fn parallelism() -> Par {
+    match rayon::current_num_threads() {
+        0 | 1 => Par::Seq,
+        threads => Par::rayon(threads),
+    }
+}
+
+/// Factorises in place; `false` = not positive definite.
+pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
+    let par = parallelism();
+    let mut memory = MemBuffer::new(llt::factor::cholesky_in_place_scratch::<f64>(n, par, Default::default()));
+    let matrix = MatMut::from_column_major_slice_mut(matrix, n, n);
+    let done =
+        llt::factor::cholesky_in_place(matrix, Default::default(), par, MemStack::new(&mut memory), Default::default());
+    done.is_ok()
+}
+
+/// Solves `L X = right` in place, with the lower factor `l` of size `n`.
+pub(super) fn solve_lower(l: &[f64], n: usize, right: &mut [f64]) {
+    let columns = right.len() / n;
+    let right = MatMut::from_column_major_slice_mut(right, n, columns);
+    solve_lower_triangular_in_place(MatRef::from_column_major_slice(l, n, n), right, parallelism());
+}
+
+/// Solves `L' X = right` in place, with the lower factor `l` of size `n`.
+pub(super) fn solve_upper(l: &[f64], n: usize, right: &mut [f64]) {
+    let columns = right.len() / n;
+    let right = MatMut::from_column_major_slice_mut(right, n, columns);
+    solve_upper_triangular_in_place(MatRef::from_column_major_slice(l, n, n).transpose(), right, parallelism());
+}
+
+/// Scalar product.
+pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(x, y)| x * y).sum()
+}

@@ -1,0 +1,119 @@
+//! Training rows, settings of a fit, its progress, and their limits.
+//!
+//! In: what the caller gives. [`fit`](super::fit) checks all of it and rejects values out of range.
+
+use std::ops::ControlFlow;
+
+use serde::{Deserialize, Serialize};
+
+use super::basis::Basis;
+use super::kernel::Kernel;
+
+/// Most inputs of a row.
+pub const MAX_DIMENSIONS: usize = 256;
+/// Most rows of an exact fit: its matrix alone is then 3.2 GB, and a search needs three of them.
+pub const MAX_EXACT_ROWS: usize = 20_000;
+/// Most neighbours of a row.
+pub const MAX_NEIGHBOURS: usize = 500;
+/// Most inducing points.
+pub const MAX_INDUCING: usize = 5_000;
+
+/// Rows to learn from.
+#[derive(Debug, Clone, Copy)]
+pub struct TrainingRows<'a> {
+    /// Inputs, row after row.
+    pub inputs: &'a [f64],
+    /// Inputs of one row.
+    pub dimensions: usize,
+    /// Value to predict, one per row.
+    pub targets: &'a [f64],
+    /// Line of each row in its file, for errors; empty = rows are counted from 1.
+    pub lines: &'a [u64],
+}
+
+/// Approximation of the covariance of many rows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum Form {
+    /// No approximation.
+    Exact,
+    /// Each row is conditioned on its nearest among the rows before it in a seeded order (Vecchia's approximation), a
+    /// prediction on the nearest of all.
+    Nearest {
+        /// Number of neighbours, 1 to 500.
+        neighbours: usize,
+    },
+    /// Through inducing points with a row-wise correction of the noise (fully independent training conditional).
+    Inducing {
+        /// Number of inducing points, 1 to 5000.
+        points: usize,
+    },
+}
+
+/// Settings of a fit.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GprSettings {
+    /// Covariance function.
+    pub kernel: Kernel,
+    /// Mean function.
+    pub basis: Basis,
+    /// A length scale for every input instead of one for all.
+    pub ard: bool,
+    /// Inputs are brought to mean 0 and standard deviation 1; length scales are then in standard deviations.
+    pub standardise: bool,
+    /// Exact or sparse.
+    pub form: Form,
+    /// Searches from seeded random starts in addition to the first.
+    pub restarts: usize,
+    /// Seed of starts, order, inducing points and folds.
+    pub seed: u64,
+    /// Most steps of one search; 0 = the start is the result.
+    pub max_iterations: usize,
+    /// Hyperparameters to start from, in the order and units of [`Model::hyperparameters`](super::Model::hyperparameters); empty = derived from the rows.
+    pub start: Vec<f64>,
+    /// Calibrates the 95 % interval by nearby training rows, each predicted without itself; else Gaussian.
+    pub calibrate: bool,
+    /// Threads, 1 or more.
+    pub threads: usize,
+}
+
+impl GprSettings {
+    /// A constant basis, one length scale, standardised inputs, one search; exact up to 2,000 rows.
+    pub fn new(kernel: Kernel, rows: usize) -> Self {
+        Self {
+            kernel,
+            basis: Basis::Constant,
+            ard: false,
+            standardise: true,
+            form: if rows <= 2000 { Form::Exact } else { Form::Nearest { neighbours: 40 } },
+            restarts: 0,
+            seed: 1,
+            max_iterations: 60,
+            start: Vec::new(),
+            calibrate: true,
+            threads: 1,
+        }
+    }
+}
+
+/// Progress of a fit.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FitProgress {
+    /// Fold being fitted, from 1; 1 of 1 outside a cross-validation.
+    pub fold: usize,
+    /// Number of folds.
+    pub folds: usize,
+    /// Present search, from 1.
+    pub search: usize,
+    /// Number of searches.
+    pub searches: usize,
+    /// Steps of this search so far.
+    pub iteration: usize,
+    /// Most steps of a search.
+    pub max_iterations: usize,
+    /// Best log marginal likelihood of this search per row, in standardised targets.
+    pub log_likelihood_per_row: f64,
+}
+
+/// Callback after each step of a search; `Break` ends the fit with [`RegressionError::Cancelled`](super::RegressionError::Cancelled).
+pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;
