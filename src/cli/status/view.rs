@@ -8,6 +8,7 @@ mod draw;
 mod feed;
 mod pages;
 mod plot;
+mod theme;
 
 use std::io::{self, IsTerminal};
 use std::path::Path;

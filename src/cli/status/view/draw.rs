@@ -7,44 +7,13 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Block, Paragraph};
 
 use super::app::{App, Page};
+use super::theme::{Theme, clock};
 use super::{pages, plot};
-use crate::alarm::Severity;
 use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
-use crate::io::stamp;
-use crate::monitor::Validity;
-use crate::quantity::Timestamp;
 use crate::status::document::StatusDocument;
 
 /// Smallest usable size.
 const LEAST: (u16, u16) = (40, 12);
-
-/// Colours, where they are wanted.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Theme {
-    has_colour: bool,
-}
-
-impl Theme {
-    pub(super) fn colour(self, colour: Color) -> Style {
-        if self.has_colour { Style::new().fg(colour) } else { Style::new() }
-    }
-
-    pub(super) fn severity(self, severity: Severity) -> Style {
-        match severity {
-            Severity::Info => self.colour(Color::Cyan),
-            Severity::Warning => self.colour(Color::Yellow).add_modifier(Modifier::BOLD),
-            Severity::Severe => self.colour(Color::Red).add_modifier(Modifier::BOLD | Modifier::REVERSED),
-        }
-    }
-
-    pub(super) fn validity(self, validity: Validity) -> Style {
-        match validity {
-            Validity::Valid => self.colour(Color::Green),
-            Validity::Degraded => self.colour(Color::Yellow).add_modifier(Modifier::BOLD),
-            Validity::Untrusted | Validity::Unavailable => self.colour(Color::Red).add_modifier(Modifier::BOLD),
-        }
-    }
-}
 
 /// Draws everything.
 pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
@@ -72,12 +41,6 @@ pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
     pages::page(frame, app, &document, theme, page_area);
     frame.render_widget(keys(app.page), keys_area);
     app.document = Some(document);
-}
-
-/// The time of day, UTC.
-pub(super) fn clock(time: Timestamp) -> String {
-    let stamp = stamp::format_utc(time);
-    stamp.split_once('T').map_or(stamp.clone(), |(_, clock)| clock.to_owned())
 }
 
 fn lost(frame: &mut Frame<'_>, app: &App, area: Rect) {

@@ -8,8 +8,8 @@ use ratatui::widgets::{Block, Paragraph, Sparkline};
 use serde_json::Value;
 
 use super::app::{App, Page, Quantity};
-use super::draw::{Theme, clock};
 use super::plot::{ValueRange, bar, sparkline};
+use super::theme::{Theme, clock};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{number, shown, with_std, word};
 use crate::quantity::Timestamp;

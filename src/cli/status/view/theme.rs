@@ -1,0 +1,42 @@
+//! Colours and words that the frame of the view and its pages share.
+
+use ratatui::style::{Color, Modifier, Style};
+
+use crate::alarm::Severity;
+use crate::io::stamp;
+use crate::monitor::Validity;
+use crate::quantity::Timestamp;
+
+/// The colours of the view; without colour only bold and reversed text.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Theme {
+    pub(super) has_colour: bool,
+}
+
+impl Theme {
+    pub(super) fn colour(self, colour: Color) -> Style {
+        if self.has_colour { Style::new().fg(colour) } else { Style::new() }
+    }
+
+    pub(super) fn severity(self, severity: Severity) -> Style {
+        match severity {
+            Severity::Info => self.colour(Color::Cyan),
+            Severity::Warning => self.colour(Color::Yellow).add_modifier(Modifier::BOLD),
+            Severity::Severe => self.colour(Color::Red).add_modifier(Modifier::BOLD | Modifier::REVERSED),
+        }
+    }
+
+    pub(super) fn validity(self, validity: Validity) -> Style {
+        match validity {
+            Validity::Valid => self.colour(Color::Green),
+            Validity::Degraded => self.colour(Color::Yellow).add_modifier(Modifier::BOLD),
+            Validity::Untrusted | Validity::Unavailable => self.colour(Color::Red).add_modifier(Modifier::BOLD),
+        }
+    }
+}
+
+/// The time of day, UTC.
+pub(super) fn clock(time: Timestamp) -> String {
+    let stamp = stamp::format_utc(time);
+    stamp.split_once('T').map_or(stamp.clone(), |(_, clock)| clock.to_owned())
+}
