@@ -37,11 +37,10 @@ mod statistics;
 mod view;
 mod watch;
 
-use clock::{ASLEEP_S, Clock, TimeJump};
+use clock::{ASLEEP_S, Clock, HOUSEKEEPING_S, TimeJump};
 use intake::Intake;
 use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
-use watch::HOUSEKEEPING_S;
 
 use crate::can::Frame;
 use crate::quantity::{BusIndex, Reading, Timestamp};
