@@ -61,7 +61,7 @@ struct UseCounter {
 }
 
 impl CapacityReading {
-    /// What passed since another.
+    /// Returns the use since another reading.
     pub fn since(&self, before: &Self) -> Usage {
         Usage {
             cycles: self.cycles - before.cycles,
