@@ -8,13 +8,14 @@ use std::rc::Rc;
 use super::Failure;
 use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
+
 use crate::config::{self, Config};
 use crate::io::log::LogSource;
 use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
-use crate::replay::{self, Settings, Sinks, Summary, Watch};
+use crate::replay::{self, OutputWatch, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::Reader;
 
 /// Arguments of `report`.
@@ -120,10 +121,10 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
         out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
         out.events.iter().for_each(|event| data.take_event(event));
     });
-    let sinks = Sinks { watch: Some(Watch(watch)), ..Sinks::default() };
+    let sinks = Sinks { watch: Some(OutputWatch(watch)), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
-    let settings = Settings::plain(args.input.sleep_gap, config.interface_names());
+    let settings = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
     let (summary, _) = result.map_err(failure)?;
@@ -132,7 +133,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
     Ok((data, provenance(args, &summary)))
 }
 
-fn provenance(args: &Args, summary: &Summary) -> Provenance {
+fn provenance(args: &Args, summary: &ReplaySummary) -> Provenance {
     let mut lines: Provenance =
         args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
     lines.push(("Frames used".to_owned(), summary.log.frames.to_string()));

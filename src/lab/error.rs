@@ -28,7 +28,7 @@ convert!(
     csv::Error,
     serde_json::Error,
     parquet::errors::ParquetError,
-    crate::regress::Fault,
+    crate::regress::RegressionError,
     FitError,
     LogError,
     PlotError,

@@ -12,13 +12,13 @@ mod trained;
 use std::path::Path;
 use std::time::Instant;
 
+use crate::error::LabError;
+use crate::io::result_file::ResultFile;
+use crate::regress::{self, Folds, GprSettings, Prediction, PredictionScore, ProgressCallback, TrainingRows};
+
 pub use pictures::{write_cross_validation, write_forecast};
 pub use table::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn};
 pub use trained::{TrainedModel, write_predictions};
-
-use crate::error::LabError;
-use crate::io::result_file::ResultFile;
-use crate::regress::{self, Folds, Prediction, Rows, Score, Settings, Watcher};
 
 /// Cross-validation of one kernel.
 #[derive(Debug, Clone)]
@@ -28,7 +28,7 @@ pub struct CrossValidation {
     /// Predictions of all rows, and the folds.
     pub folds: Folds,
     /// Errors over all rows.
-    pub score: Score,
+    pub score: PredictionScore,
     /// Time of the whole experiment with this kernel, s.
     pub seconds: f64,
     /// Most memory the process held meanwhile, KiB; `None` where the system does not say.
@@ -48,12 +48,12 @@ pub fn split(table: &ColumnTable) -> (Vec<f64>, Vec<f64>) {
 /// Too few rows for the folds, settings out of range, or the watcher stopped it.
 pub fn cross_validate(
     table: &ColumnTable,
-    settings: &Settings,
+    settings: &GprSettings,
     folds: usize,
-    watcher: &mut Watcher<'_>,
+    watcher: &mut ProgressCallback<'_>,
 ) -> Result<CrossValidation, LabError> {
     let (inputs, targets) = split(table);
-    let rows = Rows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
+    let rows = TrainingRows { inputs: &inputs, dimensions: table.width() - 1, targets: &targets, lines: &table.lines };
     reset_peak();
     let begin = Instant::now();
     let folds = regress::cross_validate(&rows, settings, folds, &|| begin.elapsed().as_secs_f64(), watcher)?;

@@ -15,10 +15,10 @@ mod truth;
 
 use serde::Serialize;
 
-pub use history::{CapacityReading, History};
-pub use truth::end_of_life;
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, RemainingLife, Usage};
 
-use crate::health::{Axis, Forecast, InsufficientData, Reading, RemainingLife, Usage};
+pub use history::{History, MeasuredCapacity};
+pub use truth::end_of_life;
 
 /// An error larger than this part of the life counts as this: one baseline that never ends must not dominate a mean.
 pub const WORST_ERROR: f64 = 1.0;
@@ -223,7 +223,7 @@ fn quantiles(axis: Axis, life: &RemainingLife) -> Option<[f64; 3]> {
 /// Returns the filter after all readings until `moment`, units of use.
 fn fed(history: &History, moment: f64) -> Forecast {
     let mut forecast = Forecast::new(history.axis, history.first_capacity_ah());
-    let mut before = CapacityReading::default();
+    let mut before = MeasuredCapacity::default();
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
@@ -233,7 +233,7 @@ fn fed(history: &History, moment: f64) -> Forecast {
             forecast.update(Usage { cycles, days, rest_days }, None);
             break;
         }
-        let reading = Reading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        let reading = CapacityReading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
         forecast.update(passed, Some(reading));
         before = *row;
     }

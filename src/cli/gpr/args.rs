@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crate::cli::Failure;
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
-use crate::regress::{Basis, Form, Kernel, MAX_INDUCING, MAX_NEIGHBOURS, Settings};
+use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
 
 /// Below the options.
 pub(super) const GRAMMAR: &str = "\
@@ -103,8 +103,8 @@ pub(super) struct ModelArgs {
 
 impl ModelArgs {
     /// Returns the settings for a number of rows.
-    pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> Settings {
-        let mut settings = Settings::new(kernel.clone(), rows);
+    pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> GprSettings {
+        let mut settings = GprSettings::new(kernel.clone(), rows);
         settings.form = match self.form {
             Some(FormName::Exact) => Form::Exact,
             Some(FormName::Nearest) => Form::Nearest { neighbours: self.neighbours },

@@ -9,7 +9,7 @@ use serde_json::{Map, Value, json};
 
 use crate::cli::output::{print_json, progress_bar, write_table};
 use crate::lab::gpr::{ColumnTable, CrossValidation, TrainedModel, peak_kib};
-use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
+use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
@@ -22,7 +22,7 @@ pub(super) fn fit_bar(fits: usize) -> ProgressBar {
 }
 
 /// Shows a step of a search; `before` fits were done before this cross-validation.
-pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
+pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
     let part = (p.search - 1) * p.max_iterations + p.iteration;
     let whole = (p.searches * p.max_iterations).max(1);
     let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
@@ -51,7 +51,7 @@ fn form_note(of: Form, default_form: bool) -> String {
     format!("form {}{why}", form(of))
 }
 
-fn basis(settings: &Settings) -> String {
+fn basis(settings: &GprSettings) -> String {
     format!("{:?}", settings.basis).to_lowercase()
 }
 
@@ -75,7 +75,7 @@ fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
 }
 
 /// Errors of predictions.
-pub(super) fn score_json(s: &Score) -> Map<String, Value> {
+pub(super) fn score_json(s: &PredictionScore) -> Map<String, Value> {
     let values = [
         ("rmse", s.rmse),
         ("mean_absolute_error", s.mean_absolute_error),
@@ -94,7 +94,7 @@ pub(super) fn short(value: f64) -> String {
 /// A cross-validation.
 pub(super) struct CvReport<'a> {
     pub(super) table: &'a ColumnTable,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a GprSettings,
     pub(super) folds: usize,
     pub(super) all: &'a [CrossValidation],
     pub(super) default_form: bool,
@@ -248,7 +248,7 @@ pub(super) struct PredictReport<'a> {
     pub(super) trained: &'a TrainedModel,
     pub(super) table: &'a ColumnTable,
     pub(super) known: usize,
-    pub(super) score: Option<Score>,
+    pub(super) score: Option<PredictionScore>,
 }
 
 impl PredictReport<'_> {

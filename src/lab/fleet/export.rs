@@ -19,6 +19,7 @@ use serde_json::json;
 use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use self::table::TableFile;
 use super::drive::{DriveSummary, LogAccess, drive};
+
 use crate::config::Config;
 use crate::error::LabError;
 use crate::fields::Fields;

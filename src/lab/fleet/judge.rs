@@ -21,6 +21,7 @@ use serde::Serialize;
 use super::track::Track;
 use super::truth::{Truth, TruthKind};
 use super::variant_batch::{AlarmHistory, Raise};
+
 use crate::alarm::{Rule, RuleConfig};
 use crate::quantity::Timestamp;
 
@@ -101,7 +102,7 @@ pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &LogLife<'_>) ->
     let verdicts: Vec<(RaiseClass, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
     // Nothing can be missed in a log that began after the end of life.
-    let is_ageing = config.rule.row().is_learned && life.end.is_none_or(|end| end > life.span.0);
+    let is_ageing = config.rule.spec().is_learned && life.end.is_none_or(|end| end > life.span.0);
     let first_true = verdicts.iter().find(|(verdict, _)| *verdict == RaiseClass::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
     AlarmScore {
@@ -159,7 +160,7 @@ impl LogLife<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Severity, When};
+    use crate::alarm::{Comparison, Severity};
     use crate::fleet::track::CapacityKind;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};
@@ -195,7 +196,7 @@ mod tests {
             severity: Severity::Warning,
             threshold: 0.8,
             clear: 0.9,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,

@@ -133,7 +133,7 @@ fn concerns(input: &AlarmInput, watches: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, When};
+    use crate::alarm::{Comparison, Observation};
 
     fn low(rule: Rule, threshold: f64) -> RuleConfig {
         RuleConfig {
@@ -141,7 +141,7 @@ mod tests {
             severity: Severity::Warning,
             threshold,
             clear: threshold * 1.02,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,
@@ -170,7 +170,7 @@ mod tests {
             let (rule, cell) = (Rule::CapacityLow, Some(CellIndex(0)));
             let seen = Observation::new(Some(value)).with_std(0.1);
             let time = Timestamp::from_secs(f64::from(second));
-            engines.take(&[(time, AlarmInput::Observe { rule, cell, seen })], &mut batch);
+            engines.take(&[(time, AlarmInput::Observe { rule, cell, observation: seen })], &mut batch);
         }
         let seconds = |number: usize| {
             let history = batch.history(number).expect("watched");

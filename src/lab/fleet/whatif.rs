@@ -14,6 +14,7 @@ use super::track::{CapacityKind, Track};
 use super::truth::{Truth, TruthKind};
 use super::variant_batch::VariantBatch;
 use super::variants::VariantGrid;
+
 use crate::alarm::{Rule, Severity};
 use crate::config::Config;
 use crate::error::LabError;

@@ -17,12 +17,16 @@ mod windows;
 use std::path::Path;
 use std::time::Instant;
 
-pub use windows::{LagWindows, RowSpacing};
+use spread::Spread;
 
 use super::{ColumnTable, interval, write_csv};
+
 use crate::error::LabError;
-use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
-use spread::Spread;
+use crate::regress::{
+    GprSettings, Jitter, Model, Prediction, PredictionScore, ProgressCallback, TrainingRows, fit, score,
+};
+
+pub use windows::{LagWindows, RowSpacing};
 
 /// Most lagged values of a column.
 pub const MAX_LAGS: usize = 200;
@@ -57,7 +61,7 @@ pub struct ForecastPlan {
     /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
     pub rows: usize,
     /// Kernel and search.
-    pub settings: Settings,
+    pub settings: GprSettings,
 }
 
 /// Forecasts of all outputs.
@@ -102,7 +106,7 @@ pub struct HorizonForecast {
     /// Rows after the origin from which forecasts were made, and the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
     /// Their errors; `None` when there are no rows after the origin.
-    pub score: Option<Score>,
+    pub score: Option<PredictionScore>,
     /// Root of the mean squared error of persistence (the value stays as it is) over the same rows.
     pub persistence_rmse: Option<f64>,
 }
@@ -127,7 +131,7 @@ pub fn horizons(steps: usize) -> Vec<usize> {
 pub fn run(
     table: &ColumnTable,
     plan: &ForecastPlan,
-    watcher: &mut Watcher<'_>,
+    watcher: &mut ProgressCallback<'_>,
     done: &mut dyn FnMut(usize, usize),
 ) -> Result<TableForecast, LabError> {
     check(plan)?;
@@ -176,7 +180,12 @@ struct HorizonTask<'a> {
 }
 
 impl HorizonTask<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(HorizonForecast, Model), LabError> {
+    fn run(
+        &self,
+        start: &[f64],
+        from: usize,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<(HorizonForecast, Model), LabError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
@@ -219,7 +228,7 @@ impl HorizonTask<'_> {
         end: usize,
         start: &[f64],
         fixed: Option<&[f64]>,
-        watcher: &mut Watcher<'_>,
+        watcher: &mut ProgressCallback<'_>,
     ) -> Result<Option<(Model, usize)>, LabError> {
         let known = self.windows.between(0, end, self.steps);
         if known.len() < self.fewest() {
@@ -228,7 +237,7 @@ impl HorizonTask<'_> {
         let rows = chosen(&known, self.plan.rows);
         let inputs = self.windows.features(&rows);
         let targets: Vec<f64> = rows.iter().map(|row| self.windows.change(*row, self.column, self.steps)).collect();
-        let mut settings = Settings { calibrate: false, ..self.plan.settings.clone() };
+        let mut settings = GprSettings { calibrate: false, ..self.plan.settings.clone() };
         if let Some(fixed) = fixed {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
@@ -236,12 +245,12 @@ impl HorizonTask<'_> {
             settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
             settings.restarts = 0;
         }
-        let rows = Rows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
+        let rows = TrainingRows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
     /// From forecasts of block after block by what came before it.
-    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, LabError> {
+    fn spread(&self, model: &Model, watcher: &mut ProgressCallback<'_>) -> Result<Spread, LabError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
@@ -282,7 +291,7 @@ impl HorizonTask<'_> {
         Ok(rows.iter().zip(windows).zip(found).map(value).collect())
     }
 
-    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<Score>, Option<f64>) {
+    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<PredictionScore>, Option<f64>) {
         if held_out.is_empty() {
             return (None, None);
         }

@@ -8,8 +8,9 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::{ColumnTable, interval, split, table, write_csv};
+
 use crate::error::LabError;
-use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
+use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
 
 /// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
@@ -43,10 +44,14 @@ impl TrainedModel {
     ///
     /// # Errors
     /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
-    pub fn fit(table: &ColumnTable, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, LabError> {
+    pub fn fit(
+        table: &ColumnTable,
+        settings: &GprSettings,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<Self, LabError> {
         let (inputs, targets) = split(table);
         let width = table.width();
-        let rows = Rows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
+        let rows = TrainingRows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
         let model = fit(&rows, settings, watcher)?;
         Ok(Self { output: table.names[width - 1].clone(), inputs: table.names[..width - 1].to_vec(), model })
     }

@@ -3,6 +3,7 @@
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
 use super::trace::Trace;
+
 use crate::fields::Fields;
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};

@@ -9,7 +9,7 @@ use super::context::PageContext;
 use super::data::{CapacityRecord, Data};
 use super::limits::threshold;
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, InsufficientData, Reading, Remaining, RemainingLife, Usage};
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
 /// Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
@@ -113,10 +113,10 @@ pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
     cells
 }
 
-fn reading(row: &CapacityRecord, gain_std: f64) -> Option<Reading> {
+fn reading(row: &CapacityRecord, gain_std: f64) -> Option<CapacityReading> {
     let (capacity_ah, std_ah) = row.measured_ah.zip(row.measured_std_ah)?;
     let gain_ah = gain_std * row.capacity_ah.0;
-    Some(Reading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
+    Some(CapacityReading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
 /// From the last half-cycle until the last moment the end of life may come, within reason.

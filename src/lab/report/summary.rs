@@ -162,11 +162,11 @@ fn is_of_battery(name: &str) -> bool {
 }
 
 fn about(name: &str) -> &str {
-    rule(name).map_or(name, |rule| rule.row().about)
+    rule(name).map_or(name, |rule| rule.spec().about)
 }
 
 fn unit(name: &str) -> &'static str {
-    rule(name).map_or("", |rule| rule.row().unit.symbol())
+    rule(name).map_or("", |rule| rule.spec().unit.symbol())
 }
 
 /// Formats a rule's value with its unit, without trailing zeros.

@@ -17,7 +17,7 @@ const DAY_S: f64 = 86_400.0;
 
 /// A reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct CapacityReading {
+pub struct MeasuredCapacity {
     /// Line of the file.
     pub line: u64,
     /// Units of the history's axis since the first reading.
@@ -38,7 +38,7 @@ pub struct History {
     /// What counts as use.
     pub axis: Axis,
     /// In order of time, at least one.
-    pub rows: Vec<CapacityReading>,
+    pub rows: Vec<MeasuredCapacity>,
 }
 
 struct Columns {
@@ -60,7 +60,7 @@ struct UseCounter {
     rest_days: f64,
 }
 
-impl CapacityReading {
+impl MeasuredCapacity {
     /// Returns the use since another reading.
     pub fn since(&self, before: &Self) -> Usage {
         Usage {
@@ -110,7 +110,7 @@ impl Columns {
 
 impl UseCounter {
     /// Counts a line; returns its reading, if it has one.
-    fn add_row(&mut self, columns: &Columns, row: &Row<'_>) -> Result<Option<CapacityReading>, TableError> {
+    fn add_row(&mut self, columns: &Columns, row: &Row<'_>) -> Result<Option<MeasuredCapacity>, TableError> {
         let time = row.stamp(columns.time)?;
         if self.last.is_some_and(|last| time < last) {
             return Err(row.fault(columns.time, "no earlier than the line before"));
@@ -122,7 +122,7 @@ impl UseCounter {
         let is_discharge = columns.kind.is_none_or(|kind| row.text(kind) == "discharge");
         let counts_cycles = columns.kind.is_some();
         let reading = capacity.filter(|_| is_discharge);
-        let reading = reading.map(|ah| CapacityReading { line: row.line, ..self.reading(counts_cycles, time, ah) });
+        let reading = reading.map(|ah| MeasuredCapacity { line: row.line, ..self.reading(counts_cycles, time, ah) });
         if is_discharge {
             self.discharges += 1.0;
         }
@@ -138,14 +138,14 @@ impl UseCounter {
         self.last = Some(time);
     }
 
-    fn reading(&mut self, counts_cycles: bool, time: Timestamp, capacity_ah: f64) -> CapacityReading {
+    fn reading(&mut self, counts_cycles: bool, time: Timestamp, capacity_ah: f64) -> MeasuredCapacity {
         if self.first.is_none() {
             (self.first, self.before, self.rest_days) = (Some(time), self.discharges, 0.0);
         }
         let days = self.first.map_or(0.0, |first| time.since(first) / DAY_S);
         let cycles = if counts_cycles { self.discharges - self.before } else { 0.0 };
         let used = if counts_cycles { cycles } else { days };
-        CapacityReading { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
+        MeasuredCapacity { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
     }
 }
 

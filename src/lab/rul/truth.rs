@@ -34,15 +34,15 @@ fn non_increasing(values: &[f64]) -> Vec<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::CapacityReading;
+    use super::super::MeasuredCapacity;
     use super::*;
     use crate::health::Axis;
 
     fn history(capacities: &[f64]) -> History {
-        let row = |(index, &capacity_ah): (u32, &f64)| CapacityReading {
+        let row = |(index, &capacity_ah): (u32, &f64)| MeasuredCapacity {
             used: f64::from(index),
             capacity_ah,
-            ..CapacityReading::default()
+            ..MeasuredCapacity::default()
         };
         History { axis: Axis::Cycles, rows: (0..).zip(capacities).map(row).collect() }
     }

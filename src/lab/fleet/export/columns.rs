@@ -7,6 +7,7 @@ use std::borrow::Cow;
 use std::fmt::Write as _;
 
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
 
@@ -152,7 +153,7 @@ pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "value" Real "unit" null, "the value that caused the change", |row| FieldValue::Real(row.alarm.number("value"));
     "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| FieldValue::Real(row.alarm.number("probability"));
     "threshold" Real "unit", "the threshold it is compared with", |row| FieldValue::Real(row.alarm.number("threshold"));
-    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.rule.row().unit.symbol());
+    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.rule.spec().unit.symbol());
     "occurrences" Whole "", "times it was raised", |row| FieldValue::Whole(row.alarm.whole("occurrences"));
     "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };

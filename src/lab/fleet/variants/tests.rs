@@ -4,7 +4,7 @@ use std::fs;
 use std::path::PathBuf;
 
 use super::*;
-use crate::alarm::{Severity, When};
+use crate::alarm::{Comparison, Severity};
 
 const ALARMS: &str = "
 [[alarm]]
@@ -56,7 +56,7 @@ fn thresholds_of_one_rule_share_a_replay() {
     assert_eq!(grid.variants[2].values, ["1.9", "0.9"]);
     assert_eq!(threshold(&grid.variants[1], Severity::Warning).0, 1.9);
     assert_eq!(threshold(&grid.variants[0], Severity::Warning).0, 2.0);
-    assert!(grid.variants[2].config.monitor.rules.iter().any(|rule| rule.when == When::Probability(0.9)));
+    assert!(grid.variants[2].config.monitor.rules.iter().any(|rule| rule.when == Comparison::Probability(0.9)));
     assert_eq!(grid.notes, ["capacity_low.threshold is capacity_low.warning"]);
     assert_eq!(grid.rules, [Rule::CapacityLow]);
 }

@@ -37,7 +37,7 @@ fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) ->
     for k in 0..current_a.len() {
         let mean_a = if k == 0 { 0.0 } else { 0.5 * (current_a[k] + current_a[k - 1]) };
         soc -= mean_a / 3600.0 / CAPACITY_AH;
-        let place = model.place(soc, temperature_c);
+        let place = model.grid_position(soc, temperature_c);
         for (i, u) in branches_v.iter_mut().enumerate() {
             let dt_s = if k == 0 { 0.0 } else { 1.0 };
             *u = BranchAt::new(model, i, &place, 1.0).voltage_after(Discretisation::Exact, *u, mean_a, dt_s);

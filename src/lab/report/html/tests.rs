@@ -1,7 +1,7 @@
 //! The size of a page of a long life, and the text of a page without data.
 
 use super::*;
-use crate::alarm::{Change, Rule, Severity, State};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
@@ -110,7 +110,7 @@ fn alarm(half: u16, active: bool) -> EventKind {
         rule: Rule::CapacityLow,
         cell: Some(CellIndex(half % 96)),
         change: if active { Change::Raised } else { Change::Cleared },
-        state: if active { State::Active } else { State::Inactive },
+        state: if active { AlarmState::Active } else { AlarmState::Inactive },
         active,
         severity: Severity::Warning,
         value: Some(capacity_ah(half, half % 96)),
