@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::alarm::{AlarmState, Rule};
+use crate::alarm::Rule;
 use crate::fields::Fields;
 use crate::health::RemainingLife;
 use crate::monitor::Estimate;
