@@ -14,9 +14,9 @@ use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 use crate::diagnosis::{self, Interrupt, Survey};
-use crate::replay::ReplayProgress;
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
+use crate::replay::ReplayProgress;
 
 /// Longest time anybody may listen, s: a day.
 const MAX_SECONDS: f64 = 86_400.0;

@@ -13,15 +13,15 @@ pub(crate) use report::Bar;
 use super::Failure;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::replay::{self, ReplayError, ReplaySettings, Sinks, ReplaySummary};
-use crate::io::snapshot_file;
-use crate::store::Recorder;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
+use crate::io::snapshot_file;
 use crate::io::socket::CanSender;
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplayError, ReplaySettings, ReplaySummary, Sinks};
 use crate::sample::VoltageSource;
+use crate::store::Recorder;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -43,7 +43,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: ReplaySettings) -> Result<(), ReplayError> {
+fn replay_all(
+    args: &Args,
+    source: &mut LogSource,
+    config: Config,
+    settings: ReplaySettings,
+) -> Result<(), ReplayError> {
     let sinks = Sinks {
         estimates: create(args.estimates.as_deref())?,
         events: create(args.events.as_deref())?,

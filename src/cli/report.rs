@@ -9,12 +9,12 @@ use std::rc::Rc;
 use super::Failure;
 use super::replay::{Bar, InputArgs, log_options};
 use crate::config::{self, Config};
-use crate::replay::{self, ReplaySettings, Sinks, ReplaySummary, OutputWatch};
-use crate::store::Reader;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::lab::report::{self, Data, Origin, Setting};
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
+use crate::store::Reader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
@@ -129,7 +129,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
         out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
         out.events.iter().for_each(|event| data.take_event(event));
     });
-    let sinks = Sinks { watch: Some(OutputWatch(watch)), ..Sinks::default() };
+    let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
     let settings = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());

@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
 use crate::cli::run::away;
-use crate::replay::LogTime;
 use crate::io::stamp;
 use crate::monitor::Downtime;
+use crate::replay::LogTime;
 
 /// Which way a CSV's positive current flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]

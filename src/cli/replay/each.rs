@@ -12,10 +12,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use super::{Args, Failure, report};
 use crate::config::Config;
-use crate::replay::{self, ReplayProgress, ReplayError, Sinks, ReplaySummary, in_order};
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplayError, ReplayProgress, ReplaySummary, Sinks, in_order};
 
 /// Runs the command.
 pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {

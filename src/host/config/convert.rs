@@ -25,7 +25,12 @@ pub(super) struct Traffic {
 }
 
 /// The settings of the core; `None` when a table is missing or faulty (and noted).
-pub(super) fn monitor(raw: &RawTables, mut model: CellModel, found: &DbcRanges, traffic: Traffic) -> Option<MonitorConfig> {
+pub(super) fn monitor(
+    raw: &RawTables,
+    mut model: CellModel,
+    found: &DbcRanges,
+    traffic: Traffic,
+) -> Option<MonitorConfig> {
     let pack = raw.pack.as_ref()?;
     model.rated_capacity_ah = pack.rated_capacity_ah.unwrap_or(model.rated_capacity_ah);
     let rated_ah = model.rated_capacity_ah;

@@ -112,7 +112,12 @@ pub struct OutputUse {
 }
 
 /// Describes a checked configuration and the signals found for it.
-pub(super) fn describe(raw: &RawTables, config: &Config, found: &[ResolvedSignal<'_>], outputs: Vec<OutputUse>) -> Description {
+pub(super) fn describe(
+    raw: &RawTables,
+    config: &Config,
+    found: &[ResolvedSignal<'_>],
+    outputs: Vec<OutputUse>,
+) -> Description {
     let model = &config.monitor.model;
     let cell = format!(
         "{}: rated {} Ah, {} Ah when new, {} to {} V, {} RC branch{}{}",

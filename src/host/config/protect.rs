@@ -14,7 +14,12 @@ use crate::quantity::BusIndex;
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub(super) fn guards(raw: &RawTables, found: &[ResolvedSignal<'_>], inputs_whole: bool, faults: &mut Faults) -> Vec<GuardConfig> {
+pub(super) fn guards(
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
+    inputs_whole: bool,
+    faults: &mut Faults,
+) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
         check_profile(keys, faults);
@@ -138,7 +143,8 @@ pub(super) fn describe(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<Str
     let mut words = vec![format!("at most {rate} frames a second of one identifier, a tenth of them at once")];
     if monitor.guards.is_empty() {
         words.push(
-            "no end-to-end protection: a damaged, repeated or old frame cannot be distinguished from a good one".to_owned(),
+            "no end-to-end protection: a damaged, repeated or old frame cannot be distinguished from a good one"
+                .to_owned(),
         );
     }
     if monitor.commands.is_none() {

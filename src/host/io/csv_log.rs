@@ -144,7 +144,8 @@ impl Columns<'_> {
 
     fn missing(&self, role: &str, column: &str) -> TableError {
         let found = self.header.names().join(",");
-        self.header.fault(format_args!("no column {column} for {role}, found {found} (map it with --column {role}=NAME)"))
+        self.header
+            .fault(format_args!("no column {column} for {role}, found {found} (map it with --column {role}=NAME)"))
     }
 
     fn required(&self, role: &str, default: &str) -> Result<usize, TableError> {
@@ -160,7 +161,9 @@ impl Columns<'_> {
         let starts = match (&self.options.start_times, column) {
             (Some(path), Some(column)) => Some(read_starts(path, &self.header.names()[column])?),
             (Some(path), None) => {
-                return Err(self.header.fault(format_args!("no section column for the start times of {}", path.display())));
+                return Err(self
+                    .header
+                    .fault(format_args!("no section column for the start times of {}", path.display())));
             }
             (None, _) => None,
         };

@@ -22,7 +22,7 @@
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::Timestamp;
 
 /// First line of every journal.

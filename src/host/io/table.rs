@@ -17,7 +17,7 @@ use crate::quantity::Timestamp;
 /// Columns at whose values time starts again, where the user names none.
 pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
-/// What is allowed where a point in time is read.
+/// Allowed forms of a point in time.
 const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
 
 /// A table that cannot be read or a field that cannot be used, with its place.
@@ -240,11 +240,14 @@ mod tests {
             faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.0));
             faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").0));
         }
-        assert_eq!(faults, [
-            "t.csv:2: column soc: found \"0.5\", must be a fraction",
-            "t.csv:4: column soc: found \"x\", must be a fraction",
-            "t.csv:4: column name: found no such field, must be a name",
-        ]);
+        assert_eq!(
+            faults,
+            [
+                "t.csv:2: column soc: found \"0.5\", must be a fraction",
+                "t.csv:4: column soc: found \"x\", must be a fraction",
+                "t.csv:4: column name: found no such field, must be a name",
+            ]
+        );
     }
 
     #[test]

@@ -15,13 +15,13 @@ use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::control::protocol::{Answer, Request};
 use crate::control::{Asked, answer};
-use crate::store::Progress;
-use crate::io::snapshot_file;
-use crate::logging;
 use crate::io::clock::MappedClock;
-use crate::io::socket::{LinkOutput, LinkMessage, LinkEvent};
+use crate::io::snapshot_file;
+use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::logging;
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
+use crate::store::Progress;
 
 /// Of these, handed over between two looks at the timer: under one tick's time of a full bus.
 const BATCH: usize = 256;

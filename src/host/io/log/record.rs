@@ -1,7 +1,7 @@
 //! Records of a log: [`Record`], an input that owns its frame, and [`Batch`], many of them at once.
 
 use crate::can::Frame;
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
 /// Content of an unused slot.
@@ -114,7 +114,7 @@ impl Record {
 pub struct Batch {
     /// All slots.
     pub(super) slots: Box<[Record]>,
-    /// How many of them are filled.
+    /// Number of filled slots.
     pub(super) len: usize,
     pub(super) carries_ticks: bool,
 }

@@ -17,7 +17,7 @@ mod tap;
 mod wire;
 
 pub use counters::{LinkCounters, LinkState};
-pub use link::{Link, LinkConfig, LinkOutput, LinkMessage, LinkEvent};
+pub use link::{Link, LinkConfig, LinkEvent, LinkMessage, LinkOutput};
 pub use listener::CanListener;
 pub use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
 pub use sender::CanSender;
