@@ -1,8 +1,8 @@
-//! `packwatch dbc`: the DBC of the frames as they are configured, for those who receive them.
+//! `packwatch dbc`: writes the DBC of the configured frames for their receivers.
 //!
-//! It is the very layout the encoder is made from: identifiers, frame formats, end-to-end protection, cycle times,
-//! value tables. A file is written beside its place and renamed when complete. A bad configuration, and one that sends
-//! nothing, ends with exit code 78.
+//! The DBC is the layout from which the encoder is made: identifiers, frame formats, end-to-end protection, cycle times,
+//! value tables. An output file appears under its name only when it is complete. Exit code 78: the configuration is
+//! invalid, or it has no frames to send.
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ pub(crate) struct Args {
     /// Configuration file
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// File to write instead of standard output; one that is there is replaced
+    /// File to write instead of standard output; an existing file is replaced
     #[arg(short, long, value_name = "FILE", default_value = "-", hide_default_value = true)]
     output: PathBuf,
 }
@@ -34,7 +34,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         file.finish()
     });
     match written {
-        // A reader that has seen enough (`| head`) is no failure.
+        // A reader that closes the pipe (`| head`) is no failure.
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::new(error.to_string())),
         Ok(()) | Err(_) => Ok(()),
     }

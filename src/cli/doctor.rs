@@ -1,7 +1,7 @@
-//! `packwatch doctor`: listens to a pack, or replays what was recorded of one, and tells what is probably wrong.
+//! `packwatch doctor`: listens to a pack or replays a record of one, and reports what is probably wrong.
 //!
-//! Exit code: 0 nothing is wrong, 1 something is, 78 the configuration itself is bad (what can be diagnosed all the same
-//! is told).
+//! Exit code: 0 = no error and no warning, 1 = findings, 78 = the configuration itself is invalid (the parts that can be
+//! read are diagnosed anyway).
 
 mod page;
 
@@ -13,15 +13,16 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
+
 use crate::diagnosis::{self, Interrupt, Survey};
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
 use crate::replay::ReplayProgress;
 
-/// Longest time anybody may listen, s: a day.
+/// Longest time to listen, s: a day.
 const MAX_SECONDS: f64 = 86_400.0;
-/// How long is listened when nothing is said, s.
-const USUAL_SECONDS: f64 = 60.0;
+/// Time to listen without `--for`, s.
+const DEFAULT_SECONDS: f64 = 60.0;
 
 /// Arguments of `doctor`.
 #[derive(Debug, clap::Args)]
@@ -29,8 +30,8 @@ pub(crate) struct Args {
     /// Configuration; it may be wrong
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Interface in place of the configured one; several for several, in their order. Other CAN interfaces of this computer
-    /// are listened to as well
+    /// Interface in place of the configured one; repeat it for several, in their order. Other CAN interfaces of this
+    /// computer are listened to as well
     #[arg(short, long = "interface", value_name = "IFACE")]
     interfaces: Vec<String>,
     /// Logs to replay instead of listening: journals, candump logs or CSV files, also .gz or .zst; - is standard input
@@ -63,13 +64,13 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut survey = diagnosis::survey(&args.config)?;
-    rename(args, &mut survey)?;
+    rename_interfaces(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;
     let mut report =
         if args.logs.is_empty() { listen(args, &survey, &interrupt)? } else { replay(args, &survey, &interrupt)? };
     complete(&mut report, &survey);
-    let source = source_words(args, &survey);
+    let source = source_name(args, &survey);
     if args.json {
         json(&report, &args.config, &source)?
     } else {
@@ -82,15 +83,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
 }
 
-/// Other names for the configured interfaces.
-fn rename(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
+/// Replaces the names of the configured interfaces.
+fn rename_interfaces(args: &Args, survey: &mut Survey) -> Result<(), Failure> {
     let configured = survey.plan.interfaces.len();
     if args.interfaces.len() > configured {
         let found = args.interfaces.len();
-        return Err(Failure::new(format!(
-            "--interface given {found} times, {} has {configured}",
-            args.config.display()
-        )));
+        let file = args.config.display();
+        return Err(Failure::new(format!("--interface given {found} times, {file} has {configured}")));
     }
     for (interface, name) in survey.plan.interfaces.iter_mut().zip(&args.interfaces) {
         interface.name.clone_from(name);
@@ -103,13 +102,12 @@ fn is_csv(log: &Path) -> bool {
     name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
-fn source_words(args: &Args, survey: &Survey) -> String {
+fn source_name(args: &Args, survey: &Survey) -> String {
     if args.logs.is_empty() {
         let names: Vec<&str> = survey.plan.interfaces.iter().map(|interface| interface.name.as_str()).collect();
         return names.join(", ");
     }
-    let names: Vec<String> = args.logs.iter().map(|log| log.display().to_string()).collect();
-    names.join(", ")
+    args.logs.iter().map(|log| log.display().to_string()).collect::<Vec<_>>().join(", ")
 }
 
 fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
@@ -117,8 +115,8 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
         columns: args.columns.clone(),
         charge_positive: args.csv_sign == CsvSign::Charge,
         start_times: args.start_times.clone(),
-        cells: if survey.plan.is_pack_total { 1 } else { survey.plan.cells },
-        pack_total: survey.plan.is_pack_total,
+        cells: if survey.plan.pack.is_total { 1 } else { survey.plan.pack.cells },
+        pack_total: survey.plan.pack.is_total,
     };
     let bar = Bar::new(&args.logs);
     let result = diagnosis::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
@@ -137,7 +135,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
 }
 
 fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
-    let wanted_s = args.seconds.unwrap_or(USUAL_SECONDS);
+    let wanted_s = args.seconds.unwrap_or(DEFAULT_SECONDS);
     let bar = ProgressBar::with_draw_target(Some((1000.0 * wanted_s) as u64), ProgressDrawTarget::stderr_with_hz(5));
     let template = "listening {bar:32} {msg} (Ctrl-C ends early)";
     bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
@@ -149,12 +147,12 @@ fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     result.map_err(|error| Failure::new(error.to_string()))
 }
 
-/// Adds the configuration's own faults, and to every change the line it is about.
+/// Adds the configuration's own faults, and to every change its line.
 fn complete(report: &mut Report, survey: &Survey) {
     for fault in &survey.faults {
-        let mut finding = Finding::new(Severity::Error, Topic::Configuration, "the configuration is not good");
+        let mut finding = Finding::new(Severity::Error, Topic::Configuration, "the configuration is invalid");
         finding.seen.clone_from(fault);
-        finding.why = "packwatch run does not start with it; what can be judged all the same is told below".to_owned();
+        finding.why = "packwatch run does not start with it; the parts that can be read are judged below".to_owned();
         report.add(finding);
     }
     for change in report.findings.iter_mut().flat_map(|finding| &mut finding.changes) {

@@ -7,9 +7,6 @@ mod report;
 use std::io;
 use std::path::Path;
 
-pub(crate) use args::{Args, CsvSign, InputArgs, column};
-pub(crate) use report::Bar;
-
 use super::Failure;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
@@ -22,6 +19,9 @@ use crate::monitor::Monitor;
 use crate::replay::{self, ReplayError, ReplaySettings, ReplaySummary, Sinks};
 use crate::sample::VoltageSource;
 use crate::store::Recorder;
+
+pub(crate) use args::{Args, CsvSign, InputArgs, column};
+pub(crate) use report::Bar;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {

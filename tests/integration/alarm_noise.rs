@@ -173,7 +173,7 @@ fn soc_day(alarm: &str) -> Day {
         let current_a = (soc - target) * model.capacity_ah * 3600.0;
         soc = soc_after(soc, current_a, model.capacity_ah);
         // Branch in balance with the current.
-        let place = model.place(soc, 25.0);
+        let place = model.grid_position(soc, 25.0);
         let voltage_v = terminal_v(model, &place, 1.0, 0.025 * current_a, current_a);
         (current_a + 0.05 * noise.next(), voltage_v + 0.01 * noise.next(), 25.0)
     })

@@ -4,7 +4,7 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use packwatch::regress::{Form, Model, Rows, Settings, assign, fit, score};
+use packwatch::regress::{Form, GprSettings, Model, TrainingRows, assign, fit, score};
 
 /// The rows, or `None` where they are not.
 fn file() -> Option<PathBuf> {
@@ -48,9 +48,9 @@ fn the_exponential_kernel_beats_the_papers_error_and_its_intervals_hold_what_the
         )
     };
     let ((inputs, targets), (queries, truth)) = (part(false), part(true));
-    let settings = Settings::new("exponential".parse().unwrap(), targets.len());
+    let settings = GprSettings::new("exponential".parse().unwrap(), targets.len());
     assert_eq!(settings.form, Form::Nearest { neighbours: 40 });
-    let rows = Rows { inputs: &inputs, dimensions: 3, targets: &targets, lines: &[] };
+    let rows = TrainingRows { inputs: &inputs, dimensions: 3, targets: &targets, lines: &[] };
     let model = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap();
     let predictions = model.predict(&queries).unwrap();
     let score = score(&predictions, &truth);

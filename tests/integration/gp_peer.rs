@@ -1,6 +1,6 @@
-//! Our exact Gaussian process against scikit-learn's, live, with the interpreter `PACKWATCH_PYTHON` names: the same rows
-//! and hyperparameters, means and standard deviations to 1e-8; and, in an optimised build only, the time of the fit, round
-//! about in one run with one thread each (`cargo test --release --test integration gp_peer -- --nocapture`).
+//! Our exact Gaussian process and scikit-learn's, live, with the interpreter that `PACKWATCH_PYTHON` names: the same rows
+//! and hyperparameters, means and standard deviations to 1e-8. `tests/peers/run --only gp` also compares the time of the fit,
+//! in turns in one run with the same number of threads.
 
 use std::io::{BufRead, BufReader, Write};
 use std::ops::ControlFlow;
@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Instant;
 
-use packwatch::regress::{Basis, Form, Model, Rows, Settings, fit};
+use packwatch::regress::{Basis, Form, GprSettings, Model, TrainingRows, fit};
 
 /// Rows and what our fit may take of scikit-learn's time.
 const BARS: [(usize, f64, usize); 2] = [(2000, 0.8, 7), (5000, 0.6, 3)];
@@ -88,11 +88,11 @@ fn case(oracle: &mut Oracle, rows: usize, folder: &Path) -> Case {
 
 /// The oracle's hyperparameters: length scale 1.5, signal 1, noise variance 0.01, no mean.
 fn ours(case: &Case, threads: usize) -> Model {
-    let mut settings = Settings::new("exponential".parse().unwrap(), case.targets.len());
+    let mut settings = GprSettings::new("exponential".parse().unwrap(), case.targets.len());
     (settings.basis, settings.form, settings.threads) = (Basis::Zero, Form::Exact, threads);
     (settings.standardise, settings.calibrate, settings.max_iterations) = (false, false, 0);
     settings.start = vec![1.5, 1.0, 0.1];
-    let rows = Rows { inputs: &case.inputs, dimensions: 3, targets: &case.targets, lines: &[] };
+    let rows = TrainingRows { inputs: &case.inputs, dimensions: 3, targets: &case.targets, lines: &[] };
     fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap()
 }
 
@@ -120,8 +120,8 @@ fn means_and_deviations_are_those_of_scikit_learn() {
 
 #[test]
 fn the_fit_takes_less_time_than_scikit_learns() {
-    if cfg!(debug_assertions) {
-        eprintln!("SKIPPED: not an optimised build, no time was compared");
+    if cfg!(debug_assertions) || std::env::var_os("PACKWATCH_TIME_PEERS").is_none() {
+        eprintln!("SKIPPED: times are compared by tests/peers/run --only gp");
         return;
     }
     for threads in [1, 2] {

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use packwatch::alarm::{Rule, RuleConfig, Severity, When};
+use packwatch::alarm::{Comparison, Rule, RuleConfig, Severity};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::circuit;
@@ -61,7 +61,7 @@ impl Bench {
     }
     fn truth(&mut self, i: f64, dt: f64) -> f64 {
         self.soc = circuit::soc_after(self.soc, i * dt, self.capacity_ah);
-        let place = self.config.model.place(self.soc, 25.0);
+        let place = self.config.model.grid_position(self.soc, 25.0);
         let b = circuit::BranchAt::new(&self.config.model, 0, &place, 1.0);
         self.u1 = b.voltage_after(Discretisation::Exact, self.u1, i, dt);
         circuit::terminal_v(&self.config.model, &place, 1.0, self.u1, i)
@@ -157,7 +157,7 @@ struct Status {
 }
 
 fn rule(rule: Rule, threshold: f64, debounce_s: f64) -> RuleConfig {
-    let (clear, severity, when) = (threshold, Severity::Warning, When::Mean);
+    let (clear, severity, when) = (threshold, Severity::Warning, Comparison::Mean);
     RuleConfig { rule, threshold, clear, severity, when, debounce_s, debounce_events: 1, is_latching: false }
 }
 fn alarm(kind: &EventKind, r: Rule, on: bool) -> bool {

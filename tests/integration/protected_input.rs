@@ -267,7 +267,11 @@ fn a_counter_skipped_beyond_the_allowed_step_is_not_used() {
     assert_eq!(bench.reported(), [(CELL_1, Status::WrongSequence, false, 1)]);
     assert_eq!((bench.estimates_of(0), bench.estimates_of(1)), (0, 1));
     bench.cycle();
-    assert_eq!(bench.reported()[1..], [(CELL_1, Status::Ok, true, 1)], "profile 5 continues from the counter of the sender");
+    assert_eq!(
+        bench.reported()[1..],
+        [(CELL_1, Status::Ok, true, 1)],
+        "profile 5 continues from the counter of the sender"
+    );
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! The doctor's report for people: findings worst first, what was fine, what could not be judged.
+//! The doctor's report as text: findings, most severe first; what is in order; what could not be judged.
 
 use std::io::IsTerminal as _;
 use std::path::Path;
@@ -6,14 +6,14 @@ use std::path::Path;
 use super::super::{Failure, control_args};
 use crate::doctor::{Change, Finding, Report, Severity};
 
-/// Width of the text where no terminal says one.
-const USUAL_WIDTH: usize = 100;
-/// Narrowest and widest the text is set.
+/// Width of the text without a terminal.
+const DEFAULT_WIDTH: usize = 100;
+/// Narrowest and widest text.
 const WIDTHS: (usize, usize) = (50, 120);
 /// Where the text of a finding begins.
 const INDENT: usize = 10;
 
-/// Colours, where a person looks.
+/// Whether text is coloured.
 #[derive(Debug, Clone, Copy)]
 struct Paint(bool);
 
@@ -36,23 +36,17 @@ pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), 
     let is_terminal = std::io::stdout().is_terminal();
     let paint = Paint(is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty()));
     let width = if is_terminal {
-        ratatui::crossterm::terminal::size().map_or(USUAL_WIDTH, |(w, _)| usize::from(w))
+        ratatui::crossterm::terminal::size().map_or(DEFAULT_WIDTH, |(w, _)| usize::from(w))
     } else {
-        USUAL_WIDTH
+        DEFAULT_WIDTH
     };
     control_args::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
 }
 
 fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Paint) -> String {
-    let mut page = String::new();
-    page.push_str(&format!(
-        "{} with {}: {:.0} s, {} frames\n\n",
-        source,
-        config.display(),
-        report.seconds,
-        report.frames
-    ));
-    page.push_str(&format!("{}\n", paint.bold(&verdict(report))));
+    let (config, seconds, frames) = (config.display(), report.seconds, report.frames);
+    let mut page = format!("{source} with {config}: {seconds:.0} s, {frames} frames\n\n");
+    page.push_str(&format!("{}\n", paint.bold(&summary(report))));
     for finding in &report.findings {
         page.push('\n');
         show(finding, width, paint, &mut page);
@@ -62,7 +56,7 @@ fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Pai
     page
 }
 
-/// The new line, or where only people can know it, what it must be.
+/// The new line; a description where only a person can know the value.
 fn proposal(change: &Change) -> String {
     let line = format!("{} = {}", change.key, change.proposed);
     if toml::from_str::<toml::Table>(&line).is_ok() {
@@ -72,21 +66,18 @@ fn proposal(change: &Change) -> String {
     }
 }
 
-/// The whole in a sentence.
-fn verdict(report: &Report) -> String {
+/// The report in one sentence.
+fn summary(report: &Report) -> String {
     let count = |severity| report.findings.iter().filter(|finding| finding.severity == severity).count();
     let many = |n: usize, one: &str| if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") };
+    const CONSEQUENCES: &str = "Begin with the first: the others may be its consequences.";
     match (count(Severity::Error), count(Severity::Warning)) {
-        (0, 0) if report.frames == 0 => "Nothing was heard.".to_owned(),
-        (0, 0) => "Nothing is wrong as far as this can be told.".to_owned(),
-        (errors, 0) => format!("{}. Begin with the first: others may follow from it.", many(errors, "error")),
+        (0, 0) if report.frames == 0 => "No frame was received.".to_owned(),
+        (0, 0) => "Nothing is wrong as far as this can be judged.".to_owned(),
+        (errors, 0) => format!("{}. {CONSEQUENCES}", many(errors, "error")),
         (0, warnings) => format!("{}.", many(warnings, "warning")),
         (errors, warnings) => {
-            format!(
-                "{} and {}. Begin with the first: others may follow from it.",
-                many(errors, "error"),
-                many(warnings, "warning")
-            )
+            format!("{} and {}. {CONSEQUENCES}", many(errors, "error"), many(warnings, "warning"))
         }
     }
 }
@@ -109,7 +100,7 @@ fn show(finding: &Finding, width: usize, paint: Paint, page: &mut String) {
     changes(&finding.changes, paint, page);
 }
 
-/// Lines to change; of many alike the first few.
+/// Lines to change; of many the first few.
 fn changes(changes: &[Change], paint: Paint, page: &mut String) {
     const SHOWN: usize = 4;
     for change in changes.iter().take(SHOWN) {
@@ -123,7 +114,7 @@ fn changes(changes: &[Change], paint: Paint, page: &mut String) {
         page.push_str(&format!("{:INDENT$}{}\n", "", paint.with("32", &proposal(change))));
     }
     if changes.len() > SHOWN {
-        page.push_str(&format!("{:INDENT$}and {} lines like it\n", "", changes.len() - SHOWN));
+        page.push_str(&format!("{:INDENT$}and {} similar lines\n", "", changes.len() - SHOWN));
     }
 }
 
@@ -166,13 +157,13 @@ mod tests {
     }
 
     #[test]
-    fn a_line_to_paste_is_told_from_one_only_people_can_write() {
+    fn a_line_to_paste_is_distinguished_from_one_that_needs_a_person() {
         assert_eq!(proposal(&change("90")), "+ cells = 90");
         assert_eq!(proposal(&change("85 to 131")), "+ cells = ... (85 to 131)");
     }
 
     #[test]
-    fn text_is_wrapped_under_itself_and_no_word_is_lost() {
+    fn text_is_wrapped_with_its_indent_and_no_word_is_lost() {
         let text = "one two three four five";
         let lines = wrapped(text, 14, 4);
         assert!(lines.lines().all(|line| line.chars().count() <= 14), "{lines}");
@@ -181,13 +172,13 @@ mod tests {
     }
 
     #[test]
-    fn of_many_lines_alike_the_first_are_shown_and_the_rest_counted() {
+    fn of_many_changes_the_first_are_shown_and_the_rest_counted() {
         let mut report = Report::default();
         let mut finding = Finding::new(Severity::Error, Topic::Unit, "off");
         finding.changes = vec![change("1"); 12];
         report.add(finding);
         let page = render(&report, Path::new("pack.toml"), "can0", 80, Paint(false));
         assert_eq!(page.matches("pack.toml:7").count(), 4);
-        assert!(page.contains("and 8 lines like it") && page.contains("1 error."), "{page}");
+        assert!(page.contains("and 8 similar lines") && page.contains("1 error."), "{page}");
     }
 }

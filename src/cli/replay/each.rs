@@ -11,6 +11,7 @@ use std::time::Instant;
 use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use super::{Args, Failure, report};
+
 use crate::config::Config;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};

@@ -1,6 +1,7 @@
-//! One CAN frame as the rest of the program sees it: classic, FD or remote, without any socket.
+//! One CAN frame: classic, FD or remote, with its identifier and up to 64 bytes; independent of any socket.
 //!
-//! Error frames are not frames here: the drivers turn them into [`crate::monitor::BusEvent`].
+//! A constructor returns `None` for an identifier or length that no frame can have. Error frames are not frames here: the
+//! drivers turn them into [`crate::monitor::BusEvent`].
 
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,14 @@ impl CanId {
         if id <= 0x1FFF_FFFF { Some(Self::Extended(id)) } else { None }
     }
 
+    /// The number by which a DBC names the identifier: bit 31 marks an extended one.
+    pub const fn dbc_number(self) -> u32 {
+        match self {
+            Self::Standard(id) => id as u32,
+            Self::Extended(id) => id | 0x8000_0000,
+        }
+    }
+
     /// The number without its kind.
     pub const fn raw(self) -> u32 {
         match self {
@@ -37,7 +46,7 @@ impl CanId {
 }
 
 impl std::fmt::Display for CanId {
-    /// As candump writes it: 3 hex digits for standard, 8 for extended.
+    /// As in candump: 3 hex digits for standard, 8 for extended.
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Standard(id) => write!(f, "{id:03X}"),
@@ -46,12 +55,12 @@ impl std::fmt::Display for CanId {
     }
 }
 
-/// What kind of frame carries the data.
+/// Kind of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum FrameKind {
     /// Classic data frame, at most 8 bytes.
     Classic,
-    /// Classic remote request: no data; the length is the length asked for.
+    /// Classic remote request: no data; the length is the requested one.
     Remote,
     /// CAN FD data frame, at most 64 bytes.
     Fd {
@@ -62,8 +71,8 @@ pub enum FrameKind {
     },
 }
 
-/// Payload bytes, zeros after the payload. Aligned, so that a word of it that is loaded soon after the frame was copied lies
-/// within one of the copy's own stores: the processor would wait for both otherwise, longer than decoding takes.
+/// Payload bytes, zeros after the payload. Aligned, so that a word loaded soon after the frame was copied lies within one
+/// store of the copy: across two stores the processor waits for both, longer than decoding takes.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 #[repr(align(8))]
 struct Data([u8; MAX_DATA]);
@@ -133,7 +142,7 @@ impl Frame {
         &self.data.0
     }
 
-    /// The payload, to be changed in place.
+    /// The payload, mutable.
     pub(crate) fn data_mut(&mut self) -> &mut [u8] {
         match self.kind {
             FrameKind::Remote => &mut [],
@@ -141,7 +150,7 @@ impl Frame {
         }
     }
 
-    /// Payload length, or for a remote request the length asked for.
+    /// Payload length; of a remote request the requested one.
     pub const fn len(&self) -> usize {
         self.len as usize
     }

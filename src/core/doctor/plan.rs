@@ -1,37 +1,23 @@
-//! What the doctor is told to expect: the configuration as far as it could be read.
+//! The configuration as far as it can be read: what the doctor expects on the buses.
 
 use crate::can::CanId;
 use crate::can::decode::Binding;
 use crate::can::guard::GuardConfig;
 use crate::can::signal::SignalLayout;
 use crate::cell::CellModel;
-use crate::quantity::BusIndex;
+use crate::quantity::{BusIndex, Channel};
 
-/// Everything expected. Where the configuration is broken parts of it are missing, and not judged.
+/// Everything expected. Parts that are missing in a broken configuration are not judged.
 #[derive(Debug, Clone, Default)]
 pub struct Plan {
-    /// Configured interfaces in the order of their numbers; others may be heard besides.
+    /// Configured interfaces in the order of their numbers; frames of others may be received too.
     pub interfaces: Vec<InterfacePlan>,
     /// Configured signals that were found in a DBC.
     pub signals: Vec<SignalPlan>,
-    /// Signals of the DBC that look like voltages of cells beyond `cells`, by number.
+    /// Signals of the DBC that look like voltages of cells beyond `pack.cells`, by number.
     pub more_cells: Vec<SignalPlan>,
-    /// Cells in series.
-    pub cells: u16,
-    /// Only the total voltage is known.
-    pub is_pack_total: bool,
-    /// Parallel strings.
-    pub strings: u16,
-    /// The cell model; `None` = it cannot be read.
-    pub model: Option<CellModel>,
-    /// Capacity of a cell, Ah: the configured one, else the model's.
-    pub capacity_ah: f64,
-    /// Temperature of the surroundings, degrees C.
-    pub ambient_c: f64,
-    /// Current up to which the pack counts as resting, A.
-    pub dead_band_a: f64,
-    /// White noise of a voltage reading that the estimator is told of, V.
-    pub voltage_noise_v: f64,
+    /// The pack.
+    pub pack: PackPlan,
     /// Ages from which readings are stale.
     pub ages: Ages,
     /// Smallest and largest plausible current, cell voltage and temperature; infinite = any.
@@ -42,8 +28,29 @@ pub struct Plan {
     pub outputs: Vec<OutputPlan>,
     /// Messages that carry configured signals.
     pub messages: Vec<MessagePlan>,
-    /// Values come from a CSV whose columns are in the program's own units: the bus's sign is not the one to change.
+    /// Values come from a CSV with columns in the program's own units: no sign of a bus is to be changed.
     pub is_csv: bool,
+}
+
+/// The pack and its cells.
+#[derive(Debug, Clone, Default)]
+pub struct PackPlan {
+    /// Cells in series.
+    pub cells: u16,
+    /// Only the total voltage is known.
+    pub is_total: bool,
+    /// Parallel strings.
+    pub strings: u16,
+    /// The cell model; `None` = it cannot be read.
+    pub model: Option<CellModel>,
+    /// Capacity of a cell, Ah: the configured one, else the model's.
+    pub capacity_ah: f64,
+    /// Temperature of the surroundings, degrees C.
+    pub ambient_c: f64,
+    /// Current up to which the pack counts as resting, A.
+    pub dead_band_a: f64,
+    /// White noise of a voltage reading that the estimator assumes, V.
+    pub voltage_noise_v: f64,
 }
 
 /// One interface.
@@ -119,4 +126,58 @@ pub struct OutputPlan {
     pub name: &'static str,
     /// Its table and key in the configuration.
     pub table: String,
+}
+
+/// Quantity of a signal, as far as the judgement distinguishes them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Kind {
+    Current,
+    Voltage,
+    Temperature,
+    Reported,
+}
+
+impl Kind {
+    pub(super) fn of(channel: Channel) -> Self {
+        match channel {
+            Channel::Current => Self::Current,
+            Channel::PackVoltage | Channel::CellVoltage(_) => Self::Voltage,
+            Channel::Temperature(_) => Self::Temperature,
+            Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => Self::Reported,
+        }
+    }
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Current => "current",
+            Self::Voltage => "voltage",
+            Self::Temperature => "temperature",
+            Self::Reported => "reported value",
+        }
+    }
+}
+
+impl Plan {
+    /// The age from which a reading of the channel is stale, s.
+    pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
+        match Kind::of(channel) {
+            Kind::Current => self.ages.current_s,
+            Kind::Voltage => self.ages.voltage_s,
+            Kind::Temperature => self.ages.temperature_s,
+            Kind::Reported => f64::INFINITY,
+        }
+    }
+
+    /// Plausible values of the channel, in its unit; `None` = any (limits of 0 and 0 too).
+    pub(super) fn plausible(&self, channel: Channel) -> Option<(f64, f64)> {
+        let [current, voltage, temperature] = self.limits;
+        let cells = if channel == Channel::PackVoltage { f64::from(self.pack.cells) } else { 1.0 };
+        let limits = match Kind::of(channel) {
+            Kind::Current => current,
+            Kind::Voltage => (voltage.0 * cells, voltage.1 * cells),
+            Kind::Temperature => temperature,
+            Kind::Reported => return None,
+        };
+        (limits != (0.0, 0.0)).then_some(limits)
+    }
 }

@@ -1,26 +1,26 @@
-//! What the doctor says.
+//! The doctor's report: findings with their evidence, reason and the line to change.
 
 use serde::Serialize;
 
-/// How bad.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
     /// Estimates will be wrong or missing.
     Error,
-    /// Look at it.
+    /// Check it.
     Warning,
     /// Worth knowing.
     Note,
 }
 
-/// What a finding is about. The order is that of causes: an earlier one can bring about a later one.
+/// Subject of a finding. The order is that of causes: an earlier one can cause a later one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Topic {
     /// The configuration itself.
     Configuration,
-    /// Interface missing, down, silent, or another one.
+    /// Interface missing, down or silent, or the pack is on another one.
     Interface,
     /// Error frames: bit rate, wiring.
     BitRate,
@@ -28,17 +28,17 @@ pub enum Topic {
     Fd,
     /// Standard against extended identifiers.
     IdKind,
-    /// Somebody else sends under our identifiers.
+    /// Another node sends with the daemon's identifiers.
     Conflict,
     /// End-to-end checks fail.
     Protection,
     /// Too many or too few cells.
     CellCount,
-    /// Configured, never seen.
+    /// Configured, never received.
     Silent,
     /// One signal in another's place.
     Swapped,
-    /// Byte order, sign of the number, or place of the bits.
+    /// Byte order, sign of the number, or position of the bits.
     Layout,
     /// Factor or offset.
     Unit,
@@ -48,15 +48,15 @@ pub enum Topic {
     Frozen,
     /// Outside the configured limits.
     Range,
-    /// One cell unlike the others.
+    /// One cell is unlike the others.
     Cell,
-    /// Comes too seldom or too unevenly.
+    /// Too slow or too uneven.
     Period,
-    /// Model of another cell.
+    /// The model is of another cell.
     CellModel,
     /// Not zero at rest.
     CurrentOffset,
-    /// Rougher than the estimator is told.
+    /// Noisier than configured.
     Noise,
 }
 
@@ -69,50 +69,44 @@ pub struct Change {
     pub key: String,
     /// Value proposed, as TOML.
     pub proposed: String,
-    /// File and line, and what stands there now: filled in by who has read the file.
+    /// File and line; filled in by the caller, which has read the file.
     pub place: Option<String>,
-    /// See `place`; `None` = not written.
+    /// Present value in the file; `None` = not set.
     pub now: Option<String>,
 }
 
-/// One thing found.
+/// One finding.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// How bad.
+    /// Severity.
     pub severity: Severity,
-    /// About what.
+    /// Subject.
     pub topic: Topic,
-    /// In a sentence.
+    /// One sentence.
     pub title: String,
-    /// The figures.
+    /// Evidence: the measured values.
     pub seen: String,
-    /// Why they point there.
+    /// Why the evidence points to this cause.
     pub why: String,
     /// Lines to change.
     pub changes: Vec<Change>,
-    /// What to do where no line of the configuration helps, or besides.
+    /// What to do in addition, or where no line of the configuration helps.
     pub advice: Option<String>,
 }
 
-/// Everything.
+/// Result of a diagnosis.
 #[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct Report {
-    /// Seconds listened; of a record, those from the first frame to the last without sleep.
+    /// Seconds listened; of a record, the time from the first frame to the last without sleep.
     pub seconds: f64,
     /// Frames seen on all interfaces.
     pub frames: u64,
-    /// Worst first, then cause before effect.
+    /// Most severe first, then causes before effects.
     pub findings: Vec<Finding>,
-    /// What was in order.
+    /// What is in order.
     pub fine: Vec<String>,
-    /// What could not be judged, and what to do for it.
+    /// What could not be judged, and what to do.
     pub unjudged: Vec<String>,
-}
-
-impl Change {
-    pub(super) fn new(table: &str, key: &str, proposed: impl Into<String>) -> Self {
-        Self { table: table.to_owned(), key: key.to_owned(), proposed: proposed.into(), place: None, now: None }
-    }
 }
 
 impl Finding {
@@ -145,8 +139,13 @@ impl Finding {
     }
 
     pub(super) fn change(mut self, table: &str, key: &str, proposed: impl Into<String>) -> Self {
-        self.changes.push(Change::new(table, key, proposed));
+        let (table, key) = (table.to_owned(), key.to_owned());
+        self.changes.push(Change { table, key, proposed: proposed.into(), place: None, now: None });
         self
+    }
+
+    pub(super) fn change_cell_model(self) -> Self {
+        self.change("pack", "cell_model", "the model of the cell that is in the pack")
     }
 
     pub(super) fn advice(mut self, advice: impl Into<String>) -> Self {
@@ -156,20 +155,16 @@ impl Finding {
 }
 
 impl Report {
-    /// Adds a finding where it belongs.
+    /// Adds a finding in the order of `findings`.
     pub fn add(&mut self, finding: Finding) {
         let key = |f: &Finding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
         self.findings.insert(at, finding);
     }
 
-    /// Whether something must be looked at: a finding that is more than a note.
+    /// Whether there is an error or a warning.
     pub fn has_findings(&self) -> bool {
         self.findings.iter().any(|finding| finding.severity != Severity::Note)
-    }
-
-    pub(super) fn has(&self, topics: &[Topic]) -> bool {
-        self.findings.iter().any(|f| f.severity != Severity::Note && topics.contains(&f.topic))
     }
 }
 
@@ -178,7 +173,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn findings_stand_worst_first_and_causes_before_effects() {
+    fn findings_are_sorted_by_severity_then_cause_before_effect() {
         let mut report = Report::default();
         report.add(Finding::note(Topic::Interface, "n"));
         assert!(!report.has_findings());

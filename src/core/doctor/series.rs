@@ -1,54 +1,54 @@
-//! One signal as it comes: how often, how far apart, from where to where, how roughly; and its bits read otherwise.
+//! Statistics of one signal: counts, periods, extent and roughness of its values, and of its bits with another layout.
 //!
-//! In: payloads with their time. Values are in the program's unit after the configured scale and offset, and not held
-//! to any limit. Memory is bounded: of gaps and values a thinned sample is kept.
+//! In: payloads with their time. Values are in the program's unit after the configured scale and offset; no limit is
+//! applied. Memory is bounded: gaps and values are kept as a thinned sample.
 
 use crate::can::decode::Binding;
-use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan as Plan, ValueType};
+use crate::can::signal::{ByteOrder, SignalLayout, SignalPlan, ValueType};
 use crate::quantity::{Fault, Timestamp};
 
-/// Values kept of each sample: quartiles of some hundred are good to a few per cent.
-const KEPT: usize = 512;
+/// Values kept per sample: quartiles of some hundred are good to a few per cent.
+const MAX_VALUES: usize = 512;
 
-/// A change by more than this within [`JUMP_S`] is none of a temperature, K.
+/// No temperature changes by more than this within [`JUMP_S`], K.
 const JUMP: f64 = 2.0;
 const JUMP_S: f64 = 2.0;
 
 /// A sample of a stream: every value at first, then every second, every fourth, ...
 #[derive(Debug, Clone)]
-pub(crate) struct Thinned {
-    kept: Vec<f64>,
+pub(crate) struct ThinnedSample {
+    values: Vec<f64>,
     stride: u64,
     seen: u64,
 }
 
-impl Default for Thinned {
+impl Default for ThinnedSample {
     fn default() -> Self {
-        Self { kept: Vec::new(), stride: 1, seen: 0 }
+        Self { values: Vec::new(), stride: 1, seen: 0 }
     }
 }
 
-impl Thinned {
+impl ThinnedSample {
     pub(crate) fn push(&mut self, value: f64) {
         if self.seen.is_multiple_of(self.stride) {
-            if self.kept.len() == KEPT {
+            if self.values.len() == MAX_VALUES {
                 let mut keep = false;
-                self.kept.retain(|_| {
+                self.values.retain(|_| {
                     keep = !keep;
                     keep
                 });
                 self.stride *= 2;
             }
             if self.seen.is_multiple_of(self.stride) {
-                self.kept.push(value);
+                self.values.push(value);
             }
         }
         self.seen += 1;
     }
 
-    /// The value below which the share `q` of them lies; `None` = there are none.
+    /// The value below which the share `q` of the values lies; `None` = no value.
     pub(crate) fn quantile(&self, q: f64) -> Option<f64> {
-        let mut sorted = self.kept.clone();
+        let mut sorted = self.values.clone();
         sorted.sort_by(f64::total_cmp);
         let at = (q * (sorted.len().max(1) - 1) as f64).round() as usize;
         sorted.get(at).copied()
@@ -56,6 +56,11 @@ impl Thinned {
 
     pub(crate) fn median(&self) -> Option<f64> {
         self.quantile(0.5)
+    }
+
+    /// The 2 % and 98 % quantiles.
+    pub(crate) fn bulk(&self) -> Option<(f64, f64)> {
+        Some((self.quantile(0.02)?, self.quantile(0.98)?))
     }
 }
 
@@ -105,7 +110,7 @@ impl Extent {
     }
 }
 
-/// How else the bits could be meant.
+/// Another layout the bits could have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum LayoutVariant {
     /// The other byte order, the same bytes.
@@ -116,69 +121,75 @@ pub(crate) enum LayoutVariant {
     Both,
 }
 
-/// The same bits read in another way.
+/// The same bits read with another layout.
 #[derive(Debug, Clone)]
-pub(crate) struct Alternative {
-    pub(crate) how: LayoutVariant,
+pub(crate) struct AlternativeReading {
+    pub(crate) variant: LayoutVariant,
     pub(crate) layout: SignalLayout,
-    plan: Plan,
+    plan: SignalPlan,
     pub(crate) extent: Extent,
 }
 
-/// Everything about one signal.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Series {
-    /// Frames that should carry it by their identifier.
-    pub(crate) frames: u64,
+/// Frames without a value, by reason.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct UnusableCounts {
     pub(crate) short: u64,
     pub(crate) not_available: u64,
     pub(crate) not_finite: u64,
-    /// Values that the DBC's own range refuses.
-    pub(crate) out_of_range: u64,
-    /// Values outside the plausible ones.
+}
+
+/// Statistics of one signal.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Series {
+    /// Frames with the signal's identifier.
+    pub(crate) frames: u64,
+    pub(crate) unusable: UnusableCounts,
+    /// Values outside `plausible`.
     pub(crate) implausible: u64,
-    band: (f64, f64),
+    plausible: Option<(f64, f64)>,
     pub(crate) extent: Extent,
-    pub(crate) values: Thinned,
+    pub(crate) values: ThinnedSample,
     /// Time between two readings, s.
-    pub(crate) gaps: Thinned,
+    pub(crate) gaps: ThinnedSample,
     pub(crate) longest_gap_s: f64,
     /// Gaps above the age from which a reading is stale.
     pub(crate) stale_gaps: u64,
     /// Absolute changes from one value to the next.
-    pub(crate) changes: Thinned,
+    pub(crate) changes: ThinnedSample,
     /// Changes no temperature can make.
     pub(crate) jumps: u64,
-    pub(crate) alternatives: Vec<Alternative>,
+    pub(crate) alternatives: Vec<AlternativeReading>,
     last_time: Option<Timestamp>,
 }
 
 impl Series {
-    /// `band`: what is plausible, both ends 0 = anything.
-    pub(crate) fn new(layout: &SignalLayout, band: (f64, f64)) -> Self {
-        Self { alternatives: alternatives(layout), band, ..Self::default() }
+    /// `plausible`: smallest and largest plausible value; `None` = any.
+    pub(crate) fn new(layout: &SignalLayout, plausible: Option<(f64, f64)>) -> Self {
+        Self { alternatives: alternatives(layout), plausible, ..Self::default() }
     }
 
-    /// Takes a frame that may carry the signal; the value when it does.
+    /// Takes a frame that may carry the signal. Returns its value.
     pub(crate) fn handle(&mut self, time: Timestamp, payload: &[u8], binding: &Binding, max_age_s: f64) -> Option<f64> {
         self.frames += 1;
-        match binding.holds(payload) {
-            Ok(true) => {}
-            Ok(false) => return None,
-            Err(_) => {
-                self.short += 1;
+        let value = match self.value(payload, binding) {
+            Ok(value) => value?,
+            Err(fault) => {
+                let count = match fault {
+                    Fault::NotAvailable => &mut self.unusable.not_available,
+                    Fault::NotFinite => &mut self.unusable.not_finite,
+                    _ => &mut self.unusable.short,
+                };
+                *count += 1;
                 return None;
             }
-        }
-        let value = self.value(payload, binding)?;
+        };
         let gap_s = self.note_gap(time, max_age_s);
         if self.extent.count > 0 {
             let change = (value - self.extent.last).abs();
             self.changes.push(change);
             self.jumps += u64::from(change > JUMP && gap_s.is_some_and(|gap_s| gap_s <= JUMP_S));
         }
-        let is_open = self.band == (0.0, 0.0);
-        self.implausible += u64::from(!is_open && !(self.band.0..=self.band.1).contains(&value));
+        self.implausible += u64::from(self.plausible.is_some_and(|(low, high)| !(low..=high).contains(&value)));
         self.extent.push(value);
         self.values.push(value);
         for other in &mut self.alternatives {
@@ -189,32 +200,18 @@ impl Series {
         Some(value)
     }
 
-    fn value(&mut self, payload: &[u8], binding: &Binding) -> Option<f64> {
-        let raw = binding.plan.raw(payload);
-        if raw.is_ok_and(|raw| binding.not_available.contains(&raw)) {
-            self.not_available += 1;
-            return None;
+    /// The value without the DBC's range; `Ok(None)` = the payload does not carry the signal.
+    fn value(&self, payload: &[u8], binding: &Binding) -> Result<Option<f64>, Fault> {
+        if !binding.holds(payload)? {
+            return Ok(None);
         }
-        match binding.plan.physical(payload) {
-            Ok(physical) => {
-                let is_refused = binding.plan.decode(payload).is_err();
-                self.out_of_range += u64::from(is_refused);
-                // The customary "nothing to say", though no value table says so.
-                if is_refused && raw.is_ok_and(|raw| raw == binding.plan.all_ones()) {
-                    self.not_available += 1;
-                    return None;
-                }
-                Some(physical * binding.scale + binding.offset)
-            }
-            Err(Fault::NotFinite) => {
-                self.not_finite += 1;
-                None
-            }
-            Err(_) => {
-                self.short += 1;
-                None
-            }
+        let raw = binding.plan.raw(payload)?;
+        // All ones outside the range customarily mean "not available", even without an entry in the value table.
+        let is_customary = raw == binding.plan.all_ones() && binding.plan.decode(payload) == Err(Fault::OutOfRange);
+        if binding.not_available.contains(&raw) || is_customary {
+            return Err(Fault::NotAvailable);
         }
+        Ok(Some(binding.plan.physical(payload)? * binding.scale + binding.offset))
     }
 
     fn note_gap(&mut self, time: Timestamp, max_age_s: f64) -> Option<f64> {
@@ -228,7 +225,7 @@ impl Series {
         gap_s
     }
 
-    /// Nobody listened: the next gap says nothing.
+    /// Not listening: the next gap says nothing.
     pub(crate) fn pause(&mut self) {
         self.last_time = None;
     }
@@ -242,7 +239,7 @@ impl Series {
         self.gaps.median()
     }
 
-    /// White part of the noise, from one reading to the next: robust against steps of less than half of them.
+    /// White part of the noise, from one reading to the next; robust where fewer than half of the readings step.
     pub(crate) fn noise(&self) -> Option<f64> {
         /// Median of |difference of two normal variables| over their standard deviation.
         const MEDIAN_OF_DIFFERENCE: f64 = 0.6745 * std::f64::consts::SQRT_2;
@@ -250,13 +247,24 @@ impl Series {
     }
 }
 
-fn alternatives(layout: &SignalLayout) -> Vec<Alternative> {
-    let mut ways = Vec::new();
-    let mut add = |how, layout: SignalLayout| {
-        // The range written belongs to the layout written.
+/// Median of the finite values.
+pub(crate) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut sorted: Vec<f64> = values.filter(|value| value.is_finite()).collect();
+    let middle = sorted.len() / 2;
+    if sorted.is_empty() {
+        return None;
+    }
+    let (_, found, _) = sorted.select_nth_unstable_by(middle, f64::total_cmp);
+    Some(*found)
+}
+
+fn alternatives(layout: &SignalLayout) -> Vec<AlternativeReading> {
+    let mut readings = Vec::new();
+    let mut add = |variant, layout: SignalLayout| {
+        // The stated range belongs to the stated layout.
         let open = SignalLayout { minimum: 0.0, maximum: 0.0, ..layout };
         if let Ok(plan) = open.plan() {
-            ways.push(Alternative { how, layout, plan, extent: Extent::default() });
+            readings.push(AlternativeReading { variant, layout, plan, extent: Extent::default() });
         }
     };
     let other_order = byte_swapped(layout);
@@ -274,7 +282,7 @@ fn alternatives(layout: &SignalLayout) -> Vec<Alternative> {
             add(LayoutVariant::Both, SignalLayout { value_type, ..swapped });
         }
     }
-    ways
+    readings
 }
 
 /// The same whole bytes in the other order; `None` = the signal does not fill whole bytes, or only one.
@@ -299,14 +307,14 @@ mod tests {
 
     #[test]
     fn a_thinned_sample_keeps_its_quartiles_and_its_size() {
-        let mut sample = Thinned::default();
+        let mut sample = ThinnedSample::default();
         (0..100_000).for_each(|n| sample.push(f64::from(n)));
-        assert!(sample.kept.len() <= KEPT);
+        assert!(sample.values.len() <= MAX_VALUES);
         for q in [0.1, 0.5, 0.9] {
             let found = sample.quantile(q).unwrap();
             assert!((found - q * 1e5).abs() < 1000.0, "{q}: {found}");
         }
-        assert_eq!(Thinned::default().median(), None);
+        assert_eq!(ThinnedSample::default().median(), None);
     }
 
     #[test]

@@ -1,11 +1,9 @@
-//! The doctor at work: takes frames and events, keeps what the judgement needs.
+//! The doctor at work: takes frames and events, and keeps the statistics that the judgement needs.
 
 use std::collections::BTreeMap;
 
-use super::judge;
-use super::link::{BLOCKS_S, Link, Slope};
 use super::plan::{InterfacePlan, Plan};
-use super::report::Report;
+use super::response::{BLOCKS_S, Slope, VoltageResponse};
 use super::series::Series;
 use crate::can::e2e::Status;
 use crate::can::guard::Guards;
@@ -13,30 +11,29 @@ use crate::can::{CanId, Frame, FrameKind};
 use crate::monitor::{BusEvent, Estimate};
 use crate::quantity::{BusIndex, Channel, Timestamp};
 
-/// Identifiers counted one by one per interface; a vehicle's bus has some hundreds.
+/// Identifiers counted per interface; a vehicle's bus has some hundreds.
 const MAX_IDS: usize = 4096;
 /// Silence of every interface for this long means that the buses slept, or the record has a hole, s.
 const SLEEP_S: f64 = 30.0;
 /// Payloads of a protected message kept to try other checks on.
-const KEPT_PAYLOADS: usize = 12;
+const MAX_PAYLOADS: usize = 12;
 
-/// An identifier as seen on an interface.
+/// Frames of an identifier on an interface.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Seen {
+pub(crate) struct IdStats {
     pub(crate) count: u64,
     pub(crate) fd: u64,
-    pub(crate) remote: u64,
     pub(crate) first: Timestamp,
     pub(crate) last: Timestamp,
     pub(crate) len: usize,
 }
 
-/// An interface as seen.
+/// Frames and state of an interface.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Bus {
+pub(crate) struct BusStats {
     pub(crate) name: String,
     pub(crate) frames: u64,
-    pub(crate) ids: BTreeMap<CanId, Seen>,
+    pub(crate) ids: BTreeMap<CanId, IdStats>,
     pub(crate) error_frames: u64,
     pub(crate) error_classes: u32,
     pub(crate) dropped: u64,
@@ -44,192 +41,189 @@ pub(crate) struct Bus {
     pub(crate) is_down: bool,
 }
 
-/// A protected message as seen.
-#[derive(Debug, Clone)]
-pub(crate) struct Checked {
+/// End-to-end checks of a protected message.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct ProtectionStats {
     pub(crate) counts: BTreeMap<&'static str, u64>,
     pub(crate) good: u64,
     pub(crate) bad: u64,
     pub(crate) payloads: Vec<Vec<u8>>,
 }
 
-/// What the estimator made of it.
+/// Results of the estimator.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Estimated {
+pub(crate) struct EstimatorStats {
     pub(crate) estimates: u64,
-    pub(crate) refused: u64,
-    pub(crate) nis_sum: f64,
+    pub(crate) rejected: u64,
     pub(crate) innovation_sum: f64,
 }
 
-/// Listens; says at the end what it thinks.
+/// Time listened.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct ListeningClock {
+    /// Time of the latest frame.
+    last: Option<Timestamp>,
+    /// Time between frames without sleep, s.
+    pub(crate) awake_s: f64,
+    /// Time on live interfaces, s; `None` = a record, `awake_s` counts.
+    listened_s: Option<f64>,
+}
+
+/// Collects frames, events and estimates; [`Doctor::finish`] judges them.
 #[derive(Debug)]
 pub struct Doctor {
     pub(crate) plan: Plan,
-    pub(crate) buses: Vec<Bus>,
+    pub(crate) buses: Vec<BusStats>,
     /// As `plan.signals`.
     pub(crate) series: Vec<Series>,
     /// As `plan.more_cells`.
     pub(crate) more_cells: Vec<Series>,
+    /// Indices into `series` (`false`) or `more_cells` (`true`) by message.
     by_id: BTreeMap<(BusIndex, CanId), Vec<(bool, usize)>>,
     guards: Guards,
-    pub(crate) checked: BTreeMap<(BusIndex, CanId), Checked>,
-    pub(crate) link: Link,
-    /// The same over longer blocks.
-    pub(crate) slow_link: Link,
-    pub(crate) estimated: Estimated,
-    pub(crate) first: Option<Timestamp>,
-    pub(crate) last: Timestamp,
-    pub(crate) awake_s: f64,
-    /// How long somebody listened, s; `None` = a record, which tells by its frames.
-    listened_s: Option<f64>,
+    pub(crate) protected: BTreeMap<(BusIndex, CanId), ProtectionStats>,
+    /// Over short and long blocks.
+    responses: [VoltageResponse; 2],
+    pub(crate) estimator: EstimatorStats,
+    pub(crate) clock: ListeningClock,
     pub(crate) frames: u64,
 }
 
 impl Doctor {
-    /// A doctor who has heard nothing yet.
+    /// A doctor without any frame.
     pub fn new(plan: Plan) -> Self {
         let mut by_id: BTreeMap<(BusIndex, CanId), Vec<(bool, usize)>> = BTreeMap::new();
         for (is_more, list) in [(false, &plan.signals), (true, &plan.more_cells)] {
-            // The current of a frame before its voltages, as the channels' order has it.
+            // In the order of channels: the current of a frame before its voltages.
             let mut order: Vec<usize> = (0..list.len()).collect();
             order.sort_by_key(|&index| list[index].binding.channel);
             for index in order {
                 by_id.entry((list[index].binding.bus, list[index].binding.id)).or_default().push((is_more, index));
             }
         }
-        let cells = if plan.is_pack_total { 1 } else { usize::from(plan.cells) };
-        let pack_ah = plan.capacity_ah * f64::from(plan.strings.max(1));
-        let bus = |interface: &InterfacePlan| Bus { name: interface.name.clone(), ..Bus::default() };
+        let cells = if plan.pack.is_total { 1 } else { usize::from(plan.pack.cells) };
+        let tolerance_a = 0.01 * (plan.pack.capacity_ah * f64::from(plan.pack.strings.max(1)));
+        let bus = |interface: &InterfacePlan| BusStats { name: interface.name.clone(), ..BusStats::default() };
+        let signals = plan.signals.iter();
         Self {
             buses: plan.interfaces.iter().map(bus).collect(),
-            series: plan
-                .signals
-                .iter()
-                .map(|signal| Series::new(&signal.layout, band(&plan, signal.binding.channel)))
-                .collect(),
-            more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, (0.0, 0.0))).collect(),
+            series: signals.map(|s| Series::new(&s.layout, plan.plausible(s.binding.channel))).collect(),
+            more_cells: plan.more_cells.iter().map(|signal| Series::new(&signal.layout, None)).collect(),
             by_id,
             guards: Guards::new(plan.guards.clone()),
-            checked: BTreeMap::new(),
-            link: Link::new(cells, 0.01 * pack_ah, BLOCKS_S[0]),
-            slow_link: Link::new(cells, 0.01 * pack_ah, BLOCKS_S[1]),
-            estimated: Estimated::default(),
-            first: None,
-            last: Timestamp::ZERO,
-            awake_s: 0.0,
-            listened_s: None,
+            protected: BTreeMap::new(),
+            responses: BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s)),
+            estimator: EstimatorStats::default(),
+            clock: ListeningClock::default(),
             frames: 0,
             plan,
         }
     }
 
-    /// Names an interface beyond the configured ones; its number is the next.
+    /// Adds an interface beyond the configured ones; its number is the next.
     pub fn add_interface(&mut self, name: &str) {
-        self.buses.push(Bus { name: name.to_owned(), ..Bus::default() });
+        self.buses.push(BusStats { name: name.to_owned(), ..BusStats::default() });
     }
 
     /// Takes a frame of any interface.
     pub fn handle_frame(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         self.note_time(time);
         self.frames += 1;
-        let Some(seen_bus) = self.buses.get_mut(bus.index()) else { return };
-        seen_bus.frames += 1;
-        let known = seen_bus.ids.len();
-        if known < MAX_IDS || seen_bus.ids.contains_key(&frame.id()) {
-            let seen = seen_bus.ids.entry(frame.id()).or_insert(Seen { first: time, ..Seen::default() });
-            seen.count += 1;
-            seen.fd += u64::from(matches!(frame.kind(), FrameKind::Fd { .. }));
-            seen.remote += u64::from(frame.kind() == FrameKind::Remote);
-            (seen.last, seen.len) = (time, frame.len());
+        let Some(stats) = self.buses.get_mut(bus.index()) else { return };
+        stats.frames += 1;
+        if stats.ids.len() < MAX_IDS || stats.ids.contains_key(&frame.id()) {
+            let stats = stats.ids.entry(frame.id()).or_insert(IdStats { first: time, ..IdStats::default() });
+            stats.count += 1;
+            stats.fd += u64::from(matches!(frame.kind(), FrameKind::Fd { .. }));
+            (stats.last, stats.len) = (time, frame.len());
         }
-        if frame.kind() == FrameKind::Remote {
-            return;
+        if frame.kind() != FrameKind::Remote {
+            self.check_protection(time, bus, frame);
+            self.read(time, bus, frame);
         }
-        self.check(time, bus, frame);
-        self.read(time, bus, frame);
     }
 
-    fn check(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
+    fn check_protection(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let Some(status) = self.guards.check(time, bus, frame) else { return };
         self.guards.take_changes().for_each(drop);
-        let empty = || Checked { counts: BTreeMap::new(), good: 0, bad: 0, payloads: Vec::new() };
-        let checked = self.checked.entry((bus, frame.id())).or_insert_with(empty);
-        *checked.counts.entry(status.name()).or_default() += 1;
-        checked.good += u64::from(status.is_usable());
-        checked.bad += u64::from(!status.is_usable() && status != Status::Initial);
-        if checked.payloads.len() < KEPT_PAYLOADS {
-            checked.payloads.push(frame.data().to_vec());
+        let stats = self.protected.entry((bus, frame.id())).or_default();
+        *stats.counts.entry(status.name()).or_default() += 1;
+        stats.good += u64::from(status.is_usable());
+        stats.bad += u64::from(!status.is_usable() && status != Status::Initial);
+        if stats.payloads.len() < MAX_PAYLOADS {
+            stats.payloads.push(frame.data().to_vec());
         }
     }
 
     fn read(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
-        let key = (bus, frame.id());
-        let count = self.by_id.get(&key).map_or(0, Vec::len);
-        let cells = f64::from(self.plan.cells.max(1));
-        for position in 0..count {
-            let Some(&(is_more, index)) = self.by_id.get(&key).and_then(|found| found.get(position)) else { return };
+        let Self { plan, series, more_cells, by_id, responses, .. } = self;
+        let cells = f64::from(plan.pack.cells.max(1));
+        for &(is_more, index) in by_id.get(&(bus, frame.id())).into_iter().flatten() {
             if is_more {
-                let binding = &self.plan.more_cells[index].binding;
-                self.more_cells[index].handle(time, frame.data(), binding, f64::INFINITY);
+                more_cells[index].handle(time, frame.data(), &plan.more_cells[index].binding, f64::INFINITY);
                 continue;
             }
-            let binding = &self.plan.signals[index].binding;
-            let max_age_s = judge::max_age_s(&self.plan, binding.channel);
-            let Some(value) = self.series[index].handle(time, frame.data(), binding, max_age_s) else { continue };
-            match binding.channel {
-                Channel::Current => self.links().for_each(|link| link.handle_current(time, value)),
-                Channel::PackVoltage => self.links().for_each(|link| link.handle_voltage(time, 0, value / cells)),
-                Channel::CellVoltage(cell) => {
-                    self.links().for_each(|link| link.handle_voltage(time, cell.index(), value));
+            let binding = &plan.signals[index].binding;
+            let max_age_s = plan.max_age_s(binding.channel);
+            let Some(value) = series[index].handle(time, frame.data(), binding, max_age_s) else { continue };
+            for response in responses.iter_mut() {
+                match binding.channel {
+                    Channel::Current => response.handle_current(time, value),
+                    Channel::PackVoltage => response.handle_voltage(time, 0, value / cells),
+                    Channel::CellVoltage(cell) => response.handle_voltage(time, cell.index(), value),
+                    Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => {}
                 }
-                Channel::Temperature(_) | Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => {}
             }
         }
     }
 
-    fn links(&mut self) -> impl Iterator<Item = &mut Link> {
-        [&mut self.link, &mut self.slow_link].into_iter()
+    /// Ends the blocks and runs of both responses.
+    pub(super) fn end_blocks(&mut self) {
+        self.responses.iter_mut().for_each(VoltageResponse::pause);
     }
 
-    /// How the pack's voltage follows its current, from the blocks that tell it best.
-    pub(crate) fn slope(&self) -> Option<Slope> {
-        self.best_link().slope()
+    /// The response over short blocks.
+    pub(super) fn fast_response(&self) -> &VoltageResponse {
+        &self.responses[0]
     }
 
-    /// The same for one cell.
-    pub(crate) fn slope_of(&self, cell: usize) -> Option<Slope> {
-        self.best_link().slope_of(cell)
+    /// Slope of the pack's voltage over its current, from the blocks that determine it best.
+    pub(super) fn slope(&self) -> Option<Slope> {
+        self.best_response().slope()
     }
 
-    fn best_link(&self) -> &Link {
-        let certainty = |link: &Link| link.slope().map_or(0.0, |slope| slope.certainty());
-        // The short blocks where they do: what is seen in them is the load and nothing slower.
-        let fast = certainty(&self.link);
-        if fast >= 1.0 || fast >= certainty(&self.slow_link) { &self.link } else { &self.slow_link }
+    /// The slope of one cell, from the same blocks.
+    pub(super) fn slope_of(&self, cell: usize) -> Option<Slope> {
+        self.best_response().slope_of(cell)
+    }
+
+    fn best_response(&self) -> &VoltageResponse {
+        let [fast, slow] = &self.responses;
+        let certainty = |response: &VoltageResponse| response.slope().map_or(0.0, |slope| slope.certainty());
+        // The short blocks where they suffice: they contain the load and nothing slower.
+        let fast_certainty = certainty(fast);
+        if fast_certainty >= 1.0 || fast_certainty >= certainty(slow) { fast } else { slow }
     }
 
     fn note_time(&mut self, time: Timestamp) {
-        if self.first.is_none() {
-            (self.first, self.last) = (Some(time), time);
-        }
-        let passed_s = time.since(self.last);
+        let last = *self.clock.last.get_or_insert(time);
+        let passed_s = time.since(last);
         if passed_s > SLEEP_S {
             self.handle_gap();
         } else {
-            self.awake_s += passed_s.max(0.0);
+            self.clock.awake_s += passed_s.max(0.0);
         }
-        self.last = self.last.max(time);
+        self.clock.last = Some(last.max(time));
     }
 
-    /// How long passed between what came and what comes is unknown, or nobody listened.
+    /// Takes a time of unknown length without listening.
     pub fn handle_gap(&mut self) {
         self.series.iter_mut().chain(&mut self.more_cells).for_each(Series::pause);
-        self.links().for_each(Link::pause);
+        self.end_blocks();
         self.guards.restart();
     }
 
-    /// Takes what an interface reports.
+    /// Takes an event of an interface.
     pub fn handle_bus(&mut self, bus: BusIndex, event: BusEvent) {
         let Some(bus) = self.buses.get_mut(bus.index()) else { return };
         match event {
@@ -245,48 +239,27 @@ impl Doctor {
         }
     }
 
-    /// Takes an estimate of the monitor's.
+    /// Takes an estimate of the monitor.
     pub fn handle_estimate(&mut self, estimate: &Estimate) {
-        let of = &mut self.estimated;
-        let nis = (estimate.innovation_v / estimate.innovation_std_v).powi(2);
-        if nis.is_finite() {
-            of.estimates += 1;
-            of.refused += u64::from(!estimate.accepted);
-            of.nis_sum += nis.min(1e6);
-            of.innovation_sum += estimate.innovation_v;
+        if (estimate.innovation_v / estimate.innovation_std_v).powi(2).is_finite() {
+            self.estimator.estimates += 1;
+            self.estimator.rejected += u64::from(!estimate.accepted);
+            self.estimator.innovation_sum += estimate.innovation_v;
         }
     }
 
     /// Seconds listened so far, sleep not counted.
     pub fn seconds(&self) -> f64 {
-        self.listened_s.unwrap_or(self.awake_s)
+        self.clock.listened_s.unwrap_or(self.clock.awake_s)
     }
 
-    /// For so long somebody listened, whether a frame came or not.
+    /// Takes the time listened to live interfaces, s, whether a frame came or not.
     pub fn handle_listened(&mut self, seconds: f64) {
-        self.listened_s = Some(seconds);
+        self.clock.listened_s = Some(seconds);
     }
 
     /// Frames so far.
     pub fn frames(&self) -> u64 {
         self.frames
-    }
-
-    /// Says what it thinks.
-    pub fn finish(mut self) -> Report {
-        self.links().for_each(Link::pause);
-        judge::judge(&self)
-    }
-}
-
-/// What is plausible, in the signal's unit.
-fn band(plan: &Plan, channel: Channel) -> (f64, f64) {
-    let [current, voltage, temperature] = plan.limits;
-    match channel {
-        Channel::Current => current,
-        Channel::CellVoltage(_) => voltage,
-        Channel::PackVoltage => (voltage.0 * f64::from(plan.cells), voltage.1 * f64::from(plan.cells)),
-        Channel::Temperature(_) => temperature,
-        Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => (0.0, 0.0),
     }
 }

@@ -4,7 +4,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
-use crate::alarm::When;
+use crate::alarm::Comparison;
 
 /// A value to compare with: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,21 +48,21 @@ impl Setting for Threshold {
     }
 }
 
-impl Setting for When {
+impl Setting for Comparison {
     const KIND: &'static str = "\"mean\", or { probability = ... } above 0 and below 1";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
-        let when = match value.get_ref() {
+        let comparison = match value.get_ref() {
             DeValue::String(text) => (text.as_ref() == "mean").then_some(Self::Mean),
             DeValue::Table(table) => probability(table),
             _ => None,
         };
-        typed(value, when)
+        typed(value, comparison)
     }
 }
 
-fn probability(table: &DeTable<'_>) -> Option<When> {
+fn probability(table: &DeTable<'_>) -> Option<Comparison> {
     let level = table.get("probability").filter(|_| table.len() == 1)?;
     let level = f64::read(level, &ValueRange::Any).ok()?;
-    (level > 0.0 && level < 1.0).then_some(When::Probability(level))
+    (level > 0.0 && level < 1.0).then_some(Comparison::Probability(level))
 }

@@ -13,7 +13,7 @@ use crate::config::{
     Config, ConfigFaults, Databases, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource, TablePlace,
     input_map,
 };
-use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, Plan, SignalPlan};
+use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 
 /// Capacity where nothing states one, Ah: a car's cell.
@@ -62,19 +62,22 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
     let signals: Vec<SignalPlan> = found.iter().filter_map(|resolved| signal(raw, resolved)).collect();
     let strings = pack.map_or(1, |pack| pack.strings);
     let pack_ah = model.map_or(USUAL_AH, |model| model.rated_capacity_ah) * f64::from(strings);
-    Plan {
-        interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
-        more_cells: more_cells(raw, databases),
-        messages: messages(found, &signals),
-        signals,
+    let pack_plan = PackPlan {
         cells: pack.map_or_else(|| cells_of(found), |pack| pack.cells),
-        is_pack_total: raw.is_pack_total(),
+        is_total: raw.is_pack_total(),
         strings,
         capacity_ah: capacity_ah(raw, model),
         model: model.cloned(),
         ambient_c: pack.map_or(25.0, |pack| pack.ambient_c),
         dead_band_a: raw.transition.as_ref().map_or(pack_ah / 50.0, |keys| keys.config(pack_ah).dead_band_a),
         voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+    };
+    Plan {
+        interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
+        more_cells: more_cells(raw, databases),
+        messages: messages(found, &signals),
+        signals,
+        pack: pack_plan,
         limits: config.map(limits).unwrap_or_default(),
         ages: ages(raw),
         guards: partial.guards(found),

@@ -13,6 +13,7 @@ use super::reload::Reload;
 use super::status_publisher::StatusPublisher;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
+
 use crate::control::protocol::{Answer, Request};
 use crate::control::{Asked, answer};
 use crate::io::clock::MappedClock;

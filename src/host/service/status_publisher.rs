@@ -3,14 +3,14 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::status::PERIOD;
-use crate::status::StatusServer;
+
+use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::monitor::TICK_PERIOD_MS;
+use crate::quantity::Timestamp;
 use crate::status::collect::{Before, Identity, Sources};
 use crate::status::counters::LoopCounters;
 use crate::status::document::ConfigFile;
-use crate::io::socket::{LinkOutput, LinkMessage, LinkEvent};
-use crate::monitor::TICK_PERIOD_MS;
-use crate::quantity::Timestamp;
+use crate::status::{PERIOD, StatusServer};
 
 /// What the loop tells of itself.
 #[derive(Debug)]

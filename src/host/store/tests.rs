@@ -10,13 +10,14 @@ use super::database::Database;
 use super::folder::DATABASE;
 use super::parts::Parts;
 use super::*;
+
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::replay::{self, LogTime, ReplaySettings, Sinks};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::monitor::{Input, Outputs};
 use crate::quantity::CellIndex;
+use crate::replay::{self, LogTime, ReplaySettings, Sinks};
 
 fn config() -> Config {
     config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../config/measured.toml")).unwrap()

@@ -204,10 +204,10 @@ impl Circuit {
         // Resistances are those at the SOC of the voltage; two passes settle it.
         let mut soc = 0.5;
         for _ in 0..3 {
-            let r0_ohm = model.r0_ohm(&model.place(soc, temperature_c)) * resistance_ratio;
+            let r0_ohm = model.r0_ohm(&model.grid_position(soc, temperature_c)) * resistance_ratio;
             soc = model.soc_of_ocv(voltage_v + load_v + current_a * r0_ohm, temperature_c);
         }
-        let place = model.place(soc, temperature_c);
+        let place = model.grid_position(soc, temperature_c);
         if let Some(last) = self.last {
             let (dt_s, mean_a) = (time_s - last.time_s, 0.5 * (current_a + last.current_a));
             self.charge_ah += mean_a * dt_s / 3600.0;
@@ -220,7 +220,7 @@ impl Circuit {
         load_v += current_a * model.r0_ohm(&place) * resistance_ratio;
         let new_soc = model.soc_of_ocv(voltage_v + load_v, temperature_c);
         let volts = config.end_error_v.hypot(config.end_load_error * load_v).hypot(0.25 * VOLTAGE_NOISE_V);
-        let deviation = volts / model.ocv_slope_v(&model.place(new_soc, temperature_c));
+        let deviation = volts / model.ocv_slope_v(&model.grid_position(new_soc, temperature_c));
         self.last = Some(*reading);
         Point {
             time_s,

@@ -1,77 +1,84 @@
 //! Interfaces, identifiers, error frames, foreign senders, end-to-end checks.
 
-use super::super::report::{Finding, Topic};
-use super::super::watch::{Bus, Checked};
-use super::{Judge, words};
+use super::context::Judge;
+use super::words::{count, number, seconds};
 use crate::can::CanId;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::guard::GuardConfig;
+use crate::doctor::plan::MessagePlan;
+use crate::doctor::report::{Finding, Topic};
+use crate::doctor::watch::{BusStats, ProtectionStats};
 use crate::quantity::BusIndex;
 
 /// Error classes of linux/can/error.h.
 const CLASS_ACK: u32 = 0x20;
 const CLASS_BUS_OFF: u32 = 0x40;
-/// Share of error frames above which the wiring must be looked at.
+/// Share of error frames above which the wiring is suspect.
 const MANY_ERRORS: f64 = 0.01;
-/// Share of frames that may fail their check before it is a finding: some are lost at every start.
+/// Share of frames that may fail their check without a finding: some are lost at every start.
 const FAILING: f64 = 0.05;
 
-pub(super) fn judge(judge: &mut Judge<'_>) {
+pub(super) fn check(judge: &mut Judge<'_>) {
     for index in 0..judge.plan.interfaces.len() {
         interface(judge, index);
     }
-    messages(judge);
+    for index in 0..judge.plan.interfaces.len() {
+        messages(judge, index);
+    }
     conflicts(judge);
     protection(judge);
     traffic(judge);
 }
 
-fn number(index: usize) -> BusIndex {
+fn bus_index(index: usize) -> BusIndex {
     BusIndex(u8::try_from(index).unwrap_or(u8::MAX))
 }
 
-/// Interfaces that carry identifiers that are wanted on `bus`, with how many.
-fn elsewhere(judge: &Judge<'_>, bus: BusIndex) -> Vec<(usize, usize)> {
-    let wanted: Vec<CanId> = judge.plan.messages.iter().filter(|m| m.bus == bus).map(|m| m.id).collect();
-    let others = judge.doctor.buses.iter().enumerate().filter(|(index, _)| *index != bus.index());
-    let counted = others.map(|(index, other)| (index, wanted.iter().filter(|id| other.ids.contains_key(id)).count()));
-    let mut found: Vec<_> = counted.filter(|(_, count)| *count > 0).collect();
-    found.sort_by_key(|(_, count)| std::cmp::Reverse(*count));
-    found
+fn interface_table(index: usize) -> String {
+    format!("interface[{}]", index + 1)
+}
+
+fn messages_of<'d>(judge: &Judge<'d>, bus: BusIndex) -> Vec<&'d MessagePlan> {
+    judge.plan.messages.iter().filter(|message| message.bus == bus).collect()
+}
+
+/// The other interface that carries most of the wanted identifiers, with their number.
+fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> Option<(&'d BusStats, usize)> {
+    let others = judge.doctor.buses.iter().enumerate().filter(|(other, _)| *other != index);
+    let counted = others.map(|(_, bus)| (bus, wanted.iter().filter(|m| bus.ids.contains_key(&m.id)).count()));
+    // Of several with as many the first.
+    counted.filter(|(_, count)| *count > 0).rev().max_by_key(|(_, count)| *count)
 }
 
 fn interface(judge: &mut Judge<'_>, index: usize) {
-    let (bus, number) = (&judge.doctor.buses[index], number(index));
-    let is_used = judge.plan.messages.iter().any(|message| message.bus == number);
+    let (bus, wanted) = (&judge.doctor.buses[index], messages_of(judge, bus_index(index)));
     if bus.error_frames > 0 {
-        error_frames(judge, bus);
+        judge.add(error_frames(bus));
     }
     if bus.dropped > 0 {
-        let seen = format!("{} lost before they were read", words::count(bus.dropped, "frame"));
-        let note = Finding::note(Topic::Interface, format!("{}: frames were lost", bus.name)).seen(seen);
-        judge.report.add(note.advice("periods are judged too long; check the load of this computer"));
+        let note = Finding::note(Topic::Interface, format!("{}: frames were lost", bus.name))
+            .seen(format!("{} lost before they were read", count(bus.dropped, "frame")))
+            .advice("periods appear too long; check the load of this computer");
+        judge.add(note);
     }
-    if bus.frames > 0 || !is_used {
+    if bus.frames > 0 || wanted.is_empty() {
         return;
     }
-    for message in judge.plan.messages.iter().filter(|message| message.bus == number) {
-        judge.explained.insert((number, message.id));
-    }
-    let table = format!("interface[{}]", index + 1);
-    let others = elsewhere(judge, number);
-    if let Some(&(other, count)) = others.first() {
-        let name = &judge.doctor.buses[other].name;
-        let all = judge.plan.messages.iter().filter(|message| message.bus == number).count();
+    judge.explained.extend(wanted.iter().map(|message| (message.bus, message.id)));
+    if let Some((BusStats { name, .. }, found)) = best_other(judge, index, &wanted) {
         let finding = Finding::error(Topic::Interface, format!("the pack is on {name}, not on {}", bus.name))
-            .seen(format!("no frame on {}; {count} of {all} configured messages came on {name}", bus.name))
+            .seen(format!("no frame on {}; {found} of {} configured messages on {name}", bus.name, wanted.len()))
             .why("the identifiers of the DBC are there, on the other bus")
-            .change(&table, "name", format!("{name:?}"));
-        return judge.report.add(finding);
+            .change(&interface_table(index), "name", format!("{name:?}"));
+        judge.add(finding);
+    } else if bus.error_frames == 0 {
+        let finding = silent_interface(judge, bus, &interface_table(index));
+        judge.add(finding);
     }
-    if bus.error_frames > 0 {
-        return; // told as a wrong bit rate
-    }
-    let (what, advice) = match (bus.is_missing, bus.is_down) {
+}
+
+fn silent_interface(judge: &Judge<'_>, bus: &BusStats, table: &str) -> Finding {
+    let (state, advice) = match (bus.is_missing, bus.is_down) {
         (true, _) => ("does not exist", "create it, plug the adapter in, or name another"),
         (_, true) => ("is down", "bring it up: ip link set NAME up type can bitrate RATE"),
         _ => (
@@ -79,136 +86,111 @@ fn interface(judge: &mut Judge<'_>, index: usize) {
             "is the vehicle awake? then check the plug, the bit rate, and that CAN_H and CAN_L are not exchanged",
         ),
     };
-    let heard: Vec<String> = judge.doctor.buses.iter().filter(|b| b.frames > 0).map(|b| b.name.clone()).collect();
-    let heard = if heard.is_empty() {
+    let busy = judge.doctor.buses.iter().filter(|other| other.frames > 0).map(|other| other.name.as_str());
+    let busy: Vec<&str> = busy.collect();
+    let others = if busy.is_empty() {
         "no other interface had any".to_owned()
     } else {
-        format!("{} had some, none of them ours", heard.join(", "))
+        format!("{} had some, none of this pack", busy.join(", "))
     };
-    let finding = Finding::error(Topic::Interface, format!("{} {what}", bus.name))
-        .seen(format!("no frame on {} in {}; {heard}", bus.name, words::seconds(judge.doctor.seconds())))
+    Finding::error(Topic::Interface, format!("{} {state}", bus.name))
+        .seen(format!("no frame on {} in {}; {others}", bus.name, seconds(judge.doctor.seconds())))
         .why("the configured signals are expected there")
-        .change(&table, "name", "the interface the pack is on")
-        .advice(advice);
-    judge.report.add(finding);
+        .change(table, "name", "the interface the pack is on")
+        .advice(advice)
 }
 
-fn error_frames(judge: &mut Judge<'_>, bus: &Bus) {
+fn error_frames(bus: &BusStats) -> Finding {
+    let (name, classes) = (&bus.name, bus.error_classes);
     let share = bus.error_frames as f64 / (bus.frames + bus.error_frames) as f64;
-    let seen =
-        format!("{} and {}", words::count(bus.error_frames, "error frame"), words::count(bus.frames, "data frame"));
-    let hint = match bus.error_classes {
-        classes if classes & CLASS_BUS_OFF != 0 => "the controller went bus-off",
-        classes if classes & CLASS_ACK != 0 => "nobody acknowledged what was sent",
-        _ => "bits were not what they should be",
+    let hint = match classes {
+        _ if classes & CLASS_BUS_OFF != 0 => "the controller went bus-off",
+        _ if classes & CLASS_ACK != 0 => "no node acknowledged the sent frames",
+        _ => "received bits were invalid",
     };
-    let advice = "check the bit rate first (ip -details link show), then the termination (60 ohm between CAN_H and CAN_L) and the plug";
     let finding = if bus.frames == 0 {
-        Finding::error(Topic::BitRate, format!("{}: error frames and nothing else: wrong bit rate?", bus.name))
-            .why(format!("{hint}, and no frame was ever understood"))
+        Finding::error(Topic::BitRate, format!("{name}: only error frames: wrong bit rate?"))
+            .why(format!("{hint}, and no valid frame was received"))
     } else if share > MANY_ERRORS {
-        Finding::warning(Topic::BitRate, format!("{}: many error frames", bus.name))
-            .why(format!("{hint}; frames do come, so the bit rate is right, and the wiring is not"))
+        Finding::warning(Topic::BitRate, format!("{name}: many error frames"))
+            .why(format!("{hint}; frames are received, so the bit rate is right and the wiring is not"))
     } else {
-        Finding::note(Topic::BitRate, format!("{}: some error frames", bus.name)).why(hint)
+        Finding::note(Topic::BitRate, format!("{name}: some error frames")).why(hint)
     };
-    judge.report.add(finding.seen(seen).advice(advice));
+    let (errors, data) = (count(bus.error_frames, "error frame"), count(bus.frames, "data frame"));
+    finding.seen(format!("{errors} and {data}")).advice(
+        "check the bit rate first (ip -details link show), then the termination (60 ohm between CAN_H and CAN_L) and \
+         the plug",
+    )
 }
 
 /// Messages that came in another form or on another bus.
-fn messages(judge: &mut Judge<'_>) {
-    let plan = judge.plan;
-    for (index, configured) in plan.interfaces.iter().enumerate() {
-        let (bus, number) = (&judge.doctor.buses[index], number(index));
-        let ours: Vec<_> = plan.messages.iter().filter(|message| message.bus == number).collect();
-        let fd: Vec<_> = ours.iter().filter(|m| bus.ids.get(&m.id).is_some_and(|seen| seen.fd > 0)).collect();
-        if !configured.fd && !fd.is_empty() {
-            let names: Vec<&str> = fd.iter().map(|message| message.name.as_str()).collect();
-            let finding = Finding::error(Topic::Fd, format!("{}: messages of the pack are CAN FD frames", bus.name))
-                .seen(format!("{} came as FD frames", names.join(", ")))
-                .why("with fd = false the kernel does not hand them to the service")
-                .change(&format!("interface[{}]", index + 1), "fd", "true");
-            judge.report.add(finding);
-        }
-        let absent: Vec<_> = ours.into_iter().filter(|message| !bus.ids.contains_key(&message.id)).collect();
-        if bus.frames == 0 || absent.is_empty() {
-            continue;
-        }
-        for message in absent {
-            if let Some(finding) = other_kind(bus, message.id, &message.name)
-                .or_else(|| other_bus(judge, number, message.id, &message.name))
-            {
-                judge.explained.insert((number, message.id));
-                judge.report.add(finding);
-            }
+fn messages(judge: &mut Judge<'_>, index: usize) {
+    let (bus, wanted) = (&judge.doctor.buses[index], messages_of(judge, bus_index(index)));
+    let is_fd = |message: &&&MessagePlan| bus.ids.get(&message.id).is_some_and(|stats| stats.fd > 0);
+    let fd: Vec<&str> = wanted.iter().filter(is_fd).map(|message| message.name.as_str()).collect();
+    if !judge.plan.interfaces[index].fd && !fd.is_empty() {
+        let finding = Finding::error(Topic::Fd, format!("{}: messages of the pack are CAN FD frames", bus.name))
+            .seen(format!("{} came as FD frames", fd.join(", ")))
+            .why("with fd = false the kernel does not deliver them to the service")
+            .change(&interface_table(index), "fd", "true");
+        judge.add(finding);
+    }
+    if bus.frames == 0 {
+        return;
+    }
+    for message in wanted.into_iter().filter(|message| !bus.ids.contains_key(&message.id)) {
+        if let Some(finding) = other_kind(bus, message).or_else(|| on_other_bus(judge, message)) {
+            judge.explained.insert((message.bus, message.id));
+            judge.add(finding);
         }
     }
 }
 
-fn other_kind(bus: &Bus, id: CanId, name: &str) -> Option<Finding> {
-    let twin = match id {
+fn other_kind(bus: &BusStats, MessagePlan { id, name, .. }: &MessagePlan) -> Option<Finding> {
+    let other = match *id {
         CanId::Standard(raw) => CanId::extended(u32::from(raw)),
         CanId::Extended(raw) => CanId::standard(raw),
     }?;
-    let seen = bus.ids.get(&twin)?;
-    let words = |id: CanId| if matches!(id, CanId::Standard(_)) { "an 11-bit" } else { "a 29-bit" };
-    let line = match twin {
-        CanId::Standard(raw) => u64::from(raw),
-        CanId::Extended(raw) => u64::from(raw) | 0x8000_0000,
+    let frames = count(bus.ids.get(&other)?.count, "frame");
+    let (found, wanted) = match other {
+        CanId::Standard(_) => ("an 11-bit", "a 29-bit"),
+        CanId::Extended(_) => ("a 29-bit", "an 11-bit"),
     };
-    Some(
-        Finding::error(
-            Topic::IdKind,
-            format!("{name} comes with {} identifier, the DBC says {} one", words(twin), words(id)),
-        )
-        .seen(format!("{} of {twin} on {}, none of {id}", words::count(seen.count, "frame"), bus.name))
-        .why("both kinds may have the same number and are different messages; bit 31 in the DBC tells them apart")
-        .advice(format!("in the DBC: BO_ {line} {name}: ...")),
-    )
-}
-
-fn other_bus(judge: &Judge<'_>, bus: BusIndex, id: CanId, name: &str) -> Option<Finding> {
-    let buses = judge.doctor.buses.iter().enumerate();
-    let (_, other) = buses.filter(|(index, _)| *index != bus.index()).find(|(_, other)| other.ids.contains_key(&id))?;
-    let seen = other.ids.get(&id)?;
-    let mut finding = Finding::error(
-        Topic::Interface,
-        format!("{name} is on {}, not on {}", other.name, judge.interface(bus)),
-    )
-    .seen(format!("{} of {id} on {}, none on {}", words::count(seen.count, "frame"), other.name, judge.interface(bus)))
-    .why("the identifier is there, on the other bus (which may use it for a message of its own: look at the values)");
-    let mut tables: Vec<&str> = judge
-        .plan
-        .signals
-        .iter()
-        .filter(|s| s.binding.bus == bus && s.binding.id == id)
-        .map(|s| s.table.as_str())
-        .collect();
-    tables.dedup();
-    for table in tables {
-        finding = finding.change(table, "interface", format!("{:?}", other.name));
-    }
+    let title = format!("{name} comes with {found} identifier, the DBC says {wanted} one");
+    let finding = Finding::error(Topic::IdKind, title)
+        .seen(format!("{frames} of {other} on {}, none of {id}", bus.name))
+        .why("identifiers of both kinds may have the same number and are different messages; bit 31 in the DBC decides")
+        .advice(format!("in the DBC: BO_ {} {name}: ...", other.dbc_number()));
     Some(finding)
 }
 
-/// Somebody sends what only we should send.
+fn on_other_bus(judge: &Judge<'_>, message: &MessagePlan) -> Option<Finding> {
+    let MessagePlan { bus, id, ref name, .. } = *message;
+    let other = judge.other_bus(bus, id)?;
+    let (frames, here) = (count(other.ids.get(&id)?.count, "frame"), judge.interface(bus));
+    let finding = Finding::error(Topic::Interface, format!("{name} is on {}, not on {here}", other.name))
+        .seen(format!("{frames} of {id} on {}, none on {here}", other.name))
+        .why("the identifier is there, on the other bus (which may use it for another message: look at the values)");
+    let signals = judge.plan.signals.iter().filter(|s| (s.binding.bus, s.binding.id) == (bus, id));
+    let mut tables: Vec<&str> = signals.map(|signal| signal.table.as_str()).collect();
+    tables.dedup();
+    Some(tables.into_iter().fold(finding, |f, table| f.change(table, "interface", format!("{:?}", other.name))))
+}
+
+/// Another node sends with an identifier of the daemon's frames.
 fn conflicts(judge: &mut Judge<'_>) {
-    let plan = judge.plan;
-    for output in &plan.outputs {
-        for bus in &output.buses {
-            let Some(seen) = judge.doctor.buses.get(bus.index()).and_then(|of| of.ids.get(&output.id)) else {
-                continue;
-            };
-            let name = judge.interface(*bus);
-            let finding = Finding::warning(
-                Topic::Conflict,
-                format!("somebody sends under {}, our {} frame", output.id, output.name),
-            )
-            .seen(format!("{} of {} on {name}", words::count(seen.count, "frame"), output.id))
-            .why("two senders of one identifier destroy each other's frames, and receivers take one for the other")
-            .change(&output.table, "id", "an identifier nobody else uses")
-            .advice("nothing is wrong when packwatch itself was running while this was heard");
-            judge.report.add(finding);
+    let buses = &judge.doctor.buses;
+    for output in &judge.plan.outputs {
+        for bus in output.buses.iter().filter_map(|bus| buses.get(bus.index())) {
+            let Some(stats) = bus.ids.get(&output.id) else { continue };
+            let title = format!("another node sends with {}, the identifier of the {} frame", output.id, output.name);
+            let finding = Finding::warning(Topic::Conflict, title)
+                .seen(format!("{} of {} on {}", count(stats.count, "frame"), output.id, bus.name))
+                .why("two senders of one identifier destroy each other's frames, and receivers take one for the other")
+                .change(&output.table, "id", "an identifier that no other node uses")
+                .advice("ignore this if packwatch itself was running at that time");
+            judge.add(finding);
         }
     }
 }
@@ -216,49 +198,46 @@ fn conflicts(judge: &mut Judge<'_>) {
 fn protection(judge: &mut Judge<'_>) {
     let plan = judge.plan;
     for (index, guard) in plan.guards.iter().enumerate() {
-        let Some(checked) = judge.doctor.checked.get(&(guard.bus, guard.id)) else { continue };
-        let name = plan
-            .messages
-            .iter()
-            .find(|m| (m.bus, m.id) == (guard.bus, guard.id))
-            .map_or("commands", |m| m.name.as_str());
-        let all = checked.good + checked.bad;
-        if all == 0 || checked.bad as f64 <= FAILING * all as f64 {
-            if checked.good > 0 {
-                judge.report.fine.push(format!("{name}: {} of {all} frames pass their end-to-end check", checked.good));
+        let key = (guard.bus, guard.id);
+        let Some(stats) = judge.doctor.protected.get(&key) else { continue };
+        let message = plan.messages.iter().find(|message| (message.bus, message.id) == key);
+        let name = message.map_or("commands", |message| message.name.as_str());
+        let all = stats.good + stats.bad;
+        if all == 0 || stats.bad as f64 <= FAILING * all as f64 {
+            if stats.good > 0 {
+                judge.fine(format!("{name}: {} of {all} frames pass their end-to-end check", stats.good));
             }
             continue;
         }
-        let counts: Vec<String> = checked.counts.iter().map(|(name, count)| format!("{name} {count}")).collect();
+        let counts: Vec<String> = stats.counts.iter().map(|(status, count)| format!("{status} {count}")).collect();
         let finding = Finding::error(Topic::Protection, format!("{name} fails its end-to-end check")).seen(format!(
             "{} of {all} frames fail: {}",
-            checked.bad,
+            stats.bad,
             counts.join(", ")
         ));
-        let finding = why_failing(finding, &format!("input.protected[{}]", index + 1), guard, checked);
-        judge.report.add(finding);
+        judge.add(why_failing(finding, &format!("input.protected[{}]", index + 1), guard, stats));
     }
 }
 
-fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, checked: &Checked) -> Finding {
+fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, stats: &ProtectionStats) -> Finding {
     let Protection { profile, data_id } = guard.check.protection;
-    let fits = |protection: Protection| checked.payloads.iter().all(|p| protection.verified_counter(p).is_some());
+    let fits = |protection: Protection| stats.payloads.iter().all(|p| protection.verified_counter(p).is_some());
     let profiles = [Profile::P01A, Profile::P01C, Profile::P05];
     if fits(guard.check.protection) {
         return finding
-            .why("the checksums are right, the counters are not: frames are repeated, lost, or sent by two")
+            .why("the checksums are right, the counters are not: frames are repeated, lost, or from two senders")
             .change(table, "max_delta_counter", "2")
-            .advice("a gateway that repeats or thins out the message makes this too");
+            .advice("a gateway that repeats or drops frames of the message has this effect too");
     }
-    let other = profiles
-        .into_iter()
-        .filter(|other| *other != profile)
-        .find(|other| data_id <= other.max_data_id() && fits(Protection { profile: *other, data_id }));
-    if let Some(other) = other {
-        return finding.why(format!("with profile {} every frame is right", other.name())).change(
+    let mut others = profiles.into_iter().filter(|other| *other != profile);
+    if let Some(other) =
+        others.find(|other| data_id <= other.max_data_id() && fits(Protection { profile: *other, data_id }))
+    {
+        let name = other.name();
+        return finding.why(format!("with profile {name} every frame is right")).change(
             table,
             "profile",
-            format!("{:?}", other.name()),
+            format!("{name:?}"),
         );
     }
     let found = profiles.into_iter().find_map(|profile| {
@@ -266,30 +245,26 @@ fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, checked: &Che
         Some((profile, id))
     });
     match found {
-        // Its eight bits cannot tell 256 identifiers apart.
+        // Its eight bits do not distinguish 256 identifiers.
         Some((Profile::P01A, id)) => finding
-            .why(format!("the checksum is that of profile 1A with another data identifier ({id:#X} and 255 others give it)"))
-            .change(table, "data_id", "as the sender's makers say"),
+            .why(format!("the checksum is that of profile 1A with another data identifier ({id:#X} and 255 others fit)"))
+            .change(table, "data_id", "the number in the sender's documentation"),
         Some((profile, id)) => finding
             .why(format!("with profile {} and data identifier {id:#X} every frame is right", profile.name()))
             .change(table, "profile", format!("{:?}", profile.name()))
             .change(table, "data_id", format!("{id:#X}")),
         None => finding
-            .why("no profile and no data identifier fits: the message is not protected in this way, or is another message")
-            .advice("ask the sender's makers, or take the table away"),
+            .why("no profile and no data identifier fits: the message is protected in another way, or is another message")
+            .advice("ask the maker of the sender, or remove the table"),
     }
 }
 
-/// What else goes on, for the record.
+/// Rate and identifiers of every interface with frames.
 fn traffic(judge: &mut Judge<'_>) {
     for bus in judge.doctor.buses.iter().filter(|bus| bus.frames > 0) {
         let per_s = bus.frames as f64 / judge.doctor.seconds().max(1e-3);
-        judge.report.fine.push(format!(
-            "{}: {} frames a second under {}{}",
-            bus.name,
-            words::number(if per_s >= 10.0 { per_s.round() } else { (per_s * 100.0).round() / 100.0 }),
-            words::count(bus.ids.len() as u64, "identifier"),
-            if bus.error_frames == 0 { ", no error frames" } else { "" },
-        ));
+        let per_s = number(if per_s >= 10.0 { per_s.round() } else { (per_s * 100.0).round() / 100.0 });
+        let (ids, errors) = (bus.ids.len() as u64, if bus.error_frames == 0 { ", no error frames" } else { "" });
+        judge.fine(format!("{}: {per_s} frames a second with {}{errors}", bus.name, count(ids, "identifier")));
     }
 }

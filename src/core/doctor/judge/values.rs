@@ -1,18 +1,24 @@
-//! Units and layouts: values that no pack can have, and what would make them possible.
+//! Units and layouts: values that no pack can have, and the unit or layout that would make them possible.
 
-use super::super::plan::SignalPlan;
-use super::super::report::{Finding, Topic};
-use super::super::series::{Alternative, LayoutVariant, Series};
-use super::places::unit_of;
-use super::{Judge, Kind, MAX_C_RATE, electrical, words};
+use super::context::{Judge, MAX_C_RATE, SignalSeries};
+use super::electrical;
+use super::unit::unit_of;
+use super::words::{number, toml};
+use crate::can::signal::{ByteOrder, ValueType};
+use crate::doctor::plan::{Kind, SignalPlan};
+use crate::doctor::report::{Finding, Severity, Topic};
+use crate::doctor::series::{AlternativeReading, Extent, LayoutVariant};
 
-/// Factors a unit may slip by.
-const SLIPS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
-/// A temperature beyond this is looked at, degrees C.
-const HOT_C: f64 = 60.0;
-const COLD_C: f64 = -40.0;
+/// Factors by which a unit may be wrong.
+const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
+/// Plausible temperatures, degrees C.
+const PLAUSIBLE_C: std::ops::RangeInclusive<f64> = -40.0..=60.0;
+/// Temperatures above the plausible ones that a pack in danger may have, degrees C.
+const HOT_C: std::ops::Range<f64> = 60.0..90.0;
+/// Share of implausible readings that is more than a disturbance.
+const MANY: f64 = 0.01;
 
-pub(super) fn judge(judge: &mut Judge<'_>) {
+pub(super) fn check(judge: &mut Judge<'_>) {
     if judge.is_mixed_up {
         return;
     }
@@ -21,29 +27,24 @@ pub(super) fn judge(judge: &mut Judge<'_>) {
     temperatures(judge);
 }
 
-type Seen<'d> = (&'d SignalPlan, &'d Series);
-
-/// Share of the signals for which a way to read them otherwise is `good`, and the first such way.
-fn otherwise<'d>(
-    all: &[Seen<'d>],
-    good: impl Fn(&Series, &Alternative) -> bool,
-) -> Option<(Seen<'d>, &'d Alternative)> {
-    for how in [LayoutVariant::ByteOrder, LayoutVariant::Sign, LayoutVariant::Both] {
-        let of = |series: &'d Series| series.alternatives.iter().find(|other| other.how == how);
-        let fits =
-            |(_, series): &&Seen<'d>| of(series).is_some_and(|other| other.extent.count > 0 && good(series, other));
-        let alive = all.iter().filter(|(_, series)| series.count() > 0).count();
-        let fitting: Vec<&Seen<'d>> = all.iter().filter(fits).collect();
-        if alive > 0 && 4 * fitting.len() >= 3 * alive {
-            let first = *fitting[0];
-            return of(first.1).map(|other| (first, other));
-        }
-    }
-    None
+/// The first alternative layout that fits three quarters of the signals, with the first signal it fits.
+fn better_layout<'d>(
+    all: &[SignalSeries<'d>],
+    fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,
+) -> Option<(SignalSeries<'d>, &'d AlternativeReading)> {
+    let alive = all.iter().filter(|(_, series)| series.count() > 0).count();
+    [LayoutVariant::ByteOrder, LayoutVariant::Sign, LayoutVariant::Both].into_iter().find_map(|variant| {
+        let alternative = |(signal, series): SignalSeries<'d>| {
+            let other = series.alternatives.iter().find(|other| other.variant == variant)?;
+            (other.extent.count > 0 && fits((signal, series), other)).then_some(((signal, series), other))
+        };
+        let fitting: Vec<_> = all.iter().filter_map(|signal| alternative(*signal)).collect();
+        (alive > 0 && 4 * fitting.len() >= 3 * alive).then(|| fitting[0])
+    })
 }
 
-/// Whether the other reading runs smoothly where the configured one jumps about.
-fn is_smoother(signal: &SignalPlan, series: &Series, other: &Alternative) -> bool {
+/// Whether the alternative reading runs smoothly where the configured one jumps.
+fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -> bool {
     let layout = &signal.layout;
     if layout.length_bits < 12 || series.extent.changes < 10 {
         return false;
@@ -53,286 +54,248 @@ fn is_smoother(signal: &SignalPlan, series: &Series, other: &Alternative) -> boo
     here.step() > 0.02 * width && there.step() * 8.0 < here.step() && there.range() < 0.25 * width
 }
 
-fn layout_finding(all: &[Seen<'_>], (signal, series): Seen<'_>, other: &Alternative, what: &str) -> Finding {
-    let title = match other.how {
-        LayoutVariant::ByteOrder => format!("{what}: wrong byte order in the DBC"),
-        LayoutVariant::Sign => format!("{what}: signed and unsigned exchanged in the DBC"),
-        LayoutVariant::Both => format!("{what}: wrong byte order and sign of the number in the DBC"),
+fn layout_finding(
+    all: &[SignalSeries<'_>],
+    ((signal, series), other): (SignalSeries<'_>, &AlternativeReading),
+    what: &str,
+) -> Finding {
+    let fault = match other.variant {
+        LayoutVariant::ByteOrder => "wrong byte order",
+        LayoutVariant::Sign => "signed and unsigned exchanged",
+        LayoutVariant::Both => "wrong byte order and sign of the number",
     };
-    let (here, there) = (&series.extent, &other.extent);
-    let span = |extent: &super::super::series::Extent| {
-        format!(
-            "{} to {} in steps of {}",
-            words::number(extent.min),
-            words::number(extent.max),
-            words::number(extent.step())
-        )
+    let span = |extent: &Extent| {
+        format!("{} to {} in steps of {}", number(extent.min), number(extent.max), number(extent.step()))
     };
-    let layout = &other.layout;
-    let sign = match layout.value_type {
-        crate::can::signal::ValueType::Signed => "-",
-        _ => "+",
-    };
-    let many = if all.len() > 1 { format!(" (and {} like it)", all.len() - 1) } else { String::new() };
-    Finding::error(Topic::Layout, title)
-        .seen(format!("{} reads {}; read the other way {}", signal.name, span(here), span(there)))
-        .why("a pack's values do not jump about, and with the other reading they do not")
-        .advice(format!(
-            "in the DBC: {}{many} : {}|{}{}{sign}",
-            signal.name,
-            layout.start_bit,
-            layout.length_bits,
-            words::order(layout.byte_order).get(..2).unwrap_or("@1"),
-        ))
+    let (name, here, there, layout) = (&signal.name, span(&series.extent), span(&other.extent), &other.layout);
+    let order = if layout.byte_order == ByteOrder::LittleEndian { "@1" } else { "@0" };
+    let sign = if layout.value_type == ValueType::Signed { "-" } else { "+" };
+    let others = if all.len() > 1 { format!(" (and {} others)", all.len() - 1) } else { String::new() };
+    Finding::error(Topic::Layout, format!("{what}: {fault} in the DBC"))
+        .seen(format!("{name} reads {here}; with the other layout {there}"))
+        .why("a pack's values do not jump like this, and with the other layout they do not")
+        .advice(format!("in the DBC: {name}{others} : {}|{}{order}{sign}", layout.start_bit, layout.length_bits))
 }
 
 fn voltages(judge: &mut Judge<'_>) {
-    let all = judge.of(Kind::Voltage);
-    let Some(middle) = judge.cell_voltage() else { return };
+    let all = judge.signals(Kind::Voltage);
+    let (Some(median_v), Some((signal, _))) = (judge.cell_voltage(), all.first().copied()) else { return };
     let (low, high) = judge.voltage_band();
-    let cells = if judge.plan.is_pack_total { f64::from(judge.plan.cells.max(1)) } else { 1.0 };
-    let what = if judge.plan.is_pack_total { "pack voltage" } else { "cell voltages" };
-    let is_plausible = (low..=high).contains(&middle);
-    let smoother = otherwise(&all, |series, other| {
-        let found = all.iter().find(|(_, s)| std::ptr::eq(*s, series));
-        let in_band = low * cells <= other.extent.mean() && other.extent.mean() <= high * cells;
-        let is_steady =
-            other.extent.range() < 0.5 * (high - low) * cells + 1e-9 || in_band && other.extent.range() < high * cells;
-        found.is_some_and(|(signal, _)| is_smoother(signal, series, other)) && is_steady
-            || !is_plausible && in_band && is_steady
+    let cells = judge.cells_per_reading();
+    let (what, per) = if judge.plan.pack.is_total { ("pack voltage", " a cell") } else { ("cell voltages", "") };
+    let is_plausible = (low..=high).contains(&median_v);
+    let better = better_layout(&all, |signal, other| {
+        let extent = &other.extent;
+        let in_band = low * cells <= extent.mean() && extent.mean() <= high * cells;
+        let is_steady = extent.range() < 0.5 * (high - low) * cells + 1e-9 || in_band && extent.range() < high * cells;
+        is_steady && (is_smoother(signal, other) || !is_plausible && in_band)
     });
-    if let Some((seen, other)) = smoother {
+    if let Some(better) = better {
         judge.is_mixed_up = true;
-        return judge.report.add(layout_finding(&all, seen, other, what));
+        return judge.add(layout_finding(&all, better, what));
     }
     if is_plausible {
         return;
     }
-    let Some((signal, _)) = all.first().copied() else { return };
-    let seen = format!(
-        "{what}: the middle reads {} V{}",
-        words::number(middle),
-        if judge.plan.is_pack_total { " a cell" } else { "" }
-    );
-    let band = format!("a cell of this model has {} to {} V", words::number(low), words::number(high));
-    let factor = SLIPS.into_iter().find(|factor| (low..=high).contains(&(middle * factor)));
-    if let Some(factor) = factor {
+    let seen = format!("{what}: the median reading is {} V{per}", number(median_v));
+    let band = format!("a cell of this model has {} to {} V", number(low), number(high));
+    let factor = UNIT_FACTORS.into_iter().find(|factor| (low..=high).contains(&(median_v * factor)));
+    let finding = if let Some(factor) = factor {
         judge.voltage_factor = factor;
-        let finding = Finding::error(Topic::Unit, format!("{what}: off by a factor of {}", slip(factor)))
+        let (by, volts) = (number(factor), number(median_v * factor));
+        Finding::error(Topic::Unit, format!("{what}: off by a factor of {}", above_one(factor)))
             .seen(seen)
-            .why(format!("{band}; times {} it is {} V", words::number(factor), words::number(middle * factor)))
-            .change(&signal.table, "scale", words::toml(signal.scale * factor));
-        return judge.report.add(finding);
-    }
-    if judge.plan.is_pack_total && middle > 0.0 {
-        return pack_count(judge, middle * cells);
-    }
-    judge.is_mixed_up = true;
-    let finding = Finding::error(Topic::CellModel, "cell voltages do not belong to this cell model")
-        .seen(seen)
-        .why(format!("{band}, and no factor of ten helps"))
-        .change("pack", "cell_model", "the model of the cell that is in the pack")
-        .advice("or the signal is not a cell voltage");
-    judge.report.add(finding);
+            .why(format!("{band}; times {by} it is {volts} V"))
+            .change(&signal.table, "scale", toml(signal.scale * factor))
+    } else if judge.plan.pack.is_total && median_v > 0.0 {
+        judge.is_mixed_up = true;
+        pack_count(judge, median_v * cells)
+    } else {
+        judge.is_mixed_up = true;
+        Finding::error(Topic::CellModel, "cell voltages do not belong to this cell model")
+            .seen(seen)
+            .why(format!("{band}, and no power of ten helps"))
+            .change_cell_model()
+            .advice("or the signal is not a cell voltage")
+    };
+    judge.add(finding);
 }
 
-/// `1000`, whichever way.
-fn slip(factor: f64) -> String {
-    words::number(if factor < 1.0 { 1.0 / factor } else { factor })
+/// The factor or its reciprocal, whichever is above 1.
+fn above_one(factor: f64) -> String {
+    number(if factor < 1.0 { 1.0 / factor } else { factor })
 }
 
-/// A total voltage that so many cells cannot make.
-fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
-    judge.is_mixed_up = true;
-    let (min_v, max_v) = judge.plan.model.as_ref().map_or((2.8, 4.2), |m| (m.voltage_min_v, m.voltage_max_v));
+/// A total voltage that the configured number of cells cannot have.
+fn pack_count(judge: &Judge<'_>, total_v: f64) -> Finding {
+    let pack = &judge.plan.pack;
+    let (min_v, max_v) = pack.model.as_ref().map_or((2.8, 4.2), |m| (m.voltage_min_v, m.voltage_max_v));
     let (fewest, most) = ((total_v / max_v).ceil(), (total_v / min_v).floor());
-    let finding = Finding::error(Topic::CellCount, format!("{} cells cannot make this pack voltage", judge.plan.cells))
-        .seen(format!(
-            "{} V in all: {} V a cell",
-            words::number(total_v),
-            words::number(total_v / f64::from(judge.plan.cells.max(1)))
-        ))
+    let (total, per_cell) = (number(total_v), number(total_v / f64::from(pack.cells.max(1))));
+    Finding::error(Topic::CellCount, format!("{} cells cannot make this pack voltage", pack.cells))
+        .seen(format!("{total} V in total: {per_cell} V a cell"))
         .why(format!("cells of this model have {min_v} to {max_v} V: it must be {fewest} to {most} of them"))
-        .change("pack", "cells", format!("{fewest} to {most}, as the pack's makers say"));
-    judge.report.add(finding);
+        .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"))
 }
 
 fn current(judge: &mut Judge<'_>) {
     let Some((signal, series)) = judge.current().filter(|(_, series)| series.count() > 0) else { return };
     let limit_a = MAX_C_RATE * judge.pack_ah();
     let all = [(signal, series)];
-    let largest =
-        series.values.quantile(0.02).unwrap_or(0.0).abs().max(series.values.quantile(0.98).unwrap_or(0.0).abs());
-    let other = otherwise(&all, |series, other| {
+    let largest_a = series.values.bulk().map_or(0.0, |(low, high)| low.abs().max(high.abs()));
+    let better = better_layout(&all, |signal, other| {
         let most = other.extent.min.abs().max(other.extent.max.abs());
-        let is_calmer = other.extent.range() < 0.1 * series.extent.range().max(largest);
-        is_smoother(signal, series, other) && most < limit_a || largest > limit_a && most < 0.5 * limit_a && is_calmer
+        let is_calmer = other.extent.range() < 0.1 * series.extent.range().max(largest_a);
+        is_smoother(signal, other) && most < limit_a || largest_a > limit_a && most < 0.5 * limit_a && is_calmer
     });
-    if let Some((seen, other)) = other {
+    if let Some(better) = better {
         judge.is_mixed_up = true;
-        return judge.report.add(layout_finding(&all, seen, other, "pack current"));
+        return judge.add(layout_finding(&all, better, "pack current"));
     }
-    let written = unit_of(&signal.unit).filter(|(_, factor, _)| *factor != 1.0 && signal.scale == 1.0);
-    if largest <= limit_a && written.is_none() {
-        return;
-    }
-    let c_rate = largest / judge.pack_ah();
-    let factor = match written {
-        Some((_, factor, _)) => factor,
-        None => electrical::factor_by_steps(judge).filter(|factor| *factor < 1.0).unwrap_or_else(|| {
-            let mut smaller = SLIPS.into_iter().rev().filter(|factor| *factor < 1.0);
+    let unit = unit_of(&signal.unit).map(|(_, factor, _)| factor).filter(|f| *f != 1.0 && signal.scale == 1.0);
+    let c_rate = largest_a / judge.pack_ah();
+    let finding = if let Some(factor) = unit {
+        judge.current_factor = factor;
+        Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", above_one(factor)))
+            .why(format!("the DBC's unit is {:?}, and the configuration does not convert it", signal.unit))
+            .change(&signal.table, "scale", toml(signal.scale * factor))
+    } else if largest_a > limit_a {
+        let factor = electrical::factor_by_steps(judge).filter(|factor| *factor < 1.0).unwrap_or_else(|| {
+            let mut smaller = UNIT_FACTORS.into_iter().rev().filter(|factor| *factor < 1.0);
             smaller.find(|factor| c_rate * factor <= 3.0).unwrap_or(1e-3)
-        }),
+        });
+        judge.current_factor = factor;
+        electrical::wrong_unit_or_cell(judge, signal, factor, Severity::Error)
+            .why(format!("that is {} times the pack's capacity in an hour", number(c_rate)))
+    } else {
+        return;
     };
-    judge.current_factor = factor;
-    let why = match written {
-        Some(_) => format!("the DBC's unit is {:?}, and the configuration does not convert it", signal.unit),
-        None => format!("that is {} times the pack's capacity in an hour", words::number(c_rate)),
-    };
-    let finding =
-        match written {
-            Some(_) => Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", slip(factor)))
-                .change(&signal.table, "scale", words::toml(signal.scale * factor)),
-            None => electrical::slip_or_other_cell(judge, signal, factor, false),
-        };
-    judge.report.add(finding.seen(format!("{} reads up to {} A", signal.name, words::number(largest))).why(why));
+    judge.add(finding.seen(format!("{} reads up to {} A", signal.name, number(largest_a))));
 }
 
-/// What a temperature could be meant as: factor, offset, in words.
-const MEANINGS: [(f64, f64, &str); 6] = [
+/// Wrong units of a temperature: factor, offset, name.
+const TEMPERATURE_UNITS: [(f64, f64, &str); 6] = [
     (1.0, -273.15, "kelvin"),
     (5.0 / 9.0, -160.0 / 9.0, "Fahrenheit"),
     (0.1, 0.0, "tenths of a degree"),
     (0.01, 0.0, "hundredths of a degree"),
     (1.0, -40.0, "an offset of 40 too much"),
-    (1.0, 273.15, "kelvin taken off twice"),
+    (1.0, 273.15, "kelvin subtracted twice"),
 ];
 
 fn temperatures(judge: &mut Judge<'_>) {
-    let all = judge.of(Kind::Temperature);
-    let medians: Vec<f64> = all.iter().filter_map(|(_, series)| series.values.median()).collect();
-    let Some(middle) = super::super::link::median(medians.into_iter()) else { return };
-    let ambient_c = judge.plan.ambient_c;
-    let is_plausible = (COLD_C..=HOT_C).contains(&middle);
-    let other = otherwise(&all, |series, other| {
-        let found = all.iter().find(|(_, s)| std::ptr::eq(*s, series));
+    let all = judge.signals(Kind::Temperature);
+    let Some(median_c) = judge.median_of(Kind::Temperature, |series| series.values.median()) else { return };
+    let ambient_c = judge.plan.pack.ambient_c;
+    let is_plausible = PLAUSIBLE_C.contains(&median_c);
+    let better = better_layout(&all, |signal, other| {
         let is_near = (other.extent.mean() - ambient_c).abs() < 45.0 && other.extent.range() < 40.0;
-        is_near && (found.is_some_and(|(signal, _)| is_smoother(signal, series, other)) || !is_plausible)
+        is_near && (is_smoother(signal, other) || !is_plausible)
     });
-    let meaning = MEANINGS
+    let unit = TEMPERATURE_UNITS
         .into_iter()
-        .map(|(factor, offset, word)| (factor, offset, word, middle * factor + offset))
-        .filter(|(.., meant)| (COLD_C..=HOT_C).contains(meant))
+        .map(|(factor, offset, name)| (factor, offset, name, median_c * factor + offset))
+        .filter(|(.., converted_c)| PLAUSIBLE_C.contains(converted_c))
         .min_by(|a, b| (a.3 - ambient_c).abs().total_cmp(&(b.3 - ambient_c).abs()));
-    // A plain slip of the unit explains more than bits in another order, unless the values jump about.
+    // A wrong unit explains more than another bit order, unless the values jump.
     let is_steady = all.iter().all(|(_, series)| series.extent.range() < 60.0);
-    if let Some((seen, other)) = other.filter(|_| meaning.is_none() || !is_steady) {
-        return judge.report.add(layout_finding(&all, seen, other, "temperatures"));
-    }
-    if let Some(finding) = unconverted(&all, middle) {
-        return judge.report.add(finding);
-    }
-    if is_plausible {
+    let finding = if let Some(better) = better.filter(|_| unit.is_none() || !is_steady) {
+        layout_finding(&all, better, "temperatures")
+    } else if let Some(finding) = unconverted(&all, median_c) {
+        finding
+    } else if is_plausible {
         return;
-    }
-    let Some((first, _)) = all.first().copied() else { return };
-    let seen = format!("the middle sensor reads {} degrees C", words::number(middle));
-    let Some((factor, offset, word, meant)) = meaning else {
-        let finding = Finding::error(Topic::Unit, "temperatures no pack has").seen(seen);
-        let finding =
-            finding.why("no usual unit makes a temperature of it").change(&first.table, "signal", "a temperature");
-        return judge.report.add(finding);
+    } else {
+        wrong_temperature(judge, &all, median_c, unit)
     };
-    let title = format!("temperatures: {word}?");
-    let is_possible = (HOT_C..90.0).contains(&middle);
-    let finding = if is_possible { Finding::warning(Topic::Unit, title) } else { Finding::error(Topic::Unit, title) };
-    let mut finding = finding.seen(seen).why(format!(
-        "{}as {word} it is {} degrees C, near the {} of pack.ambient_c",
-        if is_possible { "so hot a pack would be in danger; " } else { "no pack has that; " },
-        words::number(meant),
-        words::number(ambient_c)
-    ));
-    for (signal, _) in &all {
-        if factor != 1.0 {
-            finding = finding.change(&signal.table, "scale", words::toml(signal.scale * factor));
-        }
-        if offset != 0.0 || signal.offset != 0.0 && factor != 1.0 {
-            finding = finding.change(&signal.table, "offset", words::toml(signal.offset * factor + offset));
-        }
-    }
-    judge.report.add(finding);
+    judge.add(finding);
 }
 
-/// Temperatures whose unit in the DBC is another, and nobody converts them: 50 degrees F pass for a warm day.
-fn unconverted(all: &[Seen<'_>], middle: f64) -> Option<Finding> {
-    let written = |signal: &SignalPlan| {
-        let (kind, factor, offset) = unit_of(&signal.unit)?;
-        let is_meant = kind == "temperature" && (COLD_C..=HOT_C).contains(&(middle * factor + offset));
-        let is_plain = (signal.scale, signal.offset) == (1.0, 0.0);
-        (is_meant && is_plain && (factor, offset) != (1.0, 0.0)).then_some((factor, offset))
+fn wrong_temperature(
+    judge: &Judge<'_>,
+    all: &[SignalSeries<'_>],
+    median_c: f64,
+    unit: Option<(f64, f64, &str, f64)>,
+) -> Finding {
+    let seen = format!("the median sensor reads {} degrees C", number(median_c));
+    let Some((factor, offset, name, converted_c)) = unit else {
+        return Finding::error(Topic::Unit, "temperatures no pack has")
+            .seen(seen)
+            .why("no common unit makes a temperature of it")
+            .change(&all[0].0.table, "signal", "a temperature");
     };
-    let found: Vec<_> = all.iter().filter_map(|(signal, _)| Some((*signal, written(signal)?))).collect();
+    let (severity, hint) = match HOT_C.contains(&median_c) {
+        true => (Severity::Warning, "a pack this hot would be in danger"),
+        false => (Severity::Error, "no pack has that"),
+    };
+    let (converted, ambient) = (number(converted_c), number(judge.plan.pack.ambient_c));
+    let finding = Finding::new(severity, Topic::Unit, format!("temperatures: {name}?"))
+        .seen(seen)
+        .why(format!("{hint}; as {name} it is {converted} degrees C, near the {ambient} of pack.ambient_c"));
+    all.iter().fold(finding, |mut finding, (signal, _)| {
+        if factor != 1.0 {
+            finding = finding.change(&signal.table, "scale", toml(signal.scale * factor));
+        }
+        if offset != 0.0 || signal.offset != 0.0 && factor != 1.0 {
+            finding = finding.change(&signal.table, "offset", toml(signal.offset * factor + offset));
+        }
+        finding
+    })
+}
+
+/// Temperatures in another unit by their DBC that the configuration does not convert: 50 degrees F pass for a warm day.
+fn unconverted(all: &[SignalSeries<'_>], median_c: f64) -> Option<Finding> {
+    let conversion = |signal: &SignalPlan| {
+        let (kind, factor, offset) = unit_of(&signal.unit)?;
+        let is_plausible = kind == Kind::Temperature && PLAUSIBLE_C.contains(&(median_c * factor + offset));
+        let is_plain = (signal.scale, signal.offset) == (1.0, 0.0);
+        (is_plausible && is_plain && (factor, offset) != (1.0, 0.0)).then_some((factor, offset))
+    };
+    let found: Vec<_> = all.iter().filter_map(|(signal, _)| Some((*signal, conversion(signal)?))).collect();
     let &(first, (factor, offset)) = found.first()?;
+    let (read, converted) = (number(median_c), number(median_c * factor + offset));
     let finding = Finding::error(Topic::Unit, format!("temperatures: the DBC's unit is {:?}", first.unit))
-        .seen(format!("the middle sensor reads {} degrees C", words::number(middle)))
-        .why(format!(
-            "the configuration does not convert it; it is {} degrees C",
-            words::number(middle * factor + offset)
-        ));
+        .seen(format!("the median sensor reads {read} degrees C"))
+        .why(format!("the configuration does not convert it; it is {converted} degrees C"));
     Some(found.into_iter().fold(finding, |finding, (signal, (factor, offset))| {
-        let finding = if factor == 1.0 { finding } else { finding.change(&signal.table, "scale", words::toml(factor)) };
-        finding.change(&signal.table, "offset", words::toml(offset))
+        let finding = if factor == 1.0 { finding } else { finding.change(&signal.table, "scale", toml(factor)) };
+        finding.change(&signal.table, "offset", toml(offset))
     }))
 }
 
-/// Share of implausible readings that is more than a disturbance.
-const MANY: f64 = 0.01;
-
-/// Readings the service will refuse although nothing else is wrong: limits too tight, or disturbances.
-pub(super) fn refused(judge: &mut Judge<'_>) {
-    if judge.is_mixed_up || judge.report.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
+/// Readings the service will reject although nothing else is wrong: limits too tight, or disturbances.
+pub(super) fn check_limits(judge: &mut Judge<'_>) {
+    if judge.is_mixed_up || judge.has(&[Topic::Unit, Topic::Layout, Topic::Cell, Topic::CellCount]) {
         return;
     }
-    for (kind, table, what) in [
-        (Kind::Current, "limits.current", "currents"),
-        (Kind::Voltage, "limits.voltage", "voltages"),
-        (Kind::Temperature, "limits.temperature", "temperatures"),
+    let [current, voltage, temperature] = judge.plan.limits;
+    for (kind, table, what, limits, cells) in [
+        (Kind::Current, "limits.current", "currents", current, 1.0),
+        (Kind::Voltage, "limits.voltage", "voltages", voltage, judge.cells_per_reading()),
+        (Kind::Temperature, "limits.temperature", "temperatures", temperature, 1.0),
     ] {
-        let all = judge.of(kind);
+        let all = judge.signals(kind);
         let (implausible, count) = all.iter().fold((0, 0), |(a, b), (_, s)| (a + s.implausible, b + s.count()));
         if implausible == 0 {
             continue;
         }
         let low = all.iter().map(|(_, s)| s.extent.min).fold(f64::INFINITY, f64::min);
         let high = all.iter().map(|(_, s)| s.extent.max).fold(f64::NEG_INFINITY, f64::max);
-        let limits = judge.plan.limits[usize::from(kind != Kind::Current) + usize::from(kind == Kind::Temperature)];
-        let cells = if kind == Kind::Voltage && judge.plan.is_pack_total { f64::from(judge.plan.cells) } else { 1.0 };
-        let share = implausible as f64 / count.max(1) as f64;
-        let title = format!("{what} outside the limits");
-        let finding =
-            if share > MANY { Finding::warning(Topic::Range, title) } else { Finding::note(Topic::Range, title) };
-        let mut finding = finding
-            .seen(format!(
-                "{} of {count} readings: {} to {}, allowed {} to {}",
-                implausible,
-                words::number(low / cells),
-                words::number(high / cells),
-                words::number(limits.0),
-                words::number(limits.1)
-            ))
-            .why(if share > MANY {
-                "so many are no disturbance: the limit is too tight, and they move no estimate"
-            } else {
-                "a few are disturbances; they move no estimate"
-            });
-        if kind == Kind::Current && share > MANY {
-            if high > limits.1 {
-                finding = finding.change(table, "max_discharge_a", words::toml((1.2 * high).ceil()));
-            }
-            if low < limits.0 {
-                finding = finding.change(table, "max_charge_a", words::toml((-1.2 * low).ceil()));
-            }
+        let is_many = implausible as f64 / count.max(1) as f64 > MANY;
+        let (severity, why) = match is_many {
+            true => (Severity::Warning, "too many for disturbances: the limit is too tight, and they move no estimate"),
+            false => (Severity::Note, "single readings are disturbances; they move no estimate"),
+        };
+        let [from, to, lowest, highest] = [low / cells, high / cells, limits.0, limits.1].map(number);
+        let mut finding = Finding::new(severity, Topic::Range, format!("{what} outside the limits"))
+            .seen(format!("{implausible} of {count} readings: {from} to {to}, allowed {lowest} to {highest}"))
+            .why(why);
+        if kind == Kind::Current && is_many && high > limits.1 {
+            finding = finding.change(table, "max_discharge_a", toml((1.2 * high).ceil()));
         }
-        judge.report.add(finding);
+        if kind == Kind::Current && is_many && low < limits.0 {
+            finding = finding.change(table, "max_charge_a", toml((-1.2 * low).ceil()));
+        }
+        judge.add(finding);
     }
 }

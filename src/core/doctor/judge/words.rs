@@ -1,17 +1,16 @@
-//! Figures for people: no more digits than they carry.
+//! Numbers and channels as text: no more digits than a value carries.
 
-use crate::can::signal::ByteOrder;
 use crate::quantity::Channel;
 
-/// Most numbers named one by one.
+/// Most ranges named one by one.
 const MAX_NAMED: usize = 6;
 
 /// About four digits.
-pub(in crate::doctor) fn number(value: f64) -> String {
+pub(super) fn number(value: f64) -> String {
     if !value.is_finite() {
         return "unknown".to_owned();
     }
-    // No minus before nothing.
+    // No minus sign before 0.
     let value = if value.abs() < 5e-6 { 0.0 } else { value };
     let size = value.abs();
     let digits = match size {
@@ -26,30 +25,36 @@ pub(in crate::doctor) fn number(value: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
-/// A value for the configuration: a float with its point, without the dust of arithmetic.
-pub(in crate::doctor) fn toml(value: f64) -> String {
+/// A number in thousandths: V in mV, ohm in mOhm.
+pub(super) fn milli(value: f64) -> String {
+    number(1000.0 * value)
+}
+
+/// A fraction as whole per cent.
+pub(super) fn percent(fraction: f64) -> f64 {
+    (100.0 * fraction).round()
+}
+
+/// A float for the configuration: with its point, rounded to ten digits.
+pub(super) fn toml(value: f64) -> String {
     let rounded: f64 = format!("{value:.9e}").parse().unwrap_or(value);
     format!("{rounded:?}")
 }
 
-/// Rounded to three digits: a period jitters.
-fn three_digits(value: f64) -> f64 {
-    format!("{value:.2e}").parse().unwrap_or(value)
-}
-
-/// `100 ms`, `2.5 s`.
-pub(in crate::doctor) fn seconds(value: f64) -> String {
+/// `100 ms`, `2.5 s`; three digits, because a period jitters.
+pub(super) fn seconds(value: f64) -> String {
+    let three_digits = |value: f64| number(format!("{value:.2e}").parse().unwrap_or(value));
     if value < 0.9995 {
-        format!("{} ms", number(three_digits(1000.0 * value)))
+        format!("{} ms", three_digits(1000.0 * value))
     } else if value < 7200.0 {
-        format!("{} s", number(three_digits(value)))
+        format!("{} s", three_digits(value))
     } else {
         format!("{} h", number(value / 3600.0))
     }
 }
 
-/// `1-3, 7` of rising numbers.
-pub(in crate::doctor) fn ranges(numbers: &[usize]) -> String {
+/// Rising numbers as ranges: `1-3, 7`.
+pub(super) fn ranges(numbers: &[usize]) -> String {
     let mut runs: Vec<(usize, usize)> = Vec::new();
     for &number in numbers {
         match runs.last_mut() {
@@ -57,16 +62,13 @@ pub(in crate::doctor) fn ranges(numbers: &[usize]) -> String {
             _ => runs.push((number, number)),
         }
     }
-    let mut words: Vec<String> =
-        runs.iter().take(MAX_NAMED).map(|(a, b)| if a == b { a.to_string() } else { format!("{a}-{b}") }).collect();
-    if runs.len() > MAX_NAMED {
-        words.push("...".to_owned());
-    }
-    words.join(", ")
+    let named = runs.iter().take(MAX_NAMED).map(|(a, b)| if a == b { a.to_string() } else { format!("{a}-{b}") });
+    let more = (runs.len() > MAX_NAMED).then(|| "...".to_owned());
+    named.chain(more).collect::<Vec<_>>().join(", ")
 }
 
-/// What a channel is (cells and sensors from 1).
-pub(in crate::doctor) fn channel(channel: Channel) -> String {
+/// A channel; cells and sensors count from 1.
+pub(super) fn channel(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
@@ -78,43 +80,25 @@ pub(in crate::doctor) fn channel(channel: Channel) -> String {
     }
 }
 
-/// Several channels in few words.
-pub(in crate::doctor) fn channels(all: &[Channel]) -> String {
-    let cells: Vec<usize> = all
-        .iter()
-        .filter_map(|c| if let Channel::CellVoltage(cell) = c { Some(usize::from(cell.0) + 1) } else { None })
-        .collect();
-    let sensors: Vec<usize> = all
-        .iter()
-        .filter_map(|c| if let Channel::Temperature(sensor) = c { Some(usize::from(sensor.0) + 1) } else { None })
-        .collect();
-    let mut words: Vec<String> = all
-        .iter()
-        .filter(|c| !matches!(c, Channel::CellVoltage(_) | Channel::Temperature(_)))
-        .map(|c| channel(*c))
-        .collect();
-    let many = |one: &str, numbers: &[usize]| match numbers {
-        [number] => format!("{one} {number}"),
-        _ => format!("{one}s {}", ranges(numbers)),
-    };
-    if !cells.is_empty() {
-        words.push(many("cell", &cells));
+/// Several channels, cells and sensors as ranges.
+pub(super) fn channels(all: &[Channel]) -> String {
+    let (mut texts, mut cells, mut sensors) = (Vec::new(), Vec::new(), Vec::new());
+    for one in all {
+        match one {
+            Channel::CellVoltage(cell) => cells.push(usize::from(cell.0) + 1),
+            Channel::Temperature(sensor) => sensors.push(usize::from(sensor.0) + 1),
+            other => texts.push(channel(*other)),
+        }
     }
-    if !sensors.is_empty() {
-        words.push(many("temperature", &sensors));
+    for (name, numbers) in [("cell", cells), ("temperature", sensors)] {
+        if !numbers.is_empty() {
+            texts.push(format!("{name}{} {}", if numbers.len() == 1 { "" } else { "s" }, ranges(&numbers)));
+        }
     }
-    words.join(", ")
-}
-
-/// The byte order in the words of a DBC.
-pub(in crate::doctor) fn order(order: ByteOrder) -> &'static str {
-    match order {
-        ByteOrder::LittleEndian => "@1 (little-endian)",
-        ByteOrder::BigEndian => "@0 (big-endian)",
-    }
+    texts.join(", ")
 }
 
 /// `1 frame`, `2 frames`.
-pub(in crate::doctor) fn count(n: u64, one: &str) -> String {
-    if n == 1 { format!("1 {one}") } else { format!("{n} {one}s") }
+pub(super) fn count(n: u64, noun: &str) -> String {
+    format!("{n} {noun}{}", if n == 1 { "" } else { "s" })
 }

@@ -1,9 +1,11 @@
-//! The nearest rows to a point, by a k-d tree that can be asked for rows before a given one only.
+//! Nearest rows to a point by a k-d tree, optionally among the rows before a given one.
 //!
-//! Distances are Euclidean in weighted inputs. Of two rows as near the one with the lower number is taken, so that the
-//! answer does not depend on how the tree was built.
+//! In: rows, weights of the inputs, a point. Out: row numbers, nearest first. Inputs are finite (checked before).
+//!
+//! Distances are Euclidean in weighted inputs. Of two rows at equal distance the one with the lower number is taken, so
+//! that the result does not depend on the layout of the tree.
 
-/// Rows that are not divided further.
+/// Largest number of rows of a leaf.
 const LEAF_ROWS: usize = 16;
 
 /// A tree over rows, numbered from 0.
@@ -14,26 +16,26 @@ pub(super) struct Tree {
     points: Vec<f64>,
     /// Number of each of those rows.
     numbers: Vec<u32>,
-    nodes: Vec<Branch>,
+    nodes: Vec<TreeNode>,
 }
 
 #[derive(Debug, Clone)]
-struct Branch {
+struct TreeNode {
     first: usize,
     end: usize,
     /// Lowest number of a row below this node.
-    lowest: u32,
-    /// Axis, place of the cut, right child (the left one follows the node); `None` = a leaf.
+    minimum: u32,
+    /// Axis, position of the cut, right child (the left one follows the node); `None` = a leaf.
     cut: Option<(usize, f64, usize)>,
 }
 
-/// Rows found so far, the farthest on top.
-struct Found {
+/// Heap of the nearest rows so far, the farthest on top.
+struct NearestHeap {
     heap: Vec<(f64, u32)>,
     wanted: usize,
 }
 
-impl Found {
+impl NearestHeap {
     fn worst(&self) -> f64 {
         if self.heap.len() < self.wanted { f64::INFINITY } else { self.heap[0].0 }
     }
@@ -78,9 +80,9 @@ impl Tree {
     fn build(&mut self, points: &[f64], rows: &mut [u32], first: usize) {
         let d = self.weights.len();
         let of = |row: u32, axis: usize| points[row as usize * d + axis];
-        let lowest = rows.iter().copied().min().unwrap_or(u32::MAX);
+        let minimum = rows.iter().copied().min().unwrap_or(u32::MAX);
         let here = self.nodes.len();
-        self.nodes.push(Branch { first, end: first + rows.len(), lowest, cut: None });
+        self.nodes.push(TreeNode { first, end: first + rows.len(), minimum, cut: None });
         let spread = |axis: usize| {
             let ends = (rows.iter()).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), row| {
                 (low.min(of(*row, axis)), high.max(of(*row, axis)))
@@ -101,40 +103,40 @@ impl Tree {
         self.nodes[here].cut = Some((axis, place, right_child));
     }
 
-    /// The `wanted` nearest rows with numbers below `before` and other than `but`, nearest first.
-    pub(super) fn nearest(&self, point: &[f64], wanted: usize, before: usize, but: Option<usize>) -> Vec<u32> {
+    /// The `wanted` nearest rows with numbers below `before` and other than `excluded`, nearest first.
+    pub(super) fn nearest(&self, point: &[f64], wanted: usize, before: usize, excluded: Option<usize>) -> Vec<u32> {
         let point: Vec<f64> = point.iter().zip(&self.weights).map(|(x, w)| x * w).collect();
         let before = u32::try_from(before).unwrap_or(u32::MAX);
-        let but = but.and_then(|row| u32::try_from(row).ok());
-        let mut found = Found { heap: Vec::with_capacity(wanted), wanted };
+        let excluded = excluded.and_then(|row| u32::try_from(row).ok());
+        let mut found = NearestHeap { heap: Vec::with_capacity(wanted), wanted };
         if wanted > 0 {
-            self.visit(0, &point, before, but, &mut found);
+            self.visit(0, &point, before, excluded, &mut found);
         }
         found.heap.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         found.heap.into_iter().map(|(_, row)| row).collect()
     }
 
-    fn visit(&self, at: usize, point: &[f64], before: u32, but: Option<u32>, found: &mut Found) {
+    fn visit(&self, at: usize, point: &[f64], before: u32, excluded: Option<u32>, found: &mut NearestHeap) {
         let node = &self.nodes[at];
-        if node.lowest >= before {
+        if node.minimum >= before {
             return;
         }
         let Some((axis, place, right)) = node.cut else {
-            return self.search_leaf(node, point, before, but, found);
+            return self.search_leaf(node, point, before, excluded, found);
         };
         let away = point[axis] - place;
         let (near, far) = if away < 0.0 { (at + 1, right) } else { (right, at + 1) };
-        self.visit(near, point, before, but, found);
+        self.visit(near, point, before, excluded, found);
         if away * away <= found.worst() {
-            self.visit(far, point, before, but, found);
+            self.visit(far, point, before, excluded, found);
         }
     }
 
-    fn search_leaf(&self, node: &Branch, point: &[f64], before: u32, but: Option<u32>, found: &mut Found) {
+    fn search_leaf(&self, node: &TreeNode, point: &[f64], before: u32, excluded: Option<u32>, found: &mut NearestHeap) {
         let d = point.len();
         for place in node.first..node.end {
             let row = self.numbers[place];
-            if row < before && Some(row) != but {
+            if row < before && Some(row) != excluded {
                 let squares = self.points[place * d..][..d].iter().zip(point).map(|(a, b)| (a - b) * (a - b));
                 found.offer((squares.sum(), row));
             }
@@ -147,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_tree_finds_what_looking_at_every_row_finds() {
+    fn the_tree_agrees_with_an_exhaustive_search() {
         let mut state = 1_u64;
         let mut draw = || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
@@ -172,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_are_all_equal_do_not_recurse_for_ever() {
+    fn equal_rows_do_not_recurse_without_end() {
         let tree = Tree::new(&[1.0; 5000], &[1.0]);
         assert_eq!(tree.nearest(&[1.0], 3, 5000, Some(1)), [0, 2, 3]);
     }

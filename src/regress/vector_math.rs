@@ -1,8 +1,9 @@
-//! Exponential and logarithm without branches, so that the compiler can do several at once.
+//! Exponential and logarithm without branches, so that the compiler can vectorise them.
 //!
-//! Both are accurate to a few 1e-16 of the result over the range named at each. The loops that call them run inside
-//! `pulp`'s dispatcher (faer brings it), which picks the widest instructions of the machine at run time; nothing is
-//! fused, so the results are the same on every machine.
+//! In and out: plain numbers, accurate to a few 1e-16 of the result over the stated range; outside the range the result
+//! has no meaning. The loops that call them run inside
+//! `pulp`'s dispatcher (faer brings it), which selects the widest instructions of the machine at run time; no operation
+//! is fused, so the results are the same on every machine.
 
 use std::f64::consts::LOG2_E;
 
@@ -11,7 +12,7 @@ const LN2_HIGH: f64 = 6.931_471_803_691_238e-1;
 const LN2_LOW: f64 = 1.908_214_929_270_587_7e-10;
 /// Added to a small number, it leaves the nearest integer in the low bits.
 const ROUNDER: f64 = 6_755_399_441_055_744.0;
-/// Below it, exp is given as exp of it: about 1e-304, far from the subnormal numbers.
+/// Lower limit of the argument of exp: about 1e-304, far from the subnormal numbers.
 const EXP_LOWEST: f64 = -700.0;
 /// 1/k! for k = 13 down to 0.
 const EXP_SERIES: [f64; 14] = [

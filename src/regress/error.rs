@@ -1,18 +1,18 @@
-//! What can be wrong with rows, settings and saved models.
+//! Errors of rows, settings and saved models.
 
-/// Why there is no model or no prediction.
+/// Reason why there is no model or no prediction.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Fault {
-    /// Text that is no kernel.
+pub enum RegressionError {
+    /// A text that is not a kernel.
     #[error("kernel {text:?}, column {column}: found {found}, allowed: {allowed}")]
     Kernel {
         /// The whole text.
         text: String,
-        /// Where, from 1.
+        /// Column of the error, from 1.
         column: usize,
-        /// What stands there.
+        /// Text found there.
         found: String,
-        /// What may stand there.
+        /// Allowed text.
         allowed: String,
     },
     /// A number that is not finite among the rows.
@@ -25,34 +25,34 @@ pub enum Fault {
         /// The value.
         found: f64,
     },
-    /// Lengths that do not fit together, too few or too many of something.
+    /// A setting or a length out of its range.
     #[error("{what} = {found}, must be {allowed}")]
     OutOfRange {
-        /// What.
+        /// Name of the quantity.
         what: String,
         /// Its value.
         found: String,
-        /// What it may be.
+        /// Allowed range.
         allowed: String,
     },
-    /// A covariance matrix without a Cholesky factor, whatever is added to its diagonal.
+    /// A covariance matrix without a Cholesky factor, even with the largest jitter.
     #[error("covariance matrix is not positive definite, even with {jitter:e} of the signal variance on its diagonal")]
     NotPositiveDefinite {
-        /// Most that was added, as part of the signal variance.
+        /// Largest jitter tried, as part of the signal variance.
         jitter: f64,
     },
-    /// The watcher said so.
+    /// The progress callback cancelled the fit.
     #[error("cancelled")]
     Cancelled,
-    /// A saved model that cannot be used.
+    /// An unusable saved model.
     #[error("saved model: {0}")]
     Saved(String),
-    /// No threads to work with.
+    /// The threads could not be started.
     #[error("threads cannot be started: {0}")]
     Threads(String),
 }
 
-impl Fault {
+impl RegressionError {
     pub(super) fn range(what: &str, found: impl ToString, allowed: impl ToString) -> Self {
         Self::OutOfRange { what: what.to_owned(), found: found.to_string(), allowed: allowed.to_string() }
     }

@@ -1,0 +1,132 @@
+//! What all checks share: the received data, the plan, the report so far, and the factors found.
+
+use std::collections::BTreeSet;
+
+use crate::can::CanId;
+use crate::cell::CellModel;
+use crate::doctor::plan::{Kind, Plan, SignalPlan};
+use crate::doctor::report::{Finding, Report, Severity, Topic};
+use crate::doctor::series::{Series, median};
+use crate::doctor::watch::{BusStats, Doctor};
+use crate::quantity::BusIndex;
+
+/// A pack's current stays below this many times its capacity.
+pub(super) const MAX_C_RATE: f64 = 30.0;
+
+/// A slope's size is judged when the current explains this share of the voltage's changes: noise in the current makes it
+/// too small otherwise.
+pub(super) const EXPLAINED: f64 = 0.8;
+
+/// A configured signal with the statistics of its values.
+pub(super) type SignalSeries<'d> = (&'d SignalPlan, &'d Series);
+
+/// State of the judgement.
+pub(super) struct Judge<'d> {
+    pub(super) doctor: &'d Doctor,
+    pub(super) plan: &'d Plan,
+    pub(super) report: Report,
+    /// Messages whose absence is explained.
+    pub(super) explained: BTreeSet<(BusIndex, CanId)>,
+    /// Factor that converts the voltages as configured to V.
+    pub(super) voltage_factor: f64,
+    /// Factor that converts the current as configured to A.
+    pub(super) current_factor: f64,
+    /// A current or voltage is not the configured quantity: how voltages follow the current cannot be judged.
+    pub(super) is_mixed_up: bool,
+}
+
+impl<'d> Judge<'d> {
+    pub(super) fn new(doctor: &'d Doctor) -> Self {
+        let report = Report { seconds: doctor.seconds(), frames: doctor.frames, ..Report::default() };
+        Self {
+            doctor,
+            plan: &doctor.plan,
+            report,
+            explained: BTreeSet::new(),
+            voltage_factor: 1.0,
+            current_factor: 1.0,
+            is_mixed_up: false,
+        }
+    }
+
+    pub(super) fn add(&mut self, finding: Finding) {
+        self.report.add(finding);
+    }
+
+    pub(super) fn fine(&mut self, text: String) {
+        self.report.fine.push(text);
+    }
+
+    pub(super) fn unjudged(&mut self, text: impl Into<String>) {
+        self.report.unjudged.push(text.into());
+    }
+
+    /// Whether an error or a warning about one of the topics was found.
+    pub(super) fn has(&self, topics: &[Topic]) -> bool {
+        self.report.findings.iter().any(|f| f.severity != Severity::Note && topics.contains(&f.topic))
+    }
+
+    /// Signals of a kind.
+    pub(super) fn signals(&self, kind: Kind) -> Vec<SignalSeries<'d>> {
+        let all = self.plan.signals.iter().zip(&self.doctor.series);
+        all.filter(|(signal, _)| Kind::of(signal.binding.channel) == kind).collect()
+    }
+
+    pub(super) fn current(&self) -> Option<SignalSeries<'d>> {
+        self.signals(Kind::Current).first().copied()
+    }
+
+    /// Smallest and largest voltage the median cell may have, V.
+    pub(super) fn voltage_band(&self) -> (f64, f64) {
+        // Of the medians over time: a short peak does not move them.
+        self.plan.pack.model.as_ref().map_or((1.2, 4.6), |m| (m.voltage_min_v - 0.15, m.voltage_max_v + 0.08))
+    }
+
+    /// Charge of the whole pack, Ah.
+    pub(super) fn pack_ah(&self) -> f64 {
+        self.plan.pack.capacity_ah * f64::from(self.plan.pack.strings.max(1))
+    }
+
+    /// Cells that one voltage reading covers.
+    pub(super) fn cells_per_reading(&self) -> f64 {
+        if self.plan.pack.is_total { f64::from(self.plan.pack.cells.max(1)) } else { 1.0 }
+    }
+
+    /// Median over the cells of their median voltages as configured, V per cell; `None` = no reading.
+    pub(super) fn cell_voltage(&self) -> Option<f64> {
+        self.median_of(Kind::Voltage, |series| series.values.median()).map(|v| v / self.cells_per_reading())
+    }
+
+    /// Median over the signals of a kind.
+    pub(super) fn median_of(&self, kind: Kind, value: impl Fn(&Series) -> Option<f64>) -> Option<f64> {
+        median(self.signals(kind).into_iter().filter_map(|(_, series)| value(series)))
+    }
+
+    /// Median of the temperature sensors where it is plausible, degrees C; else the configured surroundings.
+    pub(super) fn temperature_c(&self) -> f64 {
+        let median = self.median_of(Kind::Temperature, |series| series.values.median());
+        median.filter(|c| (-40.0..80.0).contains(c)).unwrap_or(self.plan.pack.ambient_c)
+    }
+
+    /// The model's resistance for a step of about a second and for one that has settled, ohm.
+    pub(super) fn model_ohm(&self, model: &CellModel) -> (f64, f64) {
+        let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
+        let temperature_c = self.temperature_c();
+        let place = model.grid_position(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.05, 0.95), temperature_c);
+        (model.r0_ohm(&place), model.settled_ohm(&place))
+    }
+
+    pub(super) fn bus(&self, bus: BusIndex) -> Option<&'d BusStats> {
+        self.doctor.buses.get(bus.index())
+    }
+
+    pub(super) fn interface(&self, bus: BusIndex) -> &'d str {
+        self.bus(bus).map_or("unknown", |bus| bus.name.as_str())
+    }
+
+    /// Another interface that carries the identifier.
+    pub(super) fn other_bus(&self, bus: BusIndex, id: CanId) -> Option<&'d BusStats> {
+        let buses = self.doctor.buses.iter().enumerate();
+        buses.filter(|(index, _)| *index != bus.index()).map(|(_, other)| other).find(|b| b.ids.contains_key(&id))
+    }
+}

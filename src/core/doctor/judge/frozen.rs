@@ -1,0 +1,85 @@
+//! Signals that stand still while others move, and cells that respond unlike the others.
+
+use super::context::{EXPLAINED, Judge, SignalSeries};
+use super::words::{channels, count, milli, number, ranges};
+use crate::doctor::plan::Kind;
+use crate::doctor::report::{Finding, Topic};
+use crate::doctor::response::Slope;
+use crate::doctor::series::Series;
+use crate::quantity::Channel;
+
+/// Fewest readings to judge a signal by.
+const FEWEST_READINGS: u64 = 20;
+/// Fewest steps to judge a single cell by.
+const FEWEST_STEPS: usize = 4;
+/// Standard deviations from which two slopes differ.
+const SURE: f64 = 6.0;
+
+pub(super) fn check(judge: &mut Judge<'_>) {
+    voltages(judge);
+    if let Some(current) = judge.current() {
+        pack_current(judge, current);
+    }
+}
+
+fn voltages(judge: &mut Judge<'_>) {
+    let voltages = judge.signals(Kind::Voltage);
+    let judged = || voltages.iter().filter(|(_, series)| series.count() >= FEWEST_READINGS);
+    let moving = judged().filter(|(_, s)| 10 * s.extent.changes > s.count()).count();
+    let still: Vec<_> = judged().filter(|(_, s)| s.extent.changes == 0 && s.extent.last.abs() > 0.05).collect();
+    let swing_a = judge.current().map_or(0.0, |(_, series)| series.extent.range());
+    let is_all = still.len() == voltages.len() && swing_a > 0.2 * judge.pack_ah();
+    if still.is_empty() || moving <= still.len() && !is_all {
+        return;
+    }
+    let (signal, series) = still[0];
+    let list: Vec<Channel> = still.iter().map(|(signal, _)| signal.binding.channel).collect();
+    let (value, readings) = (number(series.extent.last), count(series.count(), "reading"));
+    let finding = Finding::error(Topic::Frozen, format!("{} never moves", channels(&list)))
+        .seen(format!("{} is {value} in all of {readings}", signal.name))
+        .why(if is_all { "the current moved, and a voltage must follow it" } else { "the other cells moved" })
+        .change(&signal.table, "signal", "the signal that is measured, not a default or a copy")
+        .advice("or its sender repeats an old value");
+    judge.add(finding);
+}
+
+fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
+    let noise_v = judge.median_of(Kind::Voltage, Series::noise).unwrap_or(0.0);
+    let step_v = judge.doctor.fast_response().largest_voltage_step() * judge.voltage_factor;
+    let is_step = step_v > (10.0 * noise_v / judge.cells_per_reading() * judge.voltage_factor).max(0.008);
+    if series.count() < FEWEST_READINGS || series.extent.changes > 0 || !is_step {
+        return;
+    }
+    let (value, step) = (number(series.extent.last), milli(step_v));
+    let readings = count(series.count(), "reading");
+    let finding = Finding::error(Topic::Frozen, "the pack current never moves")
+        .seen(format!("{} is {value} A in all of {readings}, while the cells step by up to {step} mV", signal.name))
+        .why("only a current moves voltages this fast")
+        .change(&signal.table, "signal", "the signal of the current that is measured");
+    judge.add(finding);
+}
+
+/// Cells with a voltage that does not follow the current as the others do.
+pub(super) fn check_response(judge: &mut Judge<'_>) {
+    let is_clear = |slope: &Slope| slope.ohm > 0.0 && slope.certainty() >= 1.0 && slope.r2 >= EXPLAINED;
+    let Some(common) = judge.doctor.slope().filter(is_clear) else { return };
+    let cells = if judge.plan.pack.is_total { 0 } else { usize::from(judge.plan.pack.cells) };
+    let odd = (0..cells.min(judge.signals(Kind::Voltage).len())).filter_map(|cell| {
+        let slope = judge.doctor.slope_of(cell)?;
+        let ratio = slope.ohm / common.ohm;
+        let is_sure = (slope.ohm - common.ohm).abs() > SURE * slope.std_ohm.max(common.std_ohm);
+        (is_sure && !(0.33..=3.0).contains(&ratio) && slope.points >= FEWEST_STEPS).then_some((cell + 1, ratio))
+    });
+    let odd: Vec<(usize, f64)> = odd.collect();
+    if cells < 4 || odd.is_empty() || 4 * odd.len() > cells || judge.has(&[Topic::Cell, Topic::Frozen]) {
+        return;
+    }
+    let numbers: Vec<usize> = odd.iter().map(|(cell, _)| *cell).collect();
+    let (first, ratio) = (odd[0].0, number(odd[0].1));
+    let title = format!("cell {} follows the current unlike the others", ranges(&numbers));
+    let finding = Finding::warning(Topic::Cell, title)
+        .seen(format!("cell {first} moves {ratio} times as far as the median cell"))
+        .why("a loose connection (more), another signal in its place or an old value repeated (less)")
+        .advice("check the connection of that cell and its signal in the DBC");
+    judge.add(finding);
+}

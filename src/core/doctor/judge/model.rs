@@ -1,0 +1,131 @@
+//! Open-circuit voltage against the cell model, current offset, noise, and the results of the estimator.
+
+use super::context::Judge;
+use super::drift::Drift;
+use super::words::{milli, number, percent, seconds, toml};
+use crate::cell::CellModel;
+use crate::doctor::plan::Kind;
+use crate::doctor::report::{Finding, Topic};
+use crate::doctor::series::Series;
+
+pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
+    if let Some(model) = &judge.plan.pack.model {
+        open_circuit(judge, model, drift);
+    }
+    offset(judge);
+    noise(judge);
+}
+
+/// Resting voltage, and its slope over charge, against the model's.
+fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
+    let temperature_c = judge.temperature_c();
+    let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
+    let rests = judge.doctor.fast_response().rests.iter().map(|rest| rest.end_v);
+    let highest = rests.clone().fold(f64::NAN, f64::max);
+    let lowest = rests.clone().fold(f64::NAN, f64::min);
+    let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
+    let is_flat = |drift: &Drift| drift.expected_v > 0.03 && drift.sigma > 0.0 && (-0.05..0.15).contains(&drift.ratio);
+    if highest > full_v + 0.06 || lowest < empty_v - 0.06 {
+        let off_v = if highest > full_v + 0.06 { highest } else { lowest };
+        let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
+        let finding = Finding::error(Topic::CellModel, "the resting voltage is not on the cell model's curve")
+            .seen(format!("{off} V at rest; {} runs from {low} to {high} V", model.name))
+            .why("a rested cell shows its open-circuit voltage: this is another chemistry, or another number of cells")
+            .change("pack", "cell_model", chemistry(off_v));
+        judge.add(finding);
+    } else if let Some(drift) = drift.filter(is_flat) {
+        let (span, expected) = (seconds(drift.seconds), milli(drift.expected_v));
+        let moved = milli(drift.expected_v * drift.ratio.max(0.0));
+        let finding = Finding::warning(Topic::CellModel, "the voltage is much flatter than the cell model's")
+            .seen(format!("in {span} of steady current it moved {moved} of the {expected} mV the model expects"))
+            .why("a curve this flat is an iron-phosphate cell's (LFP), or the cells are much larger")
+            .change_cell_model();
+        judge.add(finding);
+    } else if let Some(cell_v) = judge.cell_voltage().filter(|v| is_like_iron_phosphate(judge, model, *v)) {
+        let (voltage, soc) = (number(cell_v), per_cent(cell_v));
+        let title = "either the pack is nearly empty, or its cells are iron phosphate (LFP)";
+        let finding = Finding::note(Topic::CellModel, title)
+            .seen(format!("the median cell has {voltage} V; by {} that is {soc} %", model.name))
+            .why("iron-phosphate cells stay near 3.3 V from full to empty")
+            .change_cell_model()
+            .advice("compare with the SOC the vehicle shows");
+        judge.add(finding);
+    } else if let Some(last_v) = rests.last() {
+        let (voltage, soc) = (number(last_v), per_cent(last_v));
+        judge.fine(format!("{voltage} V at rest: {soc} % by the cell model; compare with the SOC the vehicle shows"));
+    } else {
+        judge.unjudged("open-circuit voltage: the pack did not rest; leave it without load for a minute");
+    }
+}
+
+fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> bool {
+    model.ocv_v(&model.grid_position(0.5, judge.temperature_c())) > 3.5 && (3.18..3.38).contains(&cell_v)
+}
+
+fn chemistry(voltage_v: f64) -> &'static str {
+    match voltage_v {
+        v if v < 2.0 => "the model of the cell that is in the pack",
+        v if v < 2.95 => "a model of a titanate cell (LTO), if it is one",
+        v if v < 3.45 => "a model of an iron-phosphate cell (LFP), if it is one",
+        _ => "a model of a nickel-rich or cobalt cell (NMC, NCA, LCO), if it is one",
+    }
+}
+
+/// A steady current near zero that is not zero.
+fn offset(judge: &mut Judge<'_>) {
+    let rests = &judge.doctor.fast_response().rests;
+    let Some((signal, _)) = judge.current() else { return };
+    let Some(longest) = rests.iter().max_by(|a, b| a.seconds.total_cmp(&b.seconds)) else { return };
+    let (offset_a, dead_band_a) = (longest.current_a, judge.plan.pack.dead_band_a);
+    let (offset, band) = (number(offset_a), number(dead_band_a));
+    if offset_a.abs() <= dead_band_a {
+        return judge.fine(format!("current at rest {offset} A, within the dead band of {band} A"));
+    }
+    // In the bus's own sign, on top of the offset that is configured.
+    let proposed = signal.offset - offset_a * signal.binding.scale.signum();
+    let (span, voltage) = (seconds(longest.seconds), number(longest.end_v));
+    let title = format!("the current stays at {offset} A while the voltage rests");
+    let finding = Finding::note(Topic::CurrentOffset, title)
+        .seen(format!("for {span} at {voltage} V; the pack counts as resting up to {band} A"))
+        .why("either a load draws it, or it is the sensor's offset")
+        .change(&signal.table, "offset", toml(proposed))
+        .advice("only if the contactors are open and the current must be zero; otherwise raise transition.dead_band_a");
+    judge.add(finding);
+}
+
+fn noise(judge: &mut Judge<'_>) {
+    let configured_v = judge.plan.pack.voltage_noise_v;
+    let Some(noise_v) = judge.median_of(Kind::Voltage, Series::noise).map(|v| v / judge.cells_per_reading()) else {
+        return;
+    };
+    if configured_v > 0.0 && noise_v > 4.0 * configured_v {
+        let (measured, configured) = (milli(noise_v), milli(configured_v));
+        let finding = Finding::note(Topic::Noise, "voltages are noisier than configured")
+            .seen(format!("about {measured} mV from reading to reading, {configured} mV configured"))
+            .why("the estimate follows noise that is not configured")
+            .change("estimator", "voltage_noise_v", toml((noise_v * 1e4).round() / 1e4));
+        judge.add(finding);
+    }
+}
+
+/// Share of voltages the estimator rejected.
+pub(super) fn check_estimator(judge: &mut Judge<'_>) {
+    const FEWEST: u64 = 200;
+    let stats = &judge.doctor.estimator;
+    if stats.estimates < FEWEST {
+        return;
+    }
+    let rejected = stats.rejected as f64 / stats.estimates as f64;
+    let bias = milli(stats.innovation_sum / stats.estimates as f64);
+    if rejected > 0.1 && !judge.has(&[Topic::CellModel, Topic::Cell, Topic::Frozen, Topic::CellCount]) {
+        let share = percent(rejected);
+        let finding = Finding::warning(Topic::CellModel, "the estimator rejects many voltages")
+            .seen(format!("{share} % of {} readings beyond its gate, {bias} mV off in the mean", stats.estimates))
+            .why("the model's voltages and the measured ones do not agree")
+            .change_cell_model();
+        judge.add(finding);
+    } else {
+        let share = percent(1.0 - rejected);
+        judge.fine(format!("the estimator runs: {share} % of its readings accepted, {bias} mV off in the mean"));
+    }
+}
