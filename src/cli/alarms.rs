@@ -1,10 +1,10 @@
-//! `packwatch alarms`: the alarms of the running daemon, as a table or as its own JSON.
+//! `packwatch alarms`: the alarms of the running daemon, as a table or as JSON.
 
 use std::fmt::Write as _;
 
 use super::Failure;
 use super::control_args::{ControlArgs, print};
-use crate::alarm::{Alarm, AlarmState, Rule, Severity, Unit};
+use crate::alarm::{Alarm, AlarmState, Rule, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
@@ -12,10 +12,10 @@ use crate::quantity::CellIndex;
 /// Arguments of `alarms`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The daemon's answer as it is, a line of JSON (cells from 0, times in ns since 1970)
+    /// The daemon's answer, a line of JSON (cells from 0, times in ns since 1970)
     #[arg(long)]
     json: bool,
-    /// Alarms at rest and unknown ones too
+    /// Lists also alarms at rest and unknown ones
     #[arg(long)]
     all: bool,
     #[command(flatten)]
@@ -58,7 +58,7 @@ fn table(list: &AlarmList) -> String {
         rows.iter().for_each(|row| push_row(&mut text, row, &widths));
     }
     if list.omitted > 0 {
-        let _ = writeln!(text, "and {} more, for which the answer had no room", list.omitted);
+        let _ = writeln!(text, "and {} more, beyond the length of an answer", list.omitted);
     }
     let _ = write!(text, "{} thresholds", list.thresholds);
     if list.unknown.is_empty() {
@@ -67,7 +67,7 @@ fn table(list: &AlarmList) -> String {
         let names = list
             .unknown
             .iter()
-            .map(|unknown| format!("{} {} ({})", unknown.rule.name(), severity(unknown.severity), unknown.alarms));
+            .map(|unknown| format!("{} {} ({})", unknown.rule.name(), unknown.severity.name(), unknown.alarms));
         let names: Vec<String> = names.collect();
         let _ = writeln!(text, ", not known for {} of them (alarms): {}", names.len(), names.join(", "));
     }
@@ -85,7 +85,7 @@ fn row(alarm: &Alarm) -> [String; HEAD.len()] {
     let has_been = alarm.occurrences > 0;
     [
         alarm.rule.name().to_owned(),
-        severity(alarm.severity).to_owned(),
+        alarm.severity.name().to_owned(),
         cell(alarm.cell),
         state_name(alarm.state).to_owned(),
         alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
@@ -103,7 +103,7 @@ fn row(alarm: &Alarm) -> [String; HEAD.len()] {
     ]
 }
 
-/// A cell as people count, from 1.
+/// A cell's number, from 1, or `pack`.
 pub(super) fn cell(cell: Option<CellIndex>) -> String {
     cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string())
 }
@@ -119,16 +119,7 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
     }
 }
 
-/// A severity as people write it.
-pub(super) fn severity(severity: Severity) -> &'static str {
-    match severity {
-        Severity::Info => "info",
-        Severity::Warning => "warning",
-        Severity::Severe => "severe",
-    }
-}
-
-/// Where an alarm is, in a word.
+/// The name of an alarm's state.
 pub(super) fn state_name(state: AlarmState) -> &'static str {
     match state {
         AlarmState::Unknown => "unknown",
@@ -145,6 +136,7 @@ pub(super) fn state_name(state: AlarmState) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::alarm::Severity;
     use crate::control::protocol::UnknownAlarms;
     use crate::quantity::Timestamp;
 
@@ -166,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_counts_cells_from_1_and_says_what_is_unknown() {
+    fn the_table_counts_cells_from_1_and_names_unknown_thresholds() {
         let missing = Alarm {
             rule: Rule::InputMissing,
             cell: Some(CellIndex(0)),
@@ -199,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn no_alarm_is_said() {
+    fn an_empty_list_is_reported_as_no_alarm() {
         let list = AlarmList { time: Timestamp::ZERO, thresholds: 2, unknown: vec![], alarms: vec![], omitted: 0 };
         assert_eq!(table(&list), "no alarm\n2 thresholds, all of them judged\n");
     }

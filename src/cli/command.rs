@@ -1,16 +1,16 @@
-//! `packwatch acknowledge`, `clear` and `pack-replaced`: what people tell the running daemon.
+//! `packwatch acknowledge`, `clear` and `pack-replaced`: commands to the running daemon.
 //!
-//! Success when something changed or there was nothing to change; a failure names every alarm that was refused, and why.
+//! They succeed when something changed or there was nothing to change; a failure names every refused alarm and the reason.
 
 use std::fmt::Write as _;
 
 use super::Failure;
-use super::alarms::{cell, severity, with_unit};
+use super::alarms::{cell, with_unit};
 use super::control_args::{ControlArgs, SelectorArgs, print};
 use crate::alarm::Alarm;
 use crate::control::answer::refusal;
 use crate::control::client::ControlClient;
-use crate::control::protocol::{Done, Request};
+use crate::control::protocol::{CommandOutcome, Request};
 use crate::monitor::Command;
 
 /// Arguments of `acknowledge` and `clear`.
@@ -25,7 +25,7 @@ pub(crate) struct AlarmArgs {
 /// Arguments of `pack-replaced`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ReplacedArgs {
-    /// Really: what was learned of the old pack is forgotten
+    /// Confirms it: everything learned about the old pack is forgotten
     #[arg(long)]
     yes: bool,
     #[command(flatten)]
@@ -34,12 +34,12 @@ pub(crate) struct ReplacedArgs {
 
 /// Runs `acknowledge`.
 pub(crate) fn acknowledge(args: &AlarmArgs) -> Result<(), Failure> {
-    tell(&args.control.client(), Command::Acknowledge(args.which.selector()), "acknowledged")
+    send(&args.control.client(), Command::Acknowledge(args.which.selector()), "acknowledged")
 }
 
 /// Runs `clear`.
 pub(crate) fn clear(args: &AlarmArgs) -> Result<(), Failure> {
-    tell(&args.control.client(), Command::Clear(args.which.selector()), "cleared")
+    send(&args.control.client(), Command::Clear(args.which.selector()), "cleared")
 }
 
 /// Runs `pack-replaced`.
@@ -47,24 +47,24 @@ pub(crate) fn pack_replaced(args: &ReplacedArgs) -> Result<(), Failure> {
     replace_pack(args.yes, &args.control.client())
 }
 
-/// Tells the running daemon that another pack is connected.
+/// Informs the running daemon that another pack is connected.
 pub(super) fn replace_pack(yes: bool, client: &ControlClient) -> Result<(), Failure> {
     if !yes {
         return Err(Failure::new(
-            "another pack is connected? then say --yes: the daemon forgets the capacity, the resistance and the other \
-             values it has learned, and the alarms about them, and starts again from the configuration; what it knew of \
-             the old pack goes into its log and events once more",
+            "another pack is connected? then add --yes: the daemon forgets the capacity, the resistance and the other \
+             values it has learned, and the alarms about them, and starts again from the configuration; it writes the \
+             last values of the old pack to its log and events",
         ));
     }
-    let done: Done = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
-    print(&format!("what was learned of the old pack is forgotten; alarms about it that ended: {}\n", done.changed))
+    let done: CommandOutcome = client.ask(Request::Command(Command::PackReplaced)).map_err(Failure::new)?;
+    print(&format!("the learned values of the old pack are forgotten; alarms about it that ended: {}\n", done.changed))
 }
 
-fn tell(client: &ControlClient, command: Command, word: &str) -> Result<(), Failure> {
-    let done: Done = client.ask(Request::Command(command)).map_err(Failure::new)?;
+fn send(client: &ControlClient, command: Command, word: &str) -> Result<(), Failure> {
+    let done: CommandOutcome = client.ask(Request::Command(command)).map_err(Failure::new)?;
     if done.changed > 0 || done.refused == 0 {
         print(&match done.changed {
-            0 => format!("nothing to be {word}\n"),
+            0 => format!("no alarm to be {word}\n"),
             1 => format!("1 alarm {word}\n"),
             changed => format!("{changed} alarms {word}\n"),
         })?;
@@ -72,7 +72,7 @@ fn tell(client: &ControlClient, command: Command, word: &str) -> Result<(), Fail
     if done.refused == 0 { Ok(()) } else { Err(Failure::new(refusals(&done, word))) }
 }
 
-fn refusals(done: &Done, word: &str) -> String {
+fn refusals(done: &CommandOutcome, word: &str) -> String {
     let alarms = if done.refused == 1 { "alarm" } else { "alarms" };
     let mut text = format!("{} {alarms} not {word}:", done.refused);
     for alarm in &done.refused_alarms {
@@ -82,15 +82,15 @@ fn refusals(done: &Done, word: &str) -> String {
             text,
             "\n  {} {}, cell {}: {} (value {value}, threshold {})",
             rule.name(),
-            severity(alarm.severity),
+            alarm.severity.name(),
             cell(alarm.cell),
             refusal(alarm),
             with_unit(rule, threshold)
         );
     }
-    let told = u32::try_from(done.refused_alarms.len()).unwrap_or(u32::MAX);
-    if done.refused > told {
-        let _ = write!(text, "\n  and {} more", done.refused - told);
+    let named = u32::try_from(done.refused_alarms.len()).unwrap_or(u32::MAX);
+    if done.refused > named {
+        let _ = write!(text, "\n  and {} more", done.refused - named);
     }
     text
 }

@@ -1,4 +1,4 @@
-//! What the commands to a running daemon have in common: its socket, and which alarms are meant.
+//! Arguments that the commands to a running daemon share: its socket, and the selection of alarms.
 
 use std::path::PathBuf;
 
@@ -9,47 +9,47 @@ use crate::cli::Failure;
 use crate::control::client::ControlClient;
 use crate::quantity::{CellIndex, MAX_CELLS};
 
-/// Where the daemon listens.
+/// The socket of the daemon.
 #[derive(Debug, clap::Args)]
 pub(crate) struct ControlArgs {
-    /// Control socket of the daemon (default: where `packwatch run` makes it)
+    /// Control socket of the daemon (default: where `packwatch run` creates it)
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
 }
 
 impl ControlArgs {
-    /// The daemon there.
+    /// A client of that socket.
     pub(crate) fn client(&self) -> ControlClient {
         ControlClient::new(self.control.as_deref())
     }
 }
 
-/// Which alarms are meant.
+/// A selection of alarms.
 #[derive(Debug, clap::Args)]
 #[group(id = "which", required = true, multiple = true)]
 pub(crate) struct SelectorArgs {
-    /// Those of this rule
+    /// Alarms of this rule
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true, group = "which")]
     rule: Option<Rule>,
-    /// Those of this severity
+    /// Alarms of this severity
     #[arg(long, value_parser = severity_parser(), group = "which")]
     severity: Option<Severity>,
-    /// Those of this cell, the first is 1
+    /// Alarms of this cell, the first is 1
     #[arg(long, value_name = "N", value_parser = cell, group = "which")]
     cell: Option<CellIndex>,
-    /// All of them
+    /// All alarms
     #[arg(long, conflicts_with_all = ["rule", "severity", "cell"], group = "which")]
     all: bool,
 }
 
 impl SelectorArgs {
-    /// The same for the daemon.
+    /// The selection, for the daemon.
     pub(crate) fn selector(&self) -> Selector {
         Selector { rule: self.rule, severity: self.severity, cell: self.cell }
     }
 }
 
-/// Reads a rule's name; a wrong one gets the names there are, and the one that is near.
+/// Parses a rule's name; an unknown one gets the list of names and the nearest.
 pub(crate) fn rule_parser() -> impl TypedValueParser<Value = Rule> {
     let find = |name: String| Rule::ALL.into_iter().find(|rule| rule.name() == name).ok_or("no such rule");
     PossibleValuesParser::new(Rule::ALL.map(Rule::name)).try_map(find)
@@ -65,7 +65,7 @@ fn cell(text: &str) -> Result<CellIndex, String> {
     number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell's number, 1 to {MAX_CELLS}"))
 }
 
-/// Writes to standard output; a reader that has seen enough (`| head`) is no failure.
+/// Writes to standard output; a closed pipe (`| head`) is not a failure.
 pub(crate) fn print(text: &str) -> Result<(), Failure> {
     use std::io::Write as _;
     match std::io::stdout().write_all(text.as_bytes()) {

@@ -10,10 +10,10 @@ use crate::{exporter, logging};
 /// Arguments of `exporter`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Where to listen; only this computer can reach the default
+    /// Address to listen on; the default can be reached only from this computer
     #[arg(long, value_name = "ADDR:PORT", default_value = "127.0.0.1:9558")]
     listen: SocketAddr,
-    /// Status socket of the daemon (default: where `packwatch run` makes it)
+    /// Status socket of the daemon (default: where `packwatch run` creates it)
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)

@@ -1,5 +1,5 @@
-//! `packwatch generate`: manual pages and shell completions, from the command line's own definition. Hidden: it serves
-//! those who build a package.
+//! `packwatch generate`: manual pages and shell completions, from the definition of the command line. Hidden: it is for
+//! building a package.
 
 use std::path::{Path, PathBuf};
 
@@ -12,23 +12,23 @@ use super::{Cli, Failure};
 /// Name of the manual page about configurations.
 const CONFIGURATION_PAGE: &str = "packwatch.toml.5";
 
-/// What the page about the whole says besides the command line's own definition.
-const WHOLE: &str = "\
+/// Text of the main page besides the definition of the command line.
+const MAIN_PAGE: &str = "\
 .SH EXIT STATUS
-0: success. 1: the work failed. 2: the command line is wrong. 78: the configuration is. A command with others names them.
+0: success. 1: failure. 2: wrong command line. 78: wrong configuration. A command with further codes lists them.
 .SH FILES
 .TP
 .I /etc/packwatch/packwatch.toml
-What the service reads.
+Configuration of the service.
 .TP
 .I /var/lib/packwatch
-What it has learned.
+Its state and history.
 .TP
 .I /run/packwatch
 Its sockets.
 .TP
 .I /usr/share/packwatch/packwatch.dbc
-The frames it sends, as shipped; \\fBpackwatch dbc\\fR writes them as they are configured.
+The frames it sends by default; \\fBpackwatch dbc\\fR writes the configured ones.
 .SH SEE ALSO
 .BR packwatch.toml (5)
 ";
@@ -37,12 +37,12 @@ The frames it sends, as shipped; \\fBpackwatch dbc\\fR writes them as they are c
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: What,
+    what: GenerateCommand,
 }
 
 #[derive(Debug, Subcommand)]
-enum What {
-    /// Write the manual pages of every command and of the configuration into a folder, which is made
+enum GenerateCommand {
+    /// Write the manual pages of every command and of the configuration into a folder, which is created
     Man {
         /// The folder
         #[arg(value_name = "DIR")]
@@ -58,12 +58,12 @@ enum What {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
-        What::Man { folder } => write_all(folder, &manual_pages()),
-        What::Completions { shell } => print(&String::from_utf8_lossy(&completions(*shell))),
+        GenerateCommand::Man { folder } => write_all(folder, &manual_pages()),
+        GenerateCommand::Completions { shell } => print(&String::from_utf8_lossy(&completions(*shell))),
     }
 }
 
-/// The command line without what is hidden.
+/// The command line without hidden commands.
 fn visible() -> clap::Command {
     let all = Cli::command();
     let shown = all.get_subcommands().filter(|command| !command.is_hide_set()).cloned();
@@ -85,7 +85,7 @@ fn manual_pages() -> Vec<(String, Vec<u8>)> {
     pages
 }
 
-/// The page of a command, then those of its own.
+/// Adds the page of a command, then those of its subcommands.
 fn add_pages(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) {
     pages.push(page(command));
     for own in command.get_subcommands().filter(|own| !own.is_hide_set()) {
@@ -99,7 +99,7 @@ fn page(command: &clap::Command) -> (String, Vec<u8>) {
     // Writing to a Vec cannot fail.
     let _ = man.render(&mut text);
     let is_whole = command.get_name() == "packwatch";
-    let more = if is_whole { WHOLE } else { ".SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch.toml (5)\n" };
+    let more = if is_whole { MAIN_PAGE } else { ".SH SEE ALSO\n.BR packwatch (1),\n.BR packwatch.toml (5)\n" };
     text.extend_from_slice(more.as_bytes());
     (name, text)
 }
@@ -126,7 +126,7 @@ mod tests {
 
     use super::*;
 
-    /// Names of all commands that are shown, those of a command after it: `history`, `history-verify`.
+    /// Names of all shown commands, each followed by its subcommands: `history`, `history-verify`.
     fn commands() -> Vec<String> {
         fn add(of: &clap::Command, before: &str, names: &mut Vec<String>) {
             for command in of.get_subcommands().filter(|command| !command.is_hide_set()) {
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn pages_say_how_a_command_is_called_and_name_the_others() {
+    fn pages_show_the_usage_of_a_command_and_name_the_others() {
         let pages = manual_pages();
         let text = |name: &str| {
             let page = pages.iter().find(|(of, _)| of == name).map(|(_, text)| text.clone());

@@ -1,4 +1,4 @@
-//! `packwatch history`: what the store has kept, as a table, JSON or CSV, and whether its chain is whole.
+//! `packwatch history`: the history in the store as a table, JSON or CSV, and the check of its hash chain.
 
 use std::path::PathBuf;
 
@@ -9,11 +9,11 @@ use super::control_args::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
-use crate::store::{self, Entry, Filter, Kind, Reader};
+use crate::store::{self, HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
-/// Rows listed when nobody says how many: a few screens.
+/// Rows listed by default: a few screens.
 const LISTED: u32 = 100;
 
 /// Arguments of `history`.
@@ -21,33 +21,33 @@ const LISTED: u32 = 100;
 #[command(args_conflicts_with_subcommands = false, subcommand_negates_reqs = true)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: Option<What>,
+    what: Option<HistoryCommand>,
     /// Folder of state and history (default: $STATE_DIRECTORY, else /var/lib/packwatch)
     #[arg(long, value_name = "DIR", global = true)]
     state: Option<PathBuf>,
     #[command(flatten)]
-    wanted: Wanted,
+    wanted: RowArgs,
     /// Print one JSON document (cells from 0, times in ns since 1970)
     #[arg(long)]
     json: bool,
-    /// Print at most so many rows, the latest; 0 = all
+    /// Print at most this number of rows, the latest; 0 = all
     #[arg(long, value_name = "N", default_value_t = LISTED)]
     limit: u32,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
+enum HistoryCommand {
     /// Write rows as CSV
     Export(ExportArgs),
-    /// Check the hash chain over capacities, remaining lives, alarms and resets; names the first row that is not as it was written
+    /// Check the hash chain over capacities, remaining lives, alarms and resets; names the first row that was changed
     Verify(VerifyArgs),
 }
 
 #[derive(Debug, clap::Args)]
 struct ExportArgs {
     #[command(flatten)]
-    wanted: Wanted,
-    /// Where to; - is standard output
+    wanted: RowArgs,
+    /// Output file; - is standard output
     #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
     out: PathBuf,
 }
@@ -59,9 +59,9 @@ struct VerifyArgs {
     json: bool,
 }
 
-/// Which rows are wanted.
+/// A selection of rows.
 #[derive(Debug, clap::Args)]
-struct Wanted {
+struct RowArgs {
     /// Rows of these kinds (default: all)
     #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
     kind: Vec<KindName>,
@@ -76,14 +76,14 @@ struct Wanted {
     until: Option<Timestamp>,
 }
 
-/// A kind of row, on the command line.
+/// A kind of rows, on the command line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum KindName {
     /// Charges and discharges
     HalfCycle,
-    /// Capacities learned
+    /// Learned capacities
     Capacity,
-    /// What remained of the life of the cell whose life ends first
+    /// Remaining life of the cell whose life ends first
     RemainingLife,
     /// Alarms
     Alarm,
@@ -91,7 +91,7 @@ enum KindName {
     Reset,
 }
 
-impl From<KindName> for Kind {
+impl From<KindName> for HistoryTable {
     fn from(name: KindName) -> Self {
         match name {
             KindName::HalfCycle => Self::HalfCycle,
@@ -103,9 +103,9 @@ impl From<KindName> for Kind {
     }
 }
 
-impl Wanted {
-    fn filter(&self, limit: Option<u32>) -> Filter {
-        Filter {
+impl RowArgs {
+    fn filter(&self, limit: Option<u32>) -> HistoryQuery {
+        HistoryQuery {
             kinds: self.kind.iter().map(|&name| name.into()).collect(),
             cell: self.cell.map(|number| number - 1),
             since_ns: self.since.map(Timestamp::nanos),
@@ -122,15 +122,15 @@ fn when(text: &str) -> Result<Timestamp, String> {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let folder = args.state.clone().unwrap_or_else(|| store::standard_folder().0);
-    let reader = Reader::open(&folder).map_err(Failure::new)?;
+    let reader = HistoryReader::open(&folder).map_err(Failure::new)?;
     match &args.what {
         None => list(&reader, args),
-        Some(What::Export(export)) => self::export(&reader, export),
-        Some(What::Verify(verify)) => self::verify(&reader, verify),
+        Some(HistoryCommand::Export(export)) => self::export(&reader, export),
+        Some(HistoryCommand::Verify(verify)) => self::verify(&reader, verify),
     }
 }
 
-fn list(reader: &Reader, args: &Args) -> Result<(), Failure> {
+fn list(reader: &HistoryReader, args: &Args) -> Result<(), Failure> {
     let entries =
         reader.entries(&args.wanted.filter(Some(args.limit).filter(|&limit| limit > 0))).map_err(Failure::new)?;
     if args.json {
@@ -144,16 +144,16 @@ fn list(reader: &Reader, args: &Args) -> Result<(), Failure> {
     print(&entries.iter().fold(head, |text, entry| text + &line(entry)))
 }
 
-fn line(entry: &Entry) -> String {
+fn line(entry: &HistoryEntry) -> String {
     let time = stamp::format_utc(Timestamp::from_nanos(entry.wall_ns));
-    // Cells count from 1 for people.
+    // Cells count from 1 in tables.
     let cell =
         entry.values.first().and_then(Value::as_u64).map_or_else(|| "pack".to_owned(), |cell| (cell + 1).to_string());
-    format!("{time:<26}  {:>4}  {:<14}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), words(entry))
+    format!("{time:<26}  {:>4}  {:<14}  {cell:>4}  {}\n", entry.pack, entry.kind.name(), describe(entry))
 }
 
-/// The values of a row for people.
-fn words(entry: &Entry) -> String {
+/// The values of a row in words.
+fn describe(entry: &HistoryEntry) -> String {
     let value = |name: &str| {
         let column = entry.kind.columns().iter().position(|column| *column == name);
         column.and_then(|column| entry.values.get(column)).unwrap_or(&Value::Null)
@@ -164,7 +164,7 @@ fn words(entry: &Entry) -> String {
     };
     let text = |name: &str| value(name).as_str().unwrap_or("").to_owned();
     match entry.kind {
-        Kind::HalfCycle => format!(
+        HistoryTable::HalfCycle => format!(
             "{} {} Ah, swing {} +/- {} %, {} s, {} A, {} C",
             text("mode"),
             number("charge_ah", 1.0, 3),
@@ -174,8 +174,8 @@ fn words(entry: &Entry) -> String {
             number("mean_current_a", 1.0, 2),
             number("mean_temperature_c", 1.0, 1)
         ),
-        Kind::Capacity => format!(
-            "{} +/- {} Ah, usable {} +/- {} Ah, resistance {} +/- {}, this one said {} +/- {} Ah",
+        HistoryTable::Capacity => format!(
+            "{} +/- {} Ah, usable {} +/- {} Ah, resistance {} +/- {}, measured {} +/- {} Ah",
             number("capacity_ah", 1.0, 3),
             number("capacity_std_ah", 1.0, 3),
             number("usable_capacity_ah", 1.0, 3),
@@ -185,8 +185,8 @@ fn words(entry: &Entry) -> String {
             number("measured_ah", 1.0, 3),
             number("measured_std_ah", 1.0, 3)
         ),
-        Kind::RemainingLife if value("cycles").is_null() => "not known any longer".to_owned(),
-        Kind::RemainingLife => format!(
+        HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known".to_owned(),
+        HistoryTable::RemainingLife => format!(
             "{} cycles ({} to {}), {} days ({} to {})",
             number("cycles", 1.0, 0),
             number("cycles_low", 1.0, 0),
@@ -195,7 +195,7 @@ fn words(entry: &Entry) -> String {
             number("days_low", 1.0, 0),
             number("days_high", 1.0, 0)
         ),
-        Kind::Alarm => format!(
+        HistoryTable::Alarm => format!(
             "{} {} {}, value {}, threshold {}, raised {} times",
             text("rule"),
             text("severity"),
@@ -204,7 +204,7 @@ fn words(entry: &Entry) -> String {
             number("threshold", 1.0, 4),
             number("occurrences", 1.0, 0)
         ),
-        Kind::Reset => {
+        HistoryTable::Reset => {
             let learned =
                 value("capacity_ah").as_f64().map(|ah| format!(", capacity was {ah:.3} Ah")).unwrap_or_default();
             let detail = value("detail").as_str().map(|detail| format!(": {detail}")).unwrap_or_default();
@@ -213,7 +213,7 @@ fn words(entry: &Entry) -> String {
     }
 }
 
-fn document(entry: &Entry) -> Value {
+fn document(entry: &HistoryEntry) -> Value {
     let own = json!({
         "kind": entry.kind.name(),
         "seq": entry.seq,
@@ -228,13 +228,13 @@ fn document(entry: &Entry) -> Value {
     Value::Object(keys)
 }
 
-/// Columns every row has in a CSV.
+/// Columns of every row in a CSV.
 const OWN_COLUMNS: [&str; 7] = ["kind", "seq", "wall_ns", "utc", "time_ns", "boot", "pack"];
 
-fn export(reader: &Reader, args: &ExportArgs) -> Result<(), Failure> {
+fn export(reader: &HistoryReader, args: &ExportArgs) -> Result<(), Failure> {
     let fail = |error: &dyn std::fmt::Display| Failure::new(format!("{}: {error}", args.out.display()));
     let filter = args.wanted.filter(None);
-    let kinds: Vec<Kind> = filter.wanted_kinds().collect();
+    let kinds: Vec<HistoryTable> = filter.wanted_kinds().collect();
     let mut columns: Vec<&str> = Vec::new();
     for column in kinds.iter().flat_map(|kind| kind.columns()) {
         if !columns.contains(column) {
@@ -259,12 +259,12 @@ fn export(reader: &Reader, args: &ExportArgs) -> Result<(), Failure> {
     file.finish().map_err(|error| fail(&error))
 }
 
-/// The reader of our output has seen enough.
+/// Whether the reader of the output has closed the pipe.
 fn is_broken_pipe(error: &csv::Error) -> bool {
     matches!(error.kind(), csv::ErrorKind::Io(error) if error.kind() == std::io::ErrorKind::BrokenPipe)
 }
 
-fn record(entry: &Entry, columns: &[&str]) -> Vec<String> {
+fn record(entry: &HistoryEntry, columns: &[&str]) -> Vec<String> {
     let own = [
         entry.kind.name().to_owned(),
         entry.seq.map(|seq| seq.to_string()).unwrap_or_default(),
@@ -285,20 +285,18 @@ fn record(entry: &Entry, columns: &[&str]) -> Vec<String> {
     own.into_iter().chain(columns.iter().map(value)).collect()
 }
 
-fn verify(reader: &Reader, args: &VerifyArgs) -> Result<(), Failure> {
+fn verify(reader: &HistoryReader, args: &VerifyArgs) -> Result<(), Failure> {
     let verdict = reader.verify().map_err(Failure::new)?;
     if args.json {
         print(&format!("{}\n", json!({ "version": VERSION, "verdict": verdict })))?;
     }
     match &verdict.broken {
         None if args.json => Ok(()),
-        None => {
-            print(&format!("{} rows, all as they were written; the last has the hash {}\n", verdict.rows, verdict.head))
-        }
+        None => print(&format!("{} rows, none changed; the hash of the last is {}\n", verdict.rows, verdict.head)),
         Some(broken) => {
             let place = if broken.table.is_empty() { String::new() } else { format!(" ({})", broken.table) };
             Err(Failure::new(format!(
-                "row {}{place} is not as it was written: expected {}, found {}; {} rows before it are good",
+                "row {}{place} was changed: expected {}, found {}; {} rows before it are good",
                 broken.row, broken.expected, broken.found, verdict.good_rows
             )))
         }

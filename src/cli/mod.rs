@@ -57,35 +57,35 @@ pub struct Cli {
 enum Command {
     /// Run the service on live CAN interfaces
     Run(Box<run::Args>),
-    /// Show what the running daemon knows: pack, cells, alarms, interfaces
+    /// Show the status of the running daemon: pack, cells, alarms, interfaces
     Status(status::Args),
     /// Serve the status of the running daemon as metrics for Prometheus
     Exporter(exporter::Args),
     /// Show the alarms of the running daemon
     Alarms(alarms::Args),
-    /// Tell the running daemon that alarms were seen
+    /// Acknowledge alarms of the running daemon
     Acknowledge(command::AlarmArgs),
-    /// End latched alarms of the running daemon that are healthy again; nothing learned is lost
+    /// End latched alarms of the running daemon whose value is healthy again; no learned value is lost
     Clear(command::AlarmArgs),
-    /// Tell the running daemon that another pack is connected
+    /// Inform the running daemon that another pack is connected
     PackReplaced(command::ReplacedArgs),
-    /// Begin anew with what is learned, whether a daemon runs or not
+    /// Forget the learned values, with or without a running daemon
     Reset(reset::Args),
-    /// Show, export or verify what the store has kept
+    /// Show, export or verify the history in the store
     History(Box<history::Args>),
-    /// Send a rule's alarm frame, marked as a test, and see what goes out on every interface
+    /// Send a rule's alarm frame, marked as a test, and report the frames seen on every interface
     TestAlarm(test_alarm::Args),
     /// Replay journals, candump logs or CSV files through the same core
     Replay(Box<replay::Args>),
     /// Simulate an ageing pack: a candump log and its truth, or frames onto an interface
     Simulate(Box<simulate::Args>),
-    /// A short ageing life on an in-process bus, ending in alarms; needs nothing
+    /// Run a short ageing life on an in-process bus, ending in alarms; needs no files or interfaces
     Demo(demo::Args),
     /// Check a configuration and show what each configured signal resolves to
     Check(check::Args),
-    /// Listen to a pack, or replay a log, and tell what is probably wrong with wiring or configuration
+    /// Listen to a pack, or replay a log, and report probable faults of wiring or configuration
     Doctor(Box<doctor::Args>),
-    /// Write the DBC of the frames as they are configured, for those who receive them
+    /// Write the DBC of the configured frames, for their receivers
     Dbc(dbc::Args),
     /// Write manual pages and shell completions
     #[command(hide = true)]
@@ -96,19 +96,19 @@ enum Command {
     /// Replay measured files and compare the estimates with the truth
     #[cfg(feature = "lab")]
     Score(Box<score::Args>),
-    /// Forecast the remaining useful life of measured capacity histories, and judge forecasts made during the life
+    /// Forecast the remaining useful life of measured capacity histories, and score forecasts made during the life
     #[cfg(feature = "lab")]
     Rul(rul::Args),
     /// Gaussian process regression on CSV files: cross-validate, train, predict, forecast
     #[cfg(feature = "lab")]
     Gpr(Box<gpr::Args>),
-    /// Tell when the alarms would have come with other settings, over many logs
+    /// Report when the alarms would have come with other settings, over many logs
     #[cfg(feature = "lab")]
     Whatif(Box<whatif::Args>),
     /// Write estimates, half-cycles and alarms of many logs as Parquet or CSV
     #[cfg(feature = "lab")]
     Export(Box<export::Args>),
-    /// Write a page that shows how a battery is and was, from a history or a replay
+    /// Write a page about the state and the past of a battery, from a history or a replay
     #[cfg(feature = "lab")]
     Report(Box<report::Args>),
 }
@@ -116,7 +116,7 @@ enum Command {
 /// Why a command ended without success: what to print and the exit code.
 #[derive(Debug)]
 pub struct Failure {
-    /// For the terminal, without the program's name; empty = the output has said it.
+    /// For the terminal, without the program's name; empty = the output reports it.
     pub message: String,
     /// Exit code.
     pub code: u8,

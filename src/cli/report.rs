@@ -16,7 +16,7 @@ use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
 use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
-use crate::store::Reader;
+use crate::store::HistoryReader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
@@ -95,7 +95,7 @@ impl Args {
 type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
-    let reader = Reader::open(folder).map_err(Failure::new)?;
+    let reader = HistoryReader::open(folder).map_err(Failure::new)?;
     let mut data = Data::of_store(&reader).map_err(Failure::new)?;
     let verdict = reader.verify().map_err(Failure::new)?;
     if let Some(broken) = &verdict.broken {

@@ -1,4 +1,4 @@
-//! `packwatch reset`: what was learned begins anew, through the running daemon or, without one, in its store.
+//! `packwatch reset`: forgets the learned values, through the running daemon or, without one, in its store.
 
 use std::path::PathBuf;
 
@@ -10,10 +10,10 @@ use crate::store;
 /// Arguments of `reset`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Another pack is connected: its history begins, what was learned of the old one is forgotten
+    /// Another pack is connected: starts its history and forgets the learned values of the old one
     #[arg(long, required = true)]
     pack_replaced: bool,
-    /// Really
+    /// Confirms it
     #[arg(long)]
     yes: bool,
     /// Folder of state and history, for when no daemon runs (default: $STATE_DIRECTORY, else /var/lib/packwatch)
@@ -32,7 +32,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let folder = args.state.clone().unwrap_or_else(|| store::standard_folder().0);
     let pack = store::replace_pack(&folder).map_err(Failure::new)?;
     print(&format!(
-        "no daemon runs: in {} the history of pack {} is closed, that of pack {pack} begins; the stored state, with its \
+        "no daemon runs: in {} the history of pack {} is closed, that of pack {pack} starts; the stored state, with its \
          alarms, is forgotten\n",
         folder.display(),
         pack - 1

@@ -20,10 +20,10 @@ pub(crate) struct Args {
     /// Configuration
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// Journal everything that comes in, for `packwatch replay`; a file of that name becomes FILE.1
+    /// Journal every input, for `packwatch replay`; an existing file of that name becomes FILE.1
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Log the frames handed to the interfaces, in candump's form, with the time of the input that caused each
+    /// Log the frames sent to the interfaces, in candump's form, with the time of the input that caused each
     #[arg(long, value_name = "FILE")]
     frames: Option<PathBuf>,
     /// Write events as JSON, a line each, as `packwatch replay --events` does
@@ -32,11 +32,11 @@ pub(crate) struct Args {
     /// Start from a stored state
     #[arg(long, value_name = "FILE")]
     restore: Option<PathBuf>,
-    /// Age of the stored state, where its stamp does not tell (it came from a log), or unknown
+    /// Age of the stored state, if its stamp does not give it (the state came from a log), or unknown
     #[arg(long, value_name = "SECONDS|unknown", requires = "restore", value_parser = away)]
     away: Option<Downtime>,
     /// Folder for state and history, or none to keep nothing (default: $STATE_DIRECTORY under systemd, else
-    /// /var/lib/packwatch where that can be made). The state in it is taken up, unless --restore says another
+    /// /var/lib/packwatch if that can be created). Its state is restored, unless --restore names another
     #[arg(long, value_name = "DIR")]
     state: Option<PathBuf>,
     /// Store the state here on stopping
@@ -45,26 +45,26 @@ pub(crate) struct Args {
     /// Stop after this time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
     duration: Option<f64>,
-    /// Wait this long for the first usable frame before the service manager is told that the service is ready
+    /// Wait this long for the first usable frame before reporting readiness to the service manager
     #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = ready_seconds)]
     ready_timeout: f64,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
-    /// Receive buffer to ask the kernel for, per interface
+    /// Receive buffer to request from the kernel, per interface
     #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = buffer_bytes)]
     receive_buffer: usize,
-    /// Socket for `packwatch alarms` and its like, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock under
-    /// systemd, else /run/packwatch/control.sock where that can be made)
+    /// Socket for `packwatch alarms` and other commands, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock
+    /// under systemd, else /run/packwatch/control.sock if that can be created)
     #[arg(long, value_name = "PATH")]
     control: Option<PathBuf>,
-    /// Socket for `packwatch status` and the exporter, or none for no socket; the stream of `--watch` is beside it
-    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else /run/packwatch/status.sock where that can be made)
+    /// Socket for `packwatch status` and the exporter, or none for no socket; the stream of `--watch` is next to it
+    /// (default: $RUNTIME_DIRECTORY/status.sock under systemd, else /run/packwatch/status.sock if that can be created)
     #[arg(long, value_name = "PATH")]
     status: Option<PathBuf>,
 }
 
-/// Longest time an option takes, s: ten years.
+/// Longest time of an option, s: ten years.
 const MAX_SECONDS: f64 = 315_576_000.0;
 /// Largest receive buffer, bytes: the kernel's own limit on the option, halved as it doubles it.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
@@ -83,7 +83,7 @@ fn ready_seconds(text: &str) -> Result<f64, String> {
     }
 }
 
-/// Age of a stored state.
+/// Parses the age of a stored state.
 pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     match text {
         "unknown" => Ok(Downtime::Unknown),
@@ -107,7 +107,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         frames: args.frames.clone(),
         events: args.events.clone(),
         restore: args.restore.as_deref().map(snapshot_file::read).transpose().map_err(Failure::new)?,
-        away: args.away.unwrap_or_default(),
+        downtime: args.away.unwrap_or_default(),
         snapshot: args.snapshot.clone(),
         duration: args.duration.map(Duration::from_secs_f64),
         ready_timeout: Duration::from_secs_f64(args.ready_timeout),

@@ -1,7 +1,7 @@
-//! `packwatch status`: what the running daemon knows, as a table, as its own JSON, as metrics, or live on the screen.
+//! `packwatch status`: the status of the running daemon as a table, as JSON, as metrics, or live on the screen.
 
 #[cfg(test)]
-#[path = "../host/status/sample.rs"]
+#[path = "../host/status/tests/sample.rs"]
 mod sample;
 mod table;
 mod view;
@@ -12,32 +12,34 @@ use std::path::PathBuf;
 use super::Failure;
 use super::control_args::print;
 use crate::status::client::{StatusClient, parse};
-use crate::status::document::Document;
+use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
 
-/// Exit code when no daemon tells its status.
+/// Exit code when no daemon reports its status.
 const EXIT_UNREACHABLE: u8 = 3;
 /// Exit code when an alarm is raised.
 const EXIT_ALARM: u8 = 4;
 
 /// Arguments of `status`.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Exit codes: 0 no alarm is raised, 3 no daemon tells its status, 4 an alarm is raised, 1 any \
-    other failure, 2 wrong usage. With --watch: 0 when it is left.")]
+#[command(
+    after_help = "Exit codes: 0 no alarm is raised, 3 no daemon reports its status, 4 an alarm is raised, 1 any \
+    other failure, 2 wrong usage. With --watch: 0 after quitting."
+)]
 pub(crate) struct Args {
-    /// Every cell; otherwise, of more than 16, only what they have in common and those that stand out
+    /// Lists every cell; without it, of more than 16 cells, their range and the outliers
     #[arg(long)]
     cells: bool,
-    /// The daemon's document as it is, a line of JSON (cells from 0, times in ns since 1970)
+    /// The daemon's document, a line of JSON (cells from 0, times in ns since 1970)
     #[arg(long, conflicts_with_all = ["cells", "prometheus", "watch"])]
     json: bool,
     /// Metrics, as OpenMetrics text (see `packwatch exporter`)
     #[arg(long, conflicts_with_all = ["cells", "watch"])]
     prometheus: bool,
-    /// Full screen, live: q leaves, tab changes the page, arrows move
+    /// Full screen, live: q quits, tab changes the page, arrows move
     #[arg(short, long, conflicts_with = "cells")]
     watch: bool,
-    /// Status socket of the daemon (default: where `packwatch run` makes it)
+    /// Status socket of the daemon (default: where `packwatch run` creates it)
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
 }
@@ -59,13 +61,13 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         print(&table::table(&document, args.cells))?;
     }
     if raised > 0 {
-        // Said by the output itself.
+        // The output reports it.
         return Err(Failure { message: String::new(), code: EXIT_ALARM });
     }
     Ok(())
 }
 
-/// A cell's number as people count, from 1.
+/// A cell's number, from 1.
 fn number(cell: u16) -> u32 {
     u32::from(cell) + 1
 }
@@ -88,9 +90,9 @@ fn with_std(value: Option<f64>, std: Option<f64>, decimals: usize, unit: &str) -
     }
 }
 
-/// How long, in the largest units that say something.
+/// A duration in its two largest units.
 fn duration(seconds: f64) -> String {
-    // Saturates; negative times are none.
+    // Saturates; negative times are 0.
     let seconds = seconds.max(0.0) as u64;
     let (days, hours, minutes) = (seconds / 86_400, seconds / 3600 % 24, seconds / 60 % 60);
     match (days, hours, minutes) {
@@ -101,7 +103,7 @@ fn duration(seconds: f64) -> String {
     }
 }
 
-/// A word of a document's enumeration, as in its JSON.
+/// A value of an enumeration, as in JSON.
 fn word(value: impl serde::Serialize) -> String {
     match serde_json::to_value(value) {
         Ok(serde_json::Value::String(word)) => word,
@@ -109,8 +111,8 @@ fn word(value: impl serde::Serialize) -> String {
     }
 }
 
-/// What becomes of what is learned, in a line.
-fn store(document: &Document) -> String {
+/// The store in a line.
+fn store(document: &StatusDocument) -> String {
     let Some(store) = &document.store else { return "none".to_owned() };
     let works = match store.works {
         None => "not tried yet",
@@ -121,7 +123,7 @@ fn store(document: &Document) -> String {
     if let Some(bytes) = store.file_bytes {
         let _ = write!(text, ", {:.1} MB", bytes as f64 / 1e6);
     }
-    for (count, what) in [(store.failures, "failed"), (store.late, "told before they were stored")] {
+    for (count, what) in [(store.failures, "failed"), (store.late, "announced before they were stored")] {
         if count > 0 {
             let _ = write!(text, ", {count} {what}");
         }
@@ -129,8 +131,8 @@ fn store(document: &Document) -> String {
     text
 }
 
-/// The configuration in a few characters: its name and the beginning of its fingerprint.
-fn config(document: &Document) -> String {
+/// The configuration: its name and the start of its fingerprint.
+fn config(document: &StatusDocument) -> String {
     let file = |config: &crate::status::document::ConfigFile| {
         format!("{} ({})", config.path, config.sha256.get(..8).unwrap_or_default())
     };

@@ -1,7 +1,7 @@
-//! `packwatch test-alarm`: has the running daemon send a rule's alarm frame as a test, and the test code in DM1 where
-//! there is a J1939 node, and tells what really went out.
+//! `packwatch test-alarm`: asks the running daemon to send a rule's alarm frame as a test, and the test code in DM1 if
+//! there is a J1939 node, and reports the frames seen on the bus.
 //!
-//! Success only when every channel saw at least one such frame, whole and in sequence.
+//! Succeeds only when every channel saw at least one such frame, intact and in sequence.
 
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -12,20 +12,20 @@ use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
 use crate::alarm::{AlarmState, Rule};
 use crate::config;
-use crate::control::test_alarm::{self, ChannelReport, Real};
+use crate::control::test_alarm::{self, ChannelReport, GenuineAlarm};
 use crate::io::stamp;
 use crate::monitor::MAX_TEST_S;
 
 /// Arguments of `test-alarm`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Whose frame is sent; no alarm is raised
+    /// The rule of the frame that is sent; no alarm is raised
     #[arg(value_name = "RULE", value_parser = rule_parser(), hide_possible_values = true)]
     rule: Rule,
-    /// Configuration the daemon runs with
+    /// Configuration of the daemon
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
-    /// How long it is sent
+    /// Duration of the test
     #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
     duration: f64,
     #[command(flatten)]
@@ -52,7 +52,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let path = args.config.display();
     Err(Failure::new(format!(
-        "the test did not come through on {}; is the interface up, and does the daemon run with {path}?",
+        "the test was not seen on {}; is the interface up, and does the daemon run with {path}?",
         bad.join(", ")
     )))
 }
@@ -72,10 +72,10 @@ fn table(rule: Rule, reports: &[ChannelReport]) -> String {
             report.interface,
             report.what,
             report.id.to_string(),
-            report.seen.tests,
-            stamp(report.seen.first),
-            stamp(report.seen.last),
-            if report.seen.ended { "yes" } else { "no" },
+            report.observed.tests,
+            stamp(report.observed.first),
+            stamp(report.observed.last),
+            if report.observed.ended { "yes" } else { "no" },
             protection(report)
         );
         push_notes(&mut text, report);
@@ -105,19 +105,21 @@ const ON_THE_WIRE: [AlarmState; 7] = [
     AlarmState::Unknown,
 ];
 
-/// What else was on the channel.
+/// Appends the other frames of the channel.
 fn push_notes(text: &mut String, report: &ChannelReport) {
-    let seen = &report.seen;
+    let observed = &report.observed;
     push_code(text, report);
-    for (real, count) in &seen.real {
-        let _ = match *real {
-            Real::Alarm { rule, state } => writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state)),
-            Real::Code { spn, fmi } => writeln!(text, "  meanwhile REAL: SPN {spn}, FMI {fmi}, in {count} DM1"),
+    for (genuine, count) in &observed.genuine {
+        let _ = match *genuine {
+            GenuineAlarm::Alarm { rule, state } => {
+                writeln!(text, "  meanwhile {}, {count} frames", alarm_words(rule, state))
+            }
+            GenuineAlarm::Code { spn, fmi } => writeln!(text, "  meanwhile REAL: SPN {spn}, FMI {fmi}, in {count} DM1"),
         };
     }
     let others = [
-        (seen.foreign, "test frames of other rules"),
-        (seen.unreadable, "frames that could not be read"),
+        (observed.foreign, "test frames of other rules"),
+        (observed.unreadable, "frames that could not be read"),
         (u64::from(report.dropped), "frames lost by this computer before they were seen"),
     ];
     for (count, what) in others.into_iter().filter(|(count, _)| *count > 0) {
@@ -135,15 +137,15 @@ fn alarm_words(rule: u8, state: u8) -> String {
     format!("{kind}without the marker: {name} {}", found.map_or("in an unknown state", state_name))
 }
 
-/// What DM1 told of the test: a trouble code has no marker, so its number is what to look for.
+/// Appends the test code in DM1: a trouble code has no marker, so its number identifies the test.
 fn push_code(text: &mut String, report: &ChannelReport) {
     let Some(code) = report.test_code else { return };
-    let seen = &report.seen;
-    let messages = seen.tests + seen.without_code + seen.unreadable;
+    let observed = &report.observed;
+    let messages = observed.tests + observed.without_code + observed.unreadable;
     let (spn, fmi) = (code.spn(), code.fmi());
-    let _ = writeln!(text, "  {} of {messages} DM1 had the test code, SPN {spn}, FMI {fmi}", seen.tests);
-    if seen.tests == 0 {
-        text.push_str("  no DM1 with the test code was seen; has the node its address?\n");
+    let _ = writeln!(text, "  {} of {messages} DM1 had the test code, SPN {spn}, FMI {fmi}", observed.tests);
+    if observed.tests == 0 {
+        text.push_str("  no DM1 with the test code was seen; does the node have its address?\n");
     }
 }
 
@@ -152,14 +154,14 @@ mod tests {
     use super::*;
     use crate::can::CanId;
     use crate::can::j1939::TroubleCode;
-    use crate::control::test_alarm::Seen;
+    use crate::control::test_alarm::ObservedFrames;
 
-    fn dm1(seen: Seen) -> String {
+    fn dm1(observed: ObservedFrames) -> String {
         let report = ChannelReport {
             interface: "can0".to_owned(),
             what: "J1939 DM1",
             id: CanId::Extended(0x18FE_CAF9),
-            seen,
+            observed,
             test_code: Some(TroubleCode::new(524_286, 31, 0).unwrap()),
             protection: None,
             dropped: 0,
@@ -169,20 +171,20 @@ mod tests {
     }
 
     #[test]
-    fn dm1_has_a_line_of_its_own_and_real_codes_are_told_as_real() {
-        let real = [(Real::Code { spn: 520_196, fmi: 9 }, 2)].into();
-        let text = dm1(Seen { tests: 4, without_code: 2, ended: true, real, ..Seen::default() });
+    fn dm1_has_a_separate_line_and_genuine_codes_are_marked() {
+        let genuine = [(GenuineAlarm::Code { spn: 520_196, fmi: 9 }, 2)].into();
+        let text = dm1(ObservedFrames { tests: 4, without_code: 2, ended: true, genuine, ..ObservedFrames::default() });
         let line = text.lines().nth(2).unwrap();
         assert!(line.starts_with("can0         J1939 DM1      18FECAF9      4  "), "{text}");
         assert!(text.contains("\n  4 of 6 DM1 had the test code, SPN 524286, FMI 31\n"), "{text}");
         assert!(text.contains("\n  meanwhile REAL: SPN 520196, FMI 9, in 2 DM1\n"), "{text}");
-        assert!(!text.contains("has the node its address?"), "{text}");
+        assert!(!text.contains("does the node have its address?"), "{text}");
     }
 
     #[test]
-    fn a_node_that_tells_nothing_is_asked_after() {
-        let text = dm1(Seen::default());
+    fn a_silent_node_is_pointed_out() {
+        let text = dm1(ObservedFrames::default());
         assert!(text.contains("  0 of 0 DM1 had the test code"), "{text}");
-        assert!(text.contains("  no DM1 with the test code was seen; has the node its address?\n"), "{text}");
+        assert!(text.contains("  no DM1 with the test code was seen; does the node have its address?\n"), "{text}");
     }
 }

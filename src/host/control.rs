@@ -1,6 +1,6 @@
-//! The control socket: how people on this computer look at the alarms of a running daemon and tell it what to do.
+//! The control socket: lists the alarms of a running daemon and sends it commands, from the same computer.
 //!
-//! A Unix stream socket; one JSON document per line in, one per line out, in the order of asking:
+//! A Unix stream socket; one JSON document per line in, one per line out, in the order of the requests:
 //! ```text
 //! {"version":1,"request":"alarms"}                    {"version":1,"ok":true,"time":...,"alarms":[...],...}
 //! {"version":1,"request":"clear","rule":"soc_low"}    {"version":1,"ok":true,"changed":1,"refused":0,...}
@@ -8,11 +8,11 @@
 //! ```
 //! [`protocol`] has every request and answer; cells count from 0 there, as in events.
 //!
-//! * Whoever can open the socket may look (mode 0660); what changes something is done only for the daemon's own user
-//!   and for root, as the kernel names them (`SO_PEERCRED`). Others get an error.
-//! * Connections are tasks of their own. They talk with the loop over a bounded queue, one request each at a time; one
-//!   that never reads or writes holds up nobody and is closed.
-//! * A command reaches the core as an input like any other, so it is in the journal and replays.
+//! * Owner and group may read (mode 0660); commands are executed only for the daemon's own user and for root, as the
+//!   kernel reports them (`SO_PEERCRED`). Others get an error.
+//! * Each connection is a task. It sends the loop one request at a time over a bounded queue; a connection that never
+//!   reads or writes blocks no other and is closed.
+//! * A command reaches the core as an input, so it is in the journal and replays.
 
 pub mod answer;
 pub mod client;
@@ -26,16 +26,16 @@ use std::time::Duration;
 use crate::io::unix_socket::runtime_folder;
 
 pub use crate::io::unix_socket::SocketSetting as ControlSetting;
-pub use server::{Asked, ControlServer};
+pub use server::{ControlServer, PendingRequest};
 
 /// Connections at once: a person, a display and a script, with room; each is a task and a few kilobytes.
 pub const MAX_CONNECTIONS: usize = 8;
-/// Bytes of a request, its line's end included: the longest that makes sense has under 200.
+/// Bytes of a request with the end of its line: the longest valid one has under 200.
 pub const MAX_REQUEST_BYTES: usize = 4096;
-/// Time a client has for a request and for taking its answer: a script needs milliseconds, and a place of the few must
-/// not be held for ever.
+/// Longest time for a request and for reading its answer: a script needs milliseconds, and a client must not keep one of
+/// the few places for ever.
 pub const MAX_SILENCE: Duration = Duration::from_secs(10);
-/// Alarms listed in an answer: a line of a few hundred kilobytes, made in a few milliseconds; the rest is counted.
+/// Alarms listed in an answer: a line of a few hundred kilobytes, serialised in a few milliseconds; the rest is counted.
 pub const MAX_LISTED: usize = 1024;
 
 /// Its name in the folder of the daemon.
@@ -43,7 +43,7 @@ const FILE_NAME: &str = "control.sock";
 /// Owner and group may connect.
 const MODE: u32 = 0o660;
 
-/// Where the socket is when nobody says where.
+/// The standard path of the socket.
 pub fn standard_path() -> PathBuf {
     runtime_folder().join(FILE_NAME)
 }

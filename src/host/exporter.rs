@@ -1,11 +1,11 @@
-//! The exporter: a process of its own that serves the status as metrics over HTTP, so that nothing that goes wrong here can
-//! hurt the estimation loop.
+//! The exporter: serves the daemon's status as metrics over HTTP, from a separate process, so that no fault in it can affect
+//! the estimation loop.
 //!
-//! * `/metrics`: each scrape asks the status socket anew, within [`ASK_LIMIT`]; without a fresh answer it is
-//!   `packwatch_up 0` and nothing else. OpenMetrics 1.0 for those who ask for it, else Prometheus' text 0.0.4.
-//! * `/`: a short page; `/-/healthy`: that this process lives.
-//! * At most [`MAX_CONNECTIONS`] at once, others are closed at once; requests of at most [`MAX_REQUEST_BYTES`], whose head must
-//!   come within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
+//! * `/metrics`: each scrape reads the status socket, within [`STATUS_LIMIT`]; without a fresh document the answer is
+//!   `packwatch_up 0` alone. OpenMetrics 1.0 for clients that accept it, else Prometheus' text 0.0.4.
+//! * `/`: a short page; `/-/healthy`: a sign of life.
+//! * At most [`MAX_CONNECTIONS`]; further ones are closed immediately. Requests of at most [`MAX_REQUEST_BYTES`], with their
+//!   head within [`HEAD_LIMIT`]; bodies are not read. SIGTERM and SIGINT end it cleanly.
 
 use std::cell::Cell;
 use std::convert::Infallible;
@@ -30,27 +30,28 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio::task::{JoinSet, LocalSet};
 use tokio::time::{sleep, timeout};
 
+use super::service::notify;
 use super::status::client::{check_length, explain, parse};
-use super::status::document::Document;
+use super::status::document::StatusDocument;
 use super::status::metrics::{openmetrics, prometheus_text};
 
-/// Connections at once: two servers and somebody with a browser, several times over.
+/// Connections at once: two servers and a browser, several times over.
 const MAX_CONNECTIONS: usize = 16;
 /// Longest head of a request, bytes: hyper's least.
 const MAX_REQUEST_BYTES: usize = 8192;
 /// Headers of a request.
 const MAX_HEADERS: usize = 64;
-/// Time a request's head has to come; a connection that is silent for as long is closed.
+/// Longest wait for the head of a request; a connection that is silent for as long is closed.
 const HEAD_LIMIT: Duration = Duration::from_secs(30);
-/// Time a connection has in all, whatever it does: a slow reader must not hold its place for ever.
+/// Longest life of a connection: a slow reader must not keep its place for ever.
 const CONNECTION_LIMIT: Duration = Duration::from_secs(300);
-/// Time the answer has that is under way then: as long as a scrape may take.
+/// Time for the answer that is under way at that limit: as long as a scrape may take.
 const ANSWER_LIMIT: Duration = Duration::from_secs(10);
-/// Time the daemon has to tell its status: under the ten seconds a scrape may take.
-const ASK_LIMIT: Duration = Duration::from_secs(3);
-/// Time running answers have when the exporter stops.
+/// Time for the status of the daemon: under the ten seconds of a scrape.
+const STATUS_LIMIT: Duration = Duration::from_secs(3);
+/// Time for running answers when the exporter stops.
 const DRAIN_LIMIT: Duration = Duration::from_secs(1);
-/// Pause after a connection could not be taken.
+/// Pause after a connection could not be accepted.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
 
 const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
@@ -60,30 +61,30 @@ const PLAIN: &str = "text/plain; charset=utf-8";
 const PAGE: &str = "<!DOCTYPE html><html lang=\"en\"><head><title>packwatch</title></head><body><h1>packwatch</h1>\
     <p><a href=\"/metrics\">metrics</a></p></body></html>\n";
 
-/// Which socket it asks, and whether that answered last time.
+/// The status socket, and whether the daemon answered last time.
 #[derive(Debug)]
-struct Asker {
+struct StatusSource {
     path: PathBuf,
     is_up: Cell<Option<bool>>,
 }
 
-/// Serves on `listen` what the daemon at `socket` tells, until told to stop.
+/// Serves on `listen` the status of the daemon at `socket`, until a signal.
 ///
 /// # Errors
-/// When the address cannot be had.
+/// When the address cannot be bound.
 pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
-    let asker = Rc::new(Asker { path: socket, is_up: Cell::new(None) });
-    let served = LocalSet::new().block_on(&runtime, serve(listen, asker));
+    let source = Rc::new(StatusSource { path: socket, is_up: Cell::new(None) });
+    let served = LocalSet::new().block_on(&runtime, serve(listen, source));
     served.map_err(|error| format!("{listen}: {error}"))
 }
 
-async fn serve(listen: SocketAddr, asker: Rc<Asker>) -> io::Result<()> {
+async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let listener = TcpListener::bind(listen).await?;
     let address = listener.local_addr()?;
-    tracing::info!(%address, socket = %asker.path.display(), "exporter listens");
+    tracing::info!(%address, socket = %source.path.display(), "exporter listens");
     let status = format!("listening on {address}");
     notify(&[NotifyState::Ready, NotifyState::Status(&status)]);
     let mut connections = JoinSet::new();
@@ -95,36 +96,28 @@ async fn serve(listen: SocketAddr, asker: Rc<Asker>) -> io::Result<()> {
             accepted = listener.accept() => accepted,
         };
         match accepted {
-            // Closed at once: whoever is served keeps being served.
+            // Closed: the connections that are served keep their places.
             Ok(_) if connections.len() >= MAX_CONNECTIONS => tracing::debug!("connection closed: too many at once"),
-            Ok((stream, _)) => drop(connections.spawn_local(converse(stream, Rc::clone(&asker)))),
+            Ok((stream, _)) => drop(connections.spawn_local(serve_connection(stream, Rc::clone(&source)))),
             Err(error) => {
-                tracing::warn!(%error, "connection not taken");
+                tracing::warn!(%error, "connection not accepted");
                 sleep(ACCEPT_PAUSE).await;
             }
         }
     }
     notify(&[NotifyState::Stopping]);
     drop(listener);
-    // An idle connection has nothing to finish: a short wait, then all are closed.
+    // Idle connections have nothing to finish: after a short wait all are closed.
     let drained = async { while connections.join_next().await.is_some() {} };
     let _ = timeout(DRAIN_LIMIT, drained).await;
     tracing::info!("exporter stopped");
     Ok(())
 }
 
-/// Tells the service manager; without one nothing happens.
-fn notify(states: &[NotifyState<'_>]) {
-    if let Err(error) = sd_notify::notify(states) {
-        tracing::warn!(%error, "service manager not told");
-    }
-}
-
-/// One connection.
-async fn converse(stream: TcpStream, asker: Rc<Asker>) {
+async fn serve_connection(stream: TcpStream, source: Rc<StatusSource>) {
     let answer = service_fn(move |request| {
-        let asker = Rc::clone(&asker);
-        async move { Ok::<_, Infallible>(answer(&request, &asker).await) }
+        let source = Rc::clone(&source);
+        async move { Ok::<_, Infallible>(answer(&request, &source).await) }
     });
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEAD_LIMIT);
@@ -133,7 +126,7 @@ async fn converse(stream: TcpStream, asker: Rc<Asker>) {
     let ended = match timeout(CONNECTION_LIMIT, connection.as_mut()).await {
         Ok(ended) => ended,
         Err(_) => {
-            // An answer under way is finished, another request is not taken.
+            // Finishes the answer under way and accepts no further request.
             connection.as_mut().graceful_shutdown();
             timeout(ANSWER_LIMIT, connection).await.unwrap_or(Ok(()))
         }
@@ -145,14 +138,14 @@ async fn converse(stream: TcpStream, asker: Rc<Asker>) {
 
 type Answer = Response<Full<Bytes>>;
 
-async fn answer(request: &Request<Incoming>, asker: &Asker) -> Answer {
+async fn answer(request: &Request<Incoming>, source: &StatusSource) -> Answer {
     if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut refused = respond(StatusCode::METHOD_NOT_ALLOWED, PLAIN, "must be GET or HEAD\n");
         refused.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
         return refused;
     }
     match request.uri().path() {
-        "/metrics" => metrics(request.headers(), asker).await,
+        "/metrics" => metrics(request.headers(), source).await,
         "/" => respond(StatusCode::OK, HTML, PAGE),
         "/-/healthy" => respond(StatusCode::OK, PLAIN, "healthy\n"),
         _ => respond(StatusCode::NOT_FOUND, PLAIN, "must be /, /metrics or /-/healthy\n"),
@@ -166,8 +159,8 @@ fn respond(status: StatusCode, kind: &'static str, text: impl Into<Bytes>) -> An
     response
 }
 
-async fn metrics(headers: &HeaderMap, asker: &Asker) -> Answer {
-    let text = openmetrics(asker.ask().await);
+async fn metrics(headers: &HeaderMap, source: &StatusSource) -> Answer {
+    let text = openmetrics(source.read().await);
     if wants_openmetrics(headers) {
         respond(StatusCode::OK, OPENMETRICS, text)
     } else {
@@ -175,7 +168,7 @@ async fn metrics(headers: &HeaderMap, asker: &Asker) -> Answer {
     }
 }
 
-/// Whether the client takes OpenMetrics 1.0, and does not weigh it at nothing.
+/// Whether the client accepts OpenMetrics 1.0 with a weight above 0.
 fn wants_openmetrics(headers: &HeaderMap) -> bool {
     let values = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok());
     values.flat_map(|value| value.split(',')).any(|range| {
@@ -190,14 +183,14 @@ fn wants_openmetrics(headers: &HeaderMap) -> bool {
     })
 }
 
-impl Asker {
-    /// The daemon's status; `None` = it does not tell it in time. The log is told on change.
-    async fn ask(&self) -> Option<Document> {
-        let asked = timeout(ASK_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
-        let document = asked.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
+impl StatusSource {
+    /// Reads the daemon's status; `None` = none came in time. Logs changes.
+    async fn read(&self) -> Option<StatusDocument> {
+        let line = timeout(STATUS_LIMIT, self.line()).await.unwrap_or_else(|late| Err(late.into()));
+        let document = line.map_err(|error| explain(&self.path, &error)).and_then(|line| parse(&line));
         let was_up = self.is_up.replace(Some(document.is_ok()));
         match &document {
-            Ok(_) if was_up != Some(true) => tracing::info!("the daemon tells its status"),
+            Ok(_) if was_up != Some(true) => tracing::info!("the daemon reports its status"),
             Err(error) if was_up != Some(false) => tracing::warn!(error, "no status of the daemon"),
             Ok(_) | Err(_) => {}
         }
@@ -222,7 +215,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn openmetrics_is_for_those_who_take_version_1() {
+    fn openmetrics_is_for_clients_that_accept_version_1() {
         for (accept, wanted) in [
             // What Prometheus 2.42 sends.
             (

@@ -13,3 +13,4 @@ pub mod replay;
 pub mod service;
 pub mod status;
 pub mod store;
+mod token_bucket;

@@ -1,5 +1,6 @@
-//! Where the log goes: journald with its fields when systemd connected standard error to it, else standard error.
-//! Either way no more than a burst and a trickle of it ([`limit`]).
+//! The log: to journald with fields when systemd connected standard error to it, else to standard error.
+//!
+//! The number of lines is limited in both cases (`limit`). In: a filter of `--log`. Out: log lines.
 
 mod journald;
 mod limit;
@@ -14,53 +15,85 @@ use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 
 use journald::Journal;
-use limit::Limit;
+use limit::RateLimit;
 
 /// Environment variable with the filter, where `--log` is not given.
 pub const LOG_VARIABLE: &str = "PACKWATCH_LOG";
 
-/// Lines that are in no log: over the limit, or not taken by journald.
-static LEFT_OUT: Count = Count(AtomicU64::new(0));
+/// Lines in no log: over the limit, or rejected by journald.
+static LEFT_OUT: AtomicU64 = AtomicU64::new(0);
 
-/// A number that only grows until it is taken.
-#[derive(Debug)]
-struct Count(AtomicU64);
+/// Crates of this program that log, besides `packwatch` itself.
+const MEMBER_CRATES: [&str; 3] = ["packwatch_core", "packwatch_host", "packwatch_lab"];
 
-impl Count {
-    fn add(&self, lines: u64) {
-        self.0.fetch_add(lines, Ordering::Relaxed);
-    }
+/// Counts a line that is in no log.
+fn note_left_out() {
+    LEFT_OUT.fetch_add(1, Ordering::Relaxed);
 }
 
 /// Lines left out of the log since the last call.
 pub fn take_left_out() -> u64 {
-    LEFT_OUT.0.swap(0, Ordering::Relaxed)
+    LEFT_OUT.swap(0, Ordering::Relaxed)
 }
 
-/// Starts logging; `filter` is a level (`info`) or a filter (`packwatch_host::io=debug,info`).
+/// Starts logging; `filter` is a level (`info`) or a filter (`packwatch::io=debug,info`).
 ///
 /// # Errors
 /// When the filter cannot be read.
 pub fn start(filter: Option<&str>) -> Result<(), String> {
     let text = filter.map(str::to_owned).or_else(|| std::env::var(LOG_VARIABLE).ok()).unwrap_or_else(|| "info".into());
-    let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
-    let registry = tracing_subscriber::registry().with(filter);
-    // A second start (tests) keeps the first logger: nothing is lost by that.
+    let registry = tracing_subscriber::registry().with(targets(&text)?);
+    // A second start (tests) keeps the first logger.
     let _ = match stderr_is_journal().then(Journal::new) {
-        Some(Ok(journal)) => registry.with(journal.with_filter(Limit::default())).try_init(),
-        // Colours for a person at a terminal; in a file they are rubbish. An empty NO_COLOR counts as none.
+        Some(Ok(journal)) => registry.with(journal.with_filter(RateLimit::default())).try_init(),
+        // Colours only on a terminal. An empty NO_COLOR counts as unset.
         _ => {
             let wanted = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
             let ansi = wanted && std::io::stderr().is_terminal();
             let lines = fmt::layer().with_writer(std::io::stderr).with_ansi(ansi);
-            registry.with(lines.with_filter(Limit::default())).try_init()
+            registry.with(lines.with_filter(RateLimit::default())).try_init()
         }
     };
     Ok(())
 }
 
-/// systemd names the journal's stream by device and inode; a redirected standard error is another file.
+/// Reads a filter; `packwatch::MODULE` stands for that module of every member crate.
+fn targets(text: &str) -> Result<Targets, String> {
+    let filter: Targets = text.parse().map_err(|error| format!("log filter '{text}': {error}"))?;
+    let modules = filter.iter().filter_map(|(target, level)| Some((target.strip_prefix("packwatch::")?, level)));
+    let members =
+        modules.flat_map(|(module, level)| MEMBER_CRATES.map(|member| (format!("{member}::{module}"), level)));
+    let members: Vec<_> = members.collect();
+    Ok(filter.with_targets(members))
+}
+
+/// Whether standard error is the journal. systemd names the journal's stream by device and inode.
 fn stderr_is_journal() -> bool {
     let Ok(stream) = std::env::var("JOURNAL_STREAM") else { return false };
     std::fs::metadata("/proc/self/fd/2").is_ok_and(|file| stream == format!("{}:{}", file.st_dev(), file.st_ino()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use tracing::Level;
+
+    #[test]
+    fn a_filter_names_a_module_without_its_member_crate() {
+        let filter = targets("warn,packwatch::io=debug,packwatch_host::store=trace").unwrap();
+        for (target, level, expected) in [
+            ("packwatch_host::io::socket", Level::DEBUG, true),
+            ("packwatch_host::io", Level::TRACE, false),
+            ("packwatch_host::store::writer", Level::TRACE, true),
+            ("packwatch_host::service", Level::INFO, false),
+            ("packwatch_host::service", Level::WARN, true),
+        ] {
+            assert_eq!(filter.would_enable(target, &level), expected, "{target} {level}");
+        }
+        let all = targets("packwatch=debug").unwrap();
+        assert!(
+            all.would_enable("packwatch_host::service", &Level::DEBUG) && !all.would_enable("hyper", &Level::ERROR)
+        );
+        assert!(targets("packwatch::io=loud").unwrap_err().starts_with("log filter 'packwatch::io=loud': "));
+    }
 }

@@ -1,8 +1,8 @@
-//! The live loop: interfaces in, the core stepped, frames out, a tick every [`TICK_PERIOD_MS`].
+//! The service: runs the core on live interfaces, with a tick every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS).
 //!
-//! One task owns the [`Monitor`]; every input is journalled before it is handed over, in that very order, so that
-//! the journal replayed gives the same frames. Nothing a bus, a disk or a service manager does ends the loop;
-//! SIGTERM and SIGINT do, cleanly.
+//! In: frames and states of the interfaces, ticks, commands. Out: frames, events, status. One task owns the core; every
+//! input is journalled before the core handles it, in that order, so that a replay of the journal gives the same frames.
+//! No fault of a bus, a disk or a service manager ends the loop; SIGTERM and SIGINT end it cleanly.
 
 mod engine;
 mod j1939_carrier;
@@ -16,21 +16,17 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use engine::Engine;
-use live::Loop;
-use reload::Reload;
 use sd_notify::NotifyState;
-use status_publisher::StatusPublisher;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
+
 use super::status::StatusServer;
-use super::status::collect::Identity;
+use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
 use super::store::StateSetting;
-
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::socket::{Link, LinkConfig, LinkMessage, LinkOutput};
@@ -38,15 +34,19 @@ use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
+use engine::Engine;
+use live::ServiceLoop;
+use reload::Reload;
+use status_publisher::StatusPublisher;
 pub(super) use stop::Stop;
 
-/// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
+/// LinkMessage frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
-/// Threads for what would hold up the loop: reading a configuration, long answers. More would only wait for the disk.
+/// Threads for work that would block the loop: reading a configuration, long answers. More would only wait for the disk.
 const BLOCKING_THREADS: usize = 4;
 
-/// What to run.
+/// The settings of a run.
 #[derive(Debug)]
 pub struct Service {
     /// Checked configuration.
@@ -60,14 +60,14 @@ pub struct Service {
     /// State to start from.
     pub restore: Option<Snapshot>,
     /// Age of that state.
-    pub away: Downtime,
-    /// Where the state goes when the daemon stops.
+    pub downtime: Downtime,
+    /// File for the state when the daemon stops.
     pub snapshot: Option<PathBuf>,
-    /// Stop after this long; `None` = when told to.
+    /// Time after which the service stops; `None` = it runs until a signal.
     pub duration: Option<Duration>,
-    /// How long the first usable reading is waited for before the service calls itself ready.
+    /// Longest wait for the first usable reading before the service reports that it is ready.
     pub ready_timeout: Duration,
-    /// Receive buffer asked for per interface, bytes.
+    /// Receive buffer requested per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
     pub control: ControlSetting,
@@ -75,11 +75,11 @@ pub struct Service {
     pub state: StateSetting,
     /// The status sockets.
     pub status: SocketSetting,
-    /// Where the configuration came from, for those who look.
+    /// The configuration file, for the status document.
     pub config_file: Option<ConfigFile>,
 }
 
-/// Why the service could not start, or not end as it should.
+/// Why the service could not start or stop.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {
     /// A file could not be written.
@@ -93,10 +93,10 @@ pub enum ServiceError {
     /// The snapshot does not fit.
     #[error("{0}")]
     Restore(#[from] RestoreError),
-    /// The state folder is another daemon's.
+    /// Another daemon uses the state folder.
     #[error("{0}")]
     Store(String),
-    /// The control or status socket is another daemon's, or cannot be made.
+    /// Another daemon uses the control or status socket, or it cannot be created.
     #[error("{0}")]
     Socket(String),
     /// The runtime or a signal handler could not be set up.
@@ -105,14 +105,14 @@ pub enum ServiceError {
 }
 
 impl Service {
-    /// Runs until told to stop.
+    /// Runs until a signal or the end of its duration.
     ///
     /// # Errors
     /// When it cannot start, or its final snapshot cannot be written.
     pub fn run(self) -> Result<(), ServiceError> {
         let mut builder = tokio::runtime::Builder::new_current_thread();
         let runtime = builder.enable_all().max_blocking_threads(BLOCKING_THREADS).build()?;
-        // A task like those of the interfaces: waking the one future that is no task goes through the kernel, for every frame.
+        // Spawned as a task: waking the future of `block_on` itself goes through the kernel, for every frame.
         let served = runtime.block_on(async { tokio::spawn(self.serve()).await });
         served.unwrap_or_else(|stopped| std::panic::resume_unwind(stopped.into_panic()))
     }
@@ -123,18 +123,18 @@ impl Service {
         let clock = MappedClock::new(Reading::now());
         let (sender, inbox) = mpsc::channel(INBOX);
         let snapshot = self.snapshot.take();
-        // Before any file is opened: a second daemon must not take those of the first.
-        let (asked, requests) = mpsc::channel(MAX_CONNECTIONS);
-        let control = ControlServer::start(&self.control, asked).await.map_err(ServiceError::Socket)?;
+        // Before any file is opened: a second daemon must not overwrite those of the first.
+        let (sender_of_requests, requests) = mpsc::channel(MAX_CONNECTIONS);
+        let control = ControlServer::start(&self.control, sender_of_requests).await.map_err(ServiceError::Socket)?;
         let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
         let mut engine = Engine::new(&mut self, clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
         drop(sender);
-        // The first input is the time of the start; what it sends waits for the interfaces.
+        // The first input is the time of the start; frames it sends wait for the interfaces.
         engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        engine.tell_works(clock.now(), &outputs);
+        engine.report_store_health(clock.now(), &outputs);
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
-        let mut service = Loop {
+        let mut service = ServiceLoop {
             engine,
             inbox,
             requests,
@@ -142,12 +142,12 @@ impl Service {
             clock,
             outputs,
             batch: Vec::new(),
-            left_out_told: Instant::now(),
+            left_out_reported: Instant::now(),
             status_publisher,
         };
         tracing::info!(interfaces = self.config.interfaces.len(), "started");
         if self.config.monitor.j1939.is_some() {
-            j1939_carrier::tell();
+            j1939_carrier::log_kernel_stack();
         }
         service.run(stop).await;
         notify(&[NotifyState::Stopping]);
@@ -155,9 +155,9 @@ impl Service {
         service.finish(links, snapshot.as_deref()).await
     }
 
-    fn identity(&self, clock: MappedClock) -> Identity {
+    fn identity(&self, clock: MappedClock) -> ServiceIdentity {
         let interfaces = self.config.interface_names();
-        Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
+        ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
     fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
@@ -180,9 +180,9 @@ impl Service {
     }
 }
 
-/// Tells the service manager; without one nothing happens.
-fn notify(states: &[NotifyState<'_>]) {
+/// Notifies the service manager; does nothing without one.
+pub(super) fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
-        tracing::warn!(%error, "service manager not told");
+        tracing::warn!(%error, "service manager not notified");
     }
 }

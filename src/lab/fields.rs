@@ -6,7 +6,7 @@
 use serde_json::{Map, Value};
 
 use crate::monitor::EventKind;
-use crate::store::Entry;
+use crate::store::HistoryEntry;
 
 /// Values by name.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -22,7 +22,7 @@ impl Fields {
     }
 
     /// The values of a row of a store.
-    pub(crate) fn of_entry(entry: &Entry) -> Self {
+    pub(crate) fn of_entry(entry: &HistoryEntry) -> Self {
         let names = entry.kind.columns().iter().map(|name| (*name).to_owned());
         Self(names.zip(entry.values.iter().cloned()).collect())
     }

@@ -4,18 +4,18 @@ use std::fmt::Write as _;
 
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
-use crate::cli::alarms::{cell as cell_name, severity, state_name, with_unit};
+use crate::cli::alarms::{cell as cell_name, state_name, with_unit};
 use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
-use crate::status::document::{Cell, Document, Pack};
+use crate::status::document::{CellStatus, PackStatus, StatusDocument};
 
-/// Up to so many cells all are listed: more do not fit a screen beside the rest.
+/// Most cells that are all listed: more do not fit a screen with the rest.
 const MAX_LISTED: usize = 16;
-/// Of more cells, so many are listed because they stand out.
+/// Most outliers listed of more cells.
 const MAX_OUTLIERS: usize = 8;
 
-/// The document for people; `all` = every cell.
-pub(super) fn table(document: &Document, all: bool) -> String {
+/// Formats the document as a table; `all` = every cell.
+pub(super) fn table(document: &StatusDocument, all: bool) -> String {
     let mut text = String::new();
     head(&mut text, document);
     pack(&mut text, document);
@@ -25,7 +25,7 @@ pub(super) fn table(document: &Document, all: bool) -> String {
     text
 }
 
-fn head(text: &mut String, document: &Document) {
+fn head(text: &mut String, document: &StatusDocument) {
     let _ = writeln!(
         text,
         "packwatch {}, process {}, up {}, {}, configuration {}",
@@ -37,7 +37,7 @@ fn head(text: &mut String, document: &Document) {
     );
 }
 
-fn pack(text: &mut String, document: &Document) {
+fn pack(text: &mut String, document: &StatusDocument) {
     let pack = &document.pack;
     let band = match (pack.soc_low, pack.soc_high) {
         (Some(low), Some(high)) => format!(" (95 %: {:.1} to {:.1} %)", 100.0 * low, 100.0 * high),
@@ -66,19 +66,20 @@ fn pack(text: &mut String, document: &Document) {
     let _ = writeln!(text, "life       {}", remaining(pack));
 }
 
-/// What remains of the life of the cell whose life ends first.
-fn remaining(pack: &Pack) -> String {
+/// The remaining life of the cell whose life ends first.
+fn remaining(pack: &PackStatus) -> String {
+    let life = &pack.remaining;
     let (Some(cycles), Some(low), Some(high)) =
-        (pack.remaining_cycles, pack.remaining_cycles_low, pack.remaining_cycles_high)
+        (life.remaining_cycles, life.remaining_cycles_low, life.remaining_cycles_high)
     else {
         return "not known".to_owned();
     };
     let cell = pack.shortest_lived_cell.map_or_else(String::new, |cell| format!(" (cell {})", number(cell)));
-    let days = shown(pack.remaining_days, 0, " days");
-    format!("{cycles:.0} equivalent full cycles (90 %: {low:.0} to {high:.0}){cell}, {days} at the use of late")
+    let days = shown(life.remaining_days, 0, " days");
+    format!("{cycles:.0} equivalent full cycles (90 %: {low:.0} to {high:.0}){cell}, {days} at the recent use")
 }
 
-fn interfaces(text: &mut String, document: &Document) {
+fn interfaces(text: &mut String, document: &StatusDocument) {
     for it in &document.interfaces {
         let lost = it.kernel_dropped + it.queue_dropped + it.malformed;
         let unsent = it.send_queue_full + it.send_failed;
@@ -109,7 +110,7 @@ fn interfaces(text: &mut String, document: &Document) {
     let _ = writeln!(text, "store      {}", store(document));
 }
 
-fn alarms(text: &mut String, document: &Document) {
+fn alarms(text: &mut String, document: &StatusDocument) {
     let alarms = &document.alarms;
     let unknown = match alarms.unknown.len() {
         0 => String::new(),
@@ -129,10 +130,10 @@ pub(super) fn alarm_line(alarm: &Alarm) -> String {
     let value = alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value));
     let probability =
         alarm.probability.map_or_else(String::new, |probability| format!(", {:.0} % sure", 100.0 * probability));
-    let whose = alarm.cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell_name(Some(cell))));
+    let owner = alarm.cell.map_or_else(|| "pack".to_owned(), |cell| format!("cell {}", cell_name(Some(cell))));
     format!(
-        "{} {} {whose} {}: {value}, threshold {}{probability}{}",
-        severity(alarm.severity),
+        "{} {} {owner} {}: {value}, threshold {}{probability}{}",
+        alarm.severity.name(),
         alarm.rule.name(),
         state_name(alarm.state),
         with_unit(alarm.rule, alarm.threshold),
@@ -142,16 +143,16 @@ pub(super) fn alarm_line(alarm: &Alarm) -> String {
 
 const HEAD: [&str; 7] = ["cell", "voltage", "temp.", "SOC", "capacity", "resistance", "trusted"];
 
-fn cells(text: &mut String, cells: &[Cell], all: bool) {
+fn cells(text: &mut String, cells: &[CellStatus], all: bool) {
     let is_short = cells.len() > MAX_LISTED && !all;
-    let listed: Vec<&Cell> = if is_short { outliers(cells) } else { cells.iter().collect() };
+    let listed: Vec<&CellStatus> = if is_short { outliers(cells) } else { cells.iter().collect() };
     if is_short {
         spread(text, cells);
         if listed.is_empty() {
-            text.push_str("none stands out (--cells lists all)\n");
+            text.push_str("no outliers (--cells lists all)\n");
             return;
         }
-        text.push_str("those that stand out (--cells lists all):\n");
+        text.push_str("outliers (--cells lists all):\n");
     }
     let rows: Vec<[String; 7]> = listed.into_iter().map(row).collect();
     let width = |column: usize| {
@@ -166,7 +167,7 @@ fn cells(text: &mut String, cells: &[Cell], all: bool) {
     }
 }
 
-fn row(cell: &Cell) -> [String; 7] {
+fn row(cell: &CellStatus) -> [String; 7] {
     let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
     [
         number(cell.cell).to_string(),
@@ -184,8 +185,8 @@ fn row(cell: &Cell) -> [String; 7] {
     ]
 }
 
-/// What is compared over the cells.
-type Quantity = (&'static str, &'static str, usize, fn(&Cell) -> Option<f64>);
+/// A quantity compared over the cells: name, unit, decimals, value.
+type Quantity = (&'static str, &'static str, usize, fn(&CellStatus) -> Option<f64>);
 
 const QUANTITIES: [Quantity; 5] = [
     ("voltage", " V", 3, |cell| cell.voltage_v),
@@ -196,7 +197,7 @@ const QUANTITIES: [Quantity; 5] = [
 ];
 
 /// Least and greatest of every quantity, with their cells.
-fn spread(text: &mut String, cells: &[Cell]) {
+fn spread(text: &mut String, cells: &[CellStatus]) {
     for (name, unit, decimals, of) in QUANTITIES {
         let known = || cells.iter().filter_map(|cell| Some((number(cell.cell), of(cell)?)));
         let least = known().min_by(|a, b| a.1.total_cmp(&b.1));
@@ -214,28 +215,28 @@ fn spread(text: &mut String, cells: &[Cell]) {
     }
 }
 
-/// The cells that stand out: not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
-fn outliers(cells: &[Cell]) -> Vec<&Cell> {
-    let mut ranked: Vec<(f64, &Cell)> = cells.iter().map(|cell| (0.0, cell)).collect();
+/// Outliers: cells that are not trusted, unknown, or furthest from the median of a quantity, in the order of their numbers.
+fn outliers(cells: &[CellStatus]) -> Vec<&CellStatus> {
+    let mut ranked: Vec<(f64, &CellStatus)> = cells.iter().map(|cell| (0.0, cell)).collect();
     for (_, _, _, of) in QUANTITIES {
         let mut known: Vec<f64> = cells.iter().filter_map(of).collect();
         known.sort_by(f64::total_cmp);
         let Some(&median) = known.get(known.len() / 2) else { continue };
         let mut distances: Vec<f64> = known.iter().map(|value| (value - median).abs()).collect();
         distances.sort_by(f64::total_cmp);
-        // Compared with the usual distance; of equal cells none stands out.
-        let usual = distances[distances.len() / 2].max(1e-9);
+        // Relative to the median distance; equal cells have no outlier.
+        let typical = distances[distances.len() / 2].max(1e-9);
         for (rank, cell) in &mut ranked {
-            // One of which less is known than of others stands out most.
-            *rank = rank.max(of(cell).map_or(f64::MAX, |value| (value - median).abs() / usual));
+            // A cell with an unknown value ranks first.
+            *rank = rank.max(of(cell).map_or(f64::MAX, |value| (value - median).abs() / typical));
         }
     }
     for (rank, cell) in &mut ranked {
         *rank = if cell.trusted == Some(false) { f64::MAX } else { *rank };
     }
-    // Stable: of equal ranks the first cells.
+    // A stable sort: the first cells of equal rank.
     ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let mut found: Vec<&Cell> =
+    let mut found: Vec<&CellStatus> =
         ranked.into_iter().filter(|(rank, _)| *rank > 3.0).take(MAX_OUTLIERS).map(|(_, cell)| cell).collect();
     found.sort_by_key(|cell| cell.cell);
     found

@@ -1,7 +1,7 @@
-//! The full-screen live view of `packwatch status --watch`: the terminal, and the loop round [`App`].
+//! The full-screen live view of `packwatch status --watch`: the terminal, and the loop around [`App`].
 //!
-//! In: documents of the stream socket, keys, the clock. Out: a screen, drawn anew on each of them. The terminal is put back as
-//! it was when the view is left, on SIGTERM, SIGINT and SIGHUP, and on a panic. A daemon that goes is waited for.
+//! In: documents of the stream socket, keys, the clock. Out: a screen, redrawn on each input. Restores the terminal on
+//! quitting, on SIGTERM, SIGINT and SIGHUP, and on a panic. Waits for a daemon that has stopped.
 
 mod app;
 mod draw;
@@ -23,20 +23,20 @@ use app::{App, Key};
 
 use crate::status::stream_path;
 
-/// The screen is drawn at least this often: it says for how long there was no news.
+/// Longest time between two drawings: the screen shows the time without a document.
 const DRAW_PERIOD: Duration = Duration::from_secs(1);
-/// Keys waiting: more than anybody types between two drawings.
+/// Keys waiting: more than a user types between two drawings.
 const KEYS: usize = 64;
 
-/// Runs the view until it is left; `socket` is the status socket, beside which the stream is.
+/// Runs the view until the user quits; `socket` is the status socket, next to which the stream socket lies.
 ///
 /// # Errors
 /// When there is no terminal, or it fails.
 pub(super) fn run(socket: &Path) -> Result<(), String> {
     if !io::stdout().is_terminal() || !io::stdin().is_terminal() {
         return Err(
-            "--watch needs a terminal, and standard input or output is none; without --watch there is a table, \
-                    with --json a document"
+            "--watch needs a terminal, and standard input or output is not one; run it without --watch for a table, \
+             or with --json for a document"
                 .to_owned(),
         );
     }
@@ -45,7 +45,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
     let app = App::new(stream_path(socket), has_colour);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let runtime = runtime.map_err(|error| format!("cannot start: {error}"))?;
-    // From here on a panic too puts the terminal back.
+    // From here on a panic restores the terminal, too.
     let terminal = ratatui::try_init().map_err(|error| format!("terminal: {error}"))?;
     let watched = runtime.block_on(watch(terminal, app));
     ratatui::restore();
@@ -57,7 +57,7 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
 async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
     let mut signals = Signals::new()?;
     let mut keys = read_keys()?;
-    let mut news = feed::start(app.path().to_owned());
+    let mut updates = feed::start(app.path().to_owned());
     let mut ticks = interval(DRAW_PERIOD);
     loop {
         tokio::select! {
@@ -68,12 +68,12 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
                     Some(key) => app.handle_key(key),
                     None => continue,
                 },
-                // A new size: drawn anew.
+                // A new size: redraws.
                 Some(_) => {}
-                // The terminal has gone.
+                // The terminal was closed.
                 None => return Ok(()),
             },
-            Some(update) = news.recv() => app.handle_news(update),
+            Some(update) = updates.recv() => app.handle_update(update),
             _ = ticks.tick() => {}
         }
         app.poll(feed::now());
@@ -81,7 +81,7 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
     }
 }
 
-/// What ends the view from outside.
+/// Signals that end the view.
 struct Signals {
     all: [Signal; 3],
 }
@@ -103,7 +103,7 @@ impl Signals {
     }
 }
 
-/// Keys and changes of size, from a thread that waits for them.
+/// Starts a thread that reads keys and changes of size.
 fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     let (sender, keys) = mpsc::channel(KEYS);
     std::thread::Builder::new().name("keys".to_owned()).spawn(move || {

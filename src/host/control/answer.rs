@@ -1,26 +1,26 @@
-//! Answers to what is asked: made from the alarms as they stand. Pure.
+//! Answers to requests, from the present alarms. Pure.
 
 use super::MAX_LISTED;
-use super::protocol::{AlarmList, Answer, Done, UnknownAlarms};
+use super::protocol::{AlarmList, Answer, CommandOutcome, UnknownAlarms};
 use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
 use crate::monitor::{Command, Event, EventKind, Source};
 use crate::quantity::Timestamp;
 
-/// The alarms; without `all` those that need eyes: raised, about to be, or not yet acknowledged.
+/// Lists the alarms; without `all` only those that need attention: raised, about to be raised, or not yet acknowledged.
 pub fn list(engine: &AlarmEngine, time: Timestamp, all: bool) -> Answer {
     Answer::Alarms(alarm_list(engine, time, all))
 }
 
-/// The same without the envelope.
+/// As [`list`], without the envelope.
 pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList {
-    let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_eyes(alarm)).collect();
+    let mut alarms: Vec<Alarm> = engine.all().filter(|alarm| all || needs_attention(alarm)).collect();
     let omitted = shorten(&mut alarms);
     let unknown = engine.unknown_thresholds().map(|(rule, severity, alarms)| UnknownAlarms { rule, severity, alarms });
     let (thresholds, _) = engine.unknown();
     AlarmList { time, thresholds, unknown: unknown.collect(), alarms, omitted }
 }
 
-fn needs_eyes(alarm: &Alarm) -> bool {
+fn needs_attention(alarm: &Alarm) -> bool {
     match alarm.state {
         AlarmState::Inactive | AlarmState::Unknown => alarm.occurrences > 0 && !alarm.is_acknowledged,
         AlarmState::Pending
@@ -32,7 +32,7 @@ fn needs_eyes(alarm: &Alarm) -> bool {
     }
 }
 
-/// Keeps as many as an answer has room for, raised ones first; returns how many that leaves out.
+/// Keeps the alarms for which an answer has room, raised ones first; returns the number of the others.
 fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     let omitted = alarms.len().saturating_sub(MAX_LISTED);
     if omitted > 0 {
@@ -42,7 +42,7 @@ fn shorten(alarms: &mut Vec<Alarm>) -> usize {
     omitted
 }
 
-/// Why a command cannot mean anything: nothing that is configured is meant.
+/// The error for a command that selects no configured alarm.
 pub fn meaningless(engine: &AlarmEngine, command: &Command) -> Option<Answer> {
     let (Command::Acknowledge(which) | Command::Clear(which)) = command else { return None };
     if engine.all().any(|alarm| which.matches(alarm.rule, alarm.severity, alarm.cell)) {
@@ -55,8 +55,8 @@ pub fn meaningless(engine: &AlarmEngine, command: &Command) -> Option<Answer> {
         }
     }
     let watched = if watched.is_empty() { "none".to_owned() } else { watched.join(", ") };
-    let asked = describe(which);
-    Some(Answer::Error(format!("no configured alarm is meant by {asked}; rules with a threshold are: {watched}")))
+    let selection = describe(which);
+    Some(Answer::Error(format!("no configured alarm matches {selection}; rules with a threshold are: {watched}")))
 }
 
 fn describe(which: &Selector) -> String {
@@ -69,14 +69,14 @@ fn describe(which: &Selector) -> String {
     if words.is_empty() { "\"all\"".to_owned() } else { words.join(", ") }
 }
 
-/// What became of a command, from the events it caused and the alarms after it.
+/// The outcome of a command, from the events it caused and the alarms after it.
 pub fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event], time: Timestamp) -> Answer {
-    let told = events.iter().rev().find_map(|event| match event.kind {
+    let counts = events.iter().rev().find_map(|event| match event.kind {
         EventKind::Command { source: Source::Local, changed, refused, .. } => Some((changed, refused)),
         _ => None,
     });
-    let Some((changed, refused)) = told else {
-        return Answer::Error("the daemon's core did not say what became of it".to_owned());
+    let Some((changed, refused)) = counts else {
+        return Answer::Error("the daemon's core did not report the outcome".to_owned());
     };
     let mut refused_alarms: Vec<Alarm> = match command {
         Command::Clear(which) if refused > 0 => {
@@ -85,10 +85,10 @@ pub fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event], time: 
         _ => Vec::new(),
     };
     shorten(&mut refused_alarms);
-    Answer::Done(Done { time, changed, refused, refused_alarms })
+    Answer::Outcome(CommandOutcome { time, changed, refused, refused_alarms })
 }
 
-/// Why an alarm was not cleared, for people.
+/// Why an alarm was not cleared, in words.
 pub fn refusal(alarm: &Alarm) -> &'static str {
     match alarm.state {
         AlarmState::Suppressed => "its value is not known",
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_needs_no_eyes_is_listed_only_on_request_and_unknown_ones_are_counted() {
+    fn alarms_at_rest_are_listed_only_on_request_and_unknown_ones_are_counted() {
         let mut engine = engine(3);
         see(&mut engine, Rule::CapacityLow, Some(1), Some(1.9));
         see(&mut engine, Rule::CapacityLow, Some(2), Some(2.5));
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_that_means_no_configured_alarm_says_which_there_are() {
+    fn a_command_that_matches_no_configured_alarm_gets_the_list_of_rules() {
         let engine = engine(2);
         let clear = |rule, cell: Option<u16>| {
             meaningless(&engine, &Command::Clear(Selector { rule, severity: None, cell: cell.map(CellIndex) }))
@@ -164,7 +164,7 @@ mod tests {
         let Some(Answer::Error(error)) = clear(Some(Rule::SocLow), Some(2)) else { panic!("not refused") };
         assert_eq!(
             error,
-            "no configured alarm is meant by rule soc_low, cell 3 (the first is 1); rules with a threshold are: \
+            "no configured alarm matches rule soc_low, cell 3 (the first is 1); rules with a threshold are: \
              capacity_low, temperature_high"
         );
         assert_eq!(meaningless(&engine, &Command::PackReplaced), None);
@@ -177,11 +177,11 @@ mod tests {
         let command = Command::Clear(Selector::default());
         let kind = EventKind::Command { source: Source::Local, command, changed: 0, refused: 1 };
         let events = [Event { time: Timestamp::ZERO, kind }];
-        let Answer::Done(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!((done.changed, done.refused, done.refused_alarms.len()), (0, 1, 1));
         assert_eq!(refusal(&done.refused_alarms[0]), "still beyond its threshold");
         see(&mut engine, Rule::TemperatureHigh, None, None);
-        let Answer::Done(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
+        let Answer::Outcome(done) = outcome(&engine, &command, &events, Timestamp::ZERO) else { panic!("no outcome") };
         assert_eq!(refusal(&done.refused_alarms[0]), "its value is not known");
     }
 }

@@ -1,4 +1,4 @@
-//! The other end: asks a running daemon, waits for its answer. Blocking; for commands of people.
+//! The client of the control socket: sends a request to a running daemon and waits for its answer. Blocking.
 
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
@@ -10,7 +10,7 @@ use serde::Deserialize;
 use super::protocol::{Request, contents};
 use super::standard_path;
 
-/// How long a daemon may take: it answers between two ticks, so one that needs longer hangs.
+/// Longest wait for an answer: a daemon answers between two ticks, so one that needs longer hangs.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// Longest answer, bytes: a thousand alarms of 400 bytes, ten times over.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
@@ -22,29 +22,29 @@ pub struct ControlClient {
 }
 
 impl ControlClient {
-    /// At `path`; `None` = where a daemon makes it when nobody says where.
+    /// The socket at `path`; `None` = at the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
-    /// Whether somebody listens there, or may: only a missing or forsaken socket says no.
+    /// Whether a daemon may listen there: false only for a missing or abandoned socket.
     pub fn is_served(&self) -> bool {
-        let nobody = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
-        UnixStream::connect(&self.path).map_or_else(|error| !nobody.contains(&error.kind()), |_| true)
+        let absent = [ErrorKind::NotFound, ErrorKind::ConnectionRefused];
+        UnixStream::connect(&self.path).map_or_else(|error| !absent.contains(&error.kind()), |_| true)
     }
 
-    /// Asks; returns the answer's line as it came.
+    /// Sends a request; returns the answer as a line of JSON.
     ///
     /// # Errors
-    /// When nobody answers: which socket, and what to do.
+    /// When no daemon answers: names the socket and the remedy.
     pub fn ask_line(&self, request: Request) -> Result<Vec<u8>, String> {
         self.exchange(request).map_err(|error| self.explain(&error))
     }
 
-    /// Asks; returns what the answer contains.
+    /// Sends a request; returns the contents of the answer.
     ///
     /// # Errors
-    /// When nobody answers, and what the daemon answers instead.
+    /// When no daemon answers, or its answer is an error.
     pub fn ask<T: for<'de> Deserialize<'de>>(&self, request: Request) -> Result<T, String> {
         contents(&self.ask_line(request)?)
     }
@@ -53,7 +53,7 @@ impl ControlClient {
         let mut stream = UnixStream::connect(&self.path)?;
         stream.set_read_timeout(Some(PATIENCE))?;
         stream.set_write_timeout(Some(PATIENCE))?;
-        // A daemon that has no place for us may have answered and gone already.
+        // A daemon without a free place may have answered and closed already.
         let written = stream.write_all(request.to_line().as_bytes());
         let mut line = Vec::new();
         BufReader::new(stream.take(MAX_ANSWER_BYTES)).read_until(b'\n', &mut line)?;
@@ -67,8 +67,8 @@ impl ControlClient {
         let path = self.path.display();
         match error.kind() {
             ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-                "{path}: no daemon listens there; start one with \"packwatch run -c FILE --control {path}\", or say with \
-                 --control where it listens"
+                "{path}: no daemon listens there; start one with \"packwatch run -c FILE --control {path}\", or name its \
+                 socket with --control"
             ),
             ErrorKind::PermissionDenied => {
                 format!("{path}: permission denied; the daemon's own user, its group and root may connect")

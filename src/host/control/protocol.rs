@@ -1,13 +1,13 @@
-//! What is asked and answered over the control socket, a line of JSON each.
+//! Requests and answers of the control socket, a line of JSON each.
 //!
 //! | request | keys | answer |
 //! | --- | --- | --- |
-//! | `alarms` | `all` (false): those at rest too | [`AlarmList`] |
-//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); what is left out means every | [`Done`] |
-//! | `pack_replaced` | | [`Done`] |
-//! | `test` | `rule`, `seconds` (0 ends a test) | [`Done`] |
+//! | `alarms` | `all` (false): includes those at rest | [`AlarmList`] |
+//! | `acknowledge`, `clear` | `rule`, `severity`, `cell` (from 0); a missing key selects every | [`CommandOutcome`] |
+//! | `pack_replaced` | | [`CommandOutcome`] |
+//! | `test` | `rule`, `seconds` (0 ends a test) | [`CommandOutcome`] |
 //!
-//! Every line has `version`. Anything else is answered with what was found and what is allowed.
+//! Every line has `version`. Anything else gets an error with the value found and the values allowed.
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -22,69 +22,69 @@ pub const VERSION: u64 = 1;
 /// Names of the requests.
 const REQUESTS: [&str; 5] = ["alarms", "acknowledge", "clear", "pack_replaced", "test"];
 
-/// What a client asks.
+/// A request of a client.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Request {
-    /// The alarms as they stand.
+    /// Lists the present alarms.
     Alarms {
-        /// Those at rest too.
+        /// Includes alarms at rest.
         all: bool,
     },
-    /// Something that changes something.
+    /// A command, which changes something.
     Command(Command),
 }
 
-/// What the daemon answers.
+/// An answer of the daemon.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// To `alarms`.
+    /// The answer to `alarms`.
     Alarms(AlarmList),
-    /// To every command.
-    Done(Done),
-    /// It was not done: what was found, what is allowed.
+    /// The answer to a command.
+    Outcome(CommandOutcome),
+    /// The request failed: the value found, the values allowed.
     Error(String),
 }
 
-/// The alarms as they stand.
+/// The present alarms.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct AlarmList {
-    /// When, on the daemon's clock.
+    /// Time, on the daemon's clock.
     pub time: Timestamp,
     /// Thresholds configured.
     pub thresholds: usize,
-    /// Those of them with alarms that cannot be judged.
+    /// Thresholds with alarms that cannot be evaluated.
     pub unknown: Vec<UnknownAlarms>,
     /// Alarms, in the order rule, severity, cell.
     pub alarms: Vec<Alarm>,
-    /// Further ones, for which there was no room.
+    /// Number of further alarms, for which there was no room.
     pub omitted: usize,
 }
 
-/// Alarms of one threshold that cannot be judged, because their value is not known.
+/// Alarms of one threshold that cannot be evaluated, because their value is not known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct UnknownAlarms {
-    /// Which rule.
+    /// The rule.
     pub rule: Rule,
-    /// Which of its thresholds.
+    /// The threshold.
     pub severity: Severity,
-    /// How many.
+    /// Number of alarms.
     pub alarms: usize,
 }
 
-/// What became of a command.
+/// The outcome of a command.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Done {
-    /// When, on the daemon's clock.
+pub struct CommandOutcome {
+    /// Time, on the daemon's clock.
     pub time: Timestamp,
     /// Alarms changed.
     pub changed: u32,
-    /// What could not be done: alarms that are not healthy, a test without output.
+    /// Number of refusals: alarms that are not healthy, a test without output.
     pub refused: u32,
-    /// The refused alarms as they stand.
+    /// The refused alarms.
     pub refused_alarms: Vec<Alarm>,
 }
 
-/// What every answer has round its contents.
+/// The keys of every answer, with its contents.
 #[derive(Serialize)]
 struct Envelope<'a, T> {
     version: u64,
@@ -94,10 +94,10 @@ struct Envelope<'a, T> {
 }
 
 impl Request {
-    /// Reads a line.
+    /// Parses a line.
     ///
     /// # Errors
-    /// What was found and what is allowed.
+    /// The value found and the values allowed.
     pub fn parse(line: &[u8]) -> Result<Self, String> {
         let value: Value = serde_json::from_slice(line).map_err(|error| format!("no JSON document: {error}"))?;
         let Value::Object(keys) = value else { return Err(format!("found {value}, must be a JSON object")) };
@@ -117,7 +117,7 @@ impl Request {
         }
     }
 
-    /// The line that asks it.
+    /// Formats the line of the request.
     pub fn to_line(self) -> String {
         let mut keys = match self {
             Self::Alarms { all } => json!({ "request": "alarms", "all": all }),
@@ -132,18 +132,18 @@ impl Request {
         format!("{keys}\n")
     }
 
-    /// Whether it changes something.
+    /// Whether it is a command.
     pub const fn changes_something(&self) -> bool {
         matches!(self, Self::Command(_))
     }
 }
 
 impl Answer {
-    /// The line that says it.
+    /// Formats the line of the answer.
     pub fn to_line(&self) -> Vec<u8> {
         let written = match self {
             Self::Alarms(list) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: list }),
-            Self::Done(done) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: done }),
+            Self::Outcome(done) => serde_json::to_vec(&Envelope { version: VERSION, ok: true, contents: done }),
             Self::Error(error) => {
                 let contents = &json!({ "error": error });
                 serde_json::to_vec(&Envelope { version: VERSION, ok: false, contents })
@@ -156,10 +156,10 @@ impl Answer {
     }
 }
 
-/// The contents of an answer.
+/// Parses the contents of an answer.
 ///
 /// # Errors
-/// The error it tells, or what is wrong with it.
+/// The error in the answer, or its fault.
 pub fn contents<T: for<'de> Deserialize<'de>>(line: &[u8]) -> Result<T, String> {
     let strange = |what: String| format!("the daemon's answer is not understood: {what}");
     let value: Value = serde_json::from_slice(line).map_err(|error| strange(error.to_string()))?;
@@ -168,7 +168,7 @@ pub fn contents<T: for<'de> Deserialize<'de>>(line: &[u8]) -> Result<T, String> 
     }
     if value.get("ok") != Some(&Value::Bool(true)) {
         let error = value.get("error").and_then(Value::as_str);
-        return Err(error.map_or_else(|| strange("it says neither ok nor an error".to_owned()), str::to_owned));
+        return Err(error.map_or_else(|| strange("it has neither ok nor an error".to_owned()), str::to_owned));
     }
     serde_json::from_value(value).map_err(|error| strange(error.to_string()))
 }
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_what_is_allowed() {
+    fn an_error_names_the_value_found_and_the_values_allowed() {
         let fault = |line: &str| Request::parse(line.as_bytes()).unwrap_err();
         assert!(fault("").starts_with("no JSON document"), "{}", fault(""));
         assert_eq!(fault("[1]"), "found [1], must be a JSON object");
@@ -299,19 +299,25 @@ mod tests {
 
     #[test]
     fn an_answer_is_its_contents_or_its_error() {
-        let done = Done { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
-        assert_eq!(contents::<Done>(&Answer::Done(done.clone()).to_line()), Ok(done.clone()));
-        assert_eq!(contents::<Done>(&Answer::Error("no \"way\"".to_owned()).to_line()), Err("no \"way\"".to_owned()));
-        let unlike = contents::<AlarmList>(&Answer::Done(done).to_line()).unwrap_err();
+        let done =
+            CommandOutcome { time: Timestamp::from_secs(1.5), changed: 2, refused: 1, refused_alarms: Vec::new() };
+        assert_eq!(contents::<CommandOutcome>(&Answer::Outcome(done.clone()).to_line()), Ok(done.clone()));
+        assert_eq!(
+            contents::<CommandOutcome>(&Answer::Error("no \"way\"".to_owned()).to_line()),
+            Err("no \"way\"".to_owned())
+        );
+        let unlike = contents::<AlarmList>(&Answer::Outcome(done).to_line()).unwrap_err();
         assert!(unlike.contains("missing field `thresholds`"), "{unlike}");
-        assert!(contents::<Done>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1"));
+        assert!(
+            contents::<CommandOutcome>(b"{\"version\":2,\"ok\":true}").unwrap_err().contains("version = 2, must be 1")
+        );
     }
 
     proptest! {
         #[test]
         fn any_bytes_are_a_request_or_a_fault(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
             let _ = Request::parse(&bytes);
-            let _ = contents::<Done>(&bytes);
+            let _ = contents::<CommandOutcome>(&bytes);
         }
 
         #[test]

@@ -1,9 +1,9 @@
 //! Log lines as journal entries with fields, over journald's native protocol (systemd.io/JOURNAL_NATIVE_PROTOCOL).
 //!
-//! An entry has `MESSAGE` (the text, and the fields as `name=value`, so that `systemctl status` tells them), `PRIORITY`,
-//! `SYSLOG_IDENTIFIER`, `TARGET`, where it is in the source, each field as `PACKWATCH_NAME`, and for what programs look for a
-//! `MESSAGE_ID`. Nothing here waits: an entry that a stalled journald does not take is dropped and counted, so that the
-//! estimation loop, which logs, goes on.
+//! An entry has `MESSAGE` (the text, with the fields as `name=value`, so that `systemctl status` shows them), `PRIORITY`,
+//! `SYSLOG_IDENTIFIER`, `TARGET`, its place in the source, each field as `PACKWATCH_NAME`, and for messages that programs
+//! search for a `MESSAGE_ID`. Nothing here blocks: an entry that a stalled journald does not accept is dropped and counted,
+//! so that the estimation loop, which logs, continues.
 
 use std::fmt::{self, Write as _};
 use std::io::{self, ErrorKind};
@@ -13,13 +13,13 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
 
-use super::LEFT_OUT;
+use super::note_left_out;
 
-/// Where journald listens.
+/// The socket of journald.
 const SOCKET: &str = "/run/systemd/journal/socket";
 /// Longest value, bytes; an entry of a few of them fits a datagram.
 const MAX_VALUE: usize = 8 * 1024;
-/// What programs look for, by its text; one id each for ever (`journalctl MESSAGE_ID=...`).
+/// Permanent ids of messages that programs search for (`journalctl MESSAGE_ID=...`), by their text.
 const MESSAGE_IDS: [(&str, &str); 3] = [
     ("alarm raised", "7a9c9a5d3bc5449eb08f6ca450cbf382"),
     ("alarm cleared", "15d731239a594556adf6d13cc7b79ac2"),
@@ -33,14 +33,14 @@ pub(super) struct Journal {
 }
 
 impl Journal {
-    /// Of the journald that runs here.
+    /// Connects to the running journald.
     ///
     /// # Errors
-    /// When there is none, or its socket is not to be seen.
+    /// When there is none, or its socket cannot be reached.
     pub(super) fn new() -> io::Result<Self> {
         let socket = UnixDatagram::unbound()?;
         socket.set_nonblocking(true)?;
-        // An empty datagram is nothing to journald, and an error to us when nobody listens. A full queue is somebody.
+        // journald ignores an empty datagram; sending it fails when journald does not listen. A full queue means it does.
         match socket.send_to(&[], SOCKET) {
             Err(error) if error.kind() != ErrorKind::WouldBlock => Err(error),
             Ok(_) | Err(_) => Ok(Self { socket }),
@@ -50,20 +50,20 @@ impl Journal {
 
 impl<S: Subscriber> Layer<S> for Journal {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
-        // Not connected: journald may have been started again.
+        // Not connected: journald may have been restarted.
         if self.socket.send_to(&entry(event), SOCKET).is_err() {
-            LEFT_OUT.add(1);
+            note_left_out();
         }
     }
 }
 
-/// One event as journald wants it.
+/// Formats an event for journald.
 fn entry(event: &Event<'_>) -> Vec<u8> {
-    let mut words = Words::default();
-    event.record(&mut words);
+    let mut text = EventText::default();
+    event.record(&mut text);
     let meta = event.metadata();
     let mut entry = Vec::with_capacity(512);
-    put(&mut entry, "MESSAGE", &format!("{}{}", words.message, words.told));
+    put(&mut entry, "MESSAGE", &format!("{}{}", text.message, text.fields_text));
     put(&mut entry, "PRIORITY", priority(*meta.level()));
     put(&mut entry, "SYSLOG_IDENTIFIER", "packwatch");
     put(&mut entry, "TARGET", meta.target());
@@ -71,16 +71,16 @@ fn entry(event: &Event<'_>) -> Vec<u8> {
         put(&mut entry, "CODE_FILE", file);
         put(&mut entry, "CODE_LINE", &line.to_string());
     }
-    if let Some((_, id)) = MESSAGE_IDS.iter().find(|(text, _)| *text == words.message) {
+    if let Some((_, id)) = MESSAGE_IDS.iter().find(|(message, _)| *message == text.message) {
         put(&mut entry, "MESSAGE_ID", id);
     }
-    for (name, value) in &words.fields {
+    for (name, value) in &text.fields {
         put(&mut entry, &field_name(name), value);
     }
     entry
 }
 
-/// Syslog's numbers.
+/// The priority of syslog.
 fn priority(level: Level) -> &'static str {
     match level {
         Level::ERROR => "3",
@@ -90,13 +90,13 @@ fn priority(level: Level) -> &'static str {
     }
 }
 
-/// `cell` becomes `PACKWATCH_CELL`; journald takes capital letters, digits and underscores.
+/// `PACKWATCH_CELL` for `cell`; journald allows capital letters, digits and underscores.
 fn field_name(name: &str) -> String {
     let allowed = |c: char| if c.is_ascii_alphanumeric() { c.to_ascii_uppercase() } else { '_' };
     format!("PACKWATCH_{}", name.chars().map(allowed).collect::<String>())
 }
 
-/// Appends one field; a value with line feeds goes with its length before it.
+/// Appends one field; a value with line feeds is preceded by its length.
 fn put(entry: &mut Vec<u8>, name: &str, value: &str) {
     let end = (0..=value.len().min(MAX_VALUE)).rev().find(|&end| value.is_char_boundary(end)).unwrap_or(0);
     let value = &value[..end];
@@ -113,26 +113,26 @@ fn put(entry: &mut Vec<u8>, name: &str, value: &str) {
 
 /// An event's text and fields.
 #[derive(Debug, Default)]
-struct Words {
+struct EventText {
     message: String,
     /// The fields as ` name=value`.
-    told: String,
+    fields_text: String,
     fields: Vec<(&'static str, String)>,
 }
 
-impl Words {
+impl EventText {
     fn take(&mut self, field: &Field, value: String) {
         if field.name() == "message" {
             self.message = value;
             return;
         }
         // Writing to a string cannot fail.
-        let _ = write!(self.told, " {}={value}", field.name());
+        let _ = write!(self.fields_text, " {}={value}", field.name());
         self.fields.push((field.name(), value));
     }
 }
 
-impl Visit for Words {
+impl Visit for EventText {
     fn record_str(&mut self, field: &Field, value: &str) {
         self.take(field, value.to_owned());
     }
@@ -148,18 +148,18 @@ mod tests {
     use std::sync::{Arc, Mutex};
     use tracing_subscriber::layer::SubscriberExt;
 
-    /// Keeps entries as journald would get them.
+    /// Captures entries as journald would get them.
     #[derive(Clone, Default)]
-    struct Kept(Arc<Mutex<Vec<Vec<u8>>>>);
+    struct CapturedEntries(Arc<Mutex<Vec<Vec<u8>>>>);
 
-    impl<S: Subscriber> Layer<S> for Kept {
+    impl<S: Subscriber> Layer<S> for CapturedEntries {
         fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
             self.0.lock().expect("one thread").push(entry(event));
         }
     }
 
     fn entry_of(log: impl FnOnce()) -> String {
-        let kept = Kept::default();
+        let kept = CapturedEntries::default();
         tracing::subscriber::with_default(tracing_subscriber::registry().with(kept.clone()), log);
         let entries = kept.0.lock().expect("one thread");
         assert_eq!(entries.len(), 1);
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_told_once_as_a_text_has_no_id() {
+    fn a_message_with_other_text_has_no_id() {
         let entry = entry_of(|| tracing::info!("alarm raised earlier, its value is not known now"));
         assert!(!entry.contains("MESSAGE_ID") && entry.contains("PRIORITY=6"), "{entry}");
     }

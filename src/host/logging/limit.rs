@@ -1,9 +1,9 @@
-//! How many lines of each kind the log takes: a burst, and then a trickle. What is over that is left out and counted;
-//! the count is logged when there is room again.
+//! Limits the number of log lines per kind: a burst, then a trickle. Lines beyond it are dropped and counted; the count is
+//! logged once a minute.
 //!
-//! A bus that flips all day must not wear the flash out. A kind of line is a place in the program: a thousand lines about
-//! cells do not hide the one that says that the interface is down. Alarms are never left out: their rules debounce them.
-//! Nor are lines below `info`: whoever asks for those wants them all.
+//! A bus that flips all day must not wear out the flash. A kind of line is a place in the program: a thousand lines about
+//! cells do not suppress the line about an interface. Two kinds are never dropped: lines about alarms, whose rules debounce
+//! them, and lines below `info`, which are logged only on request.
 
 use std::collections::HashMap;
 use std::sync::Mutex;
@@ -14,40 +14,28 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Metadata, Subscriber};
 use tracing_subscriber::layer::{Context, Filter};
 
-use super::LEFT_OUT;
+use super::note_left_out;
+use crate::quantity::Timestamp;
+use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Lines of one kind at once: a pack of 96 cells loses its input, all signals told one by one.
-const BURST: f64 = 150.0;
-/// Lines of one kind a second in the long run: some 30 MB of journal a day, were it a storm of lost and good again all day.
-const RATE_PER_S: f64 = 0.5;
+/// Lines of one kind. The burst: a pack of 96 cells loses its input, with a line per signal. The rate: some 30 MB of journal
+/// in a day of signals that are lost and found all the time.
+const LINES: BucketSize = BucketSize { burst: 150.0, period_s: 2.0 };
 
-/// See the module. As many buckets as the program has places that log.
-#[derive(Debug, Default)]
-pub(super) struct Limit(Mutex<HashMap<Identifier, Bucket>>);
-
-/// Lines that may still be written.
+/// See the module. Has a bucket per place in the program that logs.
 #[derive(Debug)]
-struct Bucket {
-    lines: f64,
-    filled: Instant,
+pub(super) struct RateLimit {
+    began: Instant,
+    buckets: Mutex<HashMap<Identifier, TokenBucket>>,
 }
 
-impl Bucket {
-    /// A full burst may come.
-    const fn full(now: Instant) -> Self {
-        Self { lines: BURST, filled: now }
-    }
-
-    fn take(&mut self, now: Instant) -> bool {
-        let elapsed_s = now.saturating_duration_since(self.filled).as_secs_f64();
-        (self.lines, self.filled) = ((self.lines + elapsed_s * RATE_PER_S).min(BURST), now);
-        let has_room = self.lines >= 1.0;
-        self.lines -= f64::from(u8::from(has_room));
-        has_room
+impl Default for RateLimit {
+    fn default() -> Self {
+        Self { began: Instant::now(), buckets: Mutex::default() }
     }
 }
 
-impl<S: Subscriber> Filter<S> for Limit {
+impl<S: Subscriber> Filter<S> for RateLimit {
     fn enabled(&self, _: &Metadata<'_>, _: &Context<'_, S>) -> bool {
         true
     }
@@ -56,18 +44,18 @@ impl<S: Subscriber> Filter<S> for Limit {
         if *event.metadata().level() > Level::INFO || is_exempt(event) {
             return true;
         }
-        let now = Instant::now();
-        // A panic while the lock was held has left a number there, whatever it is.
-        let mut buckets = self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let is_taken = buckets.entry(event.metadata().callsite()).or_insert_with(|| Bucket::full(now)).take(now);
-        if !is_taken {
-            LEFT_OUT.add(1);
+        let now = Timestamp::from_secs(self.began.elapsed().as_secs_f64());
+        // A panic while the lock was held leaves a valid bucket.
+        let mut buckets = self.buckets.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let is_written = buckets.entry(event.metadata().callsite()).or_insert(TokenBucket::new(LINES)).take(now);
+        if !is_written {
+            note_left_out();
         }
-        is_taken
+        is_written
     }
 }
 
-/// Lines about alarms name the rule; the line about what was left out is one a minute.
+/// Whether a line is about an alarm, which names its rule, or about dropped lines, which comes once a minute.
 fn is_exempt(event: &Event<'_>) -> bool {
     struct Exempt(bool);
     impl Visit for Exempt {
@@ -85,20 +73,7 @@ mod tests {
     use super::*;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
-    use std::time::Duration;
     use tracing_subscriber::layer::{Layer, SubscriberExt};
-
-    #[test]
-    fn a_storm_gets_its_burst_and_then_a_trickle() {
-        let began = Instant::now();
-        let mut bucket = Bucket::full(began);
-        let at = |ms| began + Duration::from_millis(ms);
-        let taken = (0..100_000).filter(|ms| bucket.take(at(*ms))).count();
-        assert_eq!(taken, 150 + 49);
-        // Silence fills it again, no further than at first.
-        let taken = (0..10_000).filter(|_| bucket.take(at(100_000_000))).count();
-        assert_eq!(taken, 150);
-    }
 
     struct Count(Arc<AtomicU64>);
     impl<S: Subscriber> Layer<S> for Count {
@@ -108,14 +83,14 @@ mod tests {
     }
 
     #[test]
-    fn alarms_pass_when_everything_else_is_left_out() {
+    fn alarms_pass_when_all_other_lines_are_dropped() {
         let count = Arc::new(AtomicU64::new(0));
-        let registry = tracing_subscriber::registry().with(Count(Arc::clone(&count)).with_filter(Limit::default()));
+        let registry = tracing_subscriber::registry().with(Count(Arc::clone(&count)).with_filter(RateLimit::default()));
         tracing::subscriber::with_default(registry, || {
             (0..1000).for_each(|n| tracing::warn!(n, "signal lost"));
             let others = count.swap(0, Ordering::Relaxed);
             assert!((150..=155).contains(&others), "{others} of 1000 lines");
-            // Another kind of line has its own room.
+            // Another kind of line has its own bucket.
             tracing::info!("interface up");
             assert_eq!(count.swap(0, Ordering::Relaxed), 1);
             (0..1000).for_each(|n| tracing::warn!(rule = ?"soc_low", n, "alarm raised"));

@@ -1,4 +1,4 @@
-//! The core with its journal, its log and the files round it: one input in, what comes of it handed on.
+//! The core with its journal, its log, its files and its store. In: one input. Out: its frames and events, dispatched.
 
 use std::io::{self, Write};
 use std::path::Path;
@@ -6,7 +6,7 @@ use std::path::Path;
 use tokio::sync::watch;
 use tokio::time::Instant;
 
-use super::readiness::{Readiness, restored_words};
+use super::readiness::{Readiness, describe_restored};
 use super::{Service, ServiceError};
 use crate::io::background_file::BackgroundFile;
 use crate::io::candump::{self, StampDigits};
@@ -18,11 +18,11 @@ use crate::io::socket::LinkOutput;
 use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
 use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
-use crate::status::document::Store as StoreStatus;
+use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{Candidate, DATABASE_SOURCE, Progress, Store, with_suffix};
+use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress, with_suffix};
 
-/// The core, its journal and its log.
+/// The core with everything that receives its outputs.
 #[derive(Debug)]
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
@@ -32,40 +32,40 @@ pub(super) struct Engine {
     events: Option<BackgroundFile>,
     names: Vec<String>,
     log: EventLog,
-    /// A file was given up.
-    lost_file: bool,
+    /// A file failed and was closed.
+    has_lost_file: bool,
     /// State and history.
     store: Option<Store>,
-    /// Whether they can be written.
+    /// Whether the store can be written.
     store_works: bool,
-    /// What the core was told last of all this.
-    told_works: Option<bool>,
-    hold: CommitBarrier,
+    /// Whether files can be written, as last reported to the core.
+    reported_works: Option<bool>,
+    barrier: CommitBarrier,
     /// Frames have come since the last checkpoint.
     is_fresh: bool,
     pub(super) readiness: Readiness,
-    /// For those who look.
+    /// The latest events, for the status document.
     pub(super) recent: RecentEvents,
-    /// What the store has told; `None` = nothing so far.
-    progress: Option<Progress>,
-    /// Announcements that did not wait for it any longer.
+    /// Progress of the store; `None` = not reported yet.
+    progress: Option<StoreProgress>,
+    /// Announcements that were sent before they were stored.
     late: u64,
 }
 
 impl Engine {
-    /// The core and the files round it.
+    /// Opens store and files, and restores the state.
     pub(super) fn new(service: &mut Service, clock: MappedClock) -> Result<Self, ServiceError> {
         let (store, found) = Store::open(&service.state, &service.config.store).map_err(ServiceError::Store)?;
         let names = service.config.interface_names();
         let mut monitor = Monitor::new(service.config.monitor.clone());
         let now = clock.now();
         let mut stamped_s = 0.0;
-        // Before any file is opened: a start that fails leaves what an earlier run has recorded.
-        let (away, unfit) = if let Some(snapshot) = service.restore.take() {
+        // Before any file is opened: a failed start keeps the recording of an earlier run.
+        let (downtime, unfit) = if let Some(snapshot) = service.restore.take() {
             stamped_s = now.since(snapshot.time);
-            monitor.restore(snapshot, service.away)?;
-            tracing::info!(away = %service.away, stamped_s, "state taken up");
-            (Some(service.away), None)
+            monitor.restore(snapshot, service.downtime)?;
+            tracing::info!(away = %service.downtime, stamped_s, "state restored");
+            (Some(service.downtime), None)
         } else {
             restore_first_valid(&mut monitor, found.states, service.record.as_deref())
         };
@@ -73,19 +73,19 @@ impl Engine {
             store.set_state_aside(why, now);
         }
         let mut record = open_journal(service.record.as_deref(), &names)?;
-        let mut lost_file = false;
-        let marked = record.as_mut().zip(away).map(|(journal, away)| journal.restored(now, away));
+        let mut has_lost_file = false;
+        let marked = record.as_mut().zip(downtime).map(|(journal, downtime)| journal.restored(now, downtime));
         if let Some(Err(error)) = marked {
             tracing::error!(%error, "recording stopped");
-            (record, lost_file) = (None, true);
+            (record, has_lost_file) = (None, true);
         }
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
-        let restored = away.map(|away| match away {
-            Downtime::Seconds(age_s) => restored_words(Some(age_s)),
-            Downtime::AsStamped => restored_words(Some(stamped_s).filter(|age_s| *age_s >= 0.0)),
-            Downtime::Unknown => restored_words(None),
+        let restored = downtime.map(|downtime| match downtime {
+            Downtime::Seconds(age_s) => describe_restored(Some(age_s)),
+            Downtime::AsStamped => describe_restored(Some(stamped_s).filter(|age_s| *age_s >= 0.0)),
+            Downtime::Unknown => describe_restored(None),
         });
         let readiness = Readiness::new(&names, service.ready_timeout, restored, Instant::now());
         Ok(Self {
@@ -97,11 +97,11 @@ impl Engine {
             names,
             log,
             readiness,
-            lost_file,
+            has_lost_file,
             store,
             store_works: found.works && unfit.is_none(),
-            told_works: None,
-            hold: CommitBarrier::default(),
+            reported_works: None,
+            barrier: CommitBarrier::default(),
             is_fresh: false,
             recent: RecentEvents::default(),
             progress: None,
@@ -109,7 +109,7 @@ impl Engine {
         })
     }
 
-    /// Journals one input, hands it to the core, and hands on what comes of it.
+    /// Journals one input, passes it to the core and dispatches its outputs.
     pub(super) fn handle(&mut self, input: &Input<'_>, links: &[LinkOutput]) {
         if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.append(input)) {
             self.stop_recording(&error);
@@ -120,10 +120,10 @@ impl Engine {
         self.dispatch_outputs(input.time(), links);
     }
 
-    /// Gives the core another configuration; the journal says that it did.
+    /// Gives the core another configuration, and journals that.
     ///
     /// # Errors
-    /// Why the core does not take it; then nothing has changed.
+    /// Why the core rejects it; then nothing has changed.
     pub(super) fn reconfigure(
         &mut self,
         config: MonitorConfig,
@@ -140,53 +140,53 @@ impl Engine {
         Ok(changed)
     }
 
-    /// What came out of the core: frames to the interfaces, events to the log, both to their files.
+    /// Sends the core's frames to the interfaces and its events to the log, and both to their files.
     fn dispatch_outputs(&mut self, time: Timestamp, links: &[LinkOutput]) {
-        self.keep(time);
+        self.commit_learned(time);
         for transmit in &self.outputs.frames {
-            if !self.hold.take(transmit) {
+            if !self.barrier.hold(transmit) {
                 send(links, transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
                 |file: &mut _| candump::write_line(file, transmit.time, StampDigits::Nanos, name, &transmit.frame);
-            self.lost_file |= write_or_stop(&mut self.frames, "frames", write);
+            self.has_lost_file |= write_or_stop(&mut self.frames, "frames", write);
         }
         for event in &self.outputs.events {
             self.log.log(event);
             self.readiness.note(event);
             self.recent.note(event);
-            self.lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
+            self.has_lost_file |= write_or_stop(&mut self.events, "events", |file| event_log::write_line(file, event));
         }
     }
 
-    /// Makes what was learned durable; its announcement waits for that. A store that fails is not waited for.
-    fn keep(&mut self, now: Timestamp) {
+    /// Commits learned results; their announcement waits for the commit, unless the store has failed.
+    fn commit_learned(&mut self, now: Timestamp) {
         let Some(store) = &mut self.store else { return };
         let ticket = store.learned(&self.outputs.events, &self.monitor, now);
         if let Some(ticket) = ticket.filter(|_| self.store_works) {
-            self.hold.begin(ticket, Instant::now());
+            self.barrier.begin(ticket, Instant::now());
         }
     }
 
-    /// How far the store is, told whenever that changes; `None` = there is none.
-    pub(super) fn store_progress(&self) -> Option<watch::Receiver<Progress>> {
+    /// The progress of the store, with every change; `None` = there is no store.
+    pub(super) fn store_progress(&self) -> Option<watch::Receiver<StoreProgress>> {
         self.store.as_ref().map(Store::progress)
     }
 
-    /// The store has come further, or has failed.
-    pub(super) fn settle(&mut self, progress: Progress, time: Timestamp, links: &[LinkOutput]) {
-        self.hold.release(progress.ticket, |transmit| send(links, transmit));
+    /// Handles progress or failure of the store.
+    pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp, links: &[LinkOutput]) {
+        self.barrier.release(progress.ticket, |transmit| send(links, transmit));
         self.store_works = progress.works;
         self.progress = Some(progress);
-        self.tell_works(time, links);
+        self.report_store_health(time, links);
     }
 
-    /// The store, for those who look.
+    /// The store, for the status document.
     pub(super) fn store_status(&self) -> Option<StoreStatus> {
         let path = match &self.store {
             Some(store) => store.folder().display().to_string(),
-            // One that cannot be opened is told as such, not as "none".
+            // A store that cannot be opened is reported as such, not as "none".
             None if !self.store_works => String::new(),
             None => return None,
         };
@@ -202,15 +202,15 @@ impl Engine {
         })
     }
 
-    /// Nothing waits any longer: the daemon stops.
-    pub(super) fn let_go(&mut self, links: &[LinkOutput]) {
-        self.hold.release(u64::MAX, |transmit| send(links, transmit));
+    /// Sends all held frames: the daemon stops.
+    pub(super) fn release_all(&mut self, links: &[LinkOutput]) {
+        self.barrier.release(u64::MAX, |transmit| send(links, transmit));
     }
 
-    /// With every tick: what has waited too long goes, and the store gets its checkpoints.
-    pub(super) fn look_after_store(&mut self, time: Timestamp, links: &[LinkOutput]) {
-        if let Some(ticket) = self.hold.overdue(Instant::now()) {
-            self.hold.release(ticket, |transmit| send(links, transmit));
+    /// Sends frames that have waited too long, and gives the store its checkpoints; called with every tick.
+    pub(super) fn poll_store(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        if let Some(ticket) = self.barrier.overdue(Instant::now()) {
+            self.barrier.release(ticket, |transmit| send(links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
             self.late += 1;
             self.store_works = false;
@@ -220,20 +220,20 @@ impl Engine {
         {
             self.is_fresh = false;
         }
-        self.tell_works(time, links);
+        self.report_store_health(time, links);
     }
 
-    /// Tells the core when it has changed whether files can be written.
-    pub(super) fn tell_works(&mut self, time: Timestamp, links: &[LinkOutput]) {
-        // The journal may be the file that is lost: the core is told all the same.
-        let works = self.store_works && !self.lost_file;
-        if self.told_works != Some(works) {
-            self.told_works = Some(works);
+    /// Reports to the core whether files can be written, when that has changed.
+    pub(super) fn report_store_health(&mut self, time: Timestamp, links: &[LinkOutput]) {
+        // The lost file may be the journal; the core gets the input anyway.
+        let works = self.store_works && !self.has_lost_file;
+        if self.reported_works != Some(works) {
+            self.reported_works = Some(works);
             self.handle(&Input::Store { time, works }, links);
         }
     }
 
-    /// The last state, on the disk.
+    /// Writes the last state to the disk.
     pub(super) fn close_store(&mut self, time: Timestamp) {
         if let Some(store) = self.store.take() {
             store.finish(&self.monitor, time);
@@ -242,15 +242,15 @@ impl Engine {
 
     fn stop_recording(&mut self, error: &io::Error) {
         tracing::error!(%error, "recording stopped");
-        (self.record, self.lost_file) = (None, true);
+        (self.record, self.has_lost_file) = (None, true);
     }
 
     pub(super) fn flush(&mut self) {
         if let Some(Err(error)) = self.record.as_mut().map(JournalWriter::flush) {
             self.stop_recording(&error);
         }
-        self.lost_file |= write_or_stop(&mut self.frames, "frames", Write::flush);
-        self.lost_file |= write_or_stop(&mut self.events, "events", Write::flush);
+        self.has_lost_file |= write_or_stop(&mut self.frames, "frames", Write::flush);
+        self.has_lost_file |= write_or_stop(&mut self.events, "events", Write::flush);
     }
 
     pub(super) fn close_files(&mut self) {
@@ -271,24 +271,24 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
     }
 }
 
-/// Takes up the first of the stored states that fits; how old it is, and why the database's was not, if it does not fit.
-/// Beside a journal goes what it began from.
+/// Restores the first stored state that validates. Returns its age, and why the database's state does not fit, if it does
+/// not. Writes the state next to a journal, which starts from it.
 fn restore_first_valid(
     monitor: &mut Monitor,
-    states: Vec<Candidate>,
+    states: Vec<StateCandidate>,
     journal: Option<&Path>,
 ) -> (Option<Downtime>, Option<String>) {
     let mut unfit = None;
-    for Candidate { snapshot, away, source } in states {
-        let beside = journal.map(|path| with_suffix(path, ".state.json"));
-        let written = beside.as_deref().map(|path| snapshot_file::write(path, &snapshot));
-        match monitor.restore(snapshot, away) {
+    for StateCandidate { snapshot, downtime, source } in states {
+        let copy = journal.map(|path| with_suffix(path, ".state.json"));
+        let written = copy.as_deref().map(|path| snapshot_file::write(path, &snapshot));
+        match monitor.restore(snapshot, downtime) {
             Ok(()) => {
-                tracing::info!(source, %away, "state taken up");
+                tracing::info!(source, away = %downtime, "state restored");
                 if let Some(Err(error)) = written {
-                    tracing::error!(%error, "the state this record begins from is not beside it");
+                    tracing::error!(%error, "the state from which this record starts was not written next to it");
                 }
-                return (Some(away), unfit);
+                return (Some(downtime), unfit);
             }
             Err(error) => {
                 tracing::error!(source, %error, "a stored state does not fit and is not used");
@@ -300,14 +300,14 @@ fn restore_first_valid(
     (None, unfit)
 }
 
-/// Writes to a file, if it is still wanted; one that cannot be written is given up, and the daemon goes on: then true.
+/// Writes to a file, if there is one. A file that cannot be written is closed; then returns `true`.
 fn write_or_stop(
     file: &mut Option<BackgroundFile>,
     what: &str,
     write: impl FnOnce(&mut BackgroundFile) -> io::Result<()>,
 ) -> bool {
     let Some(Err(error)) = file.as_mut().map(write) else { return false };
-    tracing::error!(what, %error, "file given up");
+    tracing::error!(what, %error, "file closed: it cannot be written");
     *file = None;
     true
 }

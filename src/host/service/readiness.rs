@@ -1,8 +1,8 @@
-//! What the service manager is told: when the service is ready, and in one line how it is.
+//! Determines the reports to the service manager: readiness, and a status line.
 //!
-//! Ready means: the configuration is good, and the first usable reading came, or the wait for it is over. The line
-//! names what is not as it should be, and is told anew when it has changed, at most every [`STATUS_PERIOD`]. Times are
-//! the caller's; what is to be told is returned, so that this file needs no service manager.
+//! The service is ready when the configuration is good and the first usable reading has come or the wait for it is over.
+//! The line names every problem; it is reported when it changes, at most every [`STATUS_PERIOD`]. The caller passes the
+//! times and sends the returned reports, so this file needs no service manager.
 
 use std::time::Duration;
 
@@ -13,26 +13,26 @@ use crate::quantity::Channel;
 
 /// Longest wait for the first reading, s; the unit's `TimeoutStartSec` is longer.
 pub const MAX_READY_TIMEOUT_S: f64 = 60.0;
-/// Usual wait, s: ten times what a bus needs to wake, short enough that nobody takes the start for hung.
+/// Default wait, s: ten times as long as a bus needs to wake, and too short to look like a hung start.
 pub const DEFAULT_READY_TIMEOUT_S: f64 = 10.0;
-/// The line is told at most this often.
+/// Least time between two reports of the line.
 const STATUS_PERIOD: Duration = Duration::from_secs(1);
-/// Signals named in the line; of the rest, how many.
+/// Signals named in the line; the rest is counted.
 const MAX_NAMED: usize = 3;
 /// Longest line, bytes: a datagram to the service manager carries more, a terminal does not show more.
 const MAX_LINE: usize = 1500;
 
-/// An interface, as last heard of.
+/// The last state of an interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Interface {
-    /// Nothing was heard yet.
+enum InterfaceState {
+    /// No event yet.
     Unknown,
     Up,
     Down,
     Missing,
 }
 
-/// What the service manager is to be told now.
+/// A report to the service manager.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct ManagerUpdate {
     /// The service is ready.
@@ -44,30 +44,30 @@ pub(super) struct ManagerUpdate {
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Readiness {
-    interfaces: Vec<(String, Interface)>,
+    interfaces: Vec<(String, InterfaceState)>,
     began: Instant,
     timeout: Duration,
-    /// How long after the start the first usable reading came.
+    /// Time from the start to the first usable reading.
     first_after: Option<Duration>,
     is_ready: bool,
     lost: Vec<Channel>,
     inputs: usize,
     store_works: bool,
-    /// Why the last reload was refused.
+    /// Why the last reload was rejected.
     refused: Option<String>,
-    /// What is told of the state that was taken up.
+    /// Words about the restored state.
     restored: Option<String>,
-    told: String,
-    told_at: Option<Instant>,
-    /// Something the line speaks of has changed since it was last made: most ticks make none.
+    reported: String,
+    reported_at: Option<Instant>,
+    /// A subject of the line has changed since it was built: most ticks build none.
     is_changed: bool,
 }
 
 impl Readiness {
-    /// Of a service that starts now with these interfaces and waits this long for its first reading.
+    /// Readiness of a service that starts now with these interfaces and waits this long for its first reading.
     pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
         Self {
-            interfaces: names.iter().map(|name| (name.clone(), Interface::Unknown)).collect(),
+            interfaces: names.iter().map(|name| (name.clone(), InterfaceState::Unknown)).collect(),
             began: now,
             timeout,
             first_after: None,
@@ -77,20 +77,20 @@ impl Readiness {
             store_works: true,
             refused: None,
             restored,
-            told: String::new(),
-            told_at: None,
+            reported: String::new(),
+            reported_at: None,
             is_changed: true,
         }
     }
 
-    /// Takes what the core tells.
+    /// Notes an event of the core.
     pub(super) fn note(&mut self, event: &Event) {
         match event.kind {
             EventKind::Bus { bus, what } => {
                 let state = match what {
-                    BusEvent::Up => Interface::Up,
-                    BusEvent::Down => Interface::Down,
-                    BusEvent::Missing => Interface::Missing,
+                    BusEvent::Up => InterfaceState::Up,
+                    BusEvent::Down => InterfaceState::Down,
+                    BusEvent::Missing => InterfaceState::Missing,
                     BusEvent::Dropped { .. } | BusEvent::ErrorFrame { .. } | BusEvent::SendFailed { .. } => return,
                 };
                 if let Some(interface) = self.interfaces.get_mut(bus.index()) {
@@ -103,42 +103,42 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// Takes how a reload went: `None` = well, else why not.
+    /// Notes the result of a reload; `refused` = why it was rejected.
     pub(super) fn note_reload(&mut self, refused: Option<String>) {
         self.refused = refused;
         self.is_changed = true;
     }
 
-    /// Looks at the core; gives what is to be told.
+    /// Checks the core; returns the report that is due.
     pub(super) fn poll(&mut self, monitor: &Monitor, now: Instant) -> ManagerUpdate {
         let waited = now.duration_since(self.began);
         if self.first_after.is_none() && monitor.has_heard() {
             self.first_after = Some(waited);
             self.is_changed = true;
         }
-        let is_due = self.told_at.is_none_or(|told_at| now.duration_since(told_at) >= STATUS_PERIOD);
+        let is_due = self.reported_at.is_none_or(|reported_at| now.duration_since(reported_at) >= STATUS_PERIOD);
         let ready = !self.is_ready && (self.first_after.is_some() || waited >= self.timeout);
         if !is_due && !ready {
             return ManagerUpdate::default();
         }
         self.is_ready |= ready;
         self.is_changed |= ready;
-        self.look(monitor);
+        self.check_inputs(monitor);
         ManagerUpdate { ready, status: self.new_line(now) }
     }
 
-    /// What changed just now is told at once: the line, when it is another than was told.
-    pub(super) fn tell_now(&mut self, monitor: &Monitor, now: Instant) -> Option<String> {
-        self.look(monitor);
+    /// The line, if it has changed, without waiting for the period.
+    pub(super) fn line_now(&mut self, monitor: &Monitor, now: Instant) -> Option<String> {
+        self.check_inputs(monitor);
         self.new_line(now)
     }
 
-    /// Whether the service manager was told that the service is ready.
+    /// Whether readiness was reported.
     pub(super) fn is_ready(&self) -> bool {
         self.is_ready
     }
 
-    fn look(&mut self, monitor: &Monitor) {
+    fn check_inputs(&mut self, monitor: &Monitor) {
         if self.inputs == monitor.inputs() && monitor.lost_inputs().eq(self.lost.iter().copied()) {
             return;
         }
@@ -148,17 +148,17 @@ impl Readiness {
         self.is_changed = true;
     }
 
-    /// The line, when it is another than was told.
+    /// The line, if it differs from the one reported last.
     fn new_line(&mut self, now: Instant) -> Option<String> {
         if !std::mem::take(&mut self.is_changed) {
             return None;
         }
         let line = self.line();
-        if line == self.told {
+        if line == self.reported {
             return None;
         }
-        self.told.clone_from(&line);
-        self.told_at = Some(now);
+        self.reported.clone_from(&line);
+        self.reported_at = Some(now);
         Some(line)
     }
 
@@ -194,13 +194,13 @@ impl Readiness {
         let mut problems = Vec::new();
         for (name, interface) in &self.interfaces {
             match interface {
-                Interface::Missing => problems.push(format!("{name} is missing")),
-                Interface::Down => problems.push(format!("{name} is down")),
-                Interface::Up | Interface::Unknown => {}
+                InterfaceState::Missing => problems.push(format!("{name} is missing")),
+                InterfaceState::Down => problems.push(format!("{name} is down")),
+                InterfaceState::Up | InterfaceState::Unknown => {}
             }
         }
         if !self.lost.is_empty() && self.first_after.is_some() {
-            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| words(channel)).collect();
+            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| signal_name(channel)).collect();
             if self.lost.len() > MAX_NAMED {
                 names.push("...".to_owned());
             }
@@ -214,16 +214,16 @@ impl Readiness {
     }
 }
 
-/// What is told of a state of that age, s.
-pub(super) fn restored_words(age_s: Option<f64>) -> String {
+/// Words about a restored state of that age, s.
+pub(super) fn describe_restored(age_s: Option<f64>) -> String {
     match age_s {
-        Some(age_s) => format!("restored state {} old", words_s(age_s)),
+        Some(age_s) => format!("restored state {} old", describe_duration(age_s)),
         None => "restored state of unknown age".to_owned(),
     }
 }
 
-/// A time as people say it.
-fn words_s(seconds: f64) -> String {
+/// A duration in words.
+fn describe_duration(seconds: f64) -> String {
     const DAY_S: f64 = 86_400.0;
     match seconds {
         s if s < 120.0 => format!("{s:.0} s"),
@@ -233,8 +233,8 @@ fn words_s(seconds: f64) -> String {
     }
 }
 
-/// A signal as people say it; cells and sensors count from 1.
-fn words(channel: Channel) -> String {
+/// A signal in words; cells and sensors count from 1.
+fn signal_name(channel: Channel) -> String {
     match channel {
         Channel::Current => "current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", sensor.index() + 1),
@@ -246,7 +246,7 @@ fn words(channel: Channel) -> String {
     }
 }
 
-/// Without control characters (a line feed would begin another assignment), and no longer than `limit` bytes.
+/// Replaces control characters (a line feed would start another assignment) and shortens to `limit` bytes.
 pub(super) fn one_line(text: &str, limit: usize) -> String {
     let line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
     if line.len() <= limit {

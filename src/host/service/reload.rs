@@ -1,9 +1,9 @@
-//! SIGHUP: the configuration is read again, beside the loop; a bad one is refused and the old one stays.
+//! Reloads the configuration on SIGHUP, outside the loop. A bad configuration is rejected and the old one stays.
 //!
-//! One file is read at a time, and signals that come meanwhile make one more reading when it is done, at least
-//! [`MIN_PERIOD`] after the last one began: a storm of signals neither fills the log nor holds up the loop, and the file
-//! as it was at the last signal is what holds in the end. What the sockets and files are made of needs a restart and is
-//! refused with that word; what the core takes over is [`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)'s to say.
+//! Reads one file at a time. Signals during a reading cause one further reading, at least [`MIN_PERIOD`] after the start
+//! of the last: a storm of signals neither fills the log nor blocks the loop, and the file as of the last signal applies in
+//! the end. A change of interfaces or store needs a restart and is rejected with that word; the core decides about the rest
+//! ([`Monitor::reconfigure`](crate::monitor::Monitor::reconfigure)).
 
 use std::fmt;
 use std::io;
@@ -11,57 +11,54 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until};
 
-use super::live::Loop;
-use super::{Engine, notify};
 use crate::config::{self, Config, InterfaceConfig, StoreConfig};
 use crate::monitor::{MonitorConfig, Reconfigured};
 use crate::status::document::ConfigFile;
 
-/// Readings of the file begin at least this far apart.
+/// Least time between two readings of the file.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
-/// Faults told one by one: a file that is something else altogether has thousands.
+/// Faults logged one by one: a file of another kind has thousands.
 const MAX_FAULTS_LOGGED: usize = 50;
 
-/// What happened.
+/// A step of a reload.
 #[derive(Debug)]
-pub(super) enum Step {
-    /// A reload was asked for; what follows is [`Step::Read`], sooner or later.
-    Asked,
-    /// The file was read: what the core is to take over, or every fault.
-    Read(Result<Box<Configuration>, Vec<String>>),
+pub(super) enum ReloadStep {
+    /// A signal came; [`ReloadStep::Read`] follows.
+    Requested,
+    /// The file was read: the new configuration, or every fault.
+    Read(Result<Box<LoadedConfig>, Vec<String>>),
 }
 
-/// What was read.
+/// A configuration that was read.
 #[derive(Debug)]
-pub(super) struct Configuration {
-    monitor: MonitorConfig,
-    /// For those who look.
-    file: Option<ConfigFile>,
+pub(super) struct LoadedConfig {
+    pub(super) monitor: MonitorConfig,
+    /// The file, for the status document.
+    pub(super) file: Option<ConfigFile>,
 }
 
 /// The task that reads.
-type Reading = JoinHandle<Result<Box<Configuration>, Vec<String>>>;
+type LoadTask = JoinHandle<Result<Box<LoadedConfig>, Vec<String>>>;
 
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Reload {
     hangup: Signal,
     path: PathBuf,
-    fixed: Arc<Fixed>,
-    reading: Option<Reading>,
-    /// A signal came that no reading has answered yet.
-    is_asked: bool,
-    /// Before this nothing is read.
+    fixed: Arc<FixedSettings>,
+    reading: Option<LoadTask>,
+    /// A signal waits for a reading.
+    is_requested: bool,
+    /// Earliest start of the next reading.
     not_before: Instant,
 }
 
 impl Reload {
-    /// From here on SIGHUP does not end the program. Must be called inside the runtime.
+    /// Catches SIGHUP, which no longer ends the program. Must be called inside the runtime.
     ///
     /// # Errors
     /// When the signal cannot be caught.
@@ -69,69 +66,72 @@ impl Reload {
         Ok(Self {
             hangup: signal(SignalKind::hangup())?,
             path: running.path.clone(),
-            fixed: Arc::new(Fixed::of(running)),
+            fixed: Arc::new(FixedSettings::of(running)),
             reading: None,
-            is_asked: false,
+            is_requested: false,
             not_before: Instant::now(),
         })
     }
 
-    /// Waits for the next step; nothing is lost when it is dropped and asked for again.
-    pub(super) async fn next(&mut self) -> Step {
+    /// Waits for the next step; safe to cancel.
+    pub(super) async fn next(&mut self) -> ReloadStep {
         loop {
             tokio::select! {
                 read = finished(&mut self.reading) => {
                     self.reading = None;
-                    return Step::Read(read);
+                    return ReloadStep::Read(read);
                 }
                 Some(()) = self.hangup.recv() => {
-                    if !std::mem::replace(&mut self.is_asked, true) && self.reading.is_none() {
-                        return Step::Asked;
+                    if !std::mem::replace(&mut self.is_requested, true) && self.reading.is_none() {
+                        return ReloadStep::Requested;
                     }
                 }
-                () = sleep_until(self.not_before), if self.is_asked && self.reading.is_none() => self.read(),
+                () = sleep_until(self.not_before), if self.is_requested && self.reading.is_none() => self.read(),
             }
         }
     }
 
-    /// Whether a reload is under way or waits.
+    /// Whether a reload runs or waits.
     pub(super) fn is_busy(&self) -> bool {
-        self.is_asked || self.reading.is_some()
+        self.is_requested || self.reading.is_some()
     }
 
     fn read(&mut self) {
-        self.is_asked = false;
+        self.is_requested = false;
         self.not_before = Instant::now() + MIN_PERIOD;
         let (path, fixed) = (self.path.clone(), Arc::clone(&self.fixed));
         // A large DBC takes longer than a tick.
         self.reading = Some(tokio::task::spawn_blocking(move || {
             let new = config::load(&path).map_err(|faults| faults.0)?;
             fixed.check(&new).map_err(|why| vec![why])?;
-            Ok(Box::new(Configuration { monitor: new.monitor, file: ConfigFile::of(&path) }))
+            Ok(Box::new(LoadedConfig { monitor: new.monitor, file: ConfigFile::of(&path) }))
         }));
     }
 }
 
-async fn finished(reading: &mut Option<Reading>) -> Result<Box<Configuration>, Vec<String>> {
+async fn finished(reading: &mut Option<LoadTask>) -> Result<Box<LoadedConfig>, Vec<String>> {
     match reading {
         None => std::future::pending().await,
         Some(reading) => reading.await.unwrap_or_else(|error| Err(vec![format!("cannot be read: {error}")])),
     }
 }
 
-/// What cannot change while the service runs and the core does not know: the interfaces' names and kinds, the store.
+/// Settings outside the core that cannot change while the service runs: the interfaces' names and kinds, the store.
 #[derive(Debug)]
-struct Fixed {
+struct FixedSettings {
     interfaces: Vec<InterfaceConfig>,
     store: StoreConfig,
 }
 
-impl Fixed {
+impl FixedSettings {
     fn of(config: &Config) -> Self {
         Self { interfaces: config.interfaces.clone(), store: config.store }
     }
 
-    /// Why `new` cannot be taken over, if it cannot.
+    /// Checks whether `new` can be applied.
+    ///
+    /// # Errors
+    /// The setting that needs a restart.
     fn check(&self, new: &Config) -> Result<(), String> {
         let new = Self::of(new);
         if self.interfaces != new.interfaces {
@@ -144,7 +144,7 @@ impl Fixed {
     }
 }
 
-impl fmt::Display for Fixed {
+impl fmt::Display for FixedSettings {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, interface) in self.interfaces.iter().enumerate() {
             let (comma, fd) = (if index > 0 { ", " } else { "" }, if interface.fd { " (FD)" } else { "" });
@@ -154,49 +154,11 @@ impl fmt::Display for Fixed {
     }
 }
 
-impl Loop {
-    /// Does what a step of a reload asks for, and tells the service manager.
-    pub(super) async fn handle_reload(&mut self, step: Step) {
-        let read = match step {
-            Step::Asked => return self.tell_reloading(),
-            Step::Read(read) => read,
-        };
-        // What came before it is judged by the old configuration.
-        self.drain().await;
-        let time = self.clock.now();
-        let mut file = None;
-        let taken = read.and_then(|config| {
-            file = config.file;
-            self.engine.reconfigure(config.monitor, time, &self.outputs)
-        });
-        log_outcome(&taken);
-        self.status_publisher.note_reload(if taken.is_ok() { Ok(file) } else { Err(()) });
-        let Engine { readiness, monitor, .. } = &mut self.engine;
-        readiness.note_reload(taken.err().map(|faults| faults.join("; ")));
-        let told = readiness.tell_now(monitor, Instant::now());
-        // With a further reload waiting, that one's end is the end.
-        let ready = (readiness.is_ready() && !self.reload.is_busy()).then_some(NotifyState::Ready);
-        let status = told.as_deref().map(NotifyState::Status);
-        notify(&ready.into_iter().chain(status).collect::<Vec<_>>());
-    }
-
-    fn tell_reloading(&self) {
-        // Before the service is ready the manager must not take the end of a reload for it.
-        if !self.engine.readiness.is_ready() {
-            return;
-        }
-        let mut states = vec![NotifyState::Reloading];
-        // Version 253 and later want to know when; the clock cannot fail.
-        states.extend(NotifyState::monotonic_usec_now());
-        notify(&states);
-    }
-}
-
-/// Every fault by itself, up to a limit.
-fn log_outcome(taken: &Result<Reconfigured, Vec<String>>) {
+/// Logs the result of a reload, each fault separately up to a limit.
+pub(super) fn log_outcome(taken: &Result<Reconfigured, Vec<String>>) {
     match taken {
         Ok(Reconfigured { changed, alarms_ended }) => {
-            tracing::info!(changed = changed.join(", "), alarms_ended, "configuration taken over");
+            tracing::info!(changed = changed.join(", "), alarms_ended, "configuration applied");
         }
         Err(faults) => {
             for fault in faults.iter().take(MAX_FAULTS_LOGGED) {
@@ -221,10 +183,10 @@ mod tests {
     }
 
     #[test]
-    fn another_threshold_is_taken_over() {
+    fn another_threshold_is_applied() {
         let (old, mut new) = (example(), example());
         new.monitor.rules[0].threshold *= 0.5;
-        assert_eq!(Fixed::of(&old).check(&new), Ok(()));
+        assert_eq!(FixedSettings::of(&old).check(&new), Ok(()));
     }
 
     #[test]
@@ -232,7 +194,9 @@ mod tests {
         let (old, mut new) = (example(), example());
         new.store.checkpoint_s *= 2.0;
         assert!(
-            Fixed::of(&old).check(&new).is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
+            FixedSettings::of(&old)
+                .check(&new)
+                .is_err_and(|why| why.contains("[store]") && why.contains("needs a restart"))
         );
     }
 
@@ -240,7 +204,7 @@ mod tests {
     fn another_interface_needs_a_restart_and_is_named() {
         let (old, mut new) = (example(), example());
         new.interfaces[0].name = "can7".to_owned();
-        let why = Fixed::of(&old).check(&new).expect_err("another interface");
+        let why = FixedSettings::of(&old).check(&new).expect_err("another interface");
         assert_eq!(why, format!("interfaces = can7, running with {}: needs a restart", old.interfaces[0].name));
     }
 }

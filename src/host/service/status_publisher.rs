@@ -1,73 +1,76 @@
-//! The loop's side of the status sockets: counts what the loop does, and once a second hands over what is to be told.
+//! Publishes the daemon's status once a second, and counts the work of the loop.
 
 use tokio::time::Instant;
 
 use super::engine::Engine;
-
 use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
-use crate::status::collect::{Before, Identity, Sources};
-use crate::status::counters::LoopCounters;
+use crate::status::PERIOD;
+use crate::status::StatusServer;
+use crate::status::collect::{CounterBaseline, ServiceIdentity, Sources};
+use crate::status::counters::{Latency, ServiceCounters};
 use crate::status::document::ConfigFile;
-use crate::status::{PERIOD, StatusServer};
 
-/// What the loop tells of itself.
+/// See the module.
 #[derive(Debug)]
 pub(super) struct StatusPublisher {
-    pub(super) server: Option<StatusServer>,
-    pub(super) identity: Identity,
-    pub(super) counters: LoopCounters,
-    told: Option<Instant>,
-    /// Of the first document: the first tick has taken the stored state up, and no frame was counted yet.
-    before: Option<Before>,
+    server: Option<StatusServer>,
+    identity: ServiceIdentity,
+    counters: ServiceCounters,
+    latency: Latency,
+    published: Option<Instant>,
+    /// Taken with the first document: the first tick has restored the stored state, and no frame was counted yet.
+    before: Option<CounterBaseline>,
 }
 
 impl StatusPublisher {
-    pub(super) fn new(server: Option<StatusServer>, identity: Identity) -> Self {
-        Self { server, identity, counters: LoopCounters::default(), told: None, before: None }
+    pub(super) fn new(server: Option<StatusServer>, identity: ServiceIdentity) -> Self {
+        let (counters, latency) = (ServiceCounters::default(), Latency::default());
+        Self { server, identity, counters, latency, published: None, before: None }
     }
 
-    /// A tick that was due then comes now.
+    /// Counts a tick that was due at `due`.
     pub(super) fn note_tick(&mut self, due: Instant) {
         self.counters.note_tick(due.elapsed().as_secs_f64(), f64::from(TICK_PERIOD_MS) / 1e3);
     }
 
-    /// The frames among these have their estimates now.
+    /// Counts the frames of a batch, which have their estimates at `now`.
     pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
-        frames.for_each(|received| self.counters.latency.record(now.since(received.time)));
+        frames.for_each(|received| self.latency.record(now.since(received.time)));
     }
 
-    /// The configuration was read again, and taken over (`Ok`) or not.
+    /// Counts a reload; `Ok` = the configuration was applied.
     pub(super) fn note_reload(&mut self, taken: Result<Option<ConfigFile>, ()>) {
         match taken {
             Ok(file) => {
-                self.counters.service.reloads += 1;
+                self.counters.reloads += 1;
                 self.identity.config = file;
             }
-            Err(()) => self.counters.service.reloads_refused += 1,
+            Err(()) => self.counters.reloads_refused += 1,
         }
     }
 
-    /// With a tick that was due then: hands a document over when it is time for one.
-    pub(super) fn tell(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
+    /// Publishes a document, if a period has passed at the tick that was due at `tick`.
+    pub(super) fn publish(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
-        if self.told.is_some_and(|told| tick.duration_since(told) < PERIOD) {
+        if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {
             return;
         }
-        self.told = Some(tick);
+        self.published = Some(tick);
         let sources = Sources {
             identity: &self.identity,
             monitor: &engine.monitor,
             links,
-            before: self.before.get_or_insert_with(|| Before::of(&engine.monitor)),
-            counters: &self.counters,
+            before: self.before.get_or_insert_with(|| CounterBaseline::of(&engine.monitor)),
+            counters: self.counters,
+            latency: &self.latency,
             clients: server.clients(),
             events: &engine.recent,
             store: engine.store_status(),
         };
         let is_taken = server.offer(sources.draft(now));
-        self.counters.service.documents_skipped += u64::from(!is_taken);
+        self.counters.documents_skipped += u64::from(!is_taken);
     }
 }

@@ -1,4 +1,4 @@
-//! What ends the loop: SIGTERM, SIGINT, or a time that was set.
+//! Ends the loop: on SIGTERM, on SIGINT, or after a set time.
 
 use std::io;
 use std::time::Duration;
@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::{Instant, sleep_until};
 
-/// What ends the loop.
+/// Waits for the end of the loop.
 #[derive(Debug)]
 pub(crate) struct Stop {
     terminate: Signal,

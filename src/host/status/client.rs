@@ -1,4 +1,4 @@
-//! The other end of the status socket: one document, blocking, within a bounded time.
+//! The client of the status socket: reads one document, blocking, within a bounded time.
 
 use std::io::{self, ErrorKind, Read};
 use std::os::unix::net::UnixStream;
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use serde::Deserialize;
 
-use super::document::{Document, VERSION};
+use super::document::{StatusDocument, VERSION};
 use super::{MAX_SILENCE, standard_path};
 
-/// A second longer than a daemon waits for a fresh document.
+/// Longest wait: a second longer than a daemon waits for a fresh document.
 pub const PATIENCE: Duration = Duration::from_secs(1 + MAX_SILENCE.as_secs());
 /// Longest document, bytes: 1,024 cells and as many alarms are under 1 MB.
 pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;
@@ -18,20 +18,20 @@ pub const MAX_DOCUMENT_BYTES: usize = 8 << 20;
 /// A daemon's status socket.
 #[derive(Debug, Clone)]
 pub struct StatusClient {
-    /// Where.
+    /// Its path.
     pub path: PathBuf,
 }
 
 impl StatusClient {
-    /// At `path`; `None` = where a daemon makes it when nobody says where.
+    /// The socket at `path`; `None` = at the standard path.
     pub fn new(path: Option<&Path>) -> Self {
         Self { path: path.map_or_else(standard_path, Path::to_owned) }
     }
 
-    /// The document as it came, a line of JSON.
+    /// Reads the document as a line of JSON.
     ///
     /// # Errors
-    /// When nobody tells it: which socket, and what to do.
+    /// When no daemon sends it: names the socket and the remedy.
     pub fn line(&self) -> Result<Vec<u8>, String> {
         self.read(PATIENCE).map_err(|error| explain(&self.path, &error))
     }
@@ -56,7 +56,7 @@ impl StatusClient {
     }
 }
 
-/// An error for a document that does not end.
+/// Rejects a document that does not end.
 pub fn check_length(bytes: usize) -> io::Result<()> {
     if bytes <= MAX_DOCUMENT_BYTES {
         return Ok(());
@@ -64,15 +64,15 @@ pub fn check_length(bytes: usize) -> io::Result<()> {
     Err(io::Error::new(ErrorKind::InvalidData, format!("a document of more than {MAX_DOCUMENT_BYTES} bytes")))
 }
 
-/// Why there is no document, for people.
+/// Explains why there is no document, and names the remedy.
 pub fn explain(path: &Path, error: &io::Error) -> String {
     let path = path.display();
     match error.kind() {
         ErrorKind::NotFound | ErrorKind::ConnectionRefused => format!(
-            "{path}: no daemon listens there; start one with \"packwatch run -c FILE --status {path}\", or say with \
-             --socket where it listens"
+            "{path}: no daemon listens there; start one with \"packwatch run -c FILE --status {path}\", or name its \
+             socket with --socket"
         ),
-        ErrorKind::PermissionDenied => format!("{path}: only root may look into the service's folder; try sudo"),
+        ErrorKind::PermissionDenied => format!("{path}: only root may read the service's folder; try sudo"),
         ErrorKind::WouldBlock | ErrorKind::TimedOut => format!("{path}: no document in time"),
         ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => {
             format!("{path}: the daemon has no document that is fresh, or too many clients")
@@ -81,11 +81,11 @@ pub fn explain(path: &Path, error: &io::Error) -> String {
     }
 }
 
-/// Reads a document.
+/// Parses a document.
 ///
 /// # Errors
-/// When it is none, or one of another version.
-pub fn parse(line: &[u8]) -> Result<Document, String> {
+/// When it is not a document, or of another version.
+pub fn parse(line: &[u8]) -> Result<StatusDocument, String> {
     #[derive(Deserialize)]
     struct Versioned {
         version: u32,

@@ -1,38 +1,37 @@
-//! Fills in the status document from the core, the interfaces and the loop's counts: structs are copied, nothing is
-//! written down here.
+//! Collects the status document from the core, the interfaces and the loop's counters: copies structs, serialises nothing.
 
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use super::counters::LoopCounters;
+use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
-    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, StatusCount, Store,
-    VERSION,
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
+    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 use super::server::Draft;
 use crate::can::flood::FloodCount;
 use crate::can::guard::GuardCounts;
 use crate::control::answer;
 use crate::filter::ScalarGaussian;
-use crate::health::{Remaining, RemainingLife};
+use crate::health::RemainingLife;
 use crate::io::clock::Reading;
 use crate::io::socket::{LinkCounters, LinkOutput};
 use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
 
-/// Events kept for those who look: a screenful.
+/// Events in the document: a screenful.
 const MAX_EVENTS: usize = 32;
 
-/// Half the width of an interval that holds the truth with 95 %, in standard deviations.
+/// Half the width of the 95 % interval, in standard deviations.
 const Z95: f64 = 1.96;
 
-/// The latest events, but those that come once per cell and half-cycle: they would leave nothing else.
+/// The latest events, without those that come once per cell and half-cycle: they would displace all others.
 #[derive(Debug, Default)]
 pub struct RecentEvents(VecDeque<Event>);
 
 impl RecentEvents {
-    /// Takes one.
+    /// Notes an event.
     pub fn note(&mut self, event: &Event) {
         if matches!(event.kind, EventKind::HalfCycle { .. } | EventKind::Capacity { .. }) {
             return;
@@ -44,17 +43,17 @@ impl RecentEvents {
     }
 }
 
-/// What stays the same while the daemon runs, or until its configuration is read again.
+/// Facts about the daemon that change only with a reload.
 #[derive(Debug, Clone)]
-pub struct Identity {
+pub struct ServiceIdentity {
     pub started: Timestamp,
     pub config: Option<ConfigFile>,
     pub interfaces: Vec<String>,
 }
 
-/// What had been counted before this program, by those whose counts are part of the stored state.
+/// Counts of earlier runs, which the stored state contains.
 #[derive(Debug, Clone, Default)]
-pub struct Before {
+pub struct CounterBaseline {
     statistics: Statistics,
     readings: ReadingCounts,
     time_backwards: u64,
@@ -62,15 +61,15 @@ pub struct Before {
     floods: Vec<FloodCount>,
 }
 
-impl Before {
-    /// As a monitor has it that has just taken up its stored state, if there is one. What it tells in the very tick in which
-    /// it does (an alarm about an input that has been silent meanwhile) counts as before.
+impl CounterBaseline {
+    /// The counts of a monitor that has just restored its state, if there is one. Events of the same tick (an alarm about an
+    /// input that was silent meanwhile) count as earlier.
     pub fn of(monitor: &Monitor) -> Self {
         let mut statistics = monitor.statistics().clone();
         if statistics.restores == 0 {
             return Self::default();
         }
-        // This one is this program's.
+        // This restore belongs to the present run.
         statistics.restores -= 1;
         Self {
             statistics,
@@ -82,30 +81,31 @@ impl Before {
     }
 }
 
-/// What a document is made of.
+/// The sources of a document.
 pub struct Sources<'a> {
-    pub identity: &'a Identity,
+    pub identity: &'a ServiceIdentity,
     pub monitor: &'a Monitor,
     pub links: &'a [LinkOutput],
-    pub before: &'a Before,
-    pub counters: &'a LoopCounters,
-    pub clients: Clients,
+    pub before: &'a CounterBaseline,
+    pub counters: ServiceCounters,
+    pub latency: &'a Latency,
+    pub clients: ClientCounts,
     pub events: &'a RecentEvents,
-    pub store: Option<Store>,
+    pub store: Option<StoreStatus>,
 }
 
 impl Sources<'_> {
-    /// The document, not yet written down.
+    /// Collects the document, not yet serialised.
     pub fn draft(self, now: Timestamp) -> Draft {
         let events = self.events.0.iter().copied().collect();
         Draft { document: self.document(now), events }
     }
 
-    fn document(self, now: Timestamp) -> Document {
+    fn document(self, now: Timestamp) -> StatusDocument {
         let Self { identity, monitor, before, counters, .. } = self;
         let pack = pack(monitor);
         let core = monitor.statistics().since(&before.statistics);
-        Document {
+        StatusDocument {
             version: VERSION,
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
             pid: std::process::id(),
@@ -119,18 +119,18 @@ impl Sources<'_> {
             pack,
             cells: monitor.cell_views().map(cell).collect(),
             alarms: alarms(monitor),
-            counters: Counters {
+            counters: StatusCounters {
                 core,
-                // By their index: another order of the interfaces would exchange their past.
+                // Counts of interfaces are by index: another order of the interfaces would exchange them.
                 lifetime: Statistics { buses: Vec::new(), ..monitor.statistics().clone() },
                 readings: monitor.reading_counts().since(&before.readings),
                 time_backwards: monitor.time_backwards().saturating_sub(before.time_backwards),
-                service: counters.service,
+                service: counters,
                 clients: self.clients,
             },
             protection: self.protection(),
             floods: self.floods(),
-            latency: counters.latency.document(),
+            latency: self.latency.clone(),
             store: self.store,
             events: Vec::new(),
         }
@@ -140,37 +140,37 @@ impl Sources<'_> {
         self.identity.interfaces.get(bus.index()).cloned().unwrap_or_default()
     }
 
-    fn interfaces(&self, core: &Statistics) -> Vec<Interface> {
+    fn interfaces(&self, core: &Statistics) -> Vec<InterfaceStatus> {
         let each = self.identity.interfaces.iter().zip(self.links).enumerate();
         each.map(|(bus, (name, link))| interface(name, link.counters(), core.buses.get(bus))).collect()
     }
 
-    fn protection(&self) -> Vec<Protected> {
+    fn protection(&self) -> Vec<MessageProtection> {
         let each = self.monitor.protected().map(|guard| {
             let before = self.before.protected.iter().find(|it| (it.bus, it.id) == (guard.bus, guard.id));
             let checks = guard.counts.iter().map(|(status, count)| {
                 let before = before.map_or(0, |before| before.counts.get(status));
                 StatusCount { status: status.name().to_owned(), count: count.saturating_sub(before) }
             });
-            Protected { interface: self.name(guard.bus), id: guard.id.to_string(), checks: checks.collect() }
+            MessageProtection { interface: self.name(guard.bus), id: guard.id.to_string(), checks: checks.collect() }
         });
         each.collect()
     }
 
-    fn floods(&self) -> Vec<Flooded> {
+    fn floods(&self) -> Vec<MessageFlood> {
         let each = self.monitor.dropped().map(|flood| {
             let before = self.before.floods.iter().find(|it| (it.bus, it.id) == (flood.bus, flood.id));
             let dropped = flood.dropped.saturating_sub(before.map_or(0, |before| before.dropped));
-            Flooded { interface: self.name(flood.bus), id: flood.id.to_string(), dropped }
+            MessageFlood { interface: self.name(flood.bus), id: flood.id.to_string(), dropped }
         });
         each.filter(|flood| flood.dropped > 0).collect()
     }
 }
 
-fn interface(name: &str, counters: &LinkCounters, core: Option<&BusStatistics>) -> Interface {
+fn interface(name: &str, counters: &LinkCounters, core: Option<&BusStatistics>) -> InterfaceStatus {
     let of = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
     let core = core.copied().unwrap_or_default();
-    Interface {
+    InterfaceStatus {
         name: name.to_owned(),
         state: counters.state(),
         reconnects: counters.reconnects(),
@@ -186,32 +186,37 @@ fn interface(name: &str, counters: &LinkCounters, core: Option<&BusStatistics>) 
     }
 }
 
-/// A number that is one.
+/// A finite number, or none.
 fn finite(value: f64) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-fn mean(belief: Option<&ScalarGaussian>) -> Option<f64> {
-    belief.and_then(|belief| finite(belief.mean))
+fn mean(estimate: Option<&ScalarGaussian>) -> Option<f64> {
+    estimate.and_then(|estimate| finite(estimate.mean))
 }
 
-fn std(belief: Option<&ScalarGaussian>) -> Option<f64> {
-    belief.and_then(|belief| finite(belief.std()))
+fn std(estimate: Option<&ScalarGaussian>) -> Option<f64> {
+    estimate.and_then(|estimate| finite(estimate.std()))
 }
 
-/// Cycles and days, as far as they are known.
-fn remaining(life: Option<RemainingLife>) -> (Option<Remaining>, Option<Remaining>) {
-    (life.and_then(|life| life.cycles), life.and_then(|life| life.days))
+/// The remaining life, as far as it is known.
+fn remaining(life: Option<RemainingLife>) -> RemainingStatus {
+    let (cycles, days) = (life.and_then(|life| life.cycles), life.and_then(|life| life.days));
+    RemainingStatus {
+        remaining_cycles: cycles.and_then(|cycles| finite(cycles.median)),
+        remaining_cycles_low: cycles.and_then(|cycles| finite(cycles.low)),
+        remaining_cycles_high: cycles.and_then(|cycles| finite(cycles.high)),
+        remaining_days: days.and_then(|days| finite(days.median)),
+    }
 }
 
-fn pack(monitor: &Monitor) -> Pack {
+fn pack(monitor: &Monitor) -> PackStatus {
     let view = monitor.pack_view();
     let soc = view.soc.as_ref();
     let edge = |sign: f64| soc.and_then(|soc| finite((soc.mean + sign * Z95 * soc.std()).clamp(0.0, 1.0)));
     let weakest = view.weakest.as_ref();
     let normalised = view.normalised_recharge_period.as_ref();
-    let (cycles, days) = remaining(view.remaining_life.map(|(_, life)| life));
-    Pack {
+    PackStatus {
         validity: view.validity,
         mode: view.mode,
         soc: mean(soc),
@@ -227,10 +232,7 @@ fn pack(monitor: &Monitor) -> Pack {
         capacity_std_ah: std(weakest.map(|(_, capacity)| capacity)),
         soh: view.soh.and_then(finite),
         shortest_lived_cell: view.remaining_life.map(|(cell, _)| cell.0),
-        remaining_cycles: cycles.map(|cycles| cycles.median).and_then(finite),
-        remaining_cycles_low: cycles.map(|cycles| cycles.low).and_then(finite),
-        remaining_cycles_high: cycles.map(|cycles| cycles.high).and_then(finite),
-        remaining_days: days.map(|days| days.median).and_then(finite),
+        remaining: remaining(view.remaining_life.map(|(_, life)| life)),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
         recharge_period_s: view.recharge_period_s.and_then(finite),
@@ -241,9 +243,8 @@ fn pack(monitor: &Monitor) -> Pack {
     }
 }
 
-fn cell(view: CellView) -> Cell {
-    let (cycles, days) = remaining(view.remaining_life.ok());
-    Cell {
+fn cell(view: CellView) -> CellStatus {
+    CellStatus {
         cell: view.cell.0,
         voltage_v: view.voltage_v.and_then(finite),
         current_a: view.current_a.and_then(finite),
@@ -254,10 +255,7 @@ fn cell(view: CellView) -> Cell {
         capacity_std_ah: std(view.capacity.as_ref()),
         usable_capacity_ah: mean(view.usable_capacity.as_ref()),
         usable_capacity_std_ah: std(view.usable_capacity.as_ref()),
-        remaining_cycles: cycles.map(|cycles| cycles.median).and_then(finite),
-        remaining_cycles_low: cycles.map(|cycles| cycles.low).and_then(finite),
-        remaining_cycles_high: cycles.map(|cycles| cycles.high).and_then(finite),
-        remaining_days: days.map(|days| days.median).and_then(finite),
+        remaining: remaining(view.remaining_life.ok()),
         remaining_unknown: view.remaining_life.err().map(|why| why.to_string()),
         resistance_ratio: mean(view.resistance_ratio.as_ref()),
         resistance_ratio_std: std(view.resistance_ratio.as_ref()),
@@ -265,10 +263,10 @@ fn cell(view: CellView) -> Cell {
     }
 }
 
-fn alarms(monitor: &Monitor) -> Alarms {
+fn alarms(monitor: &Monitor) -> AlarmStatus {
     let engine = monitor.alarms();
     let list = answer::alarm_list(engine, monitor.now(), false);
-    Alarms {
+    AlarmStatus {
         thresholds: list.thresholds,
         raised: engine.count(),
         highest_severity: engine.highest_severity(),

@@ -1,51 +1,22 @@
-//! What the loop counts about itself: how late it was, and how long frames waited for their estimate. Plain numbers, owned by
-//! the loop: nothing is allocated or locked per frame.
+//! Counters of the loop and of the status clients, and the latency of frames: plain numbers that the loop owns.
+//!
+//! In: the lateness of ticks and the latency of frames, s. Out: the structs as the status document has them. Nothing is
+//! allocated or locked per frame.
 
 use serde::{Deserialize, Serialize};
-
-use super::document::ServiceCounters;
 
 /// Upper bounds of the latency's buckets, s.
 pub const LATENCY_BOUNDS_S: [f64; 14] =
     [50e-6, 100e-6, 200e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 0.1, 0.2, 0.5, 1.0];
 
-/// From the kernel's receive stamp to the estimate.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct LatencyHistogram {
-    /// Frames up to each bound (not cumulative), and those beyond the last.
-    counts: [u64; LATENCY_BOUNDS_S.len() + 1],
-    sum_s: f64,
-}
-
-impl LatencyHistogram {
-    /// Takes one frame's latency; one below zero (two clocks, merged) counts as none.
-    #[inline]
-    pub fn record(&mut self, seconds: f64) {
-        let seconds = seconds.max(0.0);
-        let bucket = LATENCY_BOUNDS_S.iter().take_while(|bound| seconds > **bound).count();
-        self.counts[bucket] += 1;
-        self.sum_s += seconds;
-    }
-
-    /// As it is told.
-    pub fn document(&self) -> Latency {
-        let bounds = LATENCY_BOUNDS_S.iter().copied().map(Some).chain([None]);
-        Latency {
-            buckets: bounds.zip(self.counts).map(|(le_s, frames)| Bucket { le_s, frames }).collect(),
-            frames: self.counts.iter().sum(),
-            sum_s: self.sum_s,
-        }
-    }
-}
-
-/// Latency of frames since the program's start.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+/// Latency of frames since the program's start, from the kernel's receive stamp to the estimate.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Latency {
     /// Frames per bucket, not cumulative.
     pub buckets: Vec<Bucket>,
-    /// Frames in all.
+    /// Number of frames.
     pub frames: u64,
-    /// Their latencies added up, s.
+    /// Sum of their latencies, s.
     pub sum_s: f64,
 }
 
@@ -58,9 +29,27 @@ pub struct Bucket {
     pub frames: u64,
 }
 
+impl Default for Latency {
+    fn default() -> Self {
+        let bounds = LATENCY_BOUNDS_S.into_iter().map(Some).chain([None]);
+        Self { buckets: bounds.map(|le_s| Bucket { le_s, frames: 0 }).collect(), frames: 0, sum_s: 0.0 }
+    }
+}
+
 impl Latency {
-    /// An upper bound of the latency that this share of the frames did not exceed, s; `None` = no frame, or beyond the
-    /// last bound.
+    /// Counts one frame. A latency below zero (two clocks, merged) counts as zero.
+    #[inline]
+    pub fn record(&mut self, seconds: f64) {
+        let seconds = seconds.max(0.0);
+        let bucket = LATENCY_BOUNDS_S.iter().take_while(|bound| seconds > **bound).count();
+        if let Some(bucket) = self.buckets.get_mut(bucket) {
+            bucket.frames += 1;
+        }
+        self.frames += 1;
+        self.sum_s += seconds;
+    }
+
+    /// The bound that this share of the frames did not exceed, s; `None` = no frame, or beyond the last bound.
     pub fn quantile_s(&self, share: f64) -> Option<f64> {
         let wanted = (share * self.frames as f64).ceil().max(1.0);
         let mut so_far = 0;
@@ -72,23 +61,43 @@ impl Latency {
     }
 }
 
-/// What the shell counts since the program's start.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct LoopCounters {
-    /// As they are told.
-    pub service: ServiceCounters,
-    /// Frame to estimate.
-    pub latency: LatencyHistogram,
+/// Counters of the loop.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct ServiceCounters {
+    /// Ticks.
+    pub ticks: u64,
+    /// Ticks more than a period late.
+    pub missed_deadlines: u64,
+    /// Greatest lateness of a tick, s.
+    pub worst_lateness_s: f64,
+    /// Configurations applied while running.
+    pub reloads: u64,
+    /// Configurations rejected while running.
+    pub reloads_refused: u64,
+    /// Status documents dropped because the one before was not yet serialised.
+    pub documents_skipped: u64,
 }
 
-impl LoopCounters {
-    /// Takes how late a tick came.
+impl ServiceCounters {
+    /// Counts a tick and its lateness.
     pub fn note_tick(&mut self, lateness_s: f64, period_s: f64) {
-        let service = &mut self.service;
-        service.ticks += 1;
-        service.missed_deadlines += u64::from(lateness_s > period_s);
-        service.worst_lateness_s = service.worst_lateness_s.max(lateness_s);
+        self.ticks += 1;
+        self.missed_deadlines += u64::from(lateness_s > period_s);
+        self.worst_lateness_s = self.worst_lateness_s.max(lateness_s);
     }
+}
+
+/// Clients of the status sockets.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ClientCounts {
+    /// Connected now.
+    pub connected: u64,
+    /// Served so far, with those being served.
+    pub served: u64,
+    /// Refused: too many at once.
+    pub refused: u64,
+    /// Dropped: they did not read what they were sent.
+    pub dropped: u64,
 }
 
 #[cfg(test)]
@@ -96,12 +105,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_latency_falls_into_the_bucket_whose_bound_it_does_not_exceed() {
-        let mut histogram = LatencyHistogram::default();
+    fn a_latency_counts_in_the_bucket_whose_bound_it_does_not_exceed() {
+        let mut latency = Latency::default();
         for seconds in [-1.0, 50e-6, 51e-6, 1.0, 1.1, 60.0] {
-            histogram.record(seconds);
+            latency.record(seconds);
         }
-        let latency = histogram.document();
         let of = |le_s| latency.buckets.iter().find(|bucket| bucket.le_s == le_s).map(|bucket| bucket.frames);
         assert_eq!((of(Some(50e-6)), of(Some(100e-6)), of(Some(1.0)), of(None)), (Some(2), Some(1), Some(1), Some(2)));
         assert_eq!(latency.frames, 6);
@@ -112,11 +120,11 @@ mod tests {
 
     #[test]
     fn a_deadline_is_missed_by_more_than_a_period() {
-        let mut counters = LoopCounters::default();
+        let mut counters = ServiceCounters::default();
         for lateness_s in [0.0, 0.01, 0.011, 60.0] {
             counters.note_tick(lateness_s, 0.01);
         }
-        let ServiceCounters { ticks, missed_deadlines, worst_lateness_s, .. } = counters.service;
+        let ServiceCounters { ticks, missed_deadlines, worst_lateness_s, .. } = counters;
         assert_eq!((ticks, missed_deadlines, worst_lateness_s), (4, 2, 60.0));
     }
 }

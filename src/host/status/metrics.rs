@@ -2,9 +2,9 @@
 //!
 //! * Units are in the names (`_volts`, `_amperes`, `_celsius`, `_ratio`, `_seconds`, `_amperehours`), counters end with
 //!   `_total`, cells count from 1 as people do.
-//! * What is not known is left out: a value that is there is a value that holds.
-//! * Counters begin with the daemon's process (`packwatch_uptime_seconds`), all of them, as those who add up increases expect.
-//! * Without a daemon there is `packwatch_up 0` and nothing else.
+//! * Unknown values are left out: a value that is present is valid.
+//! * All counters start with the daemon's process (`packwatch_uptime_seconds`), as readers that sum increases expect.
+//! * Without a daemon there is only `packwatch_up 0`.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -17,23 +17,23 @@ use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::document::{Cell, Document, Pack};
+use super::document::{CellStatus, PackStatus, StatusDocument};
 use crate::alarm::Severity;
 use crate::io::socket::LinkState;
 use crate::monitor::Validity;
 use crate::quantity::Mode;
 
-/// Text that ends with `# EOF`; `None` = there is no daemon.
-pub fn openmetrics(document: Option<Document>) -> String {
+/// OpenMetrics text that ends with `# EOF`; `None` = there is no daemon.
+pub fn openmetrics(document: Option<StatusDocument>) -> String {
     let mut registry = Registry::with_prefix("packwatch");
     registry.register_collector(Box::new(Metrics(document)));
     let mut text = String::new();
-    // A string takes everything.
+    // Writing to a string cannot fail.
     let _ = encode(&mut text, &registry);
     text
 }
 
-/// The same in the form Prometheus had before OpenMetrics: a counter's description has its full name, units have no line.
+/// The same in Prometheus' form before OpenMetrics: a counter's description has its full name, units have no line.
 pub fn prometheus_text(openmetrics: &str) -> String {
     let typed = |wanted: &str| -> HashSet<&str> {
         let types = openmetrics.lines().filter_map(|line| line.strip_prefix("# TYPE ")?.split_once(' '));
@@ -65,14 +65,14 @@ pub fn prometheus_text(openmetrics: &str) -> String {
     text
 }
 
-/// What is encoded.
+/// The document, as a collector of metrics.
 #[derive(Debug)]
-struct Metrics(Option<Document>);
+struct Metrics(Option<StatusDocument>);
 
 /// Labels of one sample.
 type Labels = Vec<(&'static str, String)>;
 
-/// Writes families, each with those of its samples that are known.
+/// Writes families, each with its known samples.
 struct Families<'a>(DescriptorEncoder<'a>);
 
 impl Families<'_> {
@@ -131,15 +131,15 @@ fn label(name: &'static str, value: impl Into<String>) -> Labels {
     vec![(name, value.into())]
 }
 
-/// 1 for what is so.
-fn flag(is_so: bool) -> Option<f64> {
-    Some(f64::from(u8::from(is_so)))
+/// 1 for true, 0 for false.
+fn flag(value: bool) -> Option<f64> {
+    Some(f64::from(u8::from(value)))
 }
 
 impl Collector for Metrics {
     fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let mut families = Families(encoder);
-        families.gauge("up", "", "Whether the daemon tells its status", one(flag(self.0.is_some())))?;
+        families.gauge("up", "", "Whether the daemon reports its status", one(flag(self.0.is_some())))?;
         let Some(document) = &self.0 else { return Ok(()) };
         program(&mut families, document)?;
         interfaces(&mut families, document)?;
@@ -153,7 +153,7 @@ impl Collector for Metrics {
     }
 }
 
-fn program(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn program(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     families.info("build", "The program", &label("version", document.program_version.clone()))?;
     if let Some(config) = &document.config {
         families.info("config", "The configuration it runs with", &label("sha256", config.sha256.clone()))?;
@@ -161,7 +161,7 @@ fn program(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     families.gauge("uptime", "seconds", "Time since the daemon's start", one(Some(document.uptime_s)))?;
     let seconds = |time: crate::quantity::Timestamp| time.nanos() as f64 / 1e9;
     let written = one(Some(seconds(document.wall_time)));
-    families.gauge("status_time", "seconds", "When this was true, on the computer's clock", written)?;
+    families.gauge("status_time", "seconds", "Time of the status, on the computer's clock", written)?;
     let states = [
         (Validity::Unavailable, "unavailable"),
         (Validity::Valid, "valid"),
@@ -169,14 +169,14 @@ fn program(families: &mut Families<'_>, document: &Document) -> fmt::Result {
         (Validity::Untrusted, "untrusted"),
     ];
     let states = states.map(|(state, name)| (label("state", name), flag(document.state == state)));
-    families.gauge("validity", "", "How far the estimates are to be trusted, 1 for the present state", states)?;
+    families.gauge("validity", "", "Validity of the estimates, 1 for the present state", states)?;
     let modes =
         [(Mode::Unknown, "unknown"), (Mode::Charge, "charge"), (Mode::Rest, "rest"), (Mode::Discharge, "discharge")];
     let modes = modes.map(|(mode, name)| (label("mode", name), flag(document.pack.mode == mode)));
-    families.gauge("mode", "", "What the cells do, 1 for the present mode", modes)
+    families.gauge("mode", "", "Charge, rest or discharge, 1 for the present mode", modes)
 }
 
-fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn interfaces(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let all = &document.interfaces;
     let named = |name: &str| label("interface", name);
     let up = |state| match state {
@@ -185,13 +185,13 @@ fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     };
     let states = all.iter().map(|it| (named(&it.name), up(it.state)));
     families.gauge("interface_up", "", "Whether the interface is up", states)?;
-    let mut counts = |name, help, of: fn(&super::document::Interface) -> u64| {
+    let mut counts = |name, help, of: fn(&super::document::InterfaceStatus) -> u64| {
         families.counter(name, help, all.iter().map(|it| (named(&it.name), of(it))))
     };
     counts("interface_reconnects", "Times the interface came up again", |it| it.reconnects)?;
-    counts("interface_received_frames", "Frames taken in", |it| it.frames)?;
+    counts("interface_received_frames", "Frames received", |it| it.frames)?;
     counts("interface_error_frames", "Error frames", |it| it.error_frames)?;
-    counts("interface_bus_offs", "Error frames that say bus-off", |it| it.bus_offs)?;
+    counts("interface_bus_offs", "Error frames that report bus-off", |it| it.bus_offs)?;
     counts("interface_sent_frames", "Frames sent", |it| it.sent)?;
     let with = |name: &str, reason: &str| vec![("interface", name.to_owned()), ("reason", reason.to_owned())];
     let dropped = all.iter().flat_map(|it| {
@@ -205,7 +205,7 @@ fn interfaces(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     });
     families.counter("interface_unsent_frames", "Frames that could not be sent", unsent)?;
     let flooded = document.floods.iter().map(|flood| (message(&flood.interface, &flood.id), flood.dropped));
-    families.counter("message_flood_dropped_frames", "Frames of a message beyond the rate taken in", flooded)?;
+    families.counter("message_flood_dropped_frames", "Frames of a message beyond the accepted rate", flooded)?;
     let checks = document.protection.iter().flat_map(|protected| {
         protected.checks.iter().map(|check| {
             let mut labels = message(&protected.interface, &protected.id);
@@ -220,43 +220,43 @@ fn message(interface: &str, id: &str) -> Labels {
     vec![("interface", interface.to_owned()), ("id", id.to_owned())]
 }
 
-fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
+fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
     let number = |cell: Option<u16>| cell.map(|cell| f64::from(cell) + 1.0);
     let rows = [
         ("pack_soc", "ratio", "State of charge", pack.soc),
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
         ("pack_voltage", "volts", "Sum of the cells' voltages", pack.voltage_v),
         ("pack_current", "amperes", "Current, positive when discharging", pack.current_a),
-        (
-            "pack_temperature_max",
-            "celsius",
-            "Highest temperature, while all sensors tell theirs",
-            pack.temperature_max_c,
-        ),
+        ("pack_temperature_max", "celsius", "Highest temperature, while all sensors are fresh", pack.temperature_max_c),
         ("pack_limiting_cell", "", "Number of the cell that ends a discharge", number(pack.limiting_cell)),
         ("pack_weakest_cell", "", "Number of the cell with the least capacity", number(pack.weakest_cell)),
         ("pack_capacity", "amperehours", "Capacity of the weakest cell", pack.capacity_ah),
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
-        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", pack.remaining_cycles),
+        (
+            "pack_remaining_cycles",
+            "",
+            "Equivalent full cycles until its end of life, median",
+            pack.remaining.remaining_cycles,
+        ),
         (
             "pack_remaining_cycles_low",
             "",
             "5 % quantile of the cycles until the end of life",
-            pack.remaining_cycles_low,
+            pack.remaining.remaining_cycles_low,
         ),
         (
             "pack_remaining_cycles_high",
             "",
             "95 % quantile of the cycles until the end of life",
-            pack.remaining_cycles_high,
+            pack.remaining.remaining_cycles_high,
         ),
         (
             "pack_remaining_life",
             "seconds",
-            "Time until the end of life at the use of late, median",
-            pack.remaining_days.map(|d| 86_400.0 * d),
+            "Time until the end of life at the recent use, median",
+            pack.remaining.remaining_days.map(|d| 86_400.0 * d),
         ),
         ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
         (
@@ -284,8 +284,8 @@ fn pack(families: &mut Families<'_>, pack: &Pack) -> fmt::Result {
     rows.into_iter().try_for_each(|(name, unit, help, value)| families.gauge(name, unit, help, one(value)))
 }
 
-/// Name, unit, help, and where the value is.
-type CellRow = (&'static str, &'static str, &'static str, fn(&Cell) -> Option<f64>);
+/// Name, unit, help, and the value.
+type CellRow = (&'static str, &'static str, &'static str, fn(&CellStatus) -> Option<f64>);
 
 const CELL_ROWS: &[CellRow] = &[
     ("cell_voltage", "volts", "Voltage", |cell| cell.voltage_v),
@@ -295,12 +295,14 @@ const CELL_ROWS: &[CellRow] = &[
     ("cell_soc_std", "ratio", "Standard deviation of the state of charge", |cell| cell.soc_std),
     ("cell_capacity", "amperehours", "Learned capacity", |cell| cell.capacity_ah),
     ("cell_capacity_std", "amperehours", "Standard deviation of the learned capacity", |cell| cell.capacity_std_ah),
-    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| cell.remaining_cycles),
+    ("cell_remaining_cycles", "", "Equivalent full cycles until the end of life, median", |cell| {
+        cell.remaining.remaining_cycles
+    }),
     ("cell_remaining_cycles_low", "", "5 % quantile of the cycles until the end of life", |cell| {
-        cell.remaining_cycles_low
+        cell.remaining.remaining_cycles_low
     }),
     ("cell_remaining_cycles_high", "", "95 % quantile of the cycles until the end of life", |cell| {
-        cell.remaining_cycles_high
+        cell.remaining.remaining_cycles_high
     }),
     ("cell_usable_capacity", "amperehours", "Usable capacity", |cell| cell.usable_capacity_ah),
     ("cell_usable_capacity_std", "amperehours", "Standard deviation of the usable capacity", |cell| {
@@ -310,22 +312,22 @@ const CELL_ROWS: &[CellRow] = &[
     ("cell_resistance_std", "ratio", "Standard deviation of the resistance relative to new", |cell| {
         cell.resistance_ratio_std
     }),
-    ("cell_trusted", "", "Whether the filter agrees with itself", |cell| cell.trusted.and_then(flag)),
+    ("cell_trusted", "", "Whether the filter is consistent", |cell| cell.trusted.and_then(flag)),
 ];
 
-fn cells(families: &mut Families<'_>, cells: &[Cell]) -> fmt::Result {
+fn cells(families: &mut Families<'_>, cells: &[CellStatus]) -> fmt::Result {
     CELL_ROWS.iter().try_for_each(|(name, unit, help, of)| {
         let samples = cells.iter().map(|cell| (label("cell", (u32::from(cell.cell) + 1).to_string()), of(cell)));
         families.gauge(name, unit, help, samples)
     })
 }
 
-fn alarms(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn alarms(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let alarms = &document.alarms;
     families.gauge("alarms_active", "", "Alarms that are raised", one(Some(alarms.raised as f64)))?;
     families.gauge("alarm_thresholds", "", "Thresholds configured", one(Some(alarms.thresholds as f64)))?;
     let unknown = one(Some(alarms.unknown.len() as f64));
-    families.gauge("alarm_thresholds_unknown", "", "Thresholds with alarms that cannot be judged", unknown)?;
+    families.gauge("alarm_thresholds_unknown", "", "Thresholds with alarms that cannot be evaluated", unknown)?;
     let active = alarms.list.iter().filter(|alarm| alarm.state.is_raised()).map(|alarm| {
         let cell = alarm.cell.map_or_else(|| "pack".to_owned(), |cell| (u32::from(cell.0) + 1).to_string());
         let (rule, severity) = (alarm.rule.name().to_owned(), alarm.severity.name().to_owned());
@@ -337,71 +339,71 @@ fn alarms(families: &mut Families<'_>, document: &Document) -> fmt::Result {
     families.counter("alarms_raised", "Times an alarm was raised", raised)
 }
 
-fn readings(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn readings(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let readings = &document.counters.readings;
     families.counter("readings_accepted", "Readings used", one(readings.accepted))?;
     let rejected = readings.rejected().map(|(reason, count)| (label("reason", reason), count));
     families.counter("readings_rejected", "Readings not used", rejected)?;
-    families.counter("readings_unused", "Readings that feed nothing", one(readings.unused))?;
+    families.counter("readings_unused", "Readings without a use", one(readings.unused))?;
     families.counter("signals_stale", "Times a signal became too old", one(readings.stale))?;
     let levels = one(readings.levels_believed);
-    families.counter("signal_levels_believed", "Steps of a signal refused at first, then believed", levels)
+    families.counter("signal_levels_believed", "Steps of a signal rejected at first, then accepted", levels)
 }
 
-fn core(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn core(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let core = &document.counters.core;
     let rows = [
-        ("estimator_voltages_used", "Voltage readings that moved an estimate", core.voltages_used),
+        ("estimator_voltages_used", "Voltage readings that updated an estimate", core.voltages_used),
         ("estimator_voltages_gated", "Voltage readings beyond the filter's gate", core.voltages_gated),
         ("estimator_voltages_unmatched", "Voltage readings without a current", core.voltages_without_current),
-        ("estimator_resets", "Filters started again from their voltage", core.filter_resets),
+        ("estimator_resets", "Filters restarted from their voltage", core.filter_resets),
         ("estimator_trust_lost", "Times an estimate lost its trust", core.trust_lost),
-        ("gaps", "Times nobody measured for a while", core.gaps),
-        ("time_backwards", "Inputs that came with an earlier time", document.counters.time_backwards),
+        ("gaps", "Gaps without a measurement", core.gaps),
+        ("time_backwards", "Inputs with a time before an earlier input's", document.counters.time_backwards),
         ("mode_changes", "Changes between charge, rest and discharge", core.mode_changes),
         ("half_cycles", "Half-cycles, per cell", core.half_cycles),
         ("capacity_updates", "Runs of a capacity filter", core.capacity_updates),
         ("capacity_measurements", "Runs of a capacity filter with a measurement", core.capacity_measurements),
         ("recharge_periods", "Recharge periods recorded", core.recharge_periods),
-        ("commands", "Commands done", core.commands),
-        ("bad_commands", "Command frames not obeyed", core.bad_commands),
+        ("commands", "Commands executed", core.commands),
+        ("bad_commands", "Command frames not executed", core.bad_commands),
         ("packs_replaced", "Times the pack was replaced", core.packs_replaced),
-        ("state_restores", "Times a stored state was taken up", core.restores),
-        ("file_failures", "Times a file could not be written any more", core.store_failures),
+        ("state_restores", "Times a stored state was restored", core.restores),
+        ("file_failures", "Times a file could no longer be written", core.store_failures),
     ];
     rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, help, one(count)))
 }
 
-fn service(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn service(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let (service, clients) = (&document.counters.service, &document.counters.clients);
     let rows = [
         ("ticks", "Ticks of the loop", service.ticks),
-        ("missed_deadlines", "Ticks that came more than a period late", service.missed_deadlines),
-        ("reloads", "Configurations taken up while running", service.reloads),
-        ("reloads_refused", "Configurations refused while running", service.reloads_refused),
+        ("missed_deadlines", "Ticks more than a period late", service.missed_deadlines),
+        ("reloads", "Configurations applied while running", service.reloads),
+        ("reloads_refused", "Configurations rejected while running", service.reloads_refused),
         ("status_skipped", "Status documents skipped", service.documents_skipped),
         ("status_clients_served", "Clients of the status sockets", clients.served),
-        ("status_clients_refused", "Clients turned away, too many at once", clients.refused),
-        ("status_clients_dropped", "Clients that did not take what they were sent", clients.dropped),
+        ("status_clients_refused", "Clients refused, too many at once", clients.refused),
+        ("status_clients_dropped", "Clients that did not read in time", clients.dropped),
     ];
     rows.into_iter().try_for_each(|(name, help, count)| families.counter(name, help, one(count)))?;
     let lateness = one(Some(service.worst_lateness_s));
-    families.gauge("tick_lateness_max", "seconds", "The latest a tick ever came", lateness)?;
+    families.gauge("tick_lateness_max", "seconds", "Greatest lateness of a tick", lateness)?;
     let latency = &document.latency;
     let buckets: Vec<(f64, u64)> =
         latency.buckets.iter().map(|bucket| (bucket.le_s.unwrap_or(f64::INFINITY), bucket.frames)).collect();
     let unit = Unit::Seconds;
-    let help = "From the kernel's receive stamp of a frame to its estimate";
+    let help = "Time from the kernel's receive stamp of a frame to its estimate";
     let mut family = families.0.encode_descriptor("frame_to_estimate", help, Some(&unit), MetricType::Histogram)?;
     family.encode_histogram::<NoLabelSet>(latency.sum_s, latency.frames, &buckets, None)
 }
 
-fn store(families: &mut Families<'_>, document: &Document) -> fmt::Result {
+fn store(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Result {
     let Some(store) = &document.store else { return Ok(()) };
     families.gauge("store_works", "", "Whether the store can be written", one(store.works.and_then(flag)))?;
     families.counter("store_commits", "Commits done", one(store.commits))?;
     families.counter("store_failures", "Commits that failed", one(store.failures))?;
-    families.counter("store_late", "Results told before they were stored", one(store.late))?;
+    families.counter("store_late", "Results announced before they were stored", one(store.late))?;
     let size = one(store.file_bytes.map(|bytes| bytes as f64));
     families.gauge("store_size", "bytes", "Size of the store's files", size)
 }

@@ -1,4 +1,4 @@
-//! The thread that writes documents down and serves them. In: drafts from the loop. Out: bytes to clients.
+//! The thread that serialises documents and serves them. In: drafts from the loop. Out: lines to clients.
 
 use std::io;
 use std::path::PathBuf;
@@ -14,29 +14,30 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
 
-use super::document::{Clients, Document};
+use super::counters::ClientCounts;
+use super::document::StatusDocument;
 use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, standard_path, stream_path};
 use crate::io::unix_socket::{BindError, BoundSocket, SocketSetting, bind};
 use crate::monitor::Event;
 
-/// Pause after a connection could not be taken (no descriptor left): trying at once would find the same.
+/// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
-/// Refusals are told in the log this often.
-const TELL_PERIOD: Duration = Duration::from_secs(60);
+/// Least time between two log lines about refusals.
+const REFUSAL_LOG_PERIOD: Duration = Duration::from_secs(60);
 /// Stack of the thread, bytes: it serialises and waits.
 const STACK_BYTES: usize = 512 << 10;
 
-/// A document that is not written down yet.
+/// A document that is not serialised yet.
 #[derive(Debug)]
 pub struct Draft {
-    /// All but the events.
-    pub document: Document,
+    /// The document without its events.
+    pub document: StatusDocument,
     /// The events.
     pub events: Vec<Event>,
 }
 
 impl Draft {
-    /// The line a client gets.
+    /// Serialises the line for the clients.
     pub fn into_line(self) -> serde_json::Result<Vec<u8>> {
         let mut document = self.document;
         document.events = self.events.iter().map(serde_json::to_value).collect::<Result<_, _>>()?;
@@ -46,7 +47,7 @@ impl Draft {
     }
 }
 
-/// What became of clients; written by the thread, read by the loop.
+/// Counts of clients; written by the thread, read by the loop.
 #[derive(Debug, Default)]
 pub(super) struct ClientCounters {
     connected: AtomicU64,
@@ -56,9 +57,9 @@ pub(super) struct ClientCounters {
 }
 
 impl ClientCounters {
-    fn document(&self) -> Clients {
+    fn document(&self) -> ClientCounts {
         let of = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        Clients {
+        ClientCounts {
             connected: of(&self.connected),
             served: of(&self.served),
             refused: of(&self.refused),
@@ -67,29 +68,29 @@ impl ClientCounters {
     }
 }
 
-/// A document written down, and when that was.
+/// A serialised document and its time.
 #[derive(Debug, Clone)]
-struct Published {
+struct PublishedLine {
     line: Arc<[u8]>,
     at: Instant,
 }
 
-type Latest = watch::Receiver<Option<Published>>;
+type Latest = watch::Receiver<Option<PublishedLine>>;
 
-/// The running sockets; dropped, they end, and their files go.
+/// The running sockets; dropping this closes them and deletes their files.
 #[derive(Debug)]
 pub struct StatusServer {
-    /// `None` only while it is dropped.
+    /// `None` only during the drop.
     drafts: Option<mpsc::Sender<Box<Draft>>>,
     counters: Arc<ClientCounters>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl StatusServer {
-    /// Opens the sockets. `None` = there are none, and the log says so.
+    /// Opens the sockets. `None` = there are none, which is logged.
     ///
     /// # Errors
-    /// When another daemon has them, or one that was asked for cannot be made.
+    /// When another daemon uses them, or a requested one cannot be created.
     pub fn start(setting: &SocketSetting) -> Result<Option<Self>, String> {
         let (path, is_needed) = match setting {
             SocketSetting::Off => return Ok(None),
@@ -107,20 +108,20 @@ impl StatusServer {
             )),
             Err(BindError::Io(error)) if is_needed => Err(format!("{shown}: {error}")),
             Err(BindError::Io(error)) => {
-                tracing::info!(path = shown, %error, "no status socket; --status says where to make one");
+                tracing::info!(path = shown, %error, "no status socket; name its path with --status");
                 Ok(None)
             }
         }
     }
 
     fn open(path: PathBuf, limits: Limits) -> Result<Self, BindError> {
-        // One waits while another is written down.
+        // One waits while another is serialised.
         let (drafts, offered) = mpsc::channel(1);
         let (ready, opened) = sync_channel(1);
         let counters = Arc::new(ClientCounters::default());
-        let desk = Desk { counters: Arc::clone(&counters), limits };
+        let context = ClientContext { counters: Arc::clone(&counters), limits };
         let builder = std::thread::Builder::new().name("status".to_owned()).stack_size(STACK_BYTES);
-        let thread = builder.spawn(move || run(path, desk, offered, &ready))?;
+        let thread = builder.spawn(move || run(path, context, offered, &ready))?;
         match opened.recv() {
             Ok(Ok(())) => Ok(Self { drafts: Some(drafts), counters, thread: Some(thread) }),
             Ok(Err(error)) => Err(error),
@@ -128,20 +129,20 @@ impl StatusServer {
         }
     }
 
-    /// Hands a draft over; `false` = the thread is still busy, and nobody waits for it.
+    /// Offers a draft to the thread; `false` = the thread is busy, and the draft is dropped. Does not block.
     pub fn offer(&self, draft: Draft) -> bool {
         self.drafts.as_ref().is_some_and(|drafts| drafts.try_send(Box::new(draft)).is_ok())
     }
 
-    /// What became of clients so far.
-    pub fn clients(&self) -> Clients {
+    /// Counts of clients so far.
+    pub fn clients(&self) -> ClientCounts {
         self.counters.document()
     }
 }
 
 impl Drop for StatusServer {
     fn drop(&mut self) {
-        // The end of the drafts ends the thread; it waits for no client.
+        // Closing the channel ends the thread; it does not wait for clients.
         self.drafts = None;
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
             tracing::error!("the status thread had failed");
@@ -156,22 +157,27 @@ struct Limits {
     stale: Duration,
 }
 
-/// What every client needs.
+/// Shared by all clients.
 #[derive(Debug, Clone)]
-struct Desk {
+struct ClientContext {
     counters: Arc<ClientCounters>,
     limits: Limits,
 }
 
-/// The thread.
-fn run(path: PathBuf, desk: Desk, drafts: mpsc::Receiver<Box<Draft>>, ready: &SyncSender<Result<(), BindError>>) {
+/// Runs the thread.
+fn run(
+    path: PathBuf,
+    context: ClientContext,
+    drafts: mpsc::Receiver<Box<Draft>>,
+    ready: &SyncSender<Result<(), BindError>>,
+) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
     let served = runtime.map_err(BindError::Io).and_then(|runtime| {
         runtime.block_on(async {
             let once = bind(&path, MODE).await?;
             let stream = bind(&stream_path(&path), MODE).await?;
             let _ = ready.send(Ok(()));
-            serve([once, stream], &desk, drafts).await;
+            serve([once, stream], &context, drafts).await;
             Ok(())
         })
     });
@@ -180,11 +186,11 @@ fn run(path: PathBuf, desk: Desk, drafts: mpsc::Receiver<Box<Draft>>, ready: &Sy
     }
 }
 
-/// Until the loop has gone.
-async fn serve([once, stream]: [BoundSocket; 2], desk: &Desk, mut drafts: mpsc::Receiver<Box<Draft>>) {
+/// Serves until the loop drops the channel.
+async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut drafts: mpsc::Receiver<Box<Draft>>) {
     let (published, latest) = watch::channel(None);
     let mut clients = JoinSet::new();
-    let mut refusals = Refusals::default();
+    let mut refusals = RefusalLog::default();
     loop {
         tokio::select! {
             biased;
@@ -194,101 +200,103 @@ async fn serve([once, stream]: [BoundSocket; 2], desk: &Desk, mut drafts: mpsc::
             },
             Some(_) = clients.join_next() => {}
             accepted = once.listener.accept() => {
-                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), desk, &mut refusals).await {
-                    clients.spawn(serve_once(client, desk.clone(), latest.clone()));
+                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), context, &mut refusals).await {
+                    clients.spawn(serve_once(client, context.clone(), latest.clone()));
                 }
             }
             accepted = stream.listener.accept() => {
-                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), desk, &mut refusals).await {
-                    clients.spawn(serve_stream(client, desk.clone(), latest.clone()));
+                if let Some(client) = admit(accepted.map(|(client, _)| client), clients.len(), context, &mut refusals).await {
+                    clients.spawn(serve_stream(client, context.clone(), latest.clone()));
                 }
             }
         }
-        desk.counters.connected.store(clients.len() as u64, Ordering::Relaxed);
+        context.counters.connected.store(clients.len() as u64, Ordering::Relaxed);
     }
 }
 
-fn publish(draft: Draft, published: &watch::Sender<Option<Published>>) {
+fn publish(draft: Draft, published: &watch::Sender<Option<PublishedLine>>) {
     match draft.into_line() {
-        Ok(line) => drop(published.send_replace(Some(Published { line: line.into(), at: Instant::now() }))),
-        Err(error) => tracing::error!(%error, "status document not written"),
+        Ok(line) => drop(published.send_replace(Some(PublishedLine { line: line.into(), at: Instant::now() }))),
+        Err(error) => tracing::error!(%error, "status document not serialised"),
     }
 }
 
-/// Refusals since the log was last told.
+/// Refusals since the last log line.
 #[derive(Debug, Default)]
-struct Refusals {
-    untold: u64,
-    told: Option<Instant>,
+struct RefusalLog {
+    unreported: u64,
+    reported: Option<Instant>,
 }
 
-impl Refusals {
+impl RefusalLog {
     fn note(&mut self) {
-        self.untold += 1;
-        if self.told.is_none_or(|told| told.elapsed() >= TELL_PERIOD) {
-            tracing::warn!(clients = self.untold, limit = MAX_CLIENTS, "status clients turned away: too many at once");
-            (self.untold, self.told) = (0, Some(Instant::now()));
+        self.unreported += 1;
+        if self.reported.is_none_or(|reported| reported.elapsed() >= REFUSAL_LOG_PERIOD) {
+            tracing::warn!(clients = self.unreported, limit = MAX_CLIENTS, "status clients refused: too many at once");
+            (self.unreported, self.reported) = (0, Some(Instant::now()));
         }
     }
 }
 
-/// The client, when there is room.
+/// Admits a client, if there is room.
 async fn admit(
     accepted: io::Result<UnixStream>,
     connected: usize,
-    desk: &Desk,
-    refusals: &mut Refusals,
+    context: &ClientContext,
+    refusals: &mut RefusalLog,
 ) -> Option<UnixStream> {
     match accepted {
         Err(error) => {
-            tracing::warn!(%error, "connection to the status socket not taken");
+            tracing::warn!(%error, "connection to the status socket not accepted");
             tokio::time::sleep(ACCEPT_PAUSE).await;
             None
         }
         Ok(_) if connected >= MAX_CLIENTS => {
-            desk.counters.refused.fetch_add(1, Ordering::Relaxed);
+            context.counters.refused.fetch_add(1, Ordering::Relaxed);
             refusals.note();
             None
         }
         Ok(client) => {
-            desk.counters.served.fetch_add(1, Ordering::Relaxed);
+            context.counters.served.fetch_add(1, Ordering::Relaxed);
             Some(client)
         }
     }
 }
 
-/// One fresh document.
-async fn serve_once(mut client: UnixStream, desk: Desk, mut latest: Latest) {
-    let fresh = latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < desk.limits.stale));
-    let line = match timeout(desk.limits.max_silence, fresh).await {
+/// Sends one fresh document.
+async fn serve_once(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
+    let fresh =
+        latest.wait_for(|published| published.as_ref().is_some_and(|it| it.at.elapsed() < context.limits.stale));
+    let line = match timeout(context.limits.max_silence, fresh).await {
         Ok(Ok(published)) => published.as_ref().map(|published| Arc::clone(&published.line)),
-        // The loop makes none, or has gone.
+        // The loop makes none, or has ended.
         Ok(Err(_)) | Err(_) => None,
     };
     if let Some(line) = line {
-        tell(&mut client, &line, &desk).await;
+        send_line(&mut client, &line, &context).await;
     }
 }
 
-/// Every document from here on; one that is slow misses some.
-async fn serve_stream(mut client: UnixStream, desk: Desk, mut latest: Latest) {
+/// Sends every document from here on; a slow client misses some.
+async fn serve_stream(mut client: UnixStream, context: ClientContext, mut latest: Latest) {
     while latest.changed().await.is_ok() {
-        let fresh = latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < desk.limits.stale);
+        let fresh =
+            latest.borrow_and_update().clone().filter(|published| published.at.elapsed() < context.limits.stale);
         let line = fresh.map(|published| published.line);
         if let Some(line) = line
-            && !tell(&mut client, &line, &desk).await
+            && !send_line(&mut client, &line, &context).await
         {
             return;
         }
     }
 }
 
-/// Writes a line; `false` = the client has gone, or was dropped because it did not take it in time.
-async fn tell(client: &mut UnixStream, line: &[u8], desk: &Desk) -> bool {
-    match timeout(desk.limits.max_silence, client.write_all(line)).await {
+/// Writes a line; `false` = the client has closed, or was dropped because it did not read in time.
+async fn send_line(client: &mut UnixStream, line: &[u8], context: &ClientContext) -> bool {
+    match timeout(context.limits.max_silence, client.write_all(line)).await {
         Ok(written) => written.is_ok(),
         Err(_) => {
-            desk.counters.dropped.fetch_add(1, Ordering::Relaxed);
+            context.counters.dropped.fetch_add(1, Ordering::Relaxed);
             false
         }
     }

@@ -1,67 +1,68 @@
 //! Rows that wait for the disk, in memory and bounded.
 //!
-//! When there is no room, detail goes before what was learned: the oldest half-cycles first, then the oldest of the
-//! rest. What went is counted, and the count is written with the next rows.
+//! In: batches of rows. Out: the same batches, oldest first. When there is no room, detail is dropped before learned
+//! results: the oldest half-cycles first, then the oldest of the rest. Dropped rows are counted, and the count is written
+//! with the next rows.
 
 use std::collections::VecDeque;
 
-use super::rows::{Batch, Row};
+use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 
 /// Rows kept while the disk takes none: half a megabyte of memory, and for a pack of 96 cells some 25 transitions, days
 /// of driving.
 pub(super) const MAX_ROWS: usize = 5_000;
 
-/// Rows in waiting, oldest first.
+/// Waiting rows, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct Backlog {
-    batches: VecDeque<Batch>,
+    batches: VecDeque<RowBatch>,
     rows: usize,
-    lost: Lost,
-    /// What the rows taken last say of it.
-    telling: Lost,
+    lost: LossCount,
+    /// The losses that the rows taken last report.
+    reported: LossCount,
 }
 
-/// Rows that went for want of room.
+/// Rows dropped for lack of room.
 #[derive(Debug, Clone, Copy, Default)]
-struct Lost {
+struct LossCount {
     details: u64,
     rows: u64,
 }
 
 impl Backlog {
     /// Appends rows.
-    pub(super) fn push(&mut self, batch: Batch) {
+    pub(super) fn push(&mut self, batch: RowBatch) {
         self.rows += batch.rows.len();
         self.batches.push_back(batch);
         self.shrink();
     }
 
-    /// Takes everything, with a row for what was lost before; `now` is that row's moment.
-    pub(super) fn take(&mut self, now: &Stamp) -> Vec<Batch> {
+    /// Takes all rows, with a row that reports earlier losses; `now` is that row's moment.
+    pub(super) fn take(&mut self, now: &Stamp) -> Vec<RowBatch> {
         self.rows = 0;
-        let mut batches: Vec<Batch> = self.batches.drain(..).collect();
-        self.telling = self.lost;
+        let mut batches: Vec<RowBatch> = self.batches.drain(..).collect();
+        self.reported = self.lost;
         if self.lost() > 0 {
-            let Lost { details, rows } = self.lost;
+            let LossCount { details, rows } = self.lost;
             let detail = format!("while nothing could be written: {details} half-cycles, {rows} others");
-            let row = Row::Own { reason: "rows_lost", detail };
-            batches.push(Batch { stamp: *now, rows: vec![row] });
+            let row = HistoryRow::Own { reason: "rows_lost", detail };
+            batches.push(RowBatch { stamp: *now, rows: vec![row] });
         }
         batches
     }
 
-    /// The rows taken last are written: what was lost has been told with them.
-    pub(super) fn told(&mut self) {
-        let Lost { details, rows } = std::mem::take(&mut self.telling);
+    /// The rows taken last are on the disk, and so is their report of losses.
+    pub(super) fn commit(&mut self) {
+        let LossCount { details, rows } = std::mem::take(&mut self.reported);
         self.lost.details -= details;
         self.lost.rows -= rows;
     }
 
-    /// Puts rows back that could not be written, before those that came since. What they say of losses is said again.
-    pub(super) fn put_back(&mut self, batches: Vec<Batch>) {
-        self.telling = Lost::default();
-        let is_loss = |row: &Row| matches!(row, Row::Own { reason: "rows_lost", .. });
+    /// Returns rows that could not be written to the front. The next rows report their losses again.
+    pub(super) fn put_back(&mut self, batches: Vec<RowBatch>) {
+        self.reported = LossCount::default();
+        let is_loss = |row: &HistoryRow| matches!(row, HistoryRow::Own { reason: "rows_lost", .. });
         for batch in batches.into_iter().rev().filter(|batch| !batch.rows.iter().any(is_loss)) {
             self.rows += batch.rows.len();
             self.batches.push_front(batch);
@@ -69,7 +70,7 @@ impl Backlog {
         self.shrink();
     }
 
-    /// Rows lost so far and not yet told.
+    /// Rows lost so far whose loss is not yet reported in the history.
     pub(super) fn lost(&self) -> u64 {
         self.lost.details + self.lost.rows
     }
@@ -80,9 +81,9 @@ impl Backlog {
             for batch in &mut self.batches {
                 let before = batch.rows.len();
                 batch.rows.retain(|row| {
-                    let goes = excess > 0 && row.is_detail() == detail && !row.replaces_pack();
-                    excess -= usize::from(goes);
-                    !goes
+                    let is_dropped = excess > 0 && row.is_detail() == detail && !row.replaces_pack();
+                    excess -= usize::from(is_dropped);
+                    !is_dropped
                 });
                 let gone = before - batch.rows.len();
                 self.rows -= gone;
@@ -104,41 +105,44 @@ mod tests {
     use crate::monitor::EventKind;
     use crate::quantity::Timestamp;
 
-    fn batch(kinds: Vec<EventKind>) -> Batch {
-        Batch { stamp: Stamp::replayed(Timestamp::ZERO), rows: kinds.into_iter().map(Row::Event).collect() }
+    fn batch(kinds: Vec<EventKind>) -> RowBatch {
+        RowBatch { stamp: Stamp::replayed(Timestamp::ZERO), rows: kinds.into_iter().map(HistoryRow::Event).collect() }
     }
 
-    fn count(batches: &[Batch], what: fn(&Row) -> bool) -> usize {
+    fn count(batches: &[RowBatch], what: fn(&HistoryRow) -> bool) -> usize {
         batches.iter().flat_map(|batch| &batch.rows).filter(|row| what(row)).count()
     }
 
     #[test]
-    fn the_oldest_detail_goes_first_and_is_counted() {
+    fn the_oldest_detail_is_dropped_first_and_counted() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![alarm(Change::Raised)]));
         for cell in 0..4000 {
             backlog.push(batch(vec![half_cycle(cell), capacity(cell, Some(2.0), 2.0)]));
         }
         let batches = backlog.take(&Stamp::replayed(Timestamp::ZERO));
-        assert_eq!(count(&batches, Row::is_detail), 999);
+        assert_eq!(count(&batches, HistoryRow::is_detail), 999);
         assert_eq!(count(&batches, |row| !row.is_detail()), 4002);
         let first = batches.iter().flat_map(|batch| &batch.rows).find(|row| row.is_detail());
-        assert_eq!(first, Some(&Row::Event(half_cycle(3001))));
-        let Some(Row::Own { detail, .. }) = batches.last().and_then(|batch| batch.rows.last()) else { panic!() };
+        assert_eq!(first, Some(&HistoryRow::Event(half_cycle(3001))));
+        let Some(HistoryRow::Own { detail, .. }) = batches.last().and_then(|batch| batch.rows.last()) else { panic!() };
         assert!(detail.contains("3001 half-cycles, 0 others"), "{detail}");
-        backlog.told();
+        backlog.commit();
         assert!(backlog.take(&Stamp::replayed(Timestamp::ZERO)).is_empty());
     }
 
     #[test]
-    fn rows_that_could_not_be_written_come_again_in_their_order() {
+    fn rows_that_could_not_be_written_are_returned_in_their_order() {
         let mut backlog = Backlog::default();
         backlog.push(batch(vec![capacity(1, Some(2.0), 2.0)]));
         let taken = backlog.take(&Stamp::replayed(Timestamp::ZERO));
         backlog.push(batch(vec![capacity(2, Some(2.0), 2.0)]));
         backlog.put_back(taken);
         let again = backlog.take(&Stamp::replayed(Timestamp::ZERO));
-        let rows: Vec<&Row> = again.iter().flat_map(|batch| &batch.rows).collect();
-        assert_eq!(rows, [1, 2].map(|cell| Row::Event(capacity(cell, Some(2.0), 2.0))).iter().collect::<Vec<_>>());
+        let rows: Vec<&HistoryRow> = again.iter().flat_map(|batch| &batch.rows).collect();
+        assert_eq!(
+            rows,
+            [1, 2].map(|cell| HistoryRow::Event(capacity(cell, Some(2.0), 2.0))).iter().collect::<Vec<_>>()
+        );
     }
 }

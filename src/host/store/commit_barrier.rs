@@ -1,11 +1,11 @@
-//! Frames that wait until what they announce is on the disk.
+//! Holds frames until the results they announce are on the disk.
 //!
-//! What announces ([`Transmit::announces`]) waits, all of it, for as long as anything learned is not yet on the disk: not
-//! only the frames of the input that taught it, but also the cyclic ones that come meanwhile and would tell the same, and
-//! the later packets of a transfer whose first one waits. They go in the order in which they came. The status frame is not
-//! held: state of charge and validity must not grow old; it tells how many alarms are raised, and of none which.
+//! While a commit is under way, every announcing frame ([`Transmit::announces`]) waits: the frames of the input that
+//! taught something, the cyclic frames that would repeat it, and the later packets of a transfer whose first packet
+//! waits. They leave in the order in which they came. The status frame is not held: state of charge and validity must
+//! not grow old, and it carries only the number of raised alarms.
 //!
-//! Nothing waits longer than [`MAX_WAIT`]: an alarm that is not on the disk is worth more than one that is not on the bus.
+//! No frame waits longer than [`MAX_WAIT`]: an alarm on the bus matters more than an alarm on the disk.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -16,46 +16,46 @@ use crate::monitor::Transmit;
 
 /// Longest wait for the disk.
 const MAX_WAIT: Duration = Duration::from_millis(200);
-/// Frames in waiting: what a pack of the largest size sends in twice that time, with an alarm for each cell; beyond,
-/// they go.
+/// Frames held at most: the largest pack sends that many in twice that time, with an alarm for each cell. Beyond it, held
+/// frames are released.
 const MAX_HELD: usize = 4096;
 
 /// See the module.
 #[derive(Debug, Default)]
 pub struct CommitBarrier {
     held: VecDeque<(u64, Transmit)>,
-    /// Tickets not yet answered, and until when to wait.
+    /// Open tickets, each with the end of its wait.
     tickets: VecDeque<(u64, Instant)>,
 }
 
 impl CommitBarrier {
-    /// Frames of this ticket will wait.
+    /// Opens a ticket: from here on announcing frames wait.
     pub fn begin(&mut self, ticket: u64, now: Instant) {
         self.tickets.push_back((ticket, now + MAX_WAIT));
     }
 
-    /// Lets a frame wait, where it announces something and a ticket is open; `false` = it may go.
-    pub fn take(&mut self, transmit: &Transmit) -> bool {
+    /// Holds a frame that announces something while a ticket is open; `false` = it may be sent.
+    pub fn hold(&mut self, transmit: &Transmit) -> bool {
         let last = self.tickets.back().filter(|_| transmit.announces);
         self.held.extend(last.map(|(ticket, _)| (*ticket, *transmit)));
         last.is_some()
     }
 
-    /// Everything up to `ticket` is answered: its frames go.
+    /// Closes all tickets up to `ticket` and sends their frames.
     pub fn release(&mut self, ticket: u64, mut send: impl FnMut(&Transmit)) {
         while self.tickets.front().is_some_and(|(waiting, _)| *waiting <= ticket) {
             self.tickets.pop_front();
         }
         self.held.retain(|(waiting, transmit)| {
-            let goes = *waiting <= ticket;
-            if goes {
+            let is_released = *waiting <= ticket;
+            if is_released {
                 send(transmit);
             }
-            !goes
+            !is_released
         });
     }
 
-    /// The last ticket that has waited too long, or has too many frames behind it.
+    /// The last ticket that has waited too long or holds too many frames.
     pub fn overdue(&self, now: Instant) -> Option<u64> {
         if self.held.len() > MAX_HELD {
             return self.tickets.back().map(|(ticket, _)| *ticket);
@@ -75,42 +75,42 @@ mod tests {
         Transmit { time: Timestamp::ZERO, bus: BusIndex(0), frame, announces: true }
     }
 
-    fn sent(hold: &mut CommitBarrier, ticket: u64) -> Vec<u8> {
+    fn sent(barrier: &mut CommitBarrier, ticket: u64) -> Vec<u8> {
         let mut sent = Vec::new();
-        hold.release(ticket, |transmit| sent.push(transmit.frame.data()[0]));
+        barrier.release(ticket, |transmit| sent.push(transmit.frame.data()[0]));
         sent
     }
 
     #[test]
-    fn while_a_ticket_is_open_all_that_announces_waits_and_keeps_its_order() {
+    fn while_a_ticket_is_open_announcing_frames_wait_and_keep_their_order() {
         let now = Instant::now();
-        let mut hold = CommitBarrier::default();
+        let mut barrier = CommitBarrier::default();
         let (control, data, health) = (0x10, 0x11, 0x12);
-        assert!(!hold.take(&frame(health, 0)), "nothing to wait for");
-        hold.begin(1, now);
-        // A transfer's announcement, its packets by later ticks, a cyclic frame between.
+        assert!(!barrier.hold(&frame(health, 0)), "nothing to wait for");
+        barrier.begin(1, now);
+        // A transfer's announcement, its packets on later ticks, a cyclic frame between them.
         for (id, data) in [(control, 1), (data, 2), (health, 3), (data, 4)] {
-            assert!(hold.take(&frame(id, data)));
+            assert!(barrier.hold(&frame(id, data)));
         }
-        assert!(!hold.take(&Transmit { announces: false, ..frame(0x13, 9) }), "a state goes");
-        hold.begin(2, now);
-        assert!(hold.take(&frame(data, 5)));
-        assert_eq!(sent(&mut hold, 1), [1, 2, 3, 4]);
-        assert!(hold.take(&frame(health, 6)));
-        assert_eq!(sent(&mut hold, 2), [5, 6]);
-        assert!(!hold.take(&frame(health, 7)), "all is on the disk");
+        assert!(!barrier.hold(&Transmit { announces: false, ..frame(0x13, 9) }), "a status frame is sent");
+        barrier.begin(2, now);
+        assert!(barrier.hold(&frame(data, 5)));
+        assert_eq!(sent(&mut barrier, 1), [1, 2, 3, 4]);
+        assert!(barrier.hold(&frame(health, 6)));
+        assert_eq!(sent(&mut barrier, 2), [5, 6]);
+        assert!(!barrier.hold(&frame(health, 7)), "all is on the disk");
     }
 
     #[test]
     fn nothing_waits_longer_than_the_limit() {
         let now = Instant::now();
-        let mut hold = CommitBarrier::default();
-        hold.begin(1, now);
-        hold.begin(2, now + MAX_WAIT / 2);
-        assert_eq!(hold.overdue(now + MAX_WAIT / 2), None);
-        assert_eq!(hold.overdue(now + MAX_WAIT), Some(1));
-        assert_eq!(hold.overdue(now + 2 * MAX_WAIT), Some(2));
-        hold.release(2, |_| {});
-        assert_eq!(hold.overdue(now + 2 * MAX_WAIT), None);
+        let mut barrier = CommitBarrier::default();
+        barrier.begin(1, now);
+        barrier.begin(2, now + MAX_WAIT / 2);
+        assert_eq!(barrier.overdue(now + MAX_WAIT / 2), None);
+        assert_eq!(barrier.overdue(now + MAX_WAIT), Some(1));
+        assert_eq!(barrier.overdue(now + 2 * MAX_WAIT), Some(2));
+        barrier.release(2, |_| {});
+        assert_eq!(barrier.overdue(now + 2 * MAX_WAIT), None);
     }
 }

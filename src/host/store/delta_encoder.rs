@@ -1,63 +1,63 @@
-//! Which bytes stand for the state at a checkpoint: a delta to the last full record, or a new full one.
+//! Chooses the record of a checkpoint: a delta to the last full record, or a new full record.
 
-use super::packed::{self, Damaged};
-use super::parts::Parts;
+use super::packed::{self, DamagedRecord};
+use super::parts::JsonParts;
 
-/// A delta beyond this part of the full record is not worth it.
+/// A larger part of the full record is written in full.
 const MAX_DELTA: f64 = 0.6;
-/// Stored bytes are filled up to a multiple of this, so that SQLite overwrites a record in place: a page of 1,024 bytes
-/// of an overflowing row holds 1,020.
+/// Stored bytes are padded to a multiple of this, so that SQLite overwrites a record in place: a page of 1,024 bytes of
+/// an overflowing row holds 1,020.
 const ROOM_STEP: usize = 1020;
 
-/// The last full record and how well deltas to it do.
+/// The last full record, and the sizes of the deltas to it.
 #[derive(Debug, Default)]
 pub(super) struct DeltaEncoder {
-    base: Option<Base>,
-    /// Bytes kept for a delta.
+    base: Option<BaseRecord>,
+    /// Bytes reserved for a delta.
     delta_room: usize,
 }
 
 #[derive(Debug)]
-struct Base {
+struct BaseRecord {
     serial: i64,
-    parts: Parts,
+    parts: JsonParts,
     full_bytes: usize,
     /// The smallest delta to it so far.
     least_delta: usize,
-    /// Bytes the deltas have cost beyond the smallest: what a newer base would have saved.
+    /// Bytes of the deltas beyond the smallest: a newer base would have saved them.
     excess: usize,
 }
 
-/// A state as it is to be stored.
+/// A state, encoded for the database.
 #[derive(Debug)]
-pub(super) struct Packed {
-    /// Number of the full record it is or is based on.
+pub(super) struct EncodedState {
+    /// Number of the full record that it is or that it is based on.
     pub(super) serial: i64,
-    /// Whether it is a full one.
+    /// Whether it is a full record.
     pub(super) is_full: bool,
     /// Bytes of the record.
     pub(super) length: usize,
-    /// The record, filled up with zeros.
+    /// The record, padded with zeros.
     pub(super) bytes: Vec<u8>,
-    /// The state, for a base to come.
-    parts: Parts,
+    /// The state: a base for later deltas.
+    parts: JsonParts,
 }
 
 impl DeltaEncoder {
-    /// After a start: the full record that is stored.
-    pub(super) fn with_base(serial: i64, record: &[u8], delta_room: usize) -> Result<Self, Damaged> {
+    /// Resumes after a start, from the stored full record.
+    pub(super) fn with_base(serial: i64, record: &[u8], delta_room: usize) -> Result<Self, DamagedRecord> {
         let parts = packed::read_full(record)?;
-        let base = Base { serial, parts, full_bytes: record.len(), least_delta: usize::MAX, excess: 0 };
+        let base = BaseRecord { serial, parts, full_bytes: record.len(), least_delta: usize::MAX, excess: 0 };
         Ok(Self { base: Some(base), delta_room })
     }
 
     /// The full record's number and state.
-    pub(super) fn base(&self) -> Option<(i64, &Parts)> {
+    pub(super) fn base(&self) -> Option<(i64, &JsonParts)> {
         self.base.as_ref().map(|base| (base.serial, &base.parts))
     }
 
-    /// Packs a state; `exact` asks for a full record.
-    pub(super) fn pack(&self, parts: Parts, exact: bool) -> Packed {
+    /// Encodes a state; `exact` asks for a full record.
+    pub(super) fn encode(&self, parts: JsonParts, exact: bool) -> EncodedState {
         let serial = self.base.as_ref().map_or(0, |base| base.serial);
         let delta = self.base.as_ref().filter(|base| !exact && base.excess <= base.full_bytes);
         let record = delta.and_then(|base| {
@@ -67,23 +67,23 @@ impl DeltaEncoder {
         match record {
             Some(record) => {
                 let room = self.delta_room.max(record.len().next_multiple_of(ROOM_STEP));
-                Packed { serial, is_full: false, length: record.len(), bytes: filled(record, room), parts }
+                EncodedState { serial, is_full: false, length: record.len(), bytes: padded(record, room), parts }
             }
             None => {
                 let record = packed::full(&parts);
                 let room = record.len().next_multiple_of(ROOM_STEP);
                 let length = record.len();
-                Packed { serial: serial + 1, is_full: true, length, bytes: filled(record, room), parts }
+                EncodedState { serial: serial + 1, is_full: true, length, bytes: padded(record, room), parts }
             }
         }
     }
 
-    /// It is stored.
-    pub(super) fn stored(&mut self, packed: Packed) {
+    /// Notes that a record is on the disk.
+    pub(super) fn note_stored(&mut self, packed: EncodedState) {
         if packed.is_full {
             let full_bytes = packed.length;
             let (serial, parts) = (packed.serial, packed.parts);
-            self.base = Some(Base { serial, parts, full_bytes, least_delta: usize::MAX, excess: 0 });
+            self.base = Some(BaseRecord { serial, parts, full_bytes, least_delta: usize::MAX, excess: 0 });
         } else if let Some(base) = &mut self.base {
             base.least_delta = base.least_delta.min(packed.length);
             base.excess += packed.length - base.least_delta;
@@ -92,7 +92,7 @@ impl DeltaEncoder {
     }
 }
 
-fn filled(mut record: Vec<u8>, room: usize) -> Vec<u8> {
+fn padded(mut record: Vec<u8>, room: usize) -> Vec<u8> {
     record.resize(room, 0);
     record
 }
@@ -101,10 +101,10 @@ fn filled(mut record: Vec<u8>, room: usize) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    fn state(seed: u32, numbers: usize) -> Parts {
+    fn state(seed: u32, numbers: usize) -> JsonParts {
         let value = |n: usize| f64::from(seed) * 1e-3 + (n as f64).sqrt();
         let numbers: Vec<f64> = (0..numbers).map(value).collect();
-        Parts::of(&serde_json::to_vec(&numbers).unwrap()).unwrap()
+        JsonParts::of(&serde_json::to_vec(&numbers).unwrap()).unwrap()
     }
 
     #[test]
@@ -112,12 +112,12 @@ mod tests {
         let mut delta_encoder = DeltaEncoder::default();
         let mut fulls = 0;
         for minute in 0..300 {
-            // Half of the numbers move now and then, and stay where they are.
+            // Half of the numbers move now and then, and then stay.
             let mut parts = state(minute / 60 * 60, 1000);
             parts.bits[..300].copy_from_slice(&state(minute, 300).bits);
-            let packed = delta_encoder.pack(parts, false);
+            let packed = delta_encoder.encode(parts, false);
             fulls += u32::from(packed.is_full);
-            delta_encoder.stored(packed);
+            delta_encoder.note_stored(packed);
         }
         assert!((5..=15).contains(&fulls), "{fulls} full records for 5 changes");
     }
@@ -125,11 +125,11 @@ mod tests {
     #[test]
     fn a_delta_as_large_as_a_full_record_is_written_in_full() {
         let mut delta_encoder = DeltaEncoder::default();
-        let first = delta_encoder.pack(state(1, 10), false);
+        let first = delta_encoder.encode(state(1, 10), false);
         assert!(first.is_full && first.bytes.len() == ROOM_STEP);
-        delta_encoder.stored(first);
-        assert!(delta_encoder.pack(state(99, 2000), false).is_full);
-        assert!(!delta_encoder.pack(state(1, 10), false).is_full);
-        assert!(delta_encoder.pack(state(1, 10), true).is_full);
+        delta_encoder.note_stored(first);
+        assert!(delta_encoder.encode(state(99, 2000), false).is_full);
+        assert!(!delta_encoder.encode(state(1, 10), false).is_full);
+        assert!(delta_encoder.encode(state(1, 10), true).is_full);
     }
 }

@@ -1,5 +1,4 @@
-//! The state as it is kept: the core's snapshot with the moment it was taken. JSON in the runtime folder, packed in the
-//! database.
+//! The stored state: the core's snapshot with its moment. JSON in the runtime folder, packed in the database.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
@@ -12,7 +11,7 @@ use crate::monitor::Snapshot;
 
 /// A state and when it was taken.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub(super) struct Document {
+pub(super) struct StateDocument {
     /// State folder it belongs to: two daemons may share a runtime folder.
     pub folder: String,
     /// When it was taken.
@@ -21,18 +20,16 @@ pub(super) struct Document {
     pub snapshot: Box<Snapshot>,
 }
 
-impl Document {
-    /// As compact JSON.
-    pub(super) fn to_json(&self) -> io::Result<Vec<u8>> {
-        Ok(serde_json::to_vec(self)?)
-    }
-
-    /// From JSON; what is wrong with it otherwise.
+impl StateDocument {
+    /// Reads JSON.
+    ///
+    /// # Errors
+    /// What is wrong with it.
     pub(super) fn parse(json: &[u8]) -> Result<Self, String> {
         serde_json::from_slice(json).map_err(|error| format!("not a state: {error}"))
     }
 
-    /// Writes it beside its place and renames it. Not made last on a disk: it lives in memory.
+    /// Writes it to a temporary name and renames it. Does not sync: the file lies in memory.
     pub(super) fn write(&self, path: &Path) -> io::Result<()> {
         let part = path.with_extension("json.part");
         let mut file = BufWriter::new(File::create(&part)?);

@@ -1,16 +1,16 @@
-//! The state folder: one daemon at a time, the database opened whatever happened to it.
+//! The state folder: locks it for one daemon and opens its database, damaged or not.
 //!
-//! A damaged database is replaced by what can be read of it, kept under another name and reported. One that a newer
-//! program wrote is left alone.
+//! A damaged database is renamed, replaced by its readable rows, and reported. A database of a newer program is not
+//! touched.
 //!
-//! A power cut in the middle of a replacement loses nothing and is made good at the next start:
+//! A power cut during a replacement loses nothing; the next start completes it:
 //!
-//! | in the folder | the cut was | what is done |
+//! | in the folder | time of the cut | action |
 //! | --- | --- | --- |
-//! | `packwatch.db.part` | while it was filled | done away with, begun again |
-//! | `packwatch.db.new` | after it was complete | it takes the place of the database, whatever is there |
+//! | `packwatch.db.part` | while it was filled | deleted, filled again |
+//! | `packwatch.db.new` | after it was complete | takes the place of the database |
 //!
-//! So the damaged one goes only when all that was saved of it, with the state and the report, is on the disk.
+//! So the damaged database is moved only when its saved rows, its state and the report are on the disk.
 
 use std::fmt;
 use std::fs::{self, File, TryLockError};
@@ -18,12 +18,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use super::database::{Database, OpenError, StateRecord};
-use super::document::Document;
-use super::parts::Parts;
-use super::rows::{Batch, Row};
+use super::database::{Database, OpenError};
+use super::document::StateDocument;
+use super::rows::{HistoryRow, RowBatch};
 use super::salvage;
 use super::stamp::Stamp;
+use super::state_slots::StateRecord;
 use super::wal::{self, Fault};
 
 /// Name of the database.
@@ -32,17 +32,17 @@ pub(super) const DATABASE: &str = "packwatch.db";
 const PART: &str = "packwatch.db.part";
 /// Name of its replacement that is complete.
 const NEW: &str = "packwatch.db.new";
-/// Name of the file whose lock says that a daemon works here.
+/// Name of the file that a daemon locks while it uses the folder.
 const LOCK: &str = "packwatch.lock";
-/// Files SQLite has beside a database.
+/// Suffixes of SQLite's further files of a database.
 const COMPANIONS: [&str; 2] = ["-wal", "-shm"];
 /// Damaged databases kept; a disk that damages every file must not fill up with them.
 const MAX_SET_ASIDE: u32 = 8;
-/// Between two replacements by one process: one writes up to some 20 MB, and a full or failing disk would have another at
-/// every attempt.
+/// Least time between two replacements by one process: one writes up to some 20 MB, and a full or failing disk would cause
+/// one at every attempt.
 const REPLACEMENT_PAUSE: Duration = Duration::from_secs(600);
 
-/// What is said of a state that is set aside.
+/// Words for a state that is set aside.
 pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which it fits";
 
 /// See the module.
@@ -50,26 +50,26 @@ pub(super) const SET_ASIDE: &str = "set aside, used at the first start at which 
 pub(super) struct Folder {
     path: PathBuf,
     max_half_cycles: u32,
-    /// Held as long as this lives.
+    /// Locked as long as this lives.
     lock: Option<File>,
-    /// Why the database is to be replaced; `None` = nothing is known against it.
+    /// Damage of the database, which is to be replaced; `None` = no known damage.
     damaged: Option<String>,
-    /// When it was tried last.
+    /// Time of the last attempt to replace it.
     replaced: Option<Instant>,
 }
 
 /// A database that was opened.
 #[derive(Debug)]
-pub(super) struct Opening {
+pub(super) struct OpenedDatabase {
     pub database: Database,
-    /// What to write into the history about it.
-    pub rows: Vec<Row>,
-    /// The state it holds, or a damaged one before it held; `None` = none.
-    pub state: Option<Document>,
+    /// Rows about the opening, for the history.
+    pub rows: Vec<HistoryRow>,
+    /// Its state, or that of the damaged database before it; `None` = none.
+    pub state: Option<StateDocument>,
     /// A state that was set aside earlier.
-    pub aside: Option<Document>,
-    /// Whether the database holds a state that this program cannot read: it must not be overwritten.
-    pub is_strange: bool,
+    pub aside: Option<StateDocument>,
+    /// Whether it holds a state that this program cannot read and must not overwrite.
+    pub is_unreadable: bool,
     /// Whether nothing had to be set aside and nothing was lost.
     pub is_sound: bool,
 }
@@ -81,7 +81,7 @@ impl fmt::Display for Folder {
 }
 
 impl Folder {
-    /// Of a path that need not exist yet.
+    /// A folder that need not exist yet.
     pub(super) fn new(path: PathBuf, max_half_cycles: u32) -> Self {
         Self { path, max_half_cycles, lock: None, damaged: None, replaced: None }
     }
@@ -91,18 +91,18 @@ impl Folder {
         &self.path
     }
 
-    /// Size of the database and its log; `None` = cannot be seen.
+    /// Size of the database and its log, bytes; `None` = unknown.
     pub(super) fn file_bytes(&self) -> Option<u64> {
         let path = self.path.join(DATABASE);
         let log = fs::metadata(with_suffix(&path, COMPANIONS[0])).map_or(0, |file| file.len());
         fs::metadata(path).ok().map(|file| file.len() + log)
     }
 
-    /// Makes the folder where it is missing, and takes it for this process.
+    /// Creates the folder where it is missing, and locks it for this process.
     ///
     /// # Errors
-    /// `WouldBlock` when another process has it, else why it cannot be written.
-    pub(super) fn take(&mut self) -> io::Result<()> {
+    /// `WouldBlock` when another process has locked it, else why it cannot be written.
+    pub(super) fn lock(&mut self) -> io::Result<()> {
         if self.lock.is_some() {
             return Ok(());
         }
@@ -118,9 +118,9 @@ impl Folder {
         }
     }
 
-    /// Opens the database; a damaged one is replaced by what can be read of it.
-    pub(super) fn open(&mut self, now: &Stamp) -> Result<Opening, OpenError> {
-        self.take().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
+    /// Opens the database; replaces a damaged one by its readable rows.
+    pub(super) fn open(&mut self, now: &Stamp) -> Result<OpenedDatabase, OpenError> {
+        self.lock().map_err(|error| OpenError::Unavailable(format!("{}: {error}", self.path.display())))?;
         let was_replaced = self.finish_replacement()?;
         if was_replaced {
             self.damaged = None;
@@ -130,7 +130,8 @@ impl Folder {
             match self.open_good(&path, now) {
                 Err(OpenError::Damaged(why)) => self.damaged = Some(why),
                 result => {
-                    return result.map(|opening| Opening { is_sound: opening.is_sound && !was_replaced, ..opening });
+                    return result
+                        .map(|opening| OpenedDatabase { is_sound: opening.is_sound && !was_replaced, ..opening });
                 }
             }
         }
@@ -140,19 +141,19 @@ impl Folder {
             self.damaged = None;
         }
         let opening = self.open_good(&path, now)?;
-        Ok(Opening { is_sound: false, ..opening })
+        Ok(OpenedDatabase { is_sound: false, ..opening })
     }
 
-    /// The database is damaged: the next opening replaces it.
+    /// Notes that the database is damaged: the next opening replaces it.
     pub(super) fn mark_damaged(&mut self, why: &str) {
         self.damaged = Some(why.to_owned());
     }
 
-    /// Saves what can be read of the database, with the report of it, in a file that is then complete.
+    /// Saves the readable rows of the database and a report in a complete replacement file.
     pub(super) fn fill_replacement(&mut self, why: &str, now: &Stamp) -> Result<(), OpenError> {
         if self.replaced.is_some_and(|last| last.elapsed() < REPLACEMENT_PAUSE) {
             return Err(OpenError::Unavailable(format!(
-                "damaged: {why}; it was replaced less than {} s ago, and waits",
+                "damaged: {why}; replaced less than {} s ago, so the next replacement waits",
                 REPLACEMENT_PAUSE.as_secs()
             )));
         }
@@ -161,7 +162,7 @@ impl Folder {
         remove(&part);
         let filled = self.fill(&part, why, now);
         if filled.is_err() {
-            // Room for the next attempt, and for others.
+            // Frees the space for the next attempt and for other programs.
             remove(&part);
         }
         filled?;
@@ -179,18 +180,16 @@ impl Folder {
             half_cycles = saved.half_cycles,
             refused = saved.refused,
             state = saved.state.is_some(),
-            "the database is damaged: what can be read of it is taken over"
+            "the database is damaged: its readable rows are copied to a new one"
         );
         let detail = format!("{why}; set aside as {}; {saved}", name_of(&self.free_place()));
-        let rows = vec![Row::Own { reason: "damaged", detail }];
-        let json = saved.state.and_then(|state| state.to_json().ok());
-        let parts = json.as_deref().and_then(Parts::of);
-        let state = parts.map(|parts| StateRecord { parts, exact: true, sets_aside: false });
-        database.commit(&[Batch { stamp: *now, rows }], state)?;
+        let rows = vec![HistoryRow::Own { reason: "damaged", detail }];
+        let state = saved.state.and_then(|state| StateRecord::new(&state, true, false).ok());
+        database.commit(&[RowBatch { stamp: *now, rows }], state)?;
         Ok(database.close()?)
     }
 
-    /// Puts a complete replacement in the database's place; false when there is none.
+    /// Moves a complete replacement to the database's place; `false` = there is none.
     fn finish_replacement(&self) -> Result<bool, OpenError> {
         let (path, new) = (self.path.join(DATABASE), self.path.join(NEW));
         if !new.is_file() {
@@ -198,7 +197,7 @@ impl Folder {
         }
         let place = self.free_place();
         let moved = || -> io::Result<()> {
-            // The log first: beside the new one it would be taken for its own.
+            // The log first: SQLite would take it for the log of the new database.
             for companion in COMPANIONS {
                 move_over(&with_suffix(&path, companion), &with_suffix(&place, companion))?;
             }
@@ -212,74 +211,74 @@ impl Folder {
         Ok(true)
     }
 
-    /// Where the next damaged database is kept.
+    /// The name for the next damaged database.
     fn free_place(&self) -> PathBuf {
         let place = |number: u32| self.path.join(format!("{DATABASE}.damaged-{number}"));
         let free = (1..MAX_SET_ASIDE).map(place).find(|place| !place.exists());
-        // All taken: the latest makes room, the first is what somebody will want to read.
+        // All are in use: the latest is replaced; the first is the most useful to a reader.
         free.unwrap_or_else(|| place(MAX_SET_ASIDE))
     }
 
-    /// Makes names last on the disk.
+    /// Syncs the folder's names to the disk.
     fn sync(&self) -> io::Result<()> {
         File::open(&self.path)?.sync_all()
     }
 
-    fn open_good(&self, path: &Path, now: &Stamp) -> Result<Opening, OpenError> {
+    fn open_good(&self, path: &Path, now: &Stamp) -> Result<OpenedDatabase, OpenError> {
         if path.is_dir() {
-            return Err(OpenError::Damaged("a folder in its place".to_owned()));
+            return Err(OpenError::Damaged("a folder is in its place".to_owned()));
         }
         let was_emptied = fs::metadata(path).is_ok_and(|file| file.len() == 0);
         if was_emptied {
-            // A power cut right after it was made leaves this too.
-            tracing::warn!(path = %path.display(), "the database was empty: state and history begin anew");
+            // A power cut right after its creation leaves this too.
+            tracing::warn!(path = %path.display(), "the database was empty: state and history start again");
         }
-        // Before SQLite opens it, as it then makes the log anew.
+        // Before SQLite opens it and resets the log.
         let fault = wal::fault(&with_suffix(path, "-wal"));
         let database = Database::open(path, now, self.max_half_cycles)?;
         let (mut rows, mut is_sound, mut state) = (Vec::new(), !was_emptied, None);
-        let mut is_strange = false;
-        let mut tell = |reason: &'static str, why: String| {
+        let mut is_unreadable = false;
+        let mut report = |reason: &'static str, why: String| {
             tracing::error!(reason, error = why, "the stored state is not used");
-            rows.push(Row::Own { reason, detail: why });
+            rows.push(HistoryRow::Own { reason, detail: why });
             is_sound = false;
         };
         match fault {
-            Some(Fault::Damaged(why)) => tell("state_damaged", why),
+            Some(Fault::Damaged(why)) => report("state_damaged", why),
             Some(Fault::LastStep(page)) => tracing::warn!(
                 page,
-                "the last step of the database's write-ahead log is not whole: the power was cut in it, or it is damaged"
+                "the last transaction of the database's write-ahead log is incomplete: the power was cut, or it is damaged"
             ),
             None => {}
         }
         match database.state()? {
             Ok(None) => {}
             Ok(Some(stored)) => {
-                match Document::parse(&stored.json) {
+                match StateDocument::parse(&stored.json) {
                     Ok(document) => state = Some(document),
                     // Its hash is good: another version wrote it.
                     Err(why) => {
-                        is_strange = true;
-                        tell("state_unfit", format!("{why}; {SET_ASIDE}"));
+                        is_unreadable = true;
+                        report("state_unfit", format!("{why}; {SET_ASIDE}"));
                     }
                 }
                 if let Some(why) = stored.lost_later {
-                    tell("state_damaged", format!("{why}; an earlier state is used"));
+                    report("state_damaged", format!("{why}; an earlier state is used"));
                 }
             }
-            Err(why) => tell("state_damaged", why),
+            Err(why) => report("state_damaged", why),
         }
         let aside = database.state_aside();
-        Ok(Opening { database, rows, state, aside, is_strange, is_sound })
+        Ok(OpenedDatabase { database, rows, state, aside, is_unreadable, is_sound })
     }
 }
 
-/// Whether a folder holds a history, or one that is about to take its place.
+/// Whether a folder holds a history or the complete replacement of one.
 pub(super) fn has_history(folder: &Path) -> bool {
     [DATABASE, NEW].iter().any(|name| folder.join(name).exists())
 }
 
-/// Does away with a database and what SQLite has beside it, or a folder of that name.
+/// Deletes a database with SQLite's further files, or a folder of that name.
 fn remove(path: &Path) {
     let _ = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
     for companion in COMPANIONS {
@@ -287,7 +286,7 @@ fn remove(path: &Path) {
     }
 }
 
-/// Moves what is there, in place of anything.
+/// Moves a file or folder, over anything of the new name; does nothing without it.
 fn move_over(from: &Path, to: &Path) -> io::Result<()> {
     if !from.exists() {
         return Ok(());
@@ -304,7 +303,7 @@ fn unavailable(error: io::Error) -> OpenError {
     OpenError::Unavailable(format!("the replacement of a damaged database: {error}"))
 }
 
-/// A path with something behind its name.
+/// A path with a suffix appended to its name.
 pub fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     let mut name = path.as_os_str().to_owned();
     name.push(suffix);

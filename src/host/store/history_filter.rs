@@ -1,65 +1,66 @@
-//! What of the core's events the history keeps, and what of it is worth a commit of its own: an alarm that flickers must
-//! not wear the flash, and must not keep another one from it.
+//! Selects the events that the history keeps, and those that are committed at once.
+//!
+//! An alarm that flickers must not wear out the flash, and must not delay another alarm. In: the events of one input.
+//! Out: a [`CommitDecision`] with rows. Bounded by token buckets; times are the events'.
 
 use std::collections::BTreeMap;
 
-use super::rows::{Row, Subject};
-use super::token_bucket::{Limit, TokenBucket};
+use super::rows::{EventSubject, HistoryRow};
 use crate::alarm::Change;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::{CellIndex, Timestamp};
+use crate::token_bucket::{BucketSize, TokenBucket};
 
-/// Capacities of one cell written whatever they say: two days' of an electric car at once, then one an hour. Beyond
-/// (a hybrid that turns every minute) a row must say something: 100 bytes each, for ever.
-const CAPACITIES: Limit = Limit { burst: 64.0, period_s: 3600.0 };
-/// Beyond that, what a capacity must have moved by to be written, in standard deviations.
-const NEWS_STD: f64 = 0.25;
-/// Commits that each alarm has for itself alone, and all filters that start again together: what other alarms do cannot
-/// keep it from the disk.
-const OWN_COMMITS: Limit = Limit { burst: 10.0, period_s: 6.0 * 3600.0 };
-/// Commits for whatever is beyond that (a threshold in the noise, a cell model that does not fit). Beyond both, rows wait
-/// for a checkpoint, and of one alarm's or cell's only the first and the last are kept; the count of occurrences tells how
-/// many went. A rule that flickers in all of 96 cells makes 1,500 commits on the first day, of some 10 kB, and then 400.
-const SHARED_COMMITS: Limit = Limit { burst: 500.0, period_s: 3600.0 };
-/// Times that rows in waiting go with a checkpoint or with others: an hour of checkpoints, then once an hour. They stay
-/// for ever, and each time there are two of each alarm.
-const CARRIED: Limit = Limit { burst: 60.0, period_s: 3600.0 };
+/// Capacities of one cell written without condition: two days of an electric car at once, then one an hour. Further ones
+/// (a hybrid that reverses every minute) are written only if they differ: each row takes 100 bytes for ever.
+const CAPACITIES: BucketSize = BucketSize { burst: 64.0, period_s: 3600.0 };
+/// Least change of such a further capacity, in standard deviations.
+const MIN_CHANGE_STD: f64 = 0.25;
+/// Commits reserved for each alarm, and for all filter resets together: other alarms cannot use them up.
+const OWN_COMMITS: BucketSize = BucketSize { burst: 10.0, period_s: 6.0 * 3600.0 };
+/// Further commits, shared by all (a threshold in the noise, a cell model that does not fit). Beyond both, rows wait for a
+/// checkpoint, and only the first and the last of each alarm or cell are kept; the count of occurrences gives the number of
+/// the others. A rule that flickers in all of 96 cells causes 1,500 commits of some 10 kB on the first day, then 400.
+const SHARED_COMMITS: BucketSize = BucketSize { burst: 500.0, period_s: 3600.0 };
+/// Times that waiting rows are written with a checkpoint or with other rows: an hour of checkpoints, then once an hour.
+/// They stay for ever, and each time there are two of each alarm.
+const CARRIED: BucketSize = BucketSize { burst: 60.0, period_s: 3600.0 };
 
-/// A capacity as last written.
+/// The capacity written last.
 #[derive(Debug, Clone, Copy)]
-struct Written {
+struct WrittenCapacity {
     capacity_ah: f64,
     usable_ah: Option<f64>,
     token_bucket: TokenBucket,
 }
 
-/// A remaining life as last written: its median, and a deviation of it; `None` = it was not known.
+/// The remaining life written last: median and standard deviation, cycles; `None` = it was not known.
 #[derive(Debug, Clone, Copy)]
 struct WrittenLife {
     cycles: Option<(f64, f64)>,
     token_bucket: TokenBucket,
 }
 
-/// What one input's events are worth.
+/// Whether the events of one input are committed.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum CommitDecision {
-    /// Nothing was learned, and nothing became of an alarm.
+    /// Nothing was learned, and no alarm changed.
     Nothing,
-    /// Rows to commit now, perhaps none, with the state they were learned in.
-    Commit(Vec<Row>),
+    /// Commit the state now, with these rows, which may be none.
+    Commit(Vec<HistoryRow>),
     /// Alarms that come too often: their rows wait.
     Deferred,
 }
 
-/// Picks from the core's events what the history keeps.
+/// Selects the events that the history keeps.
 #[derive(Debug)]
 pub(super) struct HistoryFilter {
-    written: BTreeMap<CellIndex, Written>,
+    written: BTreeMap<CellIndex, WrittenCapacity>,
     written_life: WrittenLife,
-    own_commits: BTreeMap<Subject, TokenBucket>,
+    own_commits: BTreeMap<EventSubject, TokenBucket>,
     shared_commits: TokenBucket,
     carried: TokenBucket,
-    deferred: Vec<Row>,
+    deferred: Vec<HistoryRow>,
 }
 
 impl Default for HistoryFilter {
@@ -76,22 +77,22 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// Judges one input's events; rows that waited come with those that do not.
+    /// Decides about the events of one input; waiting rows go with those that are committed.
     pub(super) fn take(&mut self, events: &[Event]) -> CommitDecision {
         let Some(now) = events.iter().find(|event| is_learned(&event.kind)).map(|event| event.time) else {
             return CommitDecision::Nothing;
         };
         let learned = || events.iter().map(|event| event.kind).filter(is_learned);
-        let may_wait = learned().all(|kind| Subject::of(&kind).is_some());
-        if may_wait && !self.may_commit(learned().filter_map(|kind| Subject::of(&kind)), now) {
+        let may_wait = learned().all(|kind| EventSubject::of(&kind).is_some());
+        if may_wait && !self.may_commit(learned().filter_map(|kind| EventSubject::of(&kind)), now) {
             learned().for_each(|kind| self.defer(kind));
             return CommitDecision::Deferred;
         }
         let mut rows = self.for_checkpoint(now);
         for kind in learned() {
-            if self.is_news(&kind, now) {
-                let row = Row::Event(kind);
-                // What waited of the same alarm comes before it.
+            if self.is_worth_writing(&kind, now) {
+                let row = HistoryRow::Event(kind);
+                // Waiting rows of the same alarm come before it.
                 rows.extend(self.deferred.extract_if(.., |waiting| waiting.repeats(&row)));
                 rows.push(row);
             }
@@ -99,18 +100,18 @@ impl HistoryFilter {
         CommitDecision::Commit(rows)
     }
 
-    /// Rows that waited, when a checkpoint may take them.
-    pub(super) fn for_checkpoint(&mut self, now: Timestamp) -> Vec<Row> {
-        let goes = !self.deferred.is_empty() && self.carried.take(now);
-        if goes { self.deferred() } else { Vec::new() }
+    /// Takes the waiting rows, if a checkpoint may write them.
+    pub(super) fn for_checkpoint(&mut self, now: Timestamp) -> Vec<HistoryRow> {
+        let may_go = !self.deferred.is_empty() && self.carried.take(now);
+        if may_go { self.deferred() } else { Vec::new() }
     }
 
-    /// Rows that waited.
-    pub(super) fn deferred(&mut self) -> Vec<Row> {
+    /// Takes the waiting rows.
+    pub(super) fn deferred(&mut self) -> Vec<HistoryRow> {
         std::mem::take(&mut self.deferred)
     }
 
-    fn may_commit(&mut self, mut subjects: impl Iterator<Item = Subject>, now: Timestamp) -> bool {
+    fn may_commit(&mut self, mut subjects: impl Iterator<Item = EventSubject>, now: Timestamp) -> bool {
         let own = &mut self.own_commits;
         let mut of = |subject| own.entry(subject).or_insert(TokenBucket::new(OWN_COMMITS)).take(now);
         subjects.any(&mut of) || self.shared_commits.take(now)
@@ -118,7 +119,7 @@ impl HistoryFilter {
 
     /// Keeps the first and the last row of each alarm and each cell's filter.
     fn defer(&mut self, kind: EventKind) {
-        let row = Row::Event(kind);
+        let row = HistoryRow::Event(kind);
         let same: Vec<usize> = (0..self.deferred.len()).filter(|&at| self.deferred[at].repeats(&row)).collect();
         if let [_, .., last] = same[..] {
             self.deferred.remove(last);
@@ -126,30 +127,32 @@ impl HistoryFilter {
         self.deferred.push(row);
     }
 
-    /// As for capacities: when there have been many, one that has hardly moved is no news.
-    fn is_news_of_life(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
+    /// Whether to write a remaining life: beyond the allowance, only one that has changed.
+    fn is_life_worth_writing(&mut self, cycles: Option<(f64, f64)>, now: Timestamp) -> bool {
         let written = &mut self.written_life;
         let has_moved = match (written.cycles, cycles) {
-            (Some((before, _)), Some((median, std))) => (median - before).abs() > NEWS_STD * std,
+            (Some((before, _)), Some((median, std))) => (median - before).abs() > MIN_CHANGE_STD * std,
             (before, now) => before.is_some() != now.is_some(),
         };
-        let is_news = written.token_bucket.take(now) || has_moved;
-        if is_news {
+        let is_worth_writing = written.token_bucket.take(now) || has_moved;
+        if is_worth_writing {
             written.cycles = cycles;
         }
-        is_news
+        is_worth_writing
     }
 
-    /// A capacity that a half-cycle told nothing about, and whose usable part is the same, is no news; nor is, when
-    /// there have been many, one that has hardly moved.
-    fn is_news(&mut self, kind: &EventKind, now: Timestamp) -> bool {
+    /// Whether to write an event. A capacity without a measurement and with the same usable part is not written, nor,
+    /// beyond the allowance, one that has hardly changed.
+    fn is_worth_writing(&mut self, kind: &EventKind, now: Timestamp) -> bool {
         if matches!(kind, EventKind::PackReplaced { .. }) {
             self.written_life.cycles = None;
         }
         if let EventKind::RemainingLife { cycles, cycles_low, .. } = *kind {
-            // Half of the interval's lower part: a little less than a deviation.
-            return self
-                .is_news_of_life(cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))), now);
+            // Half of the interval's lower part: a little less than a standard deviation.
+            return self.is_life_worth_writing(
+                cycles.zip(cycles_low).map(|(median, low)| (median, 0.5 * (median - low))),
+                now,
+            );
         }
         let EventKind::Capacity {
             cell, measured_ah, capacity_ah, capacity_std_ah, usable_capacity_ah: usable_ah, ..
@@ -157,14 +160,14 @@ impl HistoryFilter {
         else {
             return !matches!(kind, EventKind::RechargePeriod { .. });
         };
-        let new = Written { capacity_ah, usable_ah, token_bucket: TokenBucket::new(CAPACITIES) };
+        let new = WrittenCapacity { capacity_ah, usable_ah, token_bucket: TokenBucket::new(CAPACITIES) };
         let before = self.written.get(&cell).copied();
         if measured_ah.is_none() && before.is_none_or(|before| before.usable_ah == usable_ah) {
             self.written.entry(cell).or_insert(new);
             return false;
         }
         let written = self.written.entry(cell).or_insert(new);
-        let far = |a: f64, b: f64| (a - b).abs() >= NEWS_STD * capacity_std_ah;
+        let far = |a: f64, b: f64| (a - b).abs() >= MIN_CHANGE_STD * capacity_std_ah;
         let has_moved = before.is_none_or(|before| {
             far(before.capacity_ah, capacity_ah)
                 || before.usable_ah.zip(usable_ah).is_some_and(|(before, now)| far(before, now))
@@ -177,8 +180,8 @@ impl HistoryFilter {
     }
 }
 
-/// What is made durable before it is announced. An alarm whose value went missing or came back is no change of what was
-/// announced, and a flickering input makes many of them.
+/// Whether an event is durable before it is announced. An alarm whose value was lost or returned does not change what was
+/// announced, and a flickering input causes many of those.
 fn is_learned(kind: &EventKind) -> bool {
     match kind {
         EventKind::HalfCycle { .. }
@@ -226,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pack_that_turns_every_minute_writes_what_moves() {
+    fn a_pack_that_reverses_every_minute_writes_only_changes() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440 {
@@ -266,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn an_alarm_that_flickers_without_end_is_written_now_and_then_with_its_ends() {
+    fn a_flickering_alarm_is_written_now_and_then_with_its_first_and_last_row() {
         let mut history_filter = HistoryFilter::default();
         let (mut commits, mut rows) = (0, 0);
         for second in 0..86_400 {
@@ -280,7 +283,7 @@ mod tests {
     }
 
     #[test]
-    fn what_misfits_keeps_no_other_alarm_from_the_disk() {
+    fn a_misfit_delays_no_other_alarm() {
         let mut history_filter = HistoryFilter::default();
         let of = |of_rule, of_severity, of_cell| {
             let mut kind = alarm(Change::Raised);
@@ -310,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_that_wait_go_with_a_checkpoint_but_not_with_every_one_for_ever() {
+    fn waiting_rows_go_with_a_checkpoint_but_not_with_every_one() {
         let mut history_filter = HistoryFilter::default();
         let mut rows = 0;
         for minute in 0..1440_u32 {

@@ -1,7 +1,7 @@
-//! A JSON document taken apart into its numbers and the rest, and put together again.
+//! Splits a JSON document into its numbers and its skeleton, and joins them again.
 //!
-//! The rest, the skeleton, is the document with every number replaced by a letter that says what kind it was. A state
-//! changes from minute to minute in its numbers; its skeleton hardly changes at all.
+//! The skeleton is the document with every number replaced by a letter for its kind. From minute to minute the numbers of
+//! a state change, its skeleton hardly does.
 
 /// Placeholder of a floating-point number.
 pub(super) const FLOAT: u8 = b'.';
@@ -10,19 +10,19 @@ pub(super) const INT: u8 = b'0';
 /// Placeholder of a larger whole number.
 pub(super) const BIG: u8 = b'9';
 
-/// A document in its parts.
+/// A document, split.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub(super) struct Parts {
-    /// Everything but the numbers.
+pub(super) struct JsonParts {
+    /// The document without its numbers.
     pub(super) skeleton: Vec<u8>,
-    /// What each number is: the placeholders in their order.
+    /// The kind of each number: the placeholders in their order.
     pub(super) kinds: Vec<u8>,
     /// The numbers' bits in the same order.
     pub(super) bits: Vec<u64>,
 }
 
-impl Parts {
-    /// Takes a compact JSON document apart; `None` when a number in it cannot be read.
+impl JsonParts {
+    /// Splits a compact JSON document; `None` when a number in it cannot be read.
     pub(super) fn of(json: &[u8]) -> Option<Self> {
         let mut parts = Self { skeleton: Vec::with_capacity(json.len()), ..Self::default() };
         let mut at = 0;
@@ -41,7 +41,7 @@ impl Parts {
         Some(parts)
     }
 
-    /// A skeleton whose numbers are all 0 so far.
+    /// A skeleton with all numbers 0.
     pub(super) fn of_skeleton(skeleton: Vec<u8>) -> Self {
         let mut kinds = Vec::new();
         let mut at = 0;
@@ -61,8 +61,8 @@ impl Parts {
         let mut at = 0;
         while let Some(&byte) = self.skeleton.get(at) {
             let end = token_end(&self.skeleton, at);
-            match numbers.next_if_placeholder(byte) {
-                Some((kind, bits)) => write_number(&mut json, kind, bits),
+            match if is_placeholder(byte) { numbers.next() } else { None } {
+                Some((kind, bits)) => write_number(&mut json, *kind, *bits),
                 None => json.extend_from_slice(&self.skeleton[at..end]),
             }
             at = end;
@@ -70,22 +70,11 @@ impl Parts {
         json
     }
 
-    /// The numbers of `self` that stand at the places of `skeleton`'s numbers; 0 where there was none.
+    /// The numbers of `self` at the places of `skeleton`'s numbers; 0 where `self` has none.
     pub(super) fn aligned_to(&self, skeleton: &[u8]) -> Vec<u64> {
         let known: std::collections::HashMap<u64, u64> =
             paths(&self.skeleton).into_iter().zip(self.bits.iter().copied()).collect();
         paths(skeleton).into_iter().map(|path| known.get(&path).copied().unwrap_or(0)).collect()
-    }
-}
-
-/// Takes the next number where the skeleton has a placeholder.
-trait NextNumber {
-    fn next_if_placeholder(&mut self, byte: u8) -> Option<(u8, u64)>;
-}
-
-impl<'a, I: Iterator<Item = (&'a u8, &'a u64)>> NextNumber for I {
-    fn next_if_placeholder(&mut self, byte: u8) -> Option<(u8, u64)> {
-        if is_placeholder(byte) { self.next().map(|(kind, bits)| (*kind, *bits)) } else { None }
     }
 }
 
@@ -140,11 +129,11 @@ fn write_number(json: &mut Vec<u8>, kind: u8, bits: u64) {
     debug_assert!(written.is_ok(), "a number was not written");
 }
 
-/// Where each number of a skeleton stands, as a hash of the keys and indices that lead to it. Two places with the same
-/// hash would only cost space: both sides look up the same number.
+/// The place of each number of a skeleton, as a hash of the keys and indices that lead to it. A collision only costs
+/// space: encoder and decoder look up the same number.
 fn paths(skeleton: &[u8]) -> Vec<u64> {
     let mut found = Vec::new();
-    // Of each open object or list: the path to it, and the key or index within.
+    // Each open object or list: its path, the present key or index, and whether it is an object.
     let mut open: Vec<(u64, u64, bool)> = Vec::new();
     let mut key_next = false;
     let mut at = 0;
@@ -179,7 +168,7 @@ fn paths(skeleton: &[u8]) -> Vec<u64> {
     found
 }
 
-/// One step of FNV-1a over whole words, stirred.
+/// One step of FNV-1a over whole words, with extra mixing.
 const fn mix(hash: u64, word: u64) -> u64 {
     let mixed = (hash ^ word.wrapping_add(0x9E37_79B9_7F4A_7C15)).wrapping_mul(0x0000_0100_0000_01B3);
     mixed ^ (mixed >> 29)
@@ -190,24 +179,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_document_comes_together_as_it_was() {
+    fn a_document_is_joined_as_it_was() {
         let json = br#"{"a":[1,-2,1.5,-0.0,1e-300],"b":{"c\"9.0":null,"d":true,"e":"0.9"},"f":18446744073709551615}"#;
-        let parts = Parts::of(json).unwrap();
+        let parts = JsonParts::of(json).unwrap();
         assert_eq!(parts.kinds, b"00...9");
         assert_eq!(parts.join(), json);
-        assert_eq!(Parts::of_skeleton(parts.skeleton.clone()).kinds, parts.kinds);
+        assert_eq!(JsonParts::of_skeleton(parts.skeleton.clone()).kinds, parts.kinds);
     }
 
     #[test]
-    fn numbers_are_found_at_their_place_when_others_came_and_went() {
-        let before = Parts::of(br#"{"a":null,"b":[{"x":1,"y":2},{"x":3,"y":4}],"c":5}"#).unwrap();
-        let after = Parts::of(br#"{"a":{"z":9},"b":[{"x":7,"y":7},{"y":7},{"x":7}],"c":7}"#).unwrap();
+    fn numbers_keep_their_place_when_others_are_added_and_removed() {
+        let before = JsonParts::of(br#"{"a":null,"b":[{"x":1,"y":2},{"x":3,"y":4}],"c":5}"#).unwrap();
+        let after = JsonParts::of(br#"{"a":{"z":9},"b":[{"x":7,"y":7},{"y":7},{"x":7}],"c":7}"#).unwrap();
         assert_eq!(before.aligned_to(&after.skeleton), [0, 1, 2, 4, 0, 5]);
     }
 
     #[test]
-    fn a_number_that_is_none_is_refused() {
-        assert_eq!(Parts::of(b"[1-2]"), None);
-        assert_eq!(Parts::of(b"[1e999]"), None);
+    fn an_invalid_number_is_rejected() {
+        assert_eq!(JsonParts::of(b"[1-2]"), None);
+        assert_eq!(JsonParts::of(b"[1e999]"), None);
     }
 }

@@ -1,4 +1,4 @@
-//! Looking at a store without changing it: while a daemon runs, after one died, on a disk that cannot be written.
+//! Reads a store without changing it: next to a running daemon, after a crash, on a disk that cannot be written.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -7,111 +7,71 @@ use rusqlite::types::Value;
 use rusqlite::{Connection, OpenFlags};
 
 use super::chain::hex;
-use super::database;
-use super::document::Document;
+use super::document::StateDocument;
 use super::folder::{DATABASE, with_suffix};
-use super::rows::Table;
+use super::rows::HistoryTable;
 use super::schema;
-use super::verify::{self, Verdict};
+use super::state_slots::{STATE, read_document};
+use super::verify::{self, ChainReport};
 
-/// Largest database that is copied to be read, with its log, bytes: what a temporary folder can be asked for.
+/// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
-/// The same for the daemon at its start: the temporary folder may be in the memory it is allowed.
+/// The same for the daemon at its start: the temporary folder may count as its memory.
 pub(super) const MAX_DAEMON_COPY_BYTES: u64 = 8 << 20;
 
-/// A store open for looking.
+/// A store, open for reading.
 #[derive(Debug)]
-pub struct Reader {
+pub struct HistoryReader {
     connection: Connection,
     path: PathBuf,
-    /// The copy it reads, when the original cannot be read where it is.
+    /// Folder of the copy it reads, when the original cannot be read in its place.
     copy: Option<PathBuf>,
 }
 
-/// Which rows are wanted.
+/// A selection of rows.
 #[derive(Debug, Clone, Default)]
-pub struct Filter {
-    /// Of these kinds; empty = all. Names of the tables.
-    pub kinds: Vec<Kind>,
-    /// Of this cell, from 0; `None` = all.
+pub struct HistoryQuery {
+    /// Tables; empty = all.
+    pub kinds: Vec<HistoryTable>,
+    /// Cell, from 0; `None` = all.
     pub cell: Option<u16>,
-    /// Wall clock from here on, ns since 1970.
+    /// Earliest wall clock, ns since 1970.
     pub since_ns: Option<i64>,
-    /// Wall clock up to here.
+    /// Latest wall clock, ns since 1970.
     pub until_ns: Option<i64>,
-    /// At most so many, the latest; `None` = all.
+    /// Greatest number of rows, the latest ones; `None` = all.
     pub limit: Option<u32>,
 }
 
-impl Filter {
-    /// Kinds that are wanted, in the order in which they are shown.
-    pub fn wanted_kinds(&self) -> impl Iterator<Item = Kind> {
-        Kind::ALL.into_iter().filter(|kind| self.kinds.is_empty() || self.kinds.contains(kind))
-    }
-}
-
-/// A kind of row.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// Charges and discharges.
-    HalfCycle,
-    /// Capacities learned.
-    Capacity,
-    /// What remained of the life of the cell whose life ends first.
-    RemainingLife,
-    /// Alarms.
-    Alarm,
-    /// Resets, packs, damages.
-    Reset,
-}
-
-impl Kind {
-    /// All of them.
-    pub const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
-
-    const fn table(self) -> Table {
-        match self {
-            Self::HalfCycle => Table::HalfCycle,
-            Self::Capacity => Table::Capacity,
-            Self::RemainingLife => Table::RemainingLife,
-            Self::Alarm => Table::Alarm,
-            Self::Reset => Table::Reset,
-        }
-    }
-
-    /// As people and JSON name it.
-    pub const fn name(self) -> &'static str {
-        self.table().name()
-    }
-
-    /// Names of the values of its rows, the cell (from 0) first.
-    pub const fn columns(self) -> &'static [&'static str] {
-        self.table().columns()
+impl HistoryQuery {
+    /// The selected tables, in the order in which they are shown.
+    pub fn wanted_kinds(&self) -> impl Iterator<Item = HistoryTable> {
+        HistoryTable::ALL.into_iter().filter(|kind| self.kinds.is_empty() || self.kinds.contains(kind))
     }
 }
 
 /// One row of the history.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Entry {
-    /// What it is.
-    pub kind: Kind,
-    /// Number in the chain; half-cycles are not in it.
+pub struct HistoryEntry {
+    /// Its table.
+    pub kind: HistoryTable,
+    /// Number in the chain; `None` for half-cycles, which are not chained.
     pub seq: Option<i64>,
-    /// The moment it was written at: rows are in its order.
+    /// Number of the moment at which it was written, the order of the rows.
     pub moment: i64,
-    /// Wall clock, ns since 1970, as it was set then.
+    /// Wall clock at that moment, ns since 1970.
     pub wall_ns: i64,
     /// The inputs' clock, ns.
     pub time_ns: i64,
-    /// Which boot.
+    /// The boot, 32 hexadecimal digits.
     pub boot: String,
-    /// Which pack, from 1.
+    /// Number of the pack, from 1.
     pub pack: i64,
-    /// Values of [`Kind::columns`].
+    /// Values of [`HistoryTable::columns`].
     pub values: Vec<serde_json::Value>,
 }
 
-impl Reader {
+impl HistoryReader {
     /// Opens the store in a folder.
     ///
     /// # Errors
@@ -120,12 +80,12 @@ impl Reader {
         Self::open_within(folder, MAX_COPY_BYTES)
     }
 
-    /// As [`Reader::open`], with another limit to what is copied where it cannot be read in its place.
+    /// As [`HistoryReader::open`], with another limit to the size of a copy.
     pub(super) fn open_within(folder: &Path, max_copy_bytes: u64) -> Result<Self, String> {
         let path = folder.join(DATABASE);
         let named = |error: String| format!("{}: {error}", path.display());
         if !path.exists() {
-            return Err(named("no history there; --state says where the daemon keeps it".to_owned()));
+            return Err(named("no history there; name the folder of the daemon with --state".to_owned()));
         }
         let (connection, copy) = open_read_only(&path, max_copy_bytes).map_err(named)?;
         let reader = Self { connection, path: path.clone(), copy };
@@ -141,24 +101,24 @@ impl Reader {
         format!("{}: {error}", self.path.display())
     }
 
-    /// Goes through the chain.
+    /// Checks the hash chain.
     ///
     /// # Errors
     /// When the file cannot be read to the end.
-    pub fn verify(&self) -> Result<Verdict, String> {
+    pub fn verify(&self) -> Result<ChainReport, String> {
         verify::verify(&self.connection).map_err(|error| self.named(&error))
     }
 
     /// The stored state, if it is good.
-    pub(super) fn state(&self) -> Option<Document> {
-        database::read_document(&self.connection, database::STATE)
+    pub(super) fn state(&self) -> Option<StateDocument> {
+        read_document(&self.connection, STATE)
     }
 
-    /// The wanted rows in the order in which they were written.
+    /// The selected rows in the order in which they were written.
     ///
     /// # Errors
     /// When the file cannot be read.
-    pub fn entries(&self, filter: &Filter) -> Result<Vec<Entry>, String> {
+    pub fn entries(&self, filter: &HistoryQuery) -> Result<Vec<HistoryEntry>, String> {
         let mut entries = Vec::new();
         for kind in filter.wanted_kinds() {
             self.read(kind, filter, "DESC", &mut |entry| entries.push(entry)).map_err(|error| self.named(&error))?;
@@ -171,37 +131,47 @@ impl Reader {
         Ok(entries)
     }
 
-    /// The wanted rows of one kind, one by one, oldest first.
+    /// Calls `take` with each selected row of one table, oldest first.
     ///
     /// # Errors
     /// When the file cannot be read.
-    pub fn for_each(&self, kind: Kind, filter: &Filter, take: &mut dyn FnMut(Entry)) -> Result<(), String> {
+    pub fn for_each(
+        &self,
+        kind: HistoryTable,
+        filter: &HistoryQuery,
+        take: &mut dyn FnMut(HistoryEntry),
+    ) -> Result<(), String> {
         self.read(kind, filter, "ASC", take).map_err(|error| self.named(&error))
     }
 
-    fn read(&self, kind: Kind, filter: &Filter, order: &str, take: &mut dyn FnMut(Entry)) -> rusqlite::Result<()> {
-        let table = kind.table();
-        if !table.is_in(schema::version(&self.connection)?) {
+    fn read(
+        &self,
+        kind: HistoryTable,
+        filter: &HistoryQuery,
+        order: &str,
+        take: &mut dyn FnMut(HistoryEntry),
+    ) -> rusqlite::Result<()> {
+        if !kind.is_in(schema::version(&self.connection)?) {
             return Ok(());
         }
         let (seq, by) = match kind {
-            Kind::HalfCycle => ("NULL", format!("r.moment {order}, r.cell {order}")),
+            HistoryTable::HalfCycle => ("NULL", format!("r.moment {order}, r.cell {order}")),
             _ => ("r.seq", format!("r.seq {order}")),
         };
-        let columns: Vec<String> = table.columns().iter().map(|column| format!("r.{column}")).collect();
+        let columns: Vec<String> = kind.columns().iter().map(|column| format!("r.{column}")).collect();
         let sql = format!(
             "SELECT {seq}, r.moment, m.wall_ns, m.time_ns, m.boot, m.pack, {} FROM {} r JOIN moment m ON m.id = r.moment \
              WHERE (?1 IS NULL OR r.cell = ?1) AND (?2 IS NULL OR m.wall_ns >= ?2) AND (?3 IS NULL OR m.wall_ns <= ?3) \
              ORDER BY {by} LIMIT ?4",
             columns.join(", "),
-            table.name()
+            kind.name()
         );
         let limit = filter.limit.map_or(-1, i64::from);
         let mut statement = self.connection.prepare(&sql)?;
         let mut rows = statement.query((filter.cell, filter.since_ns, filter.until_ns, limit))?;
         while let Some(row) = rows.next()? {
             let boot: Vec<u8> = row.get(4)?;
-            take(Entry {
+            take(HistoryEntry {
                 kind,
                 seq: row.get(0)?,
                 moment: row.get(1)?,
@@ -218,7 +188,7 @@ impl Reader {
     }
 }
 
-impl Drop for Reader {
+impl Drop for HistoryReader {
     fn drop(&mut self) {
         if let Some(folder) = &self.copy {
             let _ = fs::remove_dir_all(folder);
@@ -236,8 +206,8 @@ fn json(value: Value) -> serde_json::Value {
     }
 }
 
-/// Opens for reading: as it is, beside a daemon that writes; else, on a disk that cannot be written, where SQLite
-/// cannot make its index of the log, a copy.
+/// Opens the database for reading, next to a daemon that writes. On a disk that cannot be written, where SQLite cannot
+/// create its index of the log, opens a copy.
 fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<PathBuf>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let readable = |connection: &Connection| -> rusqlite::Result<()> {
@@ -256,9 +226,9 @@ fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Optio
     if !matches!(code, Some(rusqlite::ErrorCode::CannotOpen | rusqlite::ErrorCode::ReadOnly)) {
         return Err(error.to_string());
     }
-    let folder = copy_beside_nothing(path, max_copy_bytes)
-        .map_err(|copying| format!("{error}; and no copy of it: {copying}"))?;
-    // A copy may be written: SQLite makes its index there.
+    let folder = copy_to_temporary(path, max_copy_bytes)
+        .map_err(|copying| format!("{error}; and it cannot be copied: {copying}"))?;
+    // A copy can be written: SQLite creates its index there.
     let opened = Connection::open(folder.join(DATABASE)).and_then(|connection| {
         readable(&connection)?;
         Ok(connection)
@@ -272,8 +242,8 @@ fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Optio
     }
 }
 
-/// Copies a database and its log into a folder of its own in the temporary folder.
-fn copy_beside_nothing(path: &Path, max_bytes: u64) -> std::io::Result<PathBuf> {
+/// Copies a database and its log into a new folder in the temporary folder.
+fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<PathBuf> {
     let log_bytes = fs::metadata(with_suffix(path, "-wal")).map_or(0, |file| file.len());
     let bytes = fs::metadata(path)?.len() + log_bytes;
     if bytes > max_bytes {
@@ -301,14 +271,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_so_much_is_copied_the_log_counted() {
+    fn a_copy_is_limited_and_its_log_counts() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join(DATABASE);
         fs::write(&path, [0; 600]).unwrap();
         fs::write(with_suffix(&path, "-wal"), [0; 500]).unwrap();
-        let refused = copy_beside_nothing(&path, 1000).unwrap_err().to_string();
+        let refused = copy_to_temporary(&path, 1000).unwrap_err().to_string();
         assert_eq!(refused, "1100 bytes, at most 1000 are copied");
-        let copy = copy_beside_nothing(&path, 1100).unwrap();
+        let copy = copy_to_temporary(&path, 1100).unwrap();
         assert!(with_suffix(&copy.join(DATABASE), "-wal").exists());
         fs::remove_dir_all(copy).unwrap();
     }

@@ -1,14 +1,14 @@
-//! The store fed from a replay: the same database, written at once, in bus time.
+//! The store of a replay: the same database, written synchronously, in bus time.
 
 use std::path::Path;
 
-use super::database::{Database, StateRecord};
-use super::document::Document;
+use super::database::Database;
+use super::document::StateDocument;
 use super::folder::{self, DATABASE, Folder};
 use super::history_filter::{CommitDecision, HistoryFilter};
-use super::parts::Parts;
-use super::rows::Batch;
+use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
+use super::state_slots::StateRecord;
 use crate::config::StoreConfig;
 use crate::monitor::{Event, Monitor};
 use crate::quantity::Timestamp;
@@ -17,7 +17,7 @@ use crate::quantity::Timestamp;
 #[derive(Debug)]
 pub struct Recorder {
     database: Database,
-    /// Keeps others out.
+    /// Locked against other processes.
     folder: Folder,
     history_filter: HistoryFilter,
     checkpoint_s: f64,
@@ -25,17 +25,17 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Makes the store in a folder that has none.
+    /// Creates the store in a folder that has none.
     ///
     /// # Errors
-    /// When there is one, or it cannot be made: a replay must never get into the history of a real pack.
+    /// When there is one, or it cannot be created: a replay must never get into the history of a real pack.
     pub fn create(path: &Path, config: &StoreConfig) -> Result<Self, String> {
         let shown = path.join(DATABASE).display().to_string();
         if folder::has_history(path) {
             return Err(format!("{shown}: exists; a replay needs a state folder of its own, name a new one"));
         }
         let mut folder = Folder::new(path.to_owned(), config.max_half_cycles);
-        folder.take().map_err(|error| format!("{}: {error}", path.display()))?;
+        folder.lock().map_err(|error| format!("{}: {error}", path.display()))?;
         let now = Stamp::replayed(Timestamp::ZERO);
         let database = Database::open(&path.join(DATABASE), &now, config.max_half_cycles)
             .map_err(|error| format!("{shown}: {error}"))?;
@@ -43,7 +43,7 @@ impl Recorder {
         Ok(Self { database, folder, history_filter, checkpoint_s, checkpointed: None })
     }
 
-    /// After an input: writes what its events have taught, and the checkpoint when it is due.
+    /// Writes the rows of one input's events, and the checkpoint when it is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
         let rows = match self.history_filter.take(events) {
             CommitDecision::Commit(rows) => Some(rows),
@@ -55,27 +55,21 @@ impl Recorder {
         }
         self.checkpointed = Some(now);
         let rows = rows.unwrap_or_else(|| self.history_filter.for_checkpoint(now));
-        let rows = Some(rows).filter(|rows| !rows.is_empty());
-        let batches: Vec<Batch> = rows.map(|rows| Batch { stamp: Stamp::replayed(now), rows }).into_iter().collect();
-        self.write(&batches, monitor, now, false)
+        self.write(rows, monitor, now, false)
     }
 
-    /// The last state, to the last bit.
+    /// Writes the last state, unrounded.
     pub fn finish(mut self, monitor: &Monitor, now: Timestamp) -> Result<(), String> {
-        let batch = Batch { stamp: Stamp::replayed(now), rows: self.history_filter.deferred() };
-        let batches = if batch.rows.is_empty() { Vec::new() } else { vec![batch] };
-        self.write(&batches, monitor, now, true)
+        let rows = self.history_filter.deferred();
+        self.write(rows, monitor, now, true)
     }
 
-    fn write(&mut self, batches: &[Batch], monitor: &Monitor, now: Timestamp, exact: bool) -> Result<(), String> {
-        let document = Document {
-            folder: self.folder.to_string(),
-            stamp: Stamp::replayed(now),
-            snapshot: Box::new(monitor.snapshot()),
-        };
-        let json = document.to_json().map_err(|error| error.to_string())?;
-        let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
-        let written = self.database.commit(batches, Some(StateRecord { parts, exact, sets_aside: false }));
+    fn write(&mut self, rows: Vec<HistoryRow>, monitor: &Monitor, now: Timestamp, exact: bool) -> Result<(), String> {
+        let stamp = Stamp::replayed(now);
+        let folder = self.folder.to_string();
+        let document = StateDocument { folder, stamp, snapshot: Box::new(monitor.snapshot()) };
+        let batch = (!rows.is_empty()).then_some(RowBatch { stamp, rows });
+        let written = self.database.commit(batch.as_slice(), Some(StateRecord::new(&document, exact, false)?));
         written.map_err(|error| format!("{}: {error}", self.folder))
     }
 }

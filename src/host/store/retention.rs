@@ -1,17 +1,17 @@
-//! Bounded growth: beyond the configured number of half-cycles the older half is thinned, every second transition of it,
-//! and its moment where no other row was written then.
+//! Bounds the history: beyond the configured number of half-cycles, every second transition of the older half is deleted,
+//! with its moment where no other row belongs to it.
 //!
-//! A little at each checkpoint, so that no commit is long. Capacities, alarms and resets are never thinned.
+//! Deletes a little at each checkpoint, so that no commit is long. Capacities, alarms and resets are never thinned.
 
 use rusqlite::{Connection, OptionalExtension, params};
 
-use super::database::Meta;
-use super::rows::Table;
+use super::meta::Meta;
+use super::rows::HistoryTable;
 
-/// Transitions taken out at one checkpoint: far more than one minute brings.
+/// Transitions deleted at one checkpoint: far more than one minute adds.
 const MAX_STEPS: usize = 4;
 
-/// Takes out what is too much, up to [`MAX_STEPS`] transitions of it.
+/// Deletes transitions beyond the limit, at most [`MAX_STEPS`].
 pub(super) fn thin(connection: &Connection, meta: &mut Meta, max_half_cycles: i64) -> rusqlite::Result<()> {
     for _ in 0..MAX_STEPS {
         if meta.half_cycles <= max_half_cycles {
@@ -48,7 +48,7 @@ fn next_transition(connection: &Connection, after: i64) -> rusqlite::Result<Opti
 }
 
 fn thin_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
-    for table in Table::CHAINED {
+    for table in HistoryTable::CHAINED {
         if has_row(connection, table, moment)? {
             return Ok(());
         }
@@ -56,9 +56,9 @@ fn thin_moment(connection: &Connection, moment: i64) -> rusqlite::Result<()> {
     connection.execute("DELETE FROM moment WHERE id = ?1", [moment]).map(drop)
 }
 
-/// Whether a chained row was written at this moment. Both are numbered in the same order, so halving finds it: an index
-/// would be written to with every row.
-fn has_row(connection: &Connection, table: Table, moment: i64) -> rusqlite::Result<bool> {
+/// Whether a chained row belongs to this moment. Rows and moments are numbered in the same order, so a binary search
+/// finds it; an index would cost a write with every row.
+fn has_row(connection: &Connection, table: HistoryTable, moment: i64) -> rusqlite::Result<bool> {
     let name = table.name();
     let (mut low, mut high): (i64, i64) = connection.query_row(
         &format!("SELECT coalesce(min(seq), 0), coalesce(max(seq), 0) FROM {name}"),

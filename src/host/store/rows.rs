@@ -1,44 +1,46 @@
-//! The rows of the history, and the values of their columns from the core's events.
+//! The tables of the history, and the rows that the core's events make in them.
+//!
+//! A column of the same name as a field of the event holds that field. Cells count from 0; units are in the names. A
+//! number that is not finite is stored as NULL.
 
 use rusqlite::types::Value;
-use serde::Serialize;
 
 use super::stamp::Stamp;
-use crate::alarm::{AlarmState, Rule, Severity};
+use crate::alarm::{Rule, Severity};
 use crate::monitor::EventKind;
 use crate::quantity::CellIndex;
 
 /// One row to write.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Row {
-    /// A half-cycle, a capacity, an alarm, a filter that started again, another pack: as the core told it.
+pub(super) enum HistoryRow {
+    /// An event of the core: a half-cycle, a capacity, an alarm, a filter reset, another pack.
     Event(EventKind),
-    /// Something that happened to the store itself.
+    /// An event of the store itself.
     Own {
-        /// A word for what: `damaged`, `rows_lost`.
+        /// Its name: `damaged`, `rows_lost`.
         reason: &'static str,
-        /// The rest, for people.
+        /// Details for the reader.
         detail: String,
     },
 }
 
 /// Rows of one moment.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Batch {
-    /// When.
+pub(super) struct RowBatch {
+    /// The moment.
     pub stamp: Stamp,
-    /// What, in the order in which it was told.
-    pub rows: Vec<Row>,
+    /// The rows, in the order of the events.
+    pub rows: Vec<HistoryRow>,
 }
 
 /// A table of the history.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Table {
+pub enum HistoryTable {
     /// Charges and discharges; the oldest are thinned.
     HalfCycle,
-    /// Capacities learned; chained, never thinned.
+    /// Learned capacities; chained, never thinned.
     Capacity,
-    /// What remained of the life of the cell whose life ends first; chained, never thinned.
+    /// Remaining life of the cell whose life ends first; chained, never thinned.
     RemainingLife,
     /// Alarms; chained, never thinned.
     Alarm,
@@ -46,19 +48,19 @@ pub(super) enum Table {
     Reset,
 }
 
-impl Table {
-    /// All, in the order in which they are shown.
-    pub(super) const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
-    /// Those whose rows are chained by hash.
+impl HistoryTable {
+    /// All tables, in the order in which they are shown.
+    pub const ALL: [Self; 5] = [Self::HalfCycle, Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
+    /// The tables whose rows are chained by hash.
     pub(super) const CHAINED: [Self; 4] = [Self::Capacity, Self::RemainingLife, Self::Alarm, Self::Reset];
 
-    /// Whether a database of this layout's version has it.
+    /// Whether a database of this layout version has it.
     pub(super) const fn is_in(self, version: i32) -> bool {
         version >= if matches!(self, Self::RemainingLife) { 2 } else { 1 }
     }
 
-    /// Its name in the database.
-    pub(super) const fn name(self) -> &'static str {
+    /// Its name in the database, in JSON and in CSV.
+    pub const fn name(self) -> &'static str {
         match self {
             Self::HalfCycle => "half_cycle",
             Self::Capacity => "capacity",
@@ -68,8 +70,8 @@ impl Table {
         }
     }
 
-    /// Its columns besides the moment, the sequence number and the hash.
-    pub(super) const fn columns(self) -> &'static [&'static str] {
+    /// Its columns, the cell (from 0) first, without the moment, the sequence number and the hash.
+    pub const fn columns(self) -> &'static [&'static str] {
         match self {
             Self::HalfCycle => &[
                 "cell",
@@ -111,39 +113,64 @@ impl Table {
     }
 }
 
-impl Row {
-    /// Its table and the values of the table's columns; `None` = the history has no row for it. Cells count from 0.
-    pub(super) fn values(&self) -> Option<(Table, Vec<Value>)> {
-        let row = match self {
-            Self::Own { reason, detail } => (
-                Table::Reset,
-                vec![Value::Null, Value::Text((*reason).to_owned()), Value::Null, Value::Null, detail.clone().into()],
-            ),
-            Self::Event(kind) => event_values(kind)?,
+impl HistoryRow {
+    /// Its table and the values of the table's columns; `None` = the history has no row for it.
+    pub(super) fn values(&self) -> Option<(HistoryTable, Vec<Value>)> {
+        let text = |text: &str| Value::Text(text.to_owned());
+        let kind = match self {
+            Self::Own { reason, detail } => {
+                let values = vec![Value::Null, text(reason), Value::Null, Value::Null, text(detail)];
+                return Some((HistoryTable::Reset, values));
+            }
+            Self::Event(kind) => kind,
         };
-        Some(row)
+        // Columns whose value is not the event's field of that name.
+        let (table, own) = match kind {
+            EventKind::HalfCycle { .. } => (HistoryTable::HalfCycle, vec![]),
+            EventKind::Capacity { .. } => (HistoryTable::Capacity, vec![]),
+            EventKind::RemainingLife { .. } => (HistoryTable::RemainingLife, vec![]),
+            EventKind::Alarm { .. } => (HistoryTable::Alarm, vec![]),
+            // No threshold watches it any more: it has ended, without a value that decided.
+            EventKind::AlarmDropped { .. } => {
+                let no = Value::Integer(0);
+                let own = [("change", text("dropped")), ("state", text("inactive")), ("active", no.clone())];
+                (HistoryTable::Alarm, own.into_iter().chain([("acknowledged", no)]).collect())
+            }
+            EventKind::FilterReset { .. } => (HistoryTable::Reset, vec![("reason", text("filter_reset"))]),
+            EventKind::PackIdentity { identity } => {
+                (HistoryTable::Reset, vec![("reason", text("pack_identity")), ("detail", text(&identity.to_string()))])
+            }
+            EventKind::PackReplaced { .. } => (HistoryTable::Reset, vec![("reason", text("pack_replaced"))]),
+            _ => return None,
+        };
+        let fields = serde_json::to_value(kind).ok()?;
+        let value = |column: &&str| match own.iter().find(|(name, _)| name == column) {
+            Some((_, value)) => value.clone(),
+            None => fields.get(*column).map_or(Value::Null, sql_value),
+        };
+        Some((table, table.columns().iter().map(value).collect()))
     }
 
-    /// Detail that may go first when there is no room for all.
+    /// Whether it is detail: dropped first when there is no room for all.
     pub(super) const fn is_detail(&self) -> bool {
         matches!(self, Self::Event(EventKind::HalfCycle { .. }))
     }
 
-    /// Whether both are of one alarm, or of one cell's filter.
+    /// Whether both rows are about the same alarm, or about the filter of the same cell.
     pub(super) fn repeats(&self, other: &Self) -> bool {
         match (self, other) {
             (Self::Event(EventKind::FilterReset { cell }), Self::Event(EventKind::FilterReset { cell: other })) => {
                 cell == other
             }
             (Self::Event(one), Self::Event(other)) => {
-                let subject = Subject::of(one);
-                subject.is_some_and(|subject| subject != Subject::Filters) && subject == Subject::of(other)
+                let subject = EventSubject::of(one);
+                subject.is_some_and(|subject| subject != EventSubject::Filters) && subject == EventSubject::of(other)
             }
             _ => false,
         }
     }
 
-    /// The number of the pack that is connected, as it is told here.
+    /// The identity of the connected pack, if this row states it.
     pub(super) const fn pack_identity(&self) -> Option<f64> {
         match self {
             Self::Event(EventKind::PackIdentity { identity }) => Some(*identity),
@@ -157,17 +184,17 @@ impl Row {
     }
 }
 
-/// What may come again and again without anything having been learned.
+/// The source of events that may repeat although nothing was learned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Subject {
-    /// Filters that start again, of whatever cell.
+pub(super) enum EventSubject {
+    /// Filter resets, of any cell.
     Filters,
     /// An alarm.
     Alarm(Rule, Severity, Option<CellIndex>),
 }
 
-impl Subject {
-    /// Of an event; `None` = it is of another kind.
+impl EventSubject {
+    /// The subject of an event; `None` = an event of another kind.
     pub(super) const fn of(kind: &EventKind) -> Option<Self> {
         match *kind {
             EventKind::FilterReset { .. } => Some(Self::Filters),
@@ -177,242 +204,15 @@ impl Subject {
     }
 }
 
-fn event_values(kind: &EventKind) -> Option<(Table, Vec<Value>)> {
-    let reset = |cell: Value, reason: &str, detail: Value| {
-        (Table::Reset, vec![cell, Value::Text(reason.to_owned()), Value::Null, Value::Null, detail])
-    };
-    Some(match *kind {
-        EventKind::HalfCycle { .. } => (Table::HalfCycle, half_cycle_values(kind)?),
-        EventKind::Capacity { .. } => (Table::Capacity, capacity_values(kind)?),
-        EventKind::RemainingLife { cell, cycles, cycles_low, cycles_high, days, days_low, days_high } => {
-            let mut values = vec![cell.map_or(Value::Null, |cell| whole(cell.0))];
-            values.extend([cycles, cycles_low, cycles_high, days, days_low, days_high].map(maybe));
-            (Table::RemainingLife, values)
-        }
-        EventKind::Alarm { .. } => (Table::Alarm, alarm_values(kind)?),
-        EventKind::AlarmDropped { rule, severity, cell, active: _, occurrences } => {
-            (Table::Alarm, dropped_values(rule, severity, cell, occurrences))
-        }
-        EventKind::FilterReset { cell } => reset(whole(cell.0), "filter_reset", Value::Null),
-        EventKind::PackIdentity { identity } => reset(Value::Null, "pack_identity", Value::Text(identity.to_string())),
-        EventKind::PackReplaced { capacity_ah, capacity_std_ah } => (
-            Table::Reset,
-            vec![Value::Null, word(&"pack_replaced"), maybe(capacity_ah), maybe(capacity_std_ah), Value::Null],
-        ),
-        _ => return None,
-    })
-}
-
-fn half_cycle_values(kind: &EventKind) -> Option<Vec<Value>> {
-    let EventKind::HalfCycle {
-        cell,
-        mode,
-        charge_ah,
-        swing,
-        swing_std,
-        duration_s,
-        mean_current_a,
-        mean_temperature_c,
-    } = *kind
-    else {
-        return None;
-    };
-    Some(vec![
-        whole(cell.0),
-        word(&mode),
-        real(charge_ah),
-        maybe(swing),
-        maybe(swing_std),
-        real(duration_s),
-        real(mean_current_a),
-        maybe(mean_temperature_c),
-    ])
-}
-
-fn capacity_values(kind: &EventKind) -> Option<Vec<Value>> {
-    let EventKind::Capacity {
-        cell,
-        measured_ah,
-        measured_std_ah,
-        capacity_ah,
-        capacity_std_ah,
-        usable_capacity_ah,
-        usable_capacity_std_ah,
-        resistance_ratio,
-        resistance_ratio_std,
-    } = *kind
-    else {
-        return None;
-    };
-    Some(vec![
-        whole(cell.0),
-        maybe(measured_ah),
-        maybe(measured_std_ah),
-        real(capacity_ah),
-        real(capacity_std_ah),
-        maybe(usable_capacity_ah),
-        maybe(usable_capacity_std_ah),
-        real(resistance_ratio),
-        real(resistance_ratio_std),
-    ])
-}
-
-fn alarm_values(kind: &EventKind) -> Option<Vec<Value>> {
-    let EventKind::Alarm {
-        rule,
-        cell,
-        change,
-        state,
-        active,
-        severity,
-        value,
-        probability,
-        threshold,
-        occurrences,
-        acknowledged,
-    } = *kind
-    else {
-        return None;
-    };
-    Some(vec![
-        cell.map_or(Value::Null, |cell| whole(cell.0)),
-        Value::Text(rule.name().to_owned()),
-        word(&severity),
-        word(&change),
-        word(&state),
-        whole(u8::from(active)),
-        maybe(value),
-        maybe(probability),
-        real(threshold),
-        whole(occurrences),
-        whole(u8::from(acknowledged)),
-    ])
-}
-
-/// An alarm that nothing watches any more has ended, without a value that said so.
-fn dropped_values(rule: Rule, severity: Severity, cell: Option<CellIndex>, occurrences: u32) -> Vec<Value> {
-    vec![
-        cell.map_or(Value::Null, |cell| whole(cell.0)),
-        Value::Text(rule.name().to_owned()),
-        word(&severity),
-        word(&"dropped"),
-        word(&AlarmState::Inactive),
-        whole(0),
-        Value::Null,
-        Value::Null,
-        Value::Null,
-        whole(occurrences),
-        whole(0),
-    ]
-}
-
-fn whole(value: impl Into<i64>) -> Value {
-    Value::Integer(value.into())
-}
-
-fn real(value: f64) -> Value {
-    // SQLite has no NaN: it would store NULL, and the hash would differ.
-    if value.is_nan() { Value::Null } else { Value::Real(value) }
-}
-
-fn maybe(value: Option<f64>) -> Value {
-    value.map_or(Value::Null, real)
-}
-
-/// A choice as events and configurations write it.
-fn word(value: &impl Serialize) -> Value {
-    match serde_json::to_value(value) {
-        Ok(serde_json::Value::String(word)) => Value::Text(word),
+/// A field of an event as SQLite stores it; what has no form there is NULL.
+fn sql_value(field: &serde_json::Value) -> Value {
+    match field {
+        serde_json::Value::Bool(flag) => Value::Integer(i64::from(*flag)),
+        serde_json::Value::Number(number) => number.as_i64().map_or_else(|| number.as_f64().into(), Value::Integer),
+        serde_json::Value::String(text) => Value::Text(text.clone()),
         _ => Value::Null,
     }
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-    use super::*;
-    use crate::alarm::Change;
-    use crate::quantity::Mode;
-
-    /// A capacity of a cell, with or without information.
-    pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
-        EventKind::Capacity {
-            cell: CellIndex(cell),
-            measured_ah,
-            measured_std_ah: measured_ah.map(|_| 0.1),
-            capacity_ah: 2.5,
-            capacity_std_ah: 0.05,
-            usable_capacity_ah: Some(usable_ah),
-            usable_capacity_std_ah: Some(0.06),
-            resistance_ratio: 1.1,
-            resistance_ratio_std: 0.02,
-        }
-    }
-
-    /// A half-cycle of a cell.
-    pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
-        EventKind::HalfCycle {
-            cell: CellIndex(cell),
-            mode: Mode::Charge,
-            charge_ah: 1.5,
-            swing: Some(0.6),
-            swing_std: None,
-            duration_s: 3600.0,
-            mean_current_a: -1.5,
-            mean_temperature_c: Some(25.0),
-        }
-    }
-
-    /// What remains of the pack's life, cycles.
-    pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
-        EventKind::RemainingLife {
-            cell: Some(CellIndex(2)),
-            cycles: Some(cycles),
-            cycles_low: Some(0.5 * cycles),
-            cycles_high: Some(2.0 * cycles),
-            days: None,
-            days_low: None,
-            days_high: None,
-        }
-    }
-
-    /// An alarm of the pack.
-    pub(in crate::store) fn alarm(change: Change) -> EventKind {
-        EventKind::Alarm {
-            rule: Rule::SocLow,
-            cell: None,
-            change,
-            state: AlarmState::Active,
-            active: true,
-            severity: Severity::Warning,
-            value: Some(0.05),
-            probability: None,
-            threshold: 0.1,
-            occurrences: 1,
-            acknowledged: false,
-        }
-    }
-
-    #[test]
-    fn every_row_has_a_value_per_column() {
-        let own = Row::Own { reason: "damaged", detail: "x".to_owned() };
-        let kinds = [
-            half_cycle(3),
-            capacity(3, None, 2.4),
-            remaining_life(100.0),
-            alarm(Change::Raised),
-            EventKind::AlarmDropped {
-                rule: Rule::SocLow,
-                severity: Severity::Severe,
-                cell: None,
-                active: true,
-                occurrences: 3,
-            },
-            EventKind::FilterReset { cell: CellIndex(1) },
-            EventKind::PackReplaced { capacity_ah: Some(2.0), capacity_std_ah: None },
-        ];
-        for row in kinds.into_iter().map(Row::Event).chain([own]) {
-            let (table, values) = row.values().unwrap();
-            assert_eq!(values.len(), table.columns().len(), "{row:?}");
-        }
-    }
-}
+pub(super) mod tests;

@@ -1,13 +1,13 @@
-//! The state in the runtime folder, every second: what a crash of the daemon alone may lose.
+//! Writes the state to the runtime folder every second, so that a crash of the daemon alone loses at most a second.
 //!
-//! The folder is in memory and lives as long as the boot (systemd keeps it over restarts of the service). A thread of
-//! its own writes the latest state that was handed over; a slow disk elsewhere does not hold it up.
+//! The folder is in memory and lives as long as the boot (systemd keeps it over restarts of the service). A separate
+//! thread writes the latest state, so that a slow disk elsewhere does not delay it.
 
 use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use super::document::Document;
+use super::document::StateDocument;
 
 /// Name of the file.
 pub(super) const FILE_NAME: &str = "state.json";
@@ -21,13 +21,13 @@ pub(super) struct RuntimeState {
 
 #[derive(Debug, Default)]
 struct Shared {
-    next: Mutex<Next>,
+    next: Mutex<PendingDocument>,
     wake: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct Next {
-    document: Option<Document>,
+struct PendingDocument {
+    document: Option<StateDocument>,
     stop: bool,
 }
 
@@ -40,8 +40,8 @@ impl RuntimeState {
         Ok(Self { shared, writer: Some(writer) })
     }
 
-    /// Hands the latest state over; one that is still waiting is replaced.
-    pub(super) fn put(&self, document: Document) {
+    /// Queues the latest state; it replaces one that still waits.
+    pub(super) fn put(&self, document: StateDocument) {
         self.shared.next.lock().unwrap_or_else(PoisonError::into_inner).document = Some(document);
         self.shared.wake.notify_one();
     }
@@ -51,7 +51,7 @@ impl Drop for RuntimeState {
     fn drop(&mut self) {
         self.shared.next.lock().unwrap_or_else(PoisonError::into_inner).stop = true;
         self.shared.wake.notify_one();
-        // The folder is in memory: this takes milliseconds.
+        // The folder is in memory: the thread ends within milliseconds.
         let _ = self.writer.take().map(JoinHandle::join);
     }
 }

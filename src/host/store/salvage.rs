@@ -1,11 +1,11 @@
-//! What can still be read of a damaged database.
+//! Copies the readable rows of a damaged database.
 //!
-//! Rows are copied from the front up to where reading fails and from the back down to there, a few at a time: a history
-//! of any length needs the same memory. A chained row whose hash does not fit its own contents was changed by the damage:
-//! it is not taken over, and counted. The copies get numbers and hashes of the new chain.
+//! Copies rows from the front to the damage and from the back to the damage, a few at a time: a history of any length
+//! needs the same memory. A chained row whose hash does not match its contents was changed by the damage; it is rejected
+//! and counted. The copies get numbers and hashes of the new chain.
 //!
-//! How many packs there were is known from rows whose hash is good and from the number of rows in `pack`; a row without
-//! proof that names another pack is refused.
+//! The number of packs comes from rows with a good hash and from the table `pack`; an unchecked row that names a further
+//! pack is rejected.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -15,10 +15,13 @@ use rusqlite::types::Value;
 use rusqlite::{Connection, OpenFlags, Row, params};
 
 use super::chain::{self, Hash};
-use super::database::{self, Database, Meta};
-use super::document::Document;
-use super::rows::Table;
+use super::database::Database;
+use super::document::StateDocument;
+use super::meta::Meta;
+use super::row_sql::{MOMENT_COLUMNS, rows_sql, write_moment, write_row};
+use super::rows::HistoryTable;
 use super::stamp::{BootId, Stamp};
+use super::state_slots::{STATE, read_document};
 use crate::quantity::Timestamp;
 
 /// Rows of a table in memory at once.
@@ -26,9 +29,9 @@ const PAGE_ROWS: usize = 64;
 /// Rows copied in one transaction: the new file's log stays short.
 const STEP_ROWS: usize = 2_000;
 
-/// What was taken over.
+/// Counts of the copied rows, and the state.
 #[derive(Debug, Default)]
-pub(super) struct Saved {
+pub(super) struct SalvageReport {
     pub(super) capacities: usize,
     pub(super) lives: usize,
     pub(super) alarms: usize,
@@ -36,50 +39,50 @@ pub(super) struct Saved {
     pub(super) half_cycles: usize,
     /// Rows that the damage has changed.
     pub(super) refused: usize,
-    pub(super) state: Option<Document>,
+    pub(super) state: Option<StateDocument>,
 }
 
-impl fmt::Display for Saved {
+impl fmt::Display for SalvageReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { capacities, lives, alarms, resets, half_cycles, refused, state } = self;
         let state = if state.is_some() { "with" } else { "without" };
         write!(
             f,
-            "taken over: {capacities} capacities, {lives} remaining lives, {alarms} alarms, {resets} resets, {half_cycles} \
-             half-cycles, {state} its state; refused: {refused}"
+            "copied: {capacities} capacities, {lives} remaining lives, {alarms} alarms, {resets} resets, {half_cycles} \
+             half-cycles, {state} its state; rejected: {refused}"
         )
     }
 }
 
-impl Saved {
-    fn count(&mut self, table: Table) {
+impl SalvageReport {
+    fn count(&mut self, table: HistoryTable) {
         *match table {
-            Table::HalfCycle => &mut self.half_cycles,
-            Table::Capacity => &mut self.capacities,
-            Table::RemainingLife => &mut self.lives,
-            Table::Alarm => &mut self.alarms,
-            Table::Reset => &mut self.resets,
+            HistoryTable::HalfCycle => &mut self.half_cycles,
+            HistoryTable::Capacity => &mut self.capacities,
+            HistoryTable::RemainingLife => &mut self.lives,
+            HistoryTable::Alarm => &mut self.alarms,
+            HistoryTable::Reset => &mut self.resets,
         } += 1;
     }
 }
 
-/// Copies what is good into a database that is new and that nobody uses before this has returned.
+/// Copies the good rows into a new database that is not used before this returns.
 ///
 /// # Errors
-/// When the new one cannot be written.
-pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Result<Saved> {
+/// When the new database cannot be written.
+pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Result<SalvageReport> {
     let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let Ok(old) = Connection::open_with_flags(damaged, flags) else { return Ok(Saved::default()) };
+    let Ok(old) = Connection::open_with_flags(damaged, flags) else { return Ok(SalvageReport::default()) };
     let packs = read_packs(&old);
-    let (connection, ledger) = database.parts_mut();
-    let saved = Saved { state: database::read_document(&old, database::STATE), ..Saved::default() };
+    let (connection, meta) = database.parts_mut();
+    let saved = SalvageReport { state: read_document(&old, STATE), ..SalvageReport::default() };
     let count = i64::try_from(packs.len()).unwrap_or(1).max(1);
-    let mut copier = Copier { connection, ledger, moment: None, before: Some((0, [0; 32])), packs: count, saved };
-    let mut sources = Table::ALL.map(|table| Source::new(&old, table));
+    let mut copier = Copier { connection, meta, moment: None, before: Some((0, [0; 32])), packs: count, saved };
+    let mut sources = HistoryTable::ALL.map(|table| TableSource::new(&old, table));
     connection.execute_batch("BEGIN IMMEDIATE")?;
     let mut rows = 0_usize;
     while let Some((table, row)) = next(&old, &mut sources) {
-        copier.take(table, &row)?;
+        copier.copy_checked(table, &row)?;
         rows += 1;
         if rows.is_multiple_of(STEP_ROWS) {
             connection.execute_batch("COMMIT; BEGIN IMMEDIATE")?;
@@ -87,14 +90,14 @@ pub(super) fn salvage(damaged: &Path, database: &mut Database) -> rusqlite::Resu
     }
     copier.copy_packs(&packs)?;
     let Copier { packs, saved, .. } = copier;
-    ledger.pack = packs;
-    database::write_meta(connection, ledger)?;
+    meta.pack = packs;
+    meta.write(connection)?;
     connection.execute_batch("COMMIT")?;
     Ok(saved)
 }
 
 /// A row of the table `pack`.
-struct Pack {
+struct PackRow {
     id: i64,
     opened_ns: i64,
     closed_ns: Option<i64>,
@@ -102,99 +105,99 @@ struct Pack {
     identity: Option<String>,
 }
 
-/// Those that can be read.
-fn read_packs(old: &Connection) -> Vec<Pack> {
+/// The rows of `pack` that can be read.
+fn read_packs(old: &Connection) -> Vec<PackRow> {
     let Ok(mut statement) = old.prepare("SELECT id, opened_ns, closed_ns, reason, identity FROM pack ORDER BY id")
     else {
         return Vec::new();
     };
     let of = |row: &Row<'_>| {
         let (id, opened_ns, closed_ns) = (row.get(0)?, row.get(1)?, row.get(2)?);
-        Ok(Pack { id, opened_ns, closed_ns, reason: row.get(3)?, identity: row.get(4)? })
+        Ok(PackRow { id, opened_ns, closed_ns, reason: row.get(3)?, identity: row.get(4)? })
     };
     statement.query_map([], of).map(|packs| packs.filter_map(Result::ok).collect()).unwrap_or_default()
 }
 
-/// Where a row stands in its table: its number; of a half-cycle its moment and its cell.
-type Key = (i64, i64);
+/// The key of a row in its table: its number; of a half-cycle its moment and its cell.
+type RowKey = (i64, i64);
 
 /// A row read from the damaged file.
-struct Found {
-    key: Key,
+struct SalvagedRow {
+    key: RowKey,
     hash: Option<Hash>,
-    /// Both empty when something in them has no meaning.
+    /// Both are empty when a value in them cannot be read.
     moment: Vec<Value>,
     values: Vec<Value>,
 }
 
 /// One table's rows in order.
-struct Source {
-    table: Table,
-    page: VecDeque<Found>,
-    /// Where reading goes on. A search for the key before it could end in a damaged page.
-    from: Key,
-    /// The key of the table's last row: none is beyond it.
-    end: Key,
-    phase: Phase,
+struct TableSource {
+    table: HistoryTable,
+    page: VecDeque<SalvagedRow>,
+    /// The key at which reading continues. A search for the key before it could end in a damaged page.
+    from: RowKey,
+    /// The key of the table's last row.
+    end: RowKey,
+    phase: ReadPhase,
 }
 
-/// How far the reading of a table is.
+/// The part of a table that is being read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
-    /// From the front.
+enum ReadPhase {
+    /// Before the damage.
     Front,
-    /// Behind the damage.
+    /// After the damage.
     Back,
     Done,
 }
 
-impl Source {
-    fn new(old: &Connection, table: Table) -> Self {
+impl TableSource {
+    fn new(old: &Connection, table: HistoryTable) -> Self {
         let mut source = Self {
             table,
             page: VecDeque::new(),
             from: (i64::MIN, i64::MIN),
             end: (i64::MAX, i64::MAX),
-            phase: Phase::Front,
+            phase: ReadPhase::Front,
         };
         source.end = source.back_keys(old, Some(1)).unwrap_or(source.end);
         source
     }
 
-    /// Reads on when nothing is left.
+    /// Reads the next page when the present one is empty.
     fn fill(&mut self, old: &Connection) {
-        while self.page.is_empty() && self.phase != Phase::Done {
+        while self.page.is_empty() && self.phase != ReadPhase::Done {
             match (self.read_page(old), self.phase) {
                 (Ok(PAGE_ROWS), _) => {}
-                (Err(_), Phase::Front) => {
-                    self.phase = Phase::Back;
+                (Err(_), ReadPhase::Front) => {
+                    self.phase = ReadPhase::Back;
                     self.from = self.back_keys(old, None).unwrap_or((i64::MAX, i64::MAX));
                 }
-                _ => self.phase = Phase::Done,
+                _ => self.phase = ReadPhase::Done,
             }
         }
     }
 
-    /// The next rows; how many. What was read before an error is in the page.
+    /// Reads the next rows and returns their number. Rows read before an error are in the page.
     fn read_page(&mut self, old: &Connection) -> rusqlite::Result<usize> {
         let (which, bound): (&str, &[i64]) = match self.table {
-            Table::HalfCycle => {
+            HistoryTable::HalfCycle => {
                 ("WHERE (r.moment, r.cell) >= (?1, ?2) ORDER BY r.moment, r.cell", &[self.from.0, self.from.1])
             }
             _ => ("WHERE r.seq >= ?1 ORDER BY r.seq", &[self.from.0]),
         };
-        let sql = database::rows_sql(self.table, &format!("{which} LIMIT {PAGE_ROWS}"));
+        let sql = rows_sql(self.table, &format!("{which} LIMIT {PAGE_ROWS}"));
         let mut statement = old.prepare_cached(&sql)?;
         let mut rows = statement.query(rusqlite::params_from_iter(bound))?;
         let mut count = 0;
         while let Some(row) = rows.next()? {
             let key = key_of(self.table, row)?;
             if key < self.from || key > self.end {
-                // Out of order: reading on from there would go round, or past all that follows.
+                // Out of order: reading from there would loop, or skip the rest.
                 return Err(rusqlite::Error::QueryReturnedMoreThanOneRow);
             }
             self.from = match self.table {
-                Table::HalfCycle => (key.0, key.1.saturating_add(1)),
+                HistoryTable::HalfCycle => (key.0, key.1.saturating_add(1)),
                 _ => (key.0.saturating_add(1), key.1),
             };
             self.page.push_back(found(self.table, key, row));
@@ -203,13 +206,13 @@ impl Source {
         Ok(count)
     }
 
-    /// The lowest key that can be reached from the back in so many rows; `None` = not even the last.
-    fn back_keys(&self, old: &Connection, rows: Option<usize>) -> Option<Key> {
+    /// The lowest key that can be reached from the back within `rows` rows; `None` = not even the last row can be read.
+    fn back_keys(&self, old: &Connection, rows: Option<usize>) -> Option<RowKey> {
         let order = match self.table {
-            Table::HalfCycle => "ORDER BY r.moment DESC, r.cell DESC",
+            HistoryTable::HalfCycle => "ORDER BY r.moment DESC, r.cell DESC",
             _ => "ORDER BY r.seq DESC",
         };
-        let mut statement = old.prepare(&database::rows_sql(self.table, order)).ok()?;
+        let mut statement = old.prepare(&rows_sql(self.table, order)).ok()?;
         let mut found = statement.query([]).ok()?;
         let mut lowest = None;
         for _ in 0..rows.unwrap_or(usize::MAX) {
@@ -223,26 +226,26 @@ impl Source {
     }
 }
 
-fn key_of(table: Table, row: &Row<'_>) -> rusqlite::Result<Key> {
-    Ok((row.get(0)?, if table == Table::HalfCycle { row.get(1)? } else { 0 }))
+fn key_of(table: HistoryTable, row: &Row<'_>) -> rusqlite::Result<RowKey> {
+    Ok((row.get(0)?, if table == HistoryTable::HalfCycle { row.get(1)? } else { 0 }))
 }
 
-fn found(table: Table, key: Key, row: &Row<'_>) -> Found {
+fn found(table: HistoryTable, key: RowKey, row: &Row<'_>) -> SalvagedRow {
     let values = |from: usize, count: usize| -> Vec<Value> {
         (from..from + count).map(|index| row.get(index)).collect::<rusqlite::Result<_>>().unwrap_or_default()
     };
     let columns = table.columns().len();
-    let (moment, values) = (values(2, database::MOMENT_COLUMNS), values(2 + database::MOMENT_COLUMNS, columns));
-    let hash = if table == Table::HalfCycle { None } else { row.get(1).ok() };
-    Found { key, hash, moment, values }
+    let (moment, values) = (values(2, MOMENT_COLUMNS), values(2 + MOMENT_COLUMNS, columns));
+    let hash = if table == HistoryTable::HalfCycle { None } else { row.get(1).ok() };
+    SalvagedRow { key, hash, moment, values }
 }
 
-/// The next row: of the chain by its number, of the half-cycles with the rows of its moment.
-fn next(old: &Connection, sources: &mut [Source]) -> Option<(Table, Found)> {
+/// The next row: chained rows in the order of their numbers, half-cycles with the rows of their moment.
+fn next(old: &Connection, sources: &mut [TableSource]) -> Option<(HistoryTable, SalvagedRow)> {
     sources.iter_mut().for_each(|source| source.fill(old));
     let heads = || sources.iter().enumerate().filter_map(|(at, source)| Some((source.page.front()?, source.table, at)));
-    let chained = heads().filter(|(_, table, _)| *table != Table::HalfCycle).min_by_key(|(row, ..)| row.key);
-    let half_cycle = heads().find(|(_, table, _)| *table == Table::HalfCycle);
+    let chained = heads().filter(|(_, table, _)| *table != HistoryTable::HalfCycle).min_by_key(|(row, ..)| row.key);
+    let half_cycle = heads().find(|(_, table, _)| *table == HistoryTable::HalfCycle);
     let at = match (half_cycle, chained) {
         (Some((row, _, at)), Some((other, _, later))) => {
             let moment = if let Some(Value::Integer(moment)) = other.moment.first() { *moment } else { i64::MIN };
@@ -255,34 +258,34 @@ fn next(old: &Connection, sources: &mut [Source]) -> Option<(Table, Found)> {
     source.page.pop_front().map(|row| (source.table, row))
 }
 
-/// What speaks for a row.
+/// The result of checking a row's hash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Proof {
-    /// Its hash.
-    Proven,
-    /// Nothing, and nothing against it: it has no hash, or the row before it is lost.
-    Believed,
+enum Evidence {
+    /// Its hash is good.
+    Verified,
+    /// It has no hash, or the row before it is lost.
+    Unchecked,
     /// The damage has changed it.
     Refused,
 }
 
-/// The side of the new file.
+/// Writes the new file.
 struct Copier<'a> {
     connection: &'a Connection,
-    ledger: &'a mut Meta,
+    meta: &'a mut Meta,
     /// The last moment: its number in the old file, its values in the new one.
     moment: Option<(i64, Vec<Value>)>,
     /// Number and hash of the old chain's last row.
     before: Option<(i64, Hash)>,
-    /// Packs there were.
+    /// Number of packs.
     packs: i64,
-    saved: Saved,
+    saved: SalvageReport,
 }
 
 impl Copier<'_> {
-    fn take(&mut self, table: Table, row: &Found) -> rusqlite::Result<()> {
-        let proof = self.prove(table, row);
-        if proof != Proof::Refused && self.copy(table, row, proof)? {
+    fn copy_checked(&mut self, table: HistoryTable, row: &SalvagedRow) -> rusqlite::Result<()> {
+        let evidence = self.check(table, row);
+        if evidence != Evidence::Refused && self.copy(table, row, evidence)? {
             self.saved.count(table);
         } else {
             self.saved.refused += 1;
@@ -290,52 +293,57 @@ impl Copier<'_> {
         Ok(())
     }
 
-    fn prove(&mut self, table: Table, row: &Found) -> Proof {
-        if table == Table::HalfCycle {
-            return Proof::Believed;
+    fn check(&mut self, table: HistoryTable, row: &SalvagedRow) -> Evidence {
+        if table == HistoryTable::HalfCycle {
+            return Evidence::Unchecked;
         }
-        let (seq, Some(hash)) = (row.key.0, row.hash) else { return Proof::Refused };
-        let proof = match self.before {
-            Some((before, _)) if seq <= before => return Proof::Refused,
+        let (seq, Some(hash)) = (row.key.0, row.hash) else { return Evidence::Refused };
+        let evidence = match self.before {
+            Some((before, _)) if seq <= before => return Evidence::Refused,
             Some((before, before_hash)) if seq - 1 == before => {
                 let chained: Vec<Value> = row.moment.iter().chain(&row.values).cloned().collect();
-                if chain::link(&before_hash, table, seq, &chained) == hash { Proof::Proven } else { Proof::Refused }
+                if chain::link(&before_hash, table, seq, &chained) == hash {
+                    Evidence::Verified
+                } else {
+                    Evidence::Refused
+                }
             }
-            _ => Proof::Believed,
+            _ => Evidence::Unchecked,
         };
         self.before = Some((seq, hash));
-        proof
+        evidence
     }
 
-    /// Copies a row with its moment; false when the moment is lost or the row breaks a rule of the layout.
-    fn copy(&mut self, table: Table, row: &Found, proof: Proof) -> rusqlite::Result<bool> {
+    /// Copies a row with its moment; `false` = the moment is lost, or the row breaks a rule of the layout.
+    fn copy(&mut self, table: HistoryTable, row: &SalvagedRow, evidence: Evidence) -> rusqlite::Result<bool> {
         let Some((id, stamp, pack)) = moment_of(&row.moment) else { return Ok(false) };
-        if proof == Proof::Proven {
-            let replaces = table == Table::Reset && row.values.iter().any(is_replacement);
+        if evidence == Evidence::Verified {
+            let replaces = table == HistoryTable::Reset && row.values.iter().any(is_replacement);
             self.packs = self.packs.max(pack + i64::from(replaces));
         } else if !(1..=self.packs).contains(&pack) {
             return Ok(false);
         }
         let moment = match self.moment.take().filter(|(last, _)| *last == id) {
             Some((_, moment)) => moment,
-            None => database::write_moment(self.connection, &stamp, pack)?,
+            None => write_moment(self.connection, &stamp, pack)?,
         };
-        let before = *self.ledger;
-        let written = database::write_row(self.connection, self.ledger, table, &moment, &row.values);
+        let before = *self.meta;
+        let written = write_row(self.connection, self.meta, table, &moment, &row.values);
         self.moment = Some((id, moment));
         match written {
             Ok(()) => Ok(true),
             Err(error) if error.sqlite_error_code() == Some(rusqlite::ErrorCode::ConstraintViolation) => {
-                *self.ledger = before;
+                *self.meta = before;
                 Ok(false)
             }
             Err(error) => Err(error),
         }
     }
 
-    /// Every pack gets its row, as it was where that can be read.
-    fn copy_packs(&self, packs: &[Pack]) -> rusqlite::Result<()> {
-        for Pack { id, opened_ns, closed_ns, reason, identity } in packs.iter().filter(|pack| self.is_pack(pack.id)) {
+    /// Writes a row for every pack, unchanged where it can be read.
+    fn copy_packs(&self, packs: &[PackRow]) -> rusqlite::Result<()> {
+        for PackRow { id, opened_ns, closed_ns, reason, identity } in packs.iter().filter(|pack| self.is_pack(pack.id))
+        {
             self.connection.execute(
                 "INSERT OR REPLACE INTO pack (id, opened_ns, closed_ns, reason, identity) VALUES (?1, ?2, ?3, ?4, ?5)",
                 params![id, opened_ns, closed_ns, reason, identity],
@@ -357,7 +365,7 @@ fn is_replacement(value: &Value) -> bool {
     matches!(value, Value::Text(word) if word == "pack_replaced")
 }
 
-/// Number, stamp and pack of a moment, if all are there.
+/// Number, stamp and pack of a moment, if all are present.
 fn moment_of(values: &[Value]) -> Option<(i64, Stamp, i64)> {
     let [
         Value::Integer(id),

@@ -1,22 +1,22 @@
-//! The layout of the database, and how an older one becomes the present one.
+//! The layout of the database, and the migrations from older layouts.
 //!
 //! | table | a row is | kept |
 //! | --- | --- | --- |
 //! | `pack` | a pack that was or is connected | always |
-//! | `moment` | when rows were written: wall clock, inputs' clock, boot clock, boot, pack | always |
+//! | `moment` | a time of writing: wall clock, inputs' clock, boot clock, boot, pack | always |
 //! | `half_cycle` | a charge or discharge of one cell | the oldest thinned |
-//! | `capacity`, `remaining_life`, `alarm`, `reset` | something learned, forecast, raised, begun anew; numbered through and chained by hash | always |
-//! | `state` | the core's state: slot 0 in full, slot 1 what has changed since | the latest |
+//! | `capacity`, `remaining_life`, `alarm`, `reset` | a learned capacity, a forecast, a change of an alarm, a reset; numbered across the tables and chained by hash | always |
+//! | `state` | the core's state: slot 0 in full, slot 1 the changes since | the latest |
 //! | `meta` | one row: the chain's end, counts | |
 //!
 //! Cells count from 0, times are nanoseconds. `PRAGMA user_version` is the layout's version.
 
 use rusqlite::{Connection, TransactionBehavior};
 
-/// "pkwt": files of ours, for file(1).
+/// "pkwt": marks the file for file(1).
 const APPLICATION_ID: i32 = 0x706B_7774;
 
-/// What makes each version from the one before; the first makes it from an empty file.
+/// The statements that lead to each version from the one before; the first starts from an empty file.
 pub(super) const MIGRATIONS: &[&str] = &[VERSION_1, VERSION_2];
 
 const VERSION_1: &str = "

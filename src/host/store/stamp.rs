@@ -1,12 +1,12 @@
-//! When something was stored, on every clock there is, and how long ago that was.
+//! The moment at which a state was stored, on every clock, and its age at a later moment.
 //!
-//! The wall clock of a vehicle computer may say 1970 until somebody tells it better, and may step; the boot clock never
-//! steps but begins anew with every boot. So both are stored, with the boot they belong to.
+//! The wall clock of a vehicle computer may show 1970 until it is set, and may step; the boot clock never steps but
+//! restarts with every boot. So both are stored, with the identity of the boot.
 //!
-//! Over a boot only the wall clock can say how long it was, and only where something kept it while the computer was off.
-//! Without a hardware clock on a battery it goes on from where somebody last saved it (systemd does, at every boot): then a
-//! week off looks like seconds, and nothing about the time itself gives that away. So it is believed only where a hardware
-//! clock tells the same ([`WallClock`]), or a time server has set it.
+//! Across boots only the wall clock can measure the age, and only if a hardware clock ran while the computer was off.
+//! Without a battery-backed clock, the wall clock continues from its last saved value (systemd saves it at every boot): a
+//! week off looks like seconds, and the time itself does not show it. So the wall clock is trusted only if a hardware
+//! clock agrees with it ([`WallClock`]) or a time server has set it.
 
 use std::fmt;
 use std::path::Path;
@@ -19,12 +19,12 @@ use crate::quantity::Timestamp;
 /// A wall clock before this (2024-01-01) has not been set.
 const SANE_WALL_NS: i64 = 1_704_067_200_000_000_000;
 
-/// Where the kernel shows its hardware clocks; a sandbox reads there what it may not ask the kernel (`adjtimex`).
+/// The kernel's list of hardware clocks; readable in a sandbox that must not call `adjtimex`.
 const HARDWARE_CLOCKS: &str = "/sys/class/rtc";
-/// systemd's time client leaves this once a time server has set the clock in this boot.
+/// systemd's time client creates this file when a time server has set the clock in this boot.
 const SYNCHRONISED: &str = "/run/systemd/timesync/synchronized";
-/// A hardware clock tells the same within this, s: it counts whole seconds, drifts a few a day, and the wall clock may
-/// have been set right since it was read at the boot.
+/// Largest difference of an agreeing hardware clock, s: it counts whole seconds, drifts a few a day, and the wall clock may
+/// have been corrected since the boot.
 const HARDWARE_TOLERANCE_S: i64 = 60;
 
 /// One boot of one computer, as the kernel names it.
@@ -32,25 +32,26 @@ const HARDWARE_TOLERANCE_S: i64 = 60;
 #[serde(into = "String", try_from = "String")]
 pub struct BootId(pub(super) [u8; 16]);
 
-/// Tells which boot this is, where the kernel's own file cannot be seen.
+/// Environment variable with the identity of the boot, where the kernel's file is hidden.
 const BOOT_ID_VARIABLE: &str = "PACKWATCH_BOOT_ID";
 
 impl BootId {
-    /// A kernel that does not say which boot this is.
+    /// The kernel gives no identity.
     const UNKNOWN: Self = Self([0; 16]);
-    /// No boot at all: bus time, from a record.
+    /// No boot: bus time, from a record.
     pub const REPLAY: Self = Self(*b"packwatch replay");
 
-    /// Of this boot.
+    /// The present boot.
     pub fn current() -> Self {
-        let told = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok().and_then(|text| Self::parse(&text));
-        // A sandbox without that file (`ProcSubset=pid`) has it from its unit.
-        let told = told.or_else(|| std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text)));
-        // Two unknown boots are never the same one.
-        told.unwrap_or(Self::UNKNOWN)
+        // A sandbox without that file (`ProcSubset=pid`) gets it from its unit.
+        let text = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").ok();
+        let kernel = text.and_then(|text| Self::parse(&text));
+        let variable = || std::env::var(BOOT_ID_VARIABLE).ok().and_then(|text| Self::parse(&text));
+        // Two unknown boots are never equal.
+        kernel.or_else(variable).unwrap_or(Self::UNKNOWN)
     }
 
-    /// From the kernel's form or ours.
+    /// Reads the kernel's form or that of [`Display`](fmt::Display).
     pub(super) fn parse(text: &str) -> Option<Self> {
         let digits: String = text.chars().filter(|c| *c != '-' && !c.is_whitespace()).collect();
         u128::from_str_radix(&digits, 16).ok().filter(|_| digits.len() == 32).map(|id| Self(id.to_be_bytes()))
@@ -90,45 +91,45 @@ pub(super) struct Stamp {
     pub boot: BootId,
 }
 
-/// What the wall clock is worth over the boot.
+/// Whether the wall clock measures times across boots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum WallClock {
-    /// Something kept it while the computer was off, or has told it since.
-    Kept,
-    /// Nothing shows that it is more than the time somebody saved before.
-    Unsure,
+    /// A hardware clock or a time server confirms it.
+    Reliable,
+    /// It may be the value saved before the computer was off.
+    Unverified,
 }
 
 impl WallClock {
-    /// As it is at `now`, at the start. Set later, by GPS or a time server, it comes too late for the age of the state:
-    /// that is asked once.
-    pub(super) fn look(now: &Stamp) -> Self {
+    /// Assesses it at the start. A clock that GPS or a time server sets later is too late: the age of the state is
+    /// determined once.
+    pub(super) fn assess(now: &Stamp) -> Self {
         Self::judge(now, Path::new(HARDWARE_CLOCKS), Path::new(SYNCHRONISED))
     }
 
     fn judge(now: &Stamp, hardware_clocks: &Path, synchronised: &Path) -> Self {
         let wall_s = now.wall_ns / 1_000_000_000;
-        // One without a battery counts from its own beginning: that there is one says nothing.
-        let tells_the_same = |clock: &Path| {
-            let told = std::fs::read_to_string(clock.join("since_epoch")).ok();
-            let told_s = told.and_then(|text| text.trim().parse::<i64>().ok());
-            told_s.is_some_and(|told_s| told_s.saturating_sub(wall_s).saturating_abs() <= HARDWARE_TOLERANCE_S)
+        // A hardware clock without a battery counts from its own start, so its value has to agree.
+        let agrees = |clock: &Path| {
+            let text = std::fs::read_to_string(clock.join("since_epoch")).ok();
+            let hardware_s = text.and_then(|text| text.trim().parse::<i64>().ok());
+            hardware_s.is_some_and(|s| s.saturating_sub(wall_s).saturating_abs() <= HARDWARE_TOLERANCE_S)
         };
         let mut clocks = std::fs::read_dir(hardware_clocks).into_iter().flatten().flatten();
-        if clocks.any(|clock| tells_the_same(&clock.path())) || synchronised.exists() {
-            Self::Kept
+        if clocks.any(|clock| agrees(&clock.path())) || synchronised.exists() {
+            Self::Reliable
         } else {
-            Self::Unsure
+            Self::Unverified
         }
     }
 }
 
-/// How long ago something was stored.
+/// Time since a state was stored.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Age {
     /// Seconds.
     Seconds(f64),
-    /// The clocks do not say.
+    /// The clocks do not give it.
     Unknown,
 }
 
@@ -149,7 +150,7 @@ impl Stamp {
         self.boot == other.boot && self.boot != BootId::UNKNOWN
     }
 
-    /// How long before `now` this was.
+    /// Time from this moment to `now`.
     pub(super) fn age(&self, now: &Self, wall: WallClock) -> Age {
         let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
         if self.same_boot(now) {
@@ -157,11 +158,11 @@ impl Stamp {
         }
         let can_be = now.wall_ns > self.wall_ns && self.wall_ns >= SANE_WALL_NS;
         match wall {
-            // It was before this boot, so longer ago than that has lasted.
-            WallClock::Kept if can_be => {
+            // It was stored before this boot, so the age is at least the uptime.
+            WallClock::Reliable if can_be => {
                 Age::Seconds(seconds(self.wall_ns, now.wall_ns).max(seconds(0, now.boottime_ns)))
             }
-            WallClock::Kept | WallClock::Unsure => Age::Unknown,
+            WallClock::Reliable | WallClock::Unverified => Age::Unknown,
         }
     }
 }
@@ -178,17 +179,17 @@ mod tests {
     }
 
     #[test]
-    fn within_one_boot_the_wall_clock_does_not_count() {
+    fn within_one_boot_the_wall_clock_is_ignored() {
         for wall_s in [0, 1_800_000_000, 4_000_000_000] {
             let now = stamp(1, 130, wall_s);
-            assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unsure), Age::Seconds(30.0));
+            assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unverified), Age::Seconds(30.0));
         }
     }
 
     #[test]
-    fn over_a_boot_only_a_wall_clock_that_can_be_right_counts() {
+    fn across_boots_only_a_plausible_wall_clock_counts() {
         let stored = stamp(1, 100, 1_800_000_000);
-        let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Kept);
+        let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Reliable);
         assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Age::Seconds(600.0));
         assert_eq!(age(stored, stamp(2, 5, 1_799_999_999)), Age::Unknown, "before what was stored");
         assert_eq!(age(stored, stamp(2, 5, 30)), Age::Unknown, "1970");
@@ -199,37 +200,37 @@ mod tests {
     #[test]
     fn a_state_of_an_earlier_boot_is_at_least_as_old_as_this_one() {
         let stored = stamp(1, 100, 1_800_000_000);
-        assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Kept), Age::Seconds(3_600.0));
+        assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Reliable), Age::Seconds(3_600.0));
     }
 
     #[test]
-    fn a_week_off_is_not_the_seconds_a_saved_clock_makes_of_it() {
+    fn a_saved_clock_does_not_turn_a_week_off_into_seconds() {
         // Without a hardware clock: the time of the last save, 20 s after the last checkpoint.
         let (stored, now) = (stamp(1, 100, 1_800_000_000), stamp(2, 5, 1_800_000_020));
-        assert_eq!(stored.age(&now, WallClock::Unsure), Age::Unknown);
+        assert_eq!(stored.age(&now, WallClock::Unverified), Age::Unknown);
     }
 
     #[test]
-    fn a_wall_clock_is_kept_where_hardware_or_a_time_server_says_the_same() {
+    fn a_wall_clock_is_reliable_where_hardware_or_a_time_server_agrees() {
         let folder = tempfile::tempdir().unwrap();
         let (clocks, synchronised) = (folder.path().join("rtc"), folder.path().join("synchronized"));
         let judge = || WallClock::judge(&stamp(2, 5, 1_800_000_020), &clocks, &synchronised);
-        assert_eq!(judge(), WallClock::Unsure, "no hardware clock");
-        let tells = |text: &str| {
+        assert_eq!(judge(), WallClock::Unverified, "no hardware clock");
+        let set_clock = |text: &str| {
             std::fs::create_dir_all(clocks.join("rtc0")).unwrap();
             std::fs::write(clocks.join("rtc0/since_epoch"), text).unwrap();
         };
-        for (told, expected) in [
-            ("1800000018\n", WallClock::Kept),
-            ("946684805\n", WallClock::Unsure), // 2000-01-01: no battery
-            ("1800604800\n", WallClock::Unsure),
-            ("\n", WallClock::Unsure),
+        for (hardware, expected) in [
+            ("1800000018\n", WallClock::Reliable),
+            ("946684805\n", WallClock::Unverified), // 2000-01-01: no battery
+            ("1800604800\n", WallClock::Unverified),
+            ("\n", WallClock::Unverified),
         ] {
-            tells(told);
-            assert_eq!(judge(), expected, "{told:?}");
+            set_clock(hardware);
+            assert_eq!(judge(), expected, "{hardware:?}");
         }
         std::fs::write(&synchronised, "").unwrap();
-        assert_eq!(judge(), WallClock::Kept, "a time server");
+        assert_eq!(judge(), WallClock::Reliable, "a time server");
     }
 
     #[test]

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 
 use super::database::Database;
 use super::folder::DATABASE;
-use super::parts::Parts;
+use super::parts::JsonParts;
+use super::state_slots::StateRecord;
 use super::*;
 
 use crate::can::encode::{InputEncoder, InputProtector};
@@ -65,7 +66,7 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()
 }
 
-/// A monitor that has taken the state up.
+/// A monitor that has restored the state.
 fn restored(snapshot: Snapshot) -> Monitor {
     let mut monitor = Monitor::new(config().monitor);
     let time = snapshot.time;
@@ -76,7 +77,7 @@ fn restored(snapshot: Snapshot) -> Monitor {
 
 #[test]
 fn a_real_state_comes_back_exactly_in_full_and_nearly_as_a_delta() {
-    let parts = |snapshot: &Snapshot| Parts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
+    let parts = |snapshot: &Snapshot| JsonParts::of(&serde_json::to_vec(snapshot).unwrap()).unwrap();
     let (early, late) = (snapshot(Some(1500), None), snapshot(Some(5000), None));
     let full = packed::read_full(&packed::full(&parts(&late))).unwrap();
     assert_eq!(full.join(), serde_json::to_vec(&late).unwrap());
@@ -97,29 +98,29 @@ fn the_database_holds_the_state_in_which_the_replay_ended() {
     let database = Database::open(&state.join(DATABASE), &now, 1000).unwrap();
     let counts = database.counts();
     assert!(counts.chained >= 4 && counts.half_cycles >= 4, "{counts:?}");
-    let stored = Document::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
-    assert_eq!(stored.stamp.age(&now, WallClock::Kept), Age::Seconds(60.0));
+    let stored = StateDocument::parse(&database.state().unwrap().unwrap().unwrap().json).unwrap();
+    assert_eq!(stored.stamp.age(&now, WallClock::Reliable), Age::Seconds(60.0));
     assert_eq!(serde_json::to_vec(&stored.snapshot).unwrap(), serde_json::to_vec(&end).unwrap());
     restored(*stored.snapshot);
 }
 
 /// A document of a state taken at `boottime_s` of boot `boot`.
-pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> Document {
+pub(super) fn document(boot: u8, boottime_s: i64, wall_s: i64) -> StateDocument {
     let boot = BootId([boot; 16]);
     let time = Timestamp::from_secs(1.0);
     let stamp = Stamp { wall_ns: wall_s * 1_000_000_000, time, boottime_ns: boottime_s * 1_000_000_000, boot };
     let monitor = Monitor::new(config().monitor);
-    Document { folder: String::new(), stamp, snapshot: Box::new(monitor.snapshot()) }
+    StateDocument { folder: String::new(), stamp, snapshot: Box::new(monitor.snapshot()) }
 }
 
 #[test]
-fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
+fn the_newer_of_the_two_states_comes_first_with_its_age() {
     const WALL_S: i64 = 1_800_000_000;
     let now = document(1, 100, WALL_S).stamp;
-    let of = |running: Option<Document>, stored: Option<Document>| -> Vec<(&str, Downtime)> {
-        candidates(running, stored, &now, WallClock::Kept)
+    let of = |running: Option<StateDocument>, stored: Option<StateDocument>| -> Vec<(&str, Downtime)> {
+        candidates(running, stored, &now, WallClock::Reliable)
             .into_iter()
-            .map(|candidate| (candidate.source, candidate.away))
+            .map(|candidate| (candidate.source, candidate.downtime))
             .collect()
     };
     let (running, stored) = (|at| Some(document(1, at, 0)), |at| Some(document(1, at, 0)));
@@ -132,7 +133,7 @@ fn the_newer_of_the_two_states_is_taken_and_its_age_is_known_or_not() {
 }
 
 /// Waits for the writer's answer to a ticket.
-fn answer(store: &Store, ticket: u64) -> Progress {
+fn answer(store: &Store, ticket: u64) -> StoreProgress {
     let progress = store.progress();
     let begun = Instant::now();
     while progress.borrow().ticket < ticket {
@@ -143,10 +144,10 @@ fn answer(store: &Store, ticket: u64) -> Progress {
 }
 
 #[test]
-fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
+fn a_failing_disk_is_reported_at_once_and_gets_everything_when_it_works() {
     let place = tempfile::tempdir().unwrap();
     let state = place.path().join("folder");
-    // A file where the folder should be: nothing can be made there.
+    // A file in place of the folder: nothing can be created there.
     std::fs::write(&state, "").unwrap();
     let (store, found) = Store::open(&StateSetting::At(state.clone()), &config().store).unwrap();
     let mut store = store.unwrap();
@@ -168,8 +169,8 @@ fn a_disk_that_fails_is_told_at_once_and_gets_everything_when_it_is_back() {
     }
     assert!(store.progress().borrow().file_bytes.is_some_and(|bytes| bytes > 0));
     store.finish(&monitor, Timestamp::from_secs(4.0));
-    let entries = Reader::open(&state).unwrap().entries(&Filter::default()).unwrap();
-    assert_eq!(entries.iter().filter(|entry| entry.kind == Kind::Capacity).count(), 3);
+    let entries = HistoryReader::open(&state).unwrap().entries(&HistoryQuery::default()).unwrap();
+    assert_eq!(entries.iter().filter(|entry| entry.kind == HistoryTable::Capacity).count(), 3);
 }
 
 #[test]
@@ -188,16 +189,16 @@ fn a_disk_that_fails_from_the_start_is_tried_now_and_then_and_not_without_end() 
     }
     // After 1 s, with 2 s to the next.
     assert_eq!((changes, progress.borrow().failures), (1, 1));
-    // Tickets answered meanwhile are no attempts.
-    let desk = Arc::clone(&store.desk);
+    // Tickets answered meanwhile cause no attempt.
+    let write_queue = Arc::clone(&store.write_queue);
     for _ in 0..3 {
-        let ticket = desk.leave(None, document(1, 1, 1), false);
+        let ticket = write_queue.submit(None, document(1, 1, 1), false);
         assert_eq!(answer(&store, ticket).failures, 1);
     }
     std::fs::remove_file(&state).unwrap();
     let monitor = Monitor::new(config().monitor);
     store.finish(&monitor, Timestamp::from_secs(4.0));
-    assert!(Reader::open(&state).unwrap().state().is_some());
+    assert!(HistoryReader::open(&state).unwrap().state().is_some());
 }
 
 #[test]
@@ -227,12 +228,12 @@ fn a_database_damaged_under_the_running_writer_is_set_aside_at_the_latest_at_the
     store.finish(&monitor, Timestamp::from_secs(9.0));
     let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
     let mut store = store.unwrap();
-    // Pages that were in memory may never have been read again: then the start finds it.
+    // Cached pages may not have been read again: then the start finds the damage.
     assert!(!found.works || place.path().join("packwatch.db.damaged-1").exists());
     let ticket = learn(&mut store, 10.0);
     assert!(answer(&store, ticket).works);
     store.finish(&monitor, Timestamp::from_secs(11.0));
-    let reader = Reader::open(place.path()).unwrap();
+    let reader = HistoryReader::open(place.path()).unwrap();
     assert_eq!(reader.verify().unwrap().broken, None);
     assert!(reader.state().is_some());
     assert!(place.path().join("packwatch.db.damaged-1").exists());
@@ -245,7 +246,7 @@ fn at(seconds: f64) -> Monitor {
     monitor
 }
 
-fn states(found: &Found) -> Vec<(&'static str, f64)> {
+fn states(found: &StoredStates) -> Vec<(&'static str, f64)> {
     found.states.iter().map(|state| (state.source, state.snapshot.time.secs())).collect()
 }
 
@@ -264,13 +265,13 @@ fn on_a_disk_that_fails_the_last_state_is_in_the_runtime_folder() {
 }
 
 fn reasons(folder: &Path) -> Vec<String> {
-    let filter = Filter { kinds: vec![Kind::Reset], ..Filter::default() };
-    let entries = Reader::open(folder).unwrap().entries(&filter).unwrap();
+    let filter = HistoryQuery { kinds: vec![HistoryTable::Reset], ..HistoryQuery::default() };
+    let entries = HistoryReader::open(folder).unwrap().entries(&filter).unwrap();
     entries.iter().map(|entry| entry.values[1].as_str().unwrap().to_owned()).collect()
 }
 
 #[test]
-fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
+fn a_state_that_could_not_be_restored_waits_for_a_start_at_which_it_fits() {
     const ASIDE: &str = "database, set aside earlier";
     let place = tempfile::tempdir().unwrap();
     let open = || {
@@ -286,7 +287,7 @@ fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
     assert_eq!(reasons(place.path()), ["state_unfit"]);
     let (store, found) = open();
     assert_eq!(states(&found), [(DATABASE_SOURCE, 2.0), (ASIDE, 1.0)]);
-    // Stays, however many states come after it.
+    // It stays, whatever the number of later states.
     finish(store, 3.0);
     let (store, found) = open();
     assert_eq!(states(&found), [(DATABASE_SOURCE, 3.0), (ASIDE, 1.0)]);
@@ -303,13 +304,13 @@ fn a_state_that_nobody_could_take_up_waits_for_a_start_at_which_it_fits() {
 }
 
 #[test]
-fn a_state_of_another_version_is_told_and_not_overwritten() {
+fn a_state_of_another_version_is_reported_and_not_overwritten() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let now = document(1, 1, 1).stamp;
     let mut database = Database::open(&path, &now, 1000).unwrap();
-    let parts = Parts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
-    database.commit(&[], Some(database::StateRecord { parts, exact: true, sets_aside: false })).unwrap();
+    let parts = JsonParts::of(br#"{"another":[1.5,2.5]}"#).unwrap();
+    database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
     drop(database);
     let (store, found) = Store::open(&StateSetting::At(place.path().to_owned()), &config().store).unwrap();
     assert!(!found.works && found.states.is_empty());

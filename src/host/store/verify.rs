@@ -1,57 +1,56 @@
-//! Whether the chain of the history is whole: every row looked at, the first that is not as it was written named.
+//! Checks the hash chain of the history, row by row, up to the first row that was changed.
 
 use rusqlite::types::Value;
 use rusqlite::{Connection, Rows, Statement};
 use serde::Serialize;
 
 use super::chain::{Hash, hex, link};
-use super::database;
-use super::rows::Table;
+use super::meta::Meta;
+use super::row_sql::{MOMENT_COLUMNS, rows_sql};
+use super::rows::HistoryTable;
 use super::schema;
 
-/// What came of it.
+/// The result of a check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Verdict {
+pub struct ChainReport {
     /// Chained rows found good before the first that is not.
     pub good_rows: i64,
-    /// Rows there should be.
+    /// Rows that were written.
     pub rows: i64,
     /// Hash of the last row, to be noted elsewhere.
     pub head: String,
-    /// The first that is not as it was written; `None` = all are.
-    pub broken: Option<Broken>,
+    /// The first row that was changed; `None` = no row was.
+    pub broken: Option<BrokenRow>,
 }
 
-/// A row that is not as it was written.
+/// A row that was changed, is missing or was inserted.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Broken {
+pub struct BrokenRow {
     /// Its table; empty where a row is missing.
     pub table: String,
     /// Its number in the chain.
     pub row: i64,
-    /// What should be there.
+    /// The expected hash or row.
     pub expected: String,
-    /// What is there.
+    /// The hash or row in its place.
     pub found: String,
 }
 
 /// A row of the chain as it is stored.
-struct Link {
+struct ChainLink {
     seq: i64,
     hash: Vec<u8>,
     values: Vec<Value>,
 }
 
-/// Goes through the chain in the order of its numbers.
-pub(super) fn verify(connection: &Connection) -> rusqlite::Result<Verdict> {
-    let meta = database::read_meta(connection)?;
+/// Checks the chain in the order of its numbers.
+pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
+    let meta = Meta::read(connection)?;
     let version = schema::version(connection)?;
-    let mut statements: Vec<(Table, Statement<'_>)> = Table::CHAINED
+    let mut statements: Vec<(HistoryTable, Statement<'_>)> = HistoryTable::CHAINED
         .into_iter()
         .filter(|table| table.is_in(version))
-        .map(|table| {
-            connection.prepare(&database::rows_sql(table, "ORDER BY r.seq")).map(|statement| (table, statement))
-        })
+        .map(|table| connection.prepare(&rows_sql(table, "ORDER BY r.seq")).map(|statement| (table, statement)))
         .collect::<rusqlite::Result<_>>()?;
     let mut cursors = statements
         .iter_mut()
@@ -71,57 +70,57 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<Verdict> {
         }
     };
     let good_rows = if broken.is_some() { (seq - 1).min(meta.head.count) } else { seq - 1 };
-    Ok(Verdict { good_rows, rows: meta.head.count, head: hex(&meta.head.hash), broken })
+    Ok(ChainReport { good_rows, rows: meta.head.count, head: hex(&meta.head.hash), broken })
 }
 
 /// One table's rows in order.
 struct Cursor<'a> {
-    table: Table,
+    table: HistoryTable,
     rows: Rows<'a>,
-    next: Option<Link>,
+    next: Option<ChainLink>,
 }
 
 impl<'a> Cursor<'a> {
-    fn new(table: Table, statement: &'a mut Statement<'_>) -> rusqlite::Result<Self> {
+    fn new(table: HistoryTable, statement: &'a mut Statement<'_>) -> rusqlite::Result<Self> {
         let mut cursor = Self { table, rows: statement.query([])?, next: None };
         cursor.advance()?;
         Ok(cursor)
     }
 
     /// Takes the next row and reads the one after it.
-    fn advance(&mut self) -> rusqlite::Result<Option<Link>> {
-        let columns = database::MOMENT_COLUMNS + self.table.columns().len();
+    fn advance(&mut self) -> rusqlite::Result<Option<ChainLink>> {
+        let columns = MOMENT_COLUMNS + self.table.columns().len();
         let after = match self.rows.next()? {
             None => None,
             Some(row) => {
                 let values = (2..2 + columns).map(|index| row.get(index)).collect::<rusqlite::Result<_>>()?;
-                Some(Link { seq: row.get(0)?, hash: row.get(1)?, values })
+                Some(ChainLink { seq: row.get(0)?, hash: row.get(1)?, values })
             }
         };
         Ok(std::mem::replace(&mut self.next, after))
     }
 }
 
-/// The row's hash when it is row `seq` of the chain, as it was written.
-fn judge(table: Table, seq: i64, row: &Link, before: &Hash) -> Result<Hash, Broken> {
+/// Returns the row's hash if it is row `seq` of the chain and unchanged.
+fn judge(table: HistoryTable, seq: i64, row: &ChainLink, before: &Hash) -> Result<Hash, BrokenRow> {
     if row.seq != seq {
         let found = format!("row {} of {}", row.seq, table.name());
-        return Err(Broken { table: String::new(), row: seq, expected: format!("row {seq}"), found });
+        return Err(BrokenRow { table: String::new(), row: seq, expected: format!("row {seq}"), found });
     }
     let expected = link(before, table, seq, &row.values);
     if row.hash == expected {
         return Ok(expected);
     }
-    Err(Broken { table: table.name().to_owned(), row: seq, expected: hex(&expected), found: hex(&row.hash) })
+    Err(BrokenRow { table: table.name().to_owned(), row: seq, expected: hex(&expected), found: hex(&row.hash) })
 }
 
-/// After the last row: the head kept apart must be that row's.
-fn judge_end(meta: &database::Meta, rows: i64, last: &Hash) -> Option<Broken> {
+/// Compares the last row with the head in `meta`.
+fn judge_end(meta: &Meta, rows: i64, last: &Hash) -> Option<BrokenRow> {
     let head = &meta.head;
     if rows == head.count && *last == head.hash {
         return None;
     }
     let of = |rows: i64, hash: &Hash| format!("{rows} rows, the last of hash {}", hex(hash));
     let row = rows.min(head.count) + 1;
-    Some(Broken { table: String::new(), row, expected: of(head.count, &head.hash), found: of(rows, last) })
+    Some(BrokenRow { table: String::new(), row, expected: of(head.count, &head.hash), found: of(rows, last) })
 }

@@ -1,34 +1,34 @@
-//! Whether SQLite's write-ahead log holds pages that SQLite will not read.
+//! Finds pages of SQLite's write-ahead log that SQLite will not read.
 //!
-//! SQLite takes a log up to the first page whose checksum is wrong and forgets the rest without a word: after a power cut
-//! that rest is a transaction that was never completed, but after damage it is what was learned last. In: the log as it
-//! lies beside the database, before that is opened. Out: what is wrong. A log that is missing, empty or cannot be read
-//! tells nothing; so does one whose end alone is missing.
+//! SQLite reads a log up to the first page with a wrong checksum and drops the rest silently: after a power cut the rest is
+//! a transaction that was never completed, but after damage it is the results learned last. In: the log next to the
+//! database, before the database is opened. Out: the fault. A log that is missing, empty or unreadable has none; neither
+//! has a log whose end alone is missing.
 //!
 //! The format is that of <https://www.sqlite.org/fileformat2.html#walformat>.
 
 use std::path::Path;
 
-/// First four bytes but for the last bit, which says how checksums take their words.
+/// First four bytes without the last bit, which is the byte order of the checksums.
 const MAGIC: u32 = 0x377F_0682;
 /// Bytes of the log's header, of a frame's, and of the part of a frame's that its checksum covers.
 const HEADER: usize = 32;
 const FRAME_HEADER: usize = 24;
 const FRAME_COVERED: usize = 8;
 
-/// Rounds of the log whose pages may still lie behind those of the current one.
+/// Earlier rounds of the log whose pages may still follow those of the current round.
 const MAX_ROUNDS: u32 = 1 << 24;
 
-/// What is wrong with a log.
+/// A fault of a log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// Completed steps are lost: what and where, for people.
+    /// Completed transactions are lost: which, and where.
     Damaged(String),
-    /// The last step, from this page on, is not whole: the power was cut while it was written, or it was damaged.
+    /// The last transaction, from this page on, is incomplete: the power was cut while it was written, or it is damaged.
     LastStep(usize),
 }
 
-/// What is wrong with a log; `None` = nothing that shows.
+/// The fault of a log; `None` = no visible fault.
 pub(super) fn fault(path: &Path) -> Option<Fault> {
     let log = std::fs::read(path).ok()?;
     check(&log)
@@ -37,7 +37,7 @@ pub(super) fn fault(path: &Path) -> Option<Fault> {
 fn check(log: &[u8]) -> Option<Fault> {
     let (header, frames) = log.split_at_checked(HEADER)?;
     if header.iter().all(|&byte| byte == 0) {
-        return None; // room that was never written
+        return None; // space that was never written
     }
     let is_big = word(header, 0) == MAGIC | 1;
     let mut sum = checksum((0, 0), &header[..24], is_big);
@@ -65,7 +65,7 @@ fn check(log: &[u8]) -> Option<Fault> {
             first_bad = Some(number + 1);
         }
     }
-    // One: the transaction the power was cut in may have reached the disk in any order.
+    // One: the pages of an interrupted transaction may have reached the disk in any order.
     first_bad.map(|page| match later_commits {
         0 | 1 => Fault::LastStep(page),
         lost => Fault::Damaged(format!(
@@ -74,7 +74,7 @@ fn check(log: &[u8]) -> Option<Fault> {
     })
 }
 
-/// Whether a frame was left by an earlier round of the log: each round counts the first number up and draws the second.
+/// Whether a frame is from an earlier round of the log: each round increments the first salt and draws the second.
 fn is_of_earlier_round(frame: &[u8], header: &[u8]) -> bool {
     let rounds = word(header, 16).wrapping_sub(word(frame, 8));
     (1..MAX_ROUNDS).contains(&rounds) && word(frame, 12) != word(header, 20)
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flipped_bit_is_told_wherever_it_is() {
+    fn a_flipped_bit_is_found_wherever_it_is() {
         let good = log();
         assert_eq!(check(&good), None);
         let frame = FRAME_HEADER + usize::try_from(word(&good, 8)).unwrap();
@@ -126,7 +126,7 @@ mod tests {
                 bad[at] ^= 1 << bit;
                 match check(&bad) {
                     Some(Fault::Damaged(_)) => assert!(at < last, "byte {at}"),
-                    // A step may have reached the disk in any order; without its mark the one before is of the same.
+                    // A transaction may reach the disk in any order; without its mark, its pages count to the next one.
                     Some(Fault::LastStep(_)) => assert!(at + frame >= last, "byte {at}"),
                     None => panic!("byte {at}, bit {bit}"),
                 }
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn what_an_earlier_round_left_is_no_fault() {
+    fn frames_of_an_earlier_round_are_no_fault() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("x.db");
         let connection = rusqlite::Connection::open(&path).unwrap();

@@ -1,8 +1,8 @@
 //! The thread that writes the database, and what it shares with the loop.
 //!
-//! The loop leaves rows and the latest state and goes on. The thread takes all there is, commits it in one transaction
-//! and says up to which ticket everything is on the disk. A disk that fails is tried again with a growing pause; until
-//! then every ticket is answered at once, as failed.
+//! The loop queues rows and the latest state, and continues. The thread takes everything queued, commits it in one
+//! transaction and reports up to which ticket everything is on the disk. It retries a failing disk with a growing pause;
+//! until then every ticket is answered at once, as failed.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,23 +10,23 @@ use std::time::{Duration, Instant};
 use tokio::sync::watch;
 
 use super::backlog::Backlog;
-use super::database::{Database, StateRecord, is_damage};
-use super::document::Document;
-use super::folder::{Folder, Opening};
-use super::parts::Parts;
-use super::rows::{Batch, Row};
+use super::database::{Database, is_damage};
+use super::document::StateDocument;
+use super::folder::{Folder, OpenedDatabase};
+use super::rows::{HistoryRow, RowBatch};
 use super::stamp::{BootId, Stamp};
+use super::state_slots::StateRecord;
 use crate::quantity::Timestamp;
 
 /// First pause after a failure; it doubles up to the last.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// A disk that is back is found within this.
+/// Longest pause: a working disk is found within this.
 const LAST_PAUSE: Duration = Duration::from_secs(15);
 
-/// How far the writer is.
+/// Progress of the writer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Progress {
-    /// Everything up to this ticket was written, or cannot be now.
+pub struct StoreProgress {
+    /// Everything up to this ticket was written or has failed.
     pub ticket: u64,
     /// The last attempt succeeded.
     pub works: bool,
@@ -38,30 +38,30 @@ pub struct Progress {
     pub failures: u64,
 }
 
-/// What the loop leaves for the writer.
+/// Rows and state on their way from the loop to the writer.
 #[derive(Debug, Default)]
 pub(super) struct WriteQueue {
-    queue: Mutex<Queue>,
+    queue: Mutex<QueueState>,
     wake: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct Queue {
+struct QueueState {
     backlog: Backlog,
-    state: Option<Document>,
+    state: Option<StateDocument>,
     exact: bool,
-    /// The stored state is to be kept beside the next one.
+    /// The next state must not overwrite the stored one.
     sets_aside: bool,
     ticket: u64,
-    /// Something is to be done now.
+    /// The writer has work.
     wanted: bool,
     stop: bool,
 }
 
-/// What the writer takes from the desk.
-struct Work {
-    batches: Vec<Batch>,
-    state: Option<Document>,
+/// What the writer takes from the queue at once.
+struct PendingWrite {
+    batches: Vec<RowBatch>,
+    state: Option<StateDocument>,
     exact: bool,
     sets_aside: bool,
     ticket: u64,
@@ -69,15 +69,15 @@ struct Work {
 }
 
 impl WriteQueue {
-    fn lock(&self) -> MutexGuard<'_, Queue> {
+    fn lock(&self) -> MutexGuard<'_, QueueState> {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Leaves rows and the state they were learned in; returns the ticket of the commit that will hold both.
-    pub(super) fn leave(&self, rows: Option<Batch>, state: Document, exact: bool) -> u64 {
+    /// Queues rows and their state; returns the ticket of the commit that will contain both.
+    pub(super) fn submit(&self, rows: Option<RowBatch>, state: StateDocument, exact: bool) -> u64 {
         let mut queue = self.lock();
         rows.into_iter().for_each(|batch| queue.backlog.push(batch));
-        // A later state has all an earlier one has.
+        // A later state contains the earlier ones.
         queue.state = Some(state);
         queue.exact |= exact;
         queue.ticket += 1;
@@ -87,29 +87,29 @@ impl WriteQueue {
     }
 
     /// Keeps rows for the next commit.
-    pub(super) fn keep(&self, rows: Batch) {
+    pub(super) fn keep(&self, rows: RowBatch) {
         self.lock().backlog.push(rows);
     }
 
-    /// Nobody has taken up the stored state: the next one does not overwrite it.
+    /// The stored state was not restored: the next one does not overwrite it.
     pub(super) fn set_aside(&self) {
         self.lock().sets_aside = true;
     }
 
-    /// The last thing the writer will be asked.
+    /// Ends the writer after the work queued so far.
     pub(super) fn stop(&self) {
         let mut queue = self.lock();
         (queue.stop, queue.wanted) = (true, true);
         self.wake.notify_one();
     }
 
-    /// Rows lost for want of room and not yet told in the history.
+    /// Rows dropped for lack of room whose loss is not yet reported in the history.
     pub(super) fn lost_rows(&self) -> u64 {
         self.lock().backlog.lost()
     }
 
-    /// Waits until something is to be done, or it is time to try again.
-    fn take(&self, retry_at: Option<Instant>) -> Work {
+    /// Waits for work, or until the time of the next retry.
+    fn take(&self, retry_at: Option<Instant>) -> PendingWrite {
         let mut queue = self.lock();
         while !queue.wanted {
             match retry_at.map(|at| at.saturating_duration_since(Instant::now())) {
@@ -120,13 +120,13 @@ impl WriteQueue {
         }
         queue.wanted = false;
         let state = queue.state.take();
-        // Rows go with the state they were learned in.
+        // Rows are written with their state.
         let batches = state.as_ref().map(|state| queue.backlog.take(&state.stamp)).unwrap_or_default();
         let (exact, sets_aside) = (std::mem::take(&mut queue.exact), std::mem::take(&mut queue.sets_aside));
-        Work { batches, state, exact, sets_aside, ticket: queue.ticket, stop: queue.stop }
+        PendingWrite { batches, state, exact, sets_aside, ticket: queue.ticket, stop: queue.stop }
     }
 
-    fn put_back(&self, batches: Vec<Batch>, state: Option<Document>) {
+    fn put_back(&self, batches: Vec<RowBatch>, state: Option<StateDocument>) {
         let mut queue = self.lock();
         queue.backlog.put_back(batches);
         queue.state = queue.state.take().or(state);
@@ -136,23 +136,23 @@ impl WriteQueue {
 /// The thread's side.
 #[derive(Debug)]
 pub(super) struct Writer {
-    pub(super) desk: Arc<WriteQueue>,
+    pub(super) write_queue: Arc<WriteQueue>,
     pub(super) folder: Folder,
-    /// `None` = not reachable so far.
+    /// `None` = not open.
     pub(super) database: Option<Database>,
-    pub(super) progress: watch::Sender<Progress>,
+    pub(super) progress: watch::Sender<StoreProgress>,
     pub(super) retry: Retry,
     /// Commits done.
     pub(super) commits: u64,
     /// Attempts that failed.
     pub(super) failures: u64,
-    /// The daemon began with what the database had, or it had nothing.
+    /// The daemon started with the state of the database, or the database had none.
     pub(super) knows_state: bool,
-    /// The stored state is kept beside the next one.
+    /// The next state must not overwrite the stored one.
     pub(super) sets_aside: bool,
 }
 
-/// When a failed disk is tried again.
+/// The time of the next attempt after a failure.
 #[derive(Debug, Default)]
 pub(super) struct Retry {
     pause: Option<Duration>,
@@ -160,7 +160,7 @@ pub(super) struct Retry {
 }
 
 impl Retry {
-    /// After a failure now.
+    /// Notes a failure now.
     pub(super) fn after_failure(&mut self) {
         let pause = self.pause.map_or(FIRST_PAUSE, |pause| (2 * pause).min(LAST_PAUSE));
         (self.pause, self.at) = (Some(pause), Some(Instant::now() + pause));
@@ -172,32 +172,32 @@ impl Retry {
 }
 
 impl Writer {
-    /// Writes until told to stop.
+    /// Writes until [`WriteQueue::stop`].
     pub(super) fn run(mut self) {
         loop {
-            let work = self.desk.take(self.retry.at);
-            let Work { batches, state, exact, sets_aside, ticket, stop } = work;
+            let work = self.write_queue.take(self.retry.at);
+            let PendingWrite { batches, state, exact, sets_aside, ticket, stop } = work;
             self.sets_aside |= sets_aside;
-            // The last attempt before the end is made whenever it is.
+            // The last attempt before the end does not wait for the pause.
             let works = if self.retry.is_due() || stop {
                 self.write(batches, state, exact)
             } else {
-                self.desk.put_back(batches, state);
+                self.write_queue.put_back(batches, state);
                 false
             };
             let before = self.progress.borrow().file_bytes;
             let file_bytes = if works { self.folder.file_bytes() } else { before };
-            let progress = Progress { ticket, works, file_bytes, commits: self.commits, failures: self.failures };
-            self.progress.send_if_modified(|told| std::mem::replace(told, progress) != progress);
+            let progress = StoreProgress { ticket, works, file_bytes, commits: self.commits, failures: self.failures };
+            self.progress.send_if_modified(|last| std::mem::replace(last, progress) != progress);
             if stop {
                 return;
             }
         }
     }
 
-    /// One transaction; on failure everything waits for the next. Without a state there is nothing to write, but a
-    /// database that could not be opened is tried again.
-    fn write(&mut self, batches: Vec<Batch>, state: Option<Document>, exact: bool) -> bool {
+    /// Writes one transaction; on failure everything waits for the next. Without a state there is nothing to write, but a
+    /// database that could not be opened is opened again.
+    fn write(&mut self, batches: Vec<RowBatch>, state: Option<StateDocument>, exact: bool) -> bool {
         let begun = Instant::now();
         let written = match &state {
             Some(document) => self.commit(&batches, document, exact),
@@ -214,7 +214,7 @@ impl Writer {
                 }
                 self.retry = Retry::default();
                 self.commits += u64::from(state.is_some());
-                self.desk.lock().backlog.told();
+                self.write_queue.lock().backlog.commit();
                 true
             }
             Err(why) => {
@@ -223,23 +223,21 @@ impl Writer {
                 }
                 self.failures += 1;
                 self.retry.after_failure();
-                self.desk.put_back(batches, state);
+                self.write_queue.put_back(batches, state);
                 false
             }
         }
     }
 
-    fn commit(&mut self, batches: &[Batch], document: &Document, exact: bool) -> Result<(), String> {
-        let json = document.to_json().map_err(|error| error.to_string())?;
-        // A number that is not finite is written as nothing: the state could never be taken up again.
-        Document::parse(&json)?;
-        let parts = Parts::of(&json).ok_or("a number of the state cannot be read")?;
-        drop(json);
+    fn commit(&mut self, batches: &[RowBatch], document: &StateDocument, exact: bool) -> Result<(), String> {
+        let record = StateRecord::new(document, exact, self.sets_aside)?;
         let mut database = match self.database.take() {
             Some(database) => database,
             None => self.reopen(&document.stamp)?,
         };
-        match database.commit(batches, Some(StateRecord { parts, exact, sets_aside: self.sets_aside })) {
+        // Opening it may have found a state to set aside.
+        let record = StateRecord { sets_aside: self.sets_aside, ..record };
+        match database.commit(batches, Some(record)) {
             Ok(()) => {
                 self.sets_aside = false;
                 self.database = Some(database);
@@ -247,28 +245,28 @@ impl Writer {
             }
             Err(error) if is_damage(&error) => {
                 drop(database);
-                // The next attempt, soon, replaces it.
+                // The next attempt replaces it.
                 self.folder.mark_damaged(&error.to_string());
                 Err(format!("database damaged: {error}"))
             }
-            // A connection that failed to read or write is opened anew: it may stand on a file that is gone.
+            // A connection that failed is opened again: its file may have been deleted.
             Err(error) => Err(error.to_string()),
         }
     }
 
     fn reopen(&mut self, now: &Stamp) -> Result<Database, String> {
         let opening = self.folder.open(now).map_err(|error| error.to_string())?;
-        let Opening { mut database, mut rows, state, is_strange, .. } = opening;
-        self.sets_aside |= is_strange;
+        let OpenedDatabase { mut database, mut rows, state, is_unreadable, .. } = opening;
+        self.sets_aside |= is_unreadable;
         if !self.knows_state && state.is_some() {
-            // The daemon began without it, because the disk came too late: for people to find.
+            // The daemon started without it because the disk came too late. It is kept for the user.
             self.sets_aside = true;
             tracing::error!(folder = %self.folder, "a stored state was found after the start: set aside, not used");
-            rows.push(Row::Own { reason: "state_too_late", detail: "set aside".to_owned() });
+            rows.push(HistoryRow::Own { reason: "state_too_late", detail: "set aside".to_owned() });
         }
         self.knows_state = true;
         if !rows.is_empty() {
-            let batch = Batch { stamp: *now, rows };
+            let batch = RowBatch { stamp: *now, rows };
             database.commit(&[batch], None).map_err(|error| error.to_string())?;
         }
         Ok(database)

@@ -7,7 +7,7 @@ use super::trace::Trace;
 use crate::fields::Fields;
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
-use crate::store::{Entry, Filter, Kind, Reader};
+use crate::store::{HistoryEntry, HistoryQuery, HistoryReader, HistoryTable};
 
 /// Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
 const FIRST_DATE_S: f64 = 3.0e8;
@@ -116,9 +116,9 @@ impl Data {
     ///
     /// # Errors
     /// When the file cannot be read.
-    pub fn of_store(reader: &Reader) -> Result<Self, String> {
+    pub fn of_store(reader: &HistoryReader) -> Result<Self, String> {
         let mut data = Self::new(Origin::Store);
-        let entries = reader.entries(&Filter::default())?;
+        let entries = reader.entries(&HistoryQuery::default())?;
         let pack = entries.iter().map(|entry| entry.pack).max();
         data.source.pack = pack;
         entries.iter().filter(|entry| Some(entry.pack) == pack).for_each(|entry| data.take_entry(entry));
@@ -131,22 +131,22 @@ impl Data {
     }
 
     /// Adds a row of a store.
-    fn take_entry(&mut self, entry: &Entry) {
+    fn take_entry(&mut self, entry: &HistoryEntry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
         self.span(time_s);
         let fields = Fields::of_entry(entry);
         match entry.kind {
-            Kind::HalfCycle => self.take_half_cycle(time_s, &fields),
-            Kind::Capacity => self.take_capacity(time_s, &fields),
-            Kind::Alarm => self.take_alarm(time_s, &fields),
-            Kind::Reset => {
+            HistoryTable::HalfCycle => self.take_half_cycle(time_s, &fields),
+            HistoryTable::Capacity => self.take_capacity(time_s, &fields),
+            HistoryTable::Alarm => self.take_alarm(time_s, &fields),
+            HistoryTable::Reset => {
                 let of = cell_of(&fields).map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
                 let (reason, detail) = (fields.text("reason").replace('_', " "), fields.text("detail"));
                 let colon = if detail.is_empty() { "" } else { ": " };
                 self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
             // The forecast is computed again here.
-            Kind::RemainingLife => {}
+            HistoryTable::RemainingLife => {}
         }
     }
 

@@ -11,7 +11,7 @@ packwatch 1.2.3, process 4711, up 3 h 12 min, 2027-01-15T08:00:00Z, configuratio
 pack       valid: SOC 63.2 % (95 %: 60.8 to 65.6 %), discharge, 10.95 V, 12.50 A, at most 31.2 °C
 health     capacity 2.412 ± 0.021 Ah (cell 1), SOH 92.8 %, usable 2.310 ± 0.040 Ah, recharge period -, with the \
 reference charger 5432 ± 61 s
-life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the use of late
+life       412 equivalent full cycles (90 %: 208 to 933) (cell 1), 533 days at the recent use
 interface  can0 up: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
 interface  can1 missing: 86400 frames in, 6 lost, 1200 out, 17 not sent, 4 errors, 1 bus-off, back 1 times
 counted    123456 readings used, 7 not; 3 late ticks; 99 % of estimates within 5.00 ms
@@ -28,7 +28,7 @@ cell  voltage    temp.           SOC          capacity   resistance  trusted
 }
 
 #[test]
-fn a_store_that_fails_and_estimates_that_come_late_are_told() {
+fn a_failing_store_and_late_estimates_are_shown() {
     let mut document = sample(1);
     let store = document.store.as_mut().unwrap();
     (store.works, store.failures, store.late) = (Some(false), 3, 2);
@@ -36,7 +36,9 @@ fn a_store_that_fails_and_estimates_that_come_late_are_told() {
     document.latency.frames += 100;
     let text = table(&document, false);
     assert!(
-        text.contains("store      CANNOT BE WRITTEN, 21 commits, 0.1 MB, 3 failed, 2 told before they were stored\n"),
+        text.contains(
+            "store      CANNOT BE WRITTEN, 21 commits, 0.1 MB, 3 failed, 2 announced before they were stored\n"
+        ),
         "{text}"
     );
     assert!(text.contains("99 % of estimates within more than 1 s\n"), "{text}");
@@ -46,7 +48,7 @@ fn a_store_that_fails_and_estimates_that_come_late_are_told() {
 }
 
 #[test]
-fn of_many_cells_those_are_listed_that_stand_out() {
+fn of_many_cells_only_the_outliers_are_listed() {
     let mut document = sample(96);
     document.cells[40].soc = Some(0.1);
     let text = table(&document, false);

@@ -1,28 +1,28 @@
-//! What the view knows and where its user is. Pure: news and keys in, fields out.
+//! The state of the view: the document, the page, the selected cell. Pure: updates and keys in, fields out.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use crate::quantity::Timestamp;
 use crate::status::STALE;
-use crate::status::document::Document;
+use crate::status::document::StatusDocument;
 
-/// Documents remembered for the plots: four minutes.
+/// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
 
-/// What the stream says.
+/// An update of the stream.
 #[derive(Debug)]
-pub(super) enum News {
+pub(super) enum FeedUpdate {
     /// A document.
-    Document(Box<Document>),
-    /// The connection is lost, or cannot be made: why.
+    StatusDocument(Box<StatusDocument>),
+    /// The connection failed: why.
     Lost(String),
 }
 
-/// What a key means.
+/// The action of a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Key {
-    /// Leave.
+    /// Quit.
     Quit,
     /// To the page on the right.
     NextPage,
@@ -77,7 +77,7 @@ impl Page {
     }
 }
 
-/// What the map of the cells shows.
+/// The quantity in the map of the cells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Quantity {
     Soc,
@@ -86,12 +86,12 @@ pub(super) enum Quantity {
 
 /// A cell's values at one document.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Point {
+pub(super) struct CellPoint {
     soc: Option<f32>,
     voltage_v: Option<f32>,
 }
 
-impl Point {
+impl CellPoint {
     pub(super) fn get(self, quantity: Quantity) -> Option<f64> {
         match quantity {
             Quantity::Soc => self.soc.map(f64::from),
@@ -105,35 +105,36 @@ impl Point {
 pub(super) struct App {
     path: PathBuf,
     pub(super) has_colour: bool,
-    /// The latest document, while it holds.
-    pub(super) document: Option<Document>,
-    /// Since when there is none that holds, and why.
+    /// The latest document, while it is fresh.
+    pub(super) document: Option<StatusDocument>,
+    /// Time of the last document and the reason, while there is no fresh one.
     pub(super) lost: Option<(Option<Timestamp>, String)>,
-    /// When the latest document came.
-    heard: Option<Timestamp>,
+    /// Time of the latest document.
+    received_at: Option<Timestamp>,
     /// Per cell, oldest first.
-    pub(super) history: Vec<VecDeque<Point>>,
+    pub(super) history: Vec<VecDeque<CellPoint>>,
     pub(super) page: Page,
     pub(super) quantity: Quantity,
-    /// Of the cells.
+    /// The selected cell.
     pub(super) selected: usize,
     /// First line shown of the other pages.
     pub(super) scroll: usize,
-    /// Cells in a row of the map and lines of a page, as last drawn.
+    /// Cells in a row of the map, as last drawn.
     pub(super) row_cells: usize,
+    /// Lines of a page, as last drawn.
     pub(super) page_lines: usize,
     now: Timestamp,
 }
 
 impl App {
-    /// A view of the stream there.
+    /// A view of the stream socket at `path`.
     pub(super) fn new(path: PathBuf, has_colour: bool) -> Self {
         Self {
             path,
             has_colour,
             document: None,
             lost: None,
-            heard: None,
+            received_at: None,
             history: Vec::new(),
             page: Page::Cells,
             quantity: Quantity::Soc,
@@ -145,27 +146,29 @@ impl App {
         }
     }
 
-    /// The stream.
+    /// Path of the stream socket.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Time passed: old news is none.
+    /// Advances the time; drops a stale document.
     pub(super) fn poll(&mut self, now: Timestamp) {
         self.now = now;
-        if self.document.is_some() && self.heard.is_some_and(|heard| now.since(heard) > STALE.as_secs_f64()) {
-            self.lose("it does not tell anything".to_owned());
+        if self.document.is_some()
+            && self.received_at.is_some_and(|received_at| now.since(received_at) > STALE.as_secs_f64())
+        {
+            self.lose("it sends no document".to_owned());
         }
     }
 
-    /// Takes what the stream says.
-    pub(super) fn handle_news(&mut self, news: News) {
-        match news {
-            News::Lost(why) => self.lose(why),
-            News::Document(document) => {
+    /// Handles an update of the stream.
+    pub(super) fn handle_update(&mut self, updates: FeedUpdate) {
+        match updates {
+            FeedUpdate::Lost(why) => self.lose(why),
+            FeedUpdate::StatusDocument(document) => {
                 self.remember(&document);
                 self.selected = self.selected.min(document.cells.len().saturating_sub(1));
-                self.heard = Some(self.now.max(document.wall_time));
+                self.received_at = Some(self.now.max(document.wall_time));
                 self.lost = None;
                 self.document = Some(*document);
             }
@@ -173,25 +176,27 @@ impl App {
     }
 
     fn lose(&mut self, why: String) {
-        let since = self.lost.take().map_or(self.heard, |(since, _)| since);
+        let since = self.lost.take().map_or(self.received_at, |(since, _)| since);
         self.lost = Some((since, why));
-        // What was true is not, as far as anybody knows.
+        // A stale document is not shown.
         self.document = None;
     }
 
-    fn remember(&mut self, document: &Document) {
+    fn remember(&mut self, document: &StatusDocument) {
         self.history.resize_with(document.cells.len(), VecDeque::new);
         for (points, cell) in self.history.iter_mut().zip(&document.cells) {
             if points.len() == HISTORY {
                 points.pop_front();
             }
-            // For plots of a few dots' height.
-            points
-                .push_back(Point { soc: cell.soc.map(|soc| soc as f32), voltage_v: cell.voltage_v.map(|v| v as f32) });
+            // The plots are a few dots high, so single precision suffices.
+            points.push_back(CellPoint {
+                soc: cell.soc.map(|soc| soc as f32),
+                voltage_v: cell.voltage_v.map(|v| v as f32),
+            });
         }
     }
 
-    /// Does what a key means.
+    /// Performs the action of a key.
     pub(super) fn handle_key(&mut self, key: Key) {
         match key {
             Key::Quit => {}
@@ -207,7 +212,7 @@ impl App {
                 let last = self.history.len().saturating_sub(1);
                 self.selected = moved(self.selected, key, self.row_cells, self.page_lines * self.row_cells, last);
             }
-            // The drawing knows how far down it goes.
+            // Drawing limits it to the number of lines.
             _ => self.scroll = moved(self.scroll, key, 1, self.page_lines, usize::MAX / 2),
         }
     }

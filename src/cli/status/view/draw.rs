@@ -1,4 +1,4 @@
-//! Draws the view: head, pack, the page chosen, keys.
+//! Draws the view: head, pack, the selected page, keys.
 
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -13,9 +13,9 @@ use crate::cli::status::{config, duration, number, percent, shown, store, with_s
 use crate::io::stamp;
 use crate::monitor::Validity;
 use crate::quantity::Timestamp;
-use crate::status::document::Document;
+use crate::status::document::StatusDocument;
 
-/// Least size that shows anything sensible.
+/// Smallest usable size.
 const LEAST: (u16, u16) = (40, 12);
 
 /// Colours, where they are wanted.
@@ -54,7 +54,7 @@ pub(super) fn draw(frame: &mut Frame<'_>, app: &mut App) {
         return frame.render_widget(Paragraph::new(text), area);
     }
     let theme = Theme { has_colour: app.has_colour };
-    // Taken out, so that the pages may note in the app what they have drawn.
+    // Moved out, so that the pages can update the app while they draw.
     let Some(document) = app.document.take() else { return lost(frame, app, area) };
     let [head_area, pack_area, alarm_area, tab_area, page_area, keys_area] = Layout::vertical([
         Constraint::Length(1),
@@ -94,7 +94,7 @@ fn lost(frame: &mut Frame<'_>, app: &App, area: Rect) {
     frame.render_widget(paragraph, area);
 }
 
-fn head(document: &Document, theme: Theme) -> Line<'static> {
+fn head(document: &StatusDocument, theme: Theme) -> Line<'static> {
     let bold = Style::new().add_modifier(Modifier::BOLD);
     Line::from(vec![
         Span::styled(format!("packwatch {} ", document.program_version), bold),
@@ -109,7 +109,7 @@ fn head(document: &Document, theme: Theme) -> Line<'static> {
     ])
 }
 
-fn pack(frame: &mut Frame<'_>, document: &Document, theme: Theme, area: Rect) {
+fn pack(frame: &mut Frame<'_>, document: &StatusDocument, theme: Theme, area: Rect) {
     let pack = &document.pack;
     let is_lost = document.store.as_ref().is_some_and(|store| store.works == Some(false));
     let style = if is_lost { theme.colour(Color::Red).add_modifier(Modifier::BOLD) } else { Style::new() };
@@ -147,15 +147,15 @@ fn pack(frame: &mut Frame<'_>, document: &Document, theme: Theme, area: Rect) {
     frame.render_widget(Paragraph::new(vec![soc, Line::from(now), Line::from(health)]), inner);
 }
 
-/// The alarm that matters most, and how many there are: on every page.
-fn alarm_line(document: &Document, theme: Theme) -> Line<'static> {
+/// The most severe alarm and the number of alarms, shown on every page.
+fn alarm_line(document: &StatusDocument, theme: Theme) -> Line<'static> {
     let alarms = &document.alarms;
     let raised = alarms.list.iter().filter(|alarm| alarm.state.is_raised());
     let Some(worst) = raised.max_by_key(|alarm| alarm.severity as u8) else {
         return Line::from(match (alarms.thresholds, alarms.unknown.len()) {
             (0, _) => "no threshold is configured".to_owned(),
             (_, 0) => "no alarm".to_owned(),
-            (thresholds, unknown) => format!("no alarm; {unknown} of {thresholds} thresholds cannot be judged"),
+            (thresholds, unknown) => format!("no alarm; {unknown} of {thresholds} thresholds cannot be evaluated"),
         });
     };
     let count = if alarms.raised == 1 { "1 alarm: ".to_owned() } else { format!("{} alarms: ", alarms.raised) };
@@ -163,7 +163,7 @@ fn alarm_line(document: &Document, theme: Theme) -> Line<'static> {
     Line::from(vec![Span::raw(count), Span::styled(text, theme.severity(worst.severity))])
 }
 
-fn tabs(document: &Document, chosen: Page) -> Line<'static> {
+fn tabs(document: &StatusDocument, chosen: Page) -> Line<'static> {
     let mut spans = Vec::new();
     for page in Page::ALL {
         let text = match page {

@@ -1,4 +1,4 @@
-//! News of the stream socket, for ever: a connection that is lost is made again.
+//! Reads the stream socket, and reconnects after a failure. Out: updates for the view.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -9,14 +9,14 @@ use tokio::net::UnixStream;
 use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
-use super::app::News;
+use super::app::FeedUpdate;
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
 use crate::status::client::{check_length, explain, parse};
 
-/// Pause before a daemon that is not there is looked for again.
+/// Pause before a reconnection.
 const RETRY: Duration = Duration::from_secs(1);
-/// Without a line for this long the connection is given up: a daemon that is stopped keeps it open.
+/// Longest wait for a line before the connection is closed: a suspended daemon keeps it open.
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// The computer's clock.
@@ -24,14 +24,14 @@ pub(super) fn now() -> Timestamp {
     Timestamp::from_nanos(Reading::now().realtime_ns)
 }
 
-/// Begins to listen.
-pub(super) fn start(path: PathBuf) -> mpsc::Receiver<News> {
+/// Starts reading the socket at `path`.
+pub(super) fn start(path: PathBuf) -> mpsc::Receiver<FeedUpdate> {
     // One is drawn while the next is read.
-    let (news, received) = mpsc::channel(1);
+    let (updates, received) = mpsc::channel(1);
     tokio::spawn(async move {
         loop {
-            let Err(error) = listen(&path, &news).await else { return };
-            if news.send(News::Lost(error)).await.is_err() {
+            let Err(error) = listen(&path, &updates).await else { return };
+            if updates.send(FeedUpdate::Lost(error)).await.is_err() {
                 return;
             }
             sleep(RETRY).await;
@@ -40,8 +40,8 @@ pub(super) fn start(path: PathBuf) -> mpsc::Receiver<News> {
     received
 }
 
-/// Until the connection is lost (`Err`) or nobody wants news.
-async fn listen(path: &Path, news: &mpsc::Sender<News>) -> Result<(), String> {
+/// Reads until the connection fails (`Err`) or the view has ended.
+async fn listen(path: &Path, updates: &mpsc::Sender<FeedUpdate>) -> Result<(), String> {
     let failed = |error: io::Error| explain(path, &error);
     let mut stream = UnixStream::connect(path).await.map_err(failed)?;
     let mut unread = Vec::new();
@@ -54,7 +54,7 @@ async fn listen(path: &Path, news: &mpsc::Sender<News>) -> Result<(), String> {
         while let Some(end) = unread.iter().position(|byte| *byte == b'\n') {
             let document = parse(&unread[..end])?;
             unread.drain(..=end);
-            if news.send(News::Document(Box::new(document))).await.is_err() {
+            if updates.send(FeedUpdate::StatusDocument(Box::new(document))).await.is_err() {
                 return Ok(());
             }
         }

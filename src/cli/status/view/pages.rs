@@ -9,11 +9,11 @@ use serde_json::Value;
 
 use super::app::{App, Page, Quantity};
 use super::draw::{Theme, clock};
-use super::plot::{Scale, bar, sparkline};
+use super::plot::{ValueRange, bar, sparkline};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{number, shown, with_std, word};
 use crate::quantity::Timestamp;
-use crate::status::document::{Cell, Document};
+use crate::status::document::{CellStatus, StatusDocument};
 
 /// Width of a row's first cell number in the map.
 const LABEL: usize = 5;
@@ -22,8 +22,8 @@ const LIST_LINES: usize = 4;
 /// Height of the chosen cell's plot, its title included.
 const PLOT_LINES: usize = 5;
 
-/// Draws the page that is chosen.
-pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme, area: Rect) {
+/// Draws the selected page.
+pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme: Theme, area: Rect) {
     let lines = match app.page {
         Page::Cells => return cells(frame, app, document, theme, area),
         Page::Alarms => alarms(document, theme),
@@ -37,20 +37,20 @@ pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &Document, th
     frame.render_widget(Paragraph::new(shown), area);
 }
 
-fn of(cell: &Cell, quantity: Quantity) -> Option<f64> {
+fn of(cell: &CellStatus, quantity: Quantity) -> Option<f64> {
     match quantity {
         Quantity::Soc => cell.soc,
         Quantity::Voltage => cell.voltage_v,
     }
 }
 
-fn cells(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme, area: Rect) {
+fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme: Theme, area: Rect) {
     let height = usize::from(area.height);
     let lines = height.saturating_sub(LIST_LINES + 1).max(1);
     let grid = Grid::new(document.cells.len(), usize::from(area.width), lines);
     let map_lines = grid.rows.min(lines) + 1;
     let left = height.saturating_sub(map_lines);
-    // What the list does not need is the plot's.
+    // Lines that the list does not need go to the plot.
     let spare = left.saturating_sub(document.cells.len() + 1);
     let plot_lines = if left >= PLOT_LINES + LIST_LINES { PLOT_LINES.max(spare) } else { 0 };
     let length = |lines: usize| Constraint::Length(u16::try_from(lines).unwrap_or(u16::MAX));
@@ -64,7 +64,7 @@ fn cells(frame: &mut Frame<'_>, app: &mut App, document: &Document, theme: Theme
     }
 }
 
-/// How the map lies.
+/// The layout of the map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Grid {
     /// Characters of a cell, its space included.
@@ -74,11 +74,11 @@ struct Grid {
 }
 
 impl Grid {
-    /// The widest bars with which the cells fit; with the narrowest they may have to be scrolled.
+    /// Chooses the widest bars with which the cells fit; with the narrowest the map scrolls.
     fn new(cells: usize, width: usize, lines: usize) -> Self {
         let with = |cell_width: usize| {
             let fit = (width.saturating_sub(LABEL) / cell_width).max(1);
-            // Rows of whole dozens are easier to count.
+            // Rows of whole dozens are easy to count.
             let per_row = if fit >= 12 { fit / 12 * 12 } else { fit };
             Self { cell_width, per_row, rows: cells.div_ceil(per_row) }
         };
@@ -86,13 +86,13 @@ impl Grid {
     }
 }
 
-fn map(app: &App, document: &Document, theme: Theme, grid: &Grid, lines: usize) -> Vec<Line<'static>> {
+fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: usize) -> Vec<Line<'static>> {
     let cells = &document.cells;
-    let known = Scale::of(cells.iter().filter_map(|cell| of(cell, app.quantity)));
+    let known = ValueRange::of(cells.iter().filter_map(|cell| of(cell, app.quantity)));
     let (title, scale) = match (app.quantity, known) {
         (Quantity::Soc, Some(known)) => (
             format!("SOC {:.1} to {:.1} %, bars from 0 to 100 %", 100.0 * known.least, 100.0 * known.greatest),
-            Some(Scale { least: 0.0, greatest: 1.0 }),
+            Some(ValueRange { least: 0.0, greatest: 1.0 }),
         ),
         (Quantity::Voltage, Some(known)) => {
             (format!("voltage, bars from {:.3} to {:.3} V", known.least, known.greatest), Some(known))
@@ -127,8 +127,8 @@ fn map(app: &App, document: &Document, theme: Theme, grid: &Grid, lines: usize) 
     text
 }
 
-/// The cells round the chosen one, each with a small plot of the quantity.
-fn list(app: &App, document: &Document, theme: Theme, area: Rect) -> Vec<Line<'static>> {
+/// The cells around the selected one, each with a small plot of the quantity.
+fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<Line<'static>> {
     let height = usize::from(area.height);
     let rows = height.saturating_sub(1);
     let cells = &document.cells;
@@ -157,13 +157,13 @@ fn list(app: &App, document: &Document, theme: Theme, area: Rect) -> Vec<Line<'s
     text
 }
 
-/// The chosen cell's plot.
+/// The plot of the selected cell.
 fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let Some(points) = app.history.get(app.selected) else { return };
     let width = usize::from(area.width.saturating_sub(2));
     let values: Vec<Option<f64>> =
         points.iter().skip(points.len().saturating_sub(width)).map(|point| point.get(app.quantity)).collect();
-    let Some(scale) = Scale::of(values.iter().copied().flatten()) else { return };
+    let Some(scale) = ValueRange::of(values.iter().copied().flatten()) else { return };
     let cell = app.selected + 1;
     let title = match app.quantity {
         Quantity::Soc => {
@@ -171,18 +171,18 @@ fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
             format!(" SOC of cell {cell}, {least:.2} to {greatest:.2} % in {} s ", values.len())
         }
         Quantity::Voltage => {
-            let Scale { least, greatest } = scale;
+            let ValueRange { least, greatest } = scale;
             format!(" voltage of cell {cell}, {least:.3} to {greatest:.3} V in {} s ", values.len())
         }
     };
-    // At least a dot for what is known; 1 to 1,001.
+    // At least one dot for a known value; 1 to 1,001.
     let dots = values.into_iter().map(|value| value.and_then(|value| Some((1000.0 * scale.share(value)?) as u64 + 1)));
     let dots: Vec<Option<u64>> = dots.collect();
     let sparkline = Sparkline::default().data(dots).max(1001).style(theme.colour(Color::Cyan));
     frame.render_widget(sparkline.block(Block::bordered().title(title)), area);
 }
 
-fn alarms(document: &Document, theme: Theme) -> Vec<Line<'static>> {
+fn alarms(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
     let alarms = &document.alarms;
     let line = |alarm: &crate::alarm::Alarm| {
         let style = if alarm.state.is_raised() { theme.severity(alarm.severity) } else { Style::new() };
@@ -197,12 +197,12 @@ fn alarms(document: &Document, theme: Theme) -> Vec<Line<'static>> {
     }
     text.extend(alarms.unknown.iter().map(|unknown| {
         let (rule, severity) = (unknown.rule.name(), unknown.severity.name());
-        Line::from(format!("cannot be judged: {severity} {rule}, {} of its alarms", unknown.alarms))
+        Line::from(format!("cannot be evaluated: {severity} {rule}, {} of its alarms", unknown.alarms))
     }));
     text
 }
 
-fn interfaces(document: &Document, theme: Theme) -> Vec<Line<'static>> {
+fn interfaces(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
     let mut text = Vec::new();
     for it in &document.interfaces {
         let style = match it.state {
@@ -237,10 +237,10 @@ fn count_line(name: &str, count: u64) -> Line<'static> {
     Line::from(format!("  {name:<28}{count:>12}"))
 }
 
-fn counts(document: &Document) -> Vec<Line<'static>> {
+fn counts(document: &StatusDocument) -> Vec<Line<'static>> {
     let counters = &document.counters;
     let mut text = Vec::new();
-    // Of the counts every one by its name in the document.
+    // Every count, with its name in the document.
     for part in [serde_json::to_value(counters.readings), serde_json::to_value(&counters.core)] {
         let Ok(Value::Object(keys)) = part else { continue };
         text.extend(keys.iter().filter_map(|(name, count)| Some(count_line(&name.replace('_', " "), count.as_u64()?))));
@@ -270,7 +270,7 @@ fn counts(document: &Document) -> Vec<Line<'static>> {
 }
 
 /// Newest first.
-fn events(document: &Document) -> Vec<Line<'static>> {
+fn events(document: &StatusDocument) -> Vec<Line<'static>> {
     let mut text: Vec<Line<'_>> = document.events.iter().rev().map(|event| Line::from(event_line(event))).collect();
     if text.is_empty() {
         text.push(Line::from("no event yet"));
@@ -286,7 +286,7 @@ fn event_line(event: &Value) -> String {
     for (key, value) in keys.iter().filter(|(key, _)| !matches!(key.as_str(), "time" | "event")) {
         let value = match value {
             Value::String(word) => word.clone(),
-            // Cells as people count them.
+            // Cells count from 1 on the screen.
             Value::Number(cell) if key == "cell" => (cell.as_u64().unwrap_or(0) + 1).to_string(),
             Value::Number(number) if number.is_f64() => format!("{:.4}", number.as_f64().unwrap_or(f64::NAN)),
             other => other.to_string(),

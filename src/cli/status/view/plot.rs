@@ -2,7 +2,7 @@
 
 /// Eighths of a character's height.
 const EIGHTHS: [char; 8] = ['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█'];
-/// What is not known.
+/// An unknown value.
 const UNKNOWN: char = '·';
 
 /// A bar one character high; `share` 0 to 1 of its height.
@@ -16,19 +16,19 @@ pub(super) fn bar(share: Option<f64>) -> char {
 pub(super) fn sparkline(values: impl ExactSizeIterator<Item = Option<f64>>, width: usize) -> String {
     let skipped = values.len().saturating_sub(width);
     let values: Vec<Option<f64>> = values.skip(skipped).collect();
-    let scale = Scale::of(values.iter().copied().flatten());
+    let scale = ValueRange::of(values.iter().copied().flatten());
     let blank = " ".repeat(width.saturating_sub(values.len()));
     blank + &values.iter().map(|value| bar(value.and_then(|value| scale?.share(value)))).collect::<String>()
 }
 
 /// From the least to the greatest of some values.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Scale {
+pub(super) struct ValueRange {
     pub(super) least: f64,
     pub(super) greatest: f64,
 }
 
-impl Scale {
+impl ValueRange {
     /// `None` = there are no values.
     pub(super) fn of(values: impl Iterator<Item = f64>) -> Option<Self> {
         values.fold(None, |so_far, value| match so_far {

@@ -1,5 +1,5 @@
-//! Screens as they are drawn, against those in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` writes them anew:
-//! look at them before they are committed.
+//! Drawn screens, compared with the files in `screens/`. `PACKWATCH_WRITE_SCREENS=1 cargo test screens` rewrites the files:
+//! check them before a commit.
 
 use std::path::PathBuf;
 
@@ -7,11 +7,11 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::style::Color;
 
-use super::app::{HISTORY, News, Page};
+use super::app::{FeedUpdate, HISTORY, Page};
 use super::*;
 use crate::cli::status::sample::sample;
 use crate::quantity::Timestamp;
-use crate::status::document::Document;
+use crate::status::document::StatusDocument;
 
 fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)
@@ -29,7 +29,7 @@ fn watched(cells: u16, seconds: usize) -> App {
             cell.soc = cell.soc.map(|soc| soc - 0.0005 * second as f64);
         }
         app.poll(document.wall_time);
-        app.handle_news(News::Document(Box::new(document)));
+        app.handle_update(FeedUpdate::StatusDocument(Box::new(document)));
     }
     app
 }
@@ -89,33 +89,33 @@ fn screens_of_the_other_pages() {
 fn screens_without_a_daemon() {
     check("waiting_80x24", &mut app(), SMALL);
     let mut app = watched(96, 3);
-    app.handle_news(News::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
-    app.handle_news(News::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
+    app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
+    app.handle_update(FeedUpdate::Lost("/run/packwatch/status-stream.sock: no daemon listens there".to_owned()));
     check("lost_80x24", &mut app, SMALL);
-    // Nothing of what was true is on the screen.
+    // No stale value is on the screen.
     assert!(!drawn(&mut app, LARGE).to_string().contains("SOC"));
-    app.handle_news(News::Document(Box::new(sample(96))));
+    app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(96))));
     assert!(drawn(&mut app, LARGE).to_string().contains("SOC"));
 }
 
 #[test]
-fn a_daemon_that_says_nothing_is_lost() {
+fn a_silent_daemon_is_reported_as_lost() {
     let mut app = watched(1, 1);
-    let heard = sample(1).wall_time;
-    app.poll(heard.plus_secs(2.9));
+    let received_at = sample(1).wall_time;
+    app.poll(received_at.plus_secs(2.9));
     assert!(app.document.is_some());
-    app.poll(heard.plus_secs(3.1));
+    app.poll(received_at.plus_secs(3.1));
     assert!(app.document.is_none());
-    assert_eq!(app.lost.as_ref().map(|(since, _)| *since), Some(Some(heard)));
+    assert_eq!(app.lost.as_ref().map(|(since, _)| *since), Some(Some(received_at)));
 }
 
 #[test]
 fn unknown_is_drawn_as_unknown() {
-    let mut document = Document { cells: Vec::new(), ..sample(2) };
+    let mut document = StatusDocument { cells: Vec::new(), ..sample(2) };
     document.pack.soc = None;
     (document.pack.soc_low, document.pack.soc_high) = (None, None);
     let mut app = app();
-    app.handle_news(News::Document(Box::new(document)));
+    app.handle_update(FeedUpdate::StatusDocument(Box::new(document)));
     let screen = drawn(&mut app, SMALL).to_string();
     assert!(screen.contains("SOC       - ····") && screen.contains("not known"), "{screen}");
 }
@@ -123,9 +123,9 @@ fn unknown_is_drawn_as_unknown() {
 #[test]
 fn a_silent_cell_is_not_painted_as_trusted() {
     let mut app = app();
-    app.handle_news(News::Document(Box::new(sample(3))));
+    app.handle_update(FeedUpdate::StatusDocument(Box::new(sample(3))));
     let screen = drawn(&mut app, SMALL);
-    // The first row of the map: trusted, not trusted, silent; the chosen one is the first.
+    // The first row of the map: trusted, not trusted, silent; the selected one is the first.
     let row =
         (0..SMALL.1).find(|row| (0..5).map(|x| screen.buffer()[(x, *row)].symbol()).eq([" ", " ", " ", "1", " "]));
     let colours: Vec<Color> = [5, 9, 13].map(|x| screen.buffer()[(x, row.unwrap())].fg).to_vec();
@@ -133,7 +133,7 @@ fn a_silent_cell_is_not_painted_as_trusted() {
 }
 
 #[test]
-fn every_size_is_drawn_and_every_key_taken_without_a_fault() {
+fn every_size_and_every_key_is_handled_without_a_fault() {
     for cells in [1, 2, 96, 1024] {
         let mut app = watched(cells, 2);
         for size in [(1, 1), (40, 12), (41, 13), (57, 30), (200, 12), (80, 24), (300, 100)] {

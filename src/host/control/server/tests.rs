@@ -1,11 +1,11 @@
-//! The control socket under clients good and bad: each is answered or let go, and none holds up the loop or the others.
+//! The control socket with good and bad clients: each is answered or dropped, and none blocks the loop or another client.
 
 use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 use tokio::io::AsyncRead;
 
-use super::super::protocol::{Done, contents};
+use super::super::protocol::{CommandOutcome, contents};
 use super::*;
 use crate::monitor::Command;
 use crate::quantity::Timestamp;
@@ -16,7 +16,7 @@ fn block_on(test: impl Future<Output = ()>) {
 }
 
 fn done(changed: u32) -> Answer {
-    Answer::Done(Done { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
+    Answer::Outcome(CommandOutcome { time: Timestamp::ZERO, changed, refused: 0, refused_alarms: Vec::new() })
 }
 
 /// A server whose loop answers everything with the number of requests so far.
@@ -26,12 +26,12 @@ async fn serve(folder: &TempDir) -> (ControlServer, PathBuf) {
 
 async fn serve_patiently(folder: &TempDir, max_silence: Duration) -> (ControlServer, PathBuf) {
     let path = folder.path().join("control.sock");
-    let (sender, mut requests) = mpsc::channel::<Asked>(MAX_CONNECTIONS);
+    let (sender, mut requests) = mpsc::channel::<PendingRequest>(MAX_CONNECTIONS);
     tokio::spawn(async move {
         let mut count = 0;
-        while let Some(asked) = requests.recv().await {
+        while let Some(pending) = requests.recv().await {
             count += 1;
-            let _ = asked.answer.send(done(count));
+            let _ = pending.answer.send(done(count));
         }
     });
     let bound = bind(&path, MODE).await.map_err(|error| format!("{error:?}")).unwrap();
@@ -58,7 +58,7 @@ fn requests_of_a_connection_are_answered_in_turn() {
         let mut client = connect(&path).await;
         for count in 1..4 {
             client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            let done: Done = contents(line(&mut client).await.as_bytes()).unwrap();
+            let done: CommandOutcome = contents(line(&mut client).await.as_bytes()).unwrap();
             assert_eq!(done.changed, count);
         }
         client.write_all(b"rubbish\n").await.unwrap();
@@ -87,24 +87,24 @@ fn a_request_that_is_too_long_ends_its_connection() {
 }
 
 #[test]
-fn a_silent_client_is_sent_away() {
+fn a_silent_client_is_dropped() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
-        // Real time: a socket knows no other.
+        // Sockets need real time.
         let max_silence = Duration::from_millis(200);
         let (_server, path) = serve_patiently(&folder, max_silence).await;
         let mut client = connect(&path).await;
-        let asked = tokio::time::Instant::now();
+        let began = tokio::time::Instant::now();
         client.write_all(b"{\"version\"").await.unwrap();
         assert!(line(&mut client).await.contains("no request within 0.2 s"));
-        let waited = asked.elapsed();
+        let waited = began.elapsed();
         assert!(waited >= max_silence, "{waited:?}");
         assert_eq!(line(&mut client).await, "");
     });
 }
 
 #[test]
-fn a_client_that_never_reads_holds_up_nobody_and_is_sent_away() {
+fn a_client_that_never_reads_blocks_no_other_and_is_dropped() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve_patiently(&folder, Duration::from_millis(200)).await;
@@ -119,7 +119,7 @@ fn a_client_that_never_reads_holds_up_nobody_and_is_sent_away() {
                 Ok(_) | Err(_) => {}
             }
             client.write_all(REPLACED.to_line().as_bytes()).await.unwrap();
-            assert!(line(&mut client).await.contains("\"ok\":true"), "not served beside a deaf one");
+            assert!(line(&mut client).await.contains("\"ok\":true"), "not served next to a silent one");
             served += 1;
         }
         assert!(served > 0);
@@ -127,7 +127,7 @@ fn a_client_that_never_reads_holds_up_nobody_and_is_sent_away() {
 }
 
 #[test]
-fn nine_clients_are_one_too_many_until_one_goes() {
+fn nine_clients_are_one_too_many_until_one_closes() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let (_server, path) = serve(&folder).await;
@@ -174,7 +174,7 @@ fn a_dead_daemons_socket_is_replaced_and_a_live_ones_is_not() {
 }
 
 #[test]
-fn what_is_no_socket_is_left_alone() {
+fn a_file_that_is_no_socket_is_not_touched() {
     block_on(async {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("control.sock");

@@ -1,4 +1,4 @@
-//! When the service is said to be ready, and what the status line says of interfaces, lost signals and reloads.
+//! Reports of readiness, and the status line about interfaces, lost signals and reloads.
 
 use super::*;
 use crate::can::{CanId, Frame};
@@ -25,7 +25,7 @@ impl Scene {
         Self { monitor: Monitor::new(config.monitor), readiness, began, at_s: 0.0 }
     }
 
-    /// Hands one input over, `after_s` later.
+    /// Feeds one input, `after_s` later.
     fn feed(&mut self, after_s: f64, input: impl Fn(Timestamp) -> Input<'static>) -> ManagerUpdate {
         self.at_s += after_s;
         let mut out = Outputs::default();
@@ -42,7 +42,7 @@ impl Scene {
         self.feed(after_s, |time| Input::Bus { time, bus: BusIndex(bus), event })
     }
 
-    /// The line told after `seconds` of ticks, if any.
+    /// The line reported after `seconds` of ticks, if any.
     fn wait(&mut self, seconds: u32) -> Option<String> {
         (0..seconds * 10).filter_map(|_| self.tick(0.1).status).last()
     }
@@ -62,48 +62,48 @@ fn ready_comes_with_the_first_usable_reading_and_not_before() {
     let mut scene = Scene::new(None);
     assert_eq!(scene.tick(0.0), ManagerUpdate { ready: false, status: Some("waiting for the first frame".to_owned()) });
     assert!(!scene.bus(0.1, 0, BusEvent::Up).ready);
-    // A frame that nothing is read from is none.
+    // A frame without a configured signal does not count.
     let foreign = leaked(0x7FE, &[1]);
     assert!(!scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame: foreign }).ready);
     let frame = good_frame();
-    let told = scene.feed(0.2, |time| Input::Frame { time, bus: BusIndex(0), frame });
+    let update = scene.feed(0.2, |time| Input::Frame { time, bus: BusIndex(0), frame });
     let status = Some("running: 2 interfaces, first frame after 0.4 s".to_owned());
-    assert_eq!(told, ManagerUpdate { ready: true, status });
-    assert!(!scene.tick(5.0).ready, "ready is told once");
+    assert_eq!(update, ManagerUpdate { ready: true, status });
+    assert!(!scene.tick(5.0).ready, "readiness is reported once");
 }
 
 #[test]
 fn without_input_ready_comes_after_the_wait_and_the_line_names_the_missing_interface() {
-    let mut scene = Scene::new(Some(restored_words(Some(12.4))));
+    let mut scene = Scene::new(Some(describe_restored(Some(12.4))));
     scene.bus(0.0, 0, BusEvent::Up);
     scene.bus(0.1, 1, BusEvent::Missing);
     assert!(!scene.tick(9.8).ready);
-    let told = scene.tick(0.1);
-    assert!(told.ready);
-    let line = told.status.expect("a line");
+    let update = scene.tick(0.1);
+    assert!(update.ready);
+    let line = update.status.expect("a line");
     assert_eq!(line, "running without input: no frame in 10 s, restored state 12 s old; can1 is missing");
-    // The first frame after that is told, too.
+    // The first frame after that is reported, too.
     let frame = good_frame();
     scene.feed(1.5, |time| Input::Frame { time, bus: BusIndex(0), frame });
     assert_eq!(
-        scene.readiness.told,
+        scene.readiness.reported,
         "running: 2 interfaces, first frame after 11.5 s, restored state 12 s old; can1 is missing"
     );
 }
 
 #[test]
-fn changes_are_told_at_most_once_a_second_and_the_last_one_always() {
+fn changes_are_reported_at_most_once_a_second_and_the_last_one_always() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
     scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
-    let mut told = 0;
+    let mut reports = 0;
     for n in 0..40 {
         let event = if n % 2 == 0 { BusEvent::Down } else { BusEvent::Missing };
-        told += usize::from(scene.bus(0.05, 0, event).status.is_some());
+        reports += usize::from(scene.bus(0.05, 0, event).status.is_some());
     }
-    assert!(told <= 3, "{told} lines in 2 s");
+    assert!(reports <= 3, "{reports} lines in 2 s");
     scene.wait(2);
-    assert!(scene.readiness.told.ends_with("; can0 is missing"), "{}", scene.readiness.told);
+    assert!(scene.readiness.reported.ends_with("; can0 is missing"), "{}", scene.readiness.reported);
 }
 
 #[test]
@@ -117,19 +117,19 @@ fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
     for _ in 0..20 {
         scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
     }
-    assert_eq!(scene.readiness.told, "running: 2 interfaces, first frame after 0.0 s");
+    assert_eq!(scene.readiness.reported, "running: 2 interfaces, first frame after 0.0 s");
 }
 
 #[test]
-fn a_refused_reload_stays_in_the_line_until_one_is_taken() {
+fn a_rejected_reload_stays_in_the_line_until_one_is_applied() {
     let mut scene = Scene::new(None);
     let frame = good_frame();
     scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
     scene.readiness.note_reload(Some("pack.toml:3: pack.cells = 0,\nmust be 1 to 1024".to_owned()));
-    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("reported at once");
     assert!(line.ends_with("; reload refused: pack.toml:3: pack.cells = 0, must be 1 to 1024"), "{line}");
     scene.readiness.note_reload(None);
-    let line = scene.readiness.tell_now(&scene.monitor, scene.began).expect("told at once");
+    let line = scene.readiness.line_now(&scene.monitor, scene.began).expect("reported at once");
     assert!(!line.contains("reload"), "{line}");
 }
 

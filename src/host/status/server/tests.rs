@@ -1,4 +1,4 @@
-//! Real sockets, real time: a socket knows no other.
+//! Real sockets, in real time.
 
 use std::io::Read;
 use std::os::unix::net::UnixStream;
@@ -19,7 +19,7 @@ fn serve(folder: &TempDir, limits: Limits) -> (StatusServer, PathBuf) {
 }
 
 fn draft(cells: u16, pid: u32) -> Draft {
-    Draft { document: Document { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
+    Draft { document: StatusDocument { pid, events: Vec::new(), ..sample(cells) }, events: Vec::new() }
 }
 
 /// Offers until the thread takes it.
@@ -54,13 +54,13 @@ fn until(what: &str, mut is_so: impl FnMut() -> bool) {
 fn a_client_gets_one_document_and_the_end() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
-    // Asked before there is one: the first is waited for.
+    // Connected before there is a document: waits for the first.
     let early = connect(&path);
     offer(&server, 96, 1);
-    let told = parse(&rest(early)).unwrap();
-    assert_eq!(told, Document { pid: 1, events: Vec::new(), ..sample(96) });
+    let received = parse(&rest(early)).unwrap();
+    assert_eq!(received, StatusDocument { pid: 1, events: Vec::new(), ..sample(96) });
     let line = StatusClient::new(Some(&path)).line().unwrap();
-    assert_eq!(parse(&line).unwrap(), told);
+    assert_eq!(parse(&line).unwrap(), received);
     assert_eq!(server.clients().served, 2);
     drop(server);
     assert!(!path.exists() && !stream_path(&path).exists(), "the sockets are still there");
@@ -87,7 +87,7 @@ fn the_stream_has_a_line_per_document() {
 }
 
 #[test]
-fn clients_beyond_the_limit_are_turned_away_at_once_and_counted() {
+fn clients_beyond_the_limit_are_refused_at_once_and_counted() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, PATIENT);
     let seated: Vec<UnixStream> = (0..MAX_CLIENTS).map(|_| connect(&stream_path(&path))).collect();
@@ -100,7 +100,7 @@ fn clients_beyond_the_limit_are_turned_away_at_once_and_counted() {
     for mut stream in seated {
         assert_ne!(stream.read(&mut [0; 16]).unwrap(), 0, "a client that is seated is not served");
     }
-    // Those have gone: there is room again.
+    // Those have closed: there is room again.
     until("room", || {
         offer(&server, 1, 8);
         server.clients().connected == 0
@@ -109,7 +109,7 @@ fn clients_beyond_the_limit_are_turned_away_at_once_and_counted() {
 }
 
 #[test]
-fn a_client_that_never_reads_is_dropped_and_holds_up_nobody() {
+fn a_client_that_never_reads_is_dropped_and_blocks_no_other() {
     let folder = tempfile::tempdir().unwrap();
     let (server, path) = serve(&folder, Limits { max_silence: Duration::from_millis(300), ..PATIENT });
     let deaf = [connect(&path), connect(&stream_path(&path))];
@@ -119,7 +119,7 @@ fn a_client_that_never_reads_is_dropped_and_holds_up_nobody() {
     until("both are dropped", || {
         pid += 1;
         offer(&server, 1024, pid);
-        assert!(parse(&rest(connect(&path))).is_ok(), "not served beside a deaf one");
+        assert!(parse(&rest(connect(&path))).is_ok(), "not served next to a silent one");
         server.clients().dropped == 2
     });
     drop(deaf);
@@ -133,7 +133,7 @@ fn an_old_document_is_not_served() {
     offer(&server, 1, 1);
     assert!(!rest(connect(&path)).is_empty());
     std::thread::sleep(stale);
-    assert_eq!(rest(connect(&path)), b"", "what was true is told as if it were");
+    assert_eq!(rest(connect(&path)), b"", "a stale document is served");
     offer(&server, 1, 2);
     assert!(!rest(connect(&path)).is_empty());
 }

@@ -1,25 +1,29 @@
 //! Commits, restores, the chain and its faults, thinning, migration and damaged files, on real databases.
 
 use super::super::folder::{DATABASE, Folder};
-use super::super::reader::{Filter, Kind, Reader};
-use super::super::rows::Row;
+use super::super::parts::JsonParts;
+use super::super::reader::{HistoryQuery, HistoryReader};
+use super::super::rows::HistoryTable;
 use super::super::rows::tests::{alarm, capacity, half_cycle, remaining_life};
 use super::super::verify;
 use super::*;
 use crate::alarm::Change;
-use crate::monitor::EventKind;
 use crate::quantity::Timestamp;
 
 fn stamp(seconds: f64) -> Stamp {
     Stamp::replayed(Timestamp::from_secs(seconds))
 }
 
-fn batch(seconds: f64, kinds: &[EventKind]) -> Batch {
-    Batch { stamp: stamp(seconds), rows: kinds.iter().map(|kind| Row::Event(*kind)).collect() }
+fn batch(seconds: f64, kinds: &[EventKind]) -> RowBatch {
+    RowBatch { stamp: stamp(seconds), rows: kinds.iter().map(|kind| HistoryRow::Event(*kind)).collect() }
 }
 
 fn state(numbers: &[f64]) -> StateRecord {
-    StateRecord { parts: Parts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(), exact: false, sets_aside: false }
+    StateRecord {
+        parts: JsonParts::of(&serde_json::to_vec(numbers).unwrap()).unwrap(),
+        exact: false,
+        sets_aside: false,
+    }
 }
 
 fn open(folder: &Path) -> Database {
@@ -42,12 +46,12 @@ fn filled(folder: &Path) -> Database {
 }
 
 fn broken_row(folder: &Path) -> (String, i64) {
-    let verdict = Reader::open(folder).unwrap().verify().unwrap();
+    let verdict = HistoryReader::open(folder).unwrap().verify().unwrap();
     verdict.broken.map(|broken| (broken.table, broken.row)).unwrap_or_default()
 }
 
 #[test]
-fn what_was_committed_is_there_after_opening_again() {
+fn a_commit_is_there_after_reopening() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
     database.commit(&[], Some(state(&[1.5; 300]))).unwrap();
@@ -89,12 +93,12 @@ fn every_change_of_a_chained_row_is_found_and_named() {
 }
 
 #[test]
-fn the_number_of_a_pack_is_in_its_row_and_in_the_chain() {
+fn the_identity_of_a_pack_is_in_its_row_and_in_the_chain() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
     let another = EventKind::PackReplaced { capacity_ah: Some(1.9), capacity_std_ah: Some(0.1) };
-    let told = |identity| EventKind::PackIdentity { identity };
-    database.commit(&[batch(1.0, &[told(4711.0)]), batch(2.0, &[another, told(4712.0)])], None).unwrap();
+    let identified = |identity| EventKind::PackIdentity { identity };
+    database.commit(&[batch(1.0, &[identified(4711.0)]), batch(2.0, &[another, identified(4712.0)])], None).unwrap();
     let connection = database.connection();
     let of = |id: i64| -> String {
         connection.query_row("SELECT identity FROM pack WHERE id = ?1", [id], |row| row.get(0)).unwrap()
@@ -144,16 +148,18 @@ fn another_pack_closes_one_history_and_opens_the_next() {
         .collect();
     assert_eq!(packs, [(1, Some(9_000_000_000_000_000)), (2, None)]);
     drop(database);
-    let entries =
-        Reader::open(folder.path()).unwrap().entries(&Filter { limit: Some(2), ..Filter::default() }).unwrap();
+    let entries = HistoryReader::open(folder.path())
+        .unwrap()
+        .entries(&HistoryQuery { limit: Some(2), ..HistoryQuery::default() })
+        .unwrap();
     assert_eq!(
         entries.iter().map(|entry| (entry.kind, entry.pack)).collect::<Vec<_>>(),
-        [(Kind::Reset, 1), (Kind::Capacity, 2)]
+        [(HistoryTable::Reset, 1), (HistoryTable::Capacity, 2)]
     );
 }
 
 #[test]
-fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
+fn an_older_layout_is_migrated_with_its_rows() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
     drop(filled(folder.path()));
@@ -163,7 +169,7 @@ fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
     assert_eq!(database.counts().chained, 200);
     assert_eq!(database.connection().query_row("SELECT id FROM added", [], |row| row.get::<_, i64>(0)).unwrap(), 40);
     drop(database);
-    // And now it is a newer one: for the present program not to touch.
+    // Now it is a newer layout, which the present program must not touch.
     let before = std::fs::read(&path).unwrap();
     let newer = Database::open(&path, &stamp(2.0), 1000).unwrap_err();
     assert_eq!(newer, OpenError::Newer { found: 3, known: 2 });
@@ -171,24 +177,24 @@ fn a_layout_of_before_is_brought_up_to_date_with_its_rows() {
 }
 
 #[test]
-fn a_history_of_before_the_remaining_lives_is_read_as_it_is_and_goes_on() {
+fn a_history_of_layout_version_1_is_read_and_continued() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(DATABASE);
     let mut old = Database::open_with(&path, &stamp(1.0), 1000, &MIGRATIONS[..1]).unwrap();
-    let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(Row::Event).collect();
-    old.commit(&[Batch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
+    let rows = |kinds: Vec<EventKind>| kinds.into_iter().map(HistoryRow::Event).collect();
+    old.commit(&[RowBatch { stamp: stamp(2.0), rows: rows(vec![capacity(0, Some(2.0), 1.9)]) }], None).unwrap();
     drop(old);
-    let kinds = || -> Vec<Kind> {
-        let reader = Reader::open(folder.path()).unwrap();
+    let kinds = || -> Vec<HistoryTable> {
+        let reader = HistoryReader::open(folder.path()).unwrap();
         assert_eq!(reader.verify().unwrap().broken, None);
-        reader.entries(&Filter::default()).unwrap().iter().map(|entry| entry.kind).collect()
+        reader.entries(&HistoryQuery::default()).unwrap().iter().map(|entry| entry.kind).collect()
     };
-    assert_eq!(kinds(), [Kind::Capacity]);
+    assert_eq!(kinds(), [HistoryTable::Capacity]);
     let mut database = open(folder.path());
-    let batch = Batch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
+    let batch = RowBatch { stamp: stamp(3.0), rows: rows(vec![capacity(0, Some(2.0), 1.8), remaining_life(90.0)]) };
     database.commit(&[batch], None).unwrap();
     drop(database);
-    assert_eq!(kinds(), [Kind::Capacity, Kind::Capacity, Kind::RemainingLife]);
+    assert_eq!(kinds(), [HistoryTable::Capacity, HistoryTable::Capacity, HistoryTable::RemainingLife]);
 }
 
 #[test]
@@ -225,7 +231,7 @@ fn damage(path: &Path, from: f64, bytes: usize) {
 }
 
 #[test]
-fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
+fn a_damaged_database_is_set_aside_and_its_rows_are_copied() {
     for from in [0.3, 0.5, 0.7, 0.9] {
         let place = tempfile::tempdir().unwrap();
         drop(filled(place.path()));
@@ -236,14 +242,14 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
         assert!(place.path().join("packwatch.db.damaged-1").exists(), "{from}");
         let saved = opening.database.counts();
         assert!(saved.chained > 100 && saved.chained < 200, "{from}: {saved:?}");
-        let told: i64 = opening
+        let reports: i64 = opening
             .database
             .connection()
             .query_row("SELECT count(*) FROM reset WHERE reason = 'damaged'", [], |row| row.get(0))
             .unwrap();
-        assert_eq!(told, 1, "{from}");
+        assert_eq!(reports, 1, "{from}");
         assert_eq!(verify::verify(opening.database.connection()).unwrap().broken, None, "{from}");
-        // Nothing that was changed has come over.
+        // No changed row was copied.
         let odd: i64 = opening
             .database
             .connection()
@@ -254,7 +260,7 @@ fn a_damaged_database_is_set_aside_and_its_rows_are_taken_over() {
 }
 
 #[test]
-fn what_is_no_database_is_set_aside() {
+fn a_file_that_is_no_database_is_set_aside() {
     let place = tempfile::tempdir().unwrap();
     let path = place.path().join(DATABASE);
     let makers: [&dyn Fn(); 3] = [
@@ -277,11 +283,11 @@ fn what_is_no_database_is_set_aside() {
 fn a_folder_belongs_to_one_process() {
     let place = tempfile::tempdir().unwrap();
     let mut first = Folder::new(place.path().join("made/on the way"), 1000);
-    first.take().unwrap();
+    first.lock().unwrap();
     let mut second = Folder::new(place.path().join("made/on the way"), 1000);
-    assert_eq!(second.take().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
+    assert_eq!(second.lock().unwrap_err().kind(), std::io::ErrorKind::WouldBlock);
     drop(first);
-    second.take().unwrap();
+    second.lock().unwrap();
 }
 
 #[test]
@@ -304,19 +310,19 @@ fn a_checkpoint_overwrites_its_pages_in_place() {
 fn a_history_can_be_read_while_it_is_written() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = filled(folder.path());
-    let reader = Reader::open(folder.path()).unwrap();
-    let all = reader.entries(&Filter::default()).unwrap();
+    let reader = HistoryReader::open(folder.path()).unwrap();
+    let all = reader.entries(&HistoryQuery::default()).unwrap();
     assert_eq!(all.len(), 360);
     database.commit(&[batch(9e6, &[alarm(Change::Cleared)])], None).unwrap();
-    let filter = Filter { kinds: vec![Kind::Alarm], limit: Some(1), ..Filter::default() };
+    let filter = HistoryQuery { kinds: vec![HistoryTable::Alarm], limit: Some(1), ..HistoryQuery::default() };
     let last = &reader.entries(&filter).unwrap()[0];
     assert_eq!((last.seq, last.wall_ns), (Some(201), 9_000_000_000_000_000));
     assert_eq!(last.values[3], "cleared");
-    let of_cell = Filter {
+    let of_cell = HistoryQuery {
         cell: Some(2),
         since_ns: Some(86_400_000_000_000),
         until_ns: Some(2 * 86_400_000_000_000),
-        ..Filter::default()
+        ..HistoryQuery::default()
     };
     assert_eq!(reader.entries(&of_cell).unwrap().len(), 4);
 }
@@ -334,7 +340,7 @@ fn a_delta_never_fits_another_full_record_of_its_number() {
         statement.query_map([], |row| row.get(0)).unwrap().map(Result::unwrap).collect()
     };
     assert_eq!(serials(&database), [1, 1]);
-    // The full record can no longer be read: numbers begin anew.
+    // The full record can no longer be read: numbers restart.
     database.connection().execute("UPDATE state SET bytes = zeroblob(length) WHERE slot = 0", []).unwrap();
     drop(database);
     let mut database = open(folder.path());
@@ -347,11 +353,11 @@ fn a_delta_never_fits_another_full_record_of_its_number() {
 }
 
 #[test]
-fn a_moment_goes_with_its_last_row() {
+fn a_moment_is_deleted_with_its_last_row() {
     let folder = tempfile::tempdir().unwrap();
     let mut database = open(folder.path());
     for day in 0..1200_u32 {
-        // Every fifth transition teaches something; now and then there is an alarm.
+        // Every fifth transition has a capacity, some have an alarm.
         let mut learned = vec![half_cycle(0)];
         learned.extend((day % 5 == 0).then(|| capacity(0, Some(2.0), 1.9)));
         learned.extend((day % 7 == 0).then(|| alarm(Change::Raised)));

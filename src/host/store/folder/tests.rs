@@ -1,7 +1,7 @@
 //! A damaged database replaced, with the power cut after each step.
 
 use super::super::database::Counts;
-use super::super::reader::{Filter, Reader};
+use super::super::reader::{HistoryQuery, HistoryReader};
 use super::super::rows::tests::capacity;
 use super::super::tests::document;
 use super::*;
@@ -18,11 +18,10 @@ fn damaged() -> tempfile::TempDir {
     for hundredth in 0..200_u32 {
         let learned: Vec<EventKind> =
             (0..4).map(|cell| capacity(cell, Some(2.0), f64::from(hundredth) / 100.0)).collect();
-        let rows = learned.into_iter().map(Row::Event).collect();
-        database.commit(&[Batch { stamp: state.stamp, rows }], None).unwrap();
+        let rows = learned.into_iter().map(HistoryRow::Event).collect();
+        database.commit(&[RowBatch { stamp: state.stamp, rows }], None).unwrap();
     }
-    let parts = Parts::of(&state.to_json().unwrap()).unwrap();
-    database.commit(&[], Some(StateRecord { parts, exact: true, sets_aside: false })).unwrap();
+    database.commit(&[], Some(StateRecord::new(&state, true, false).unwrap())).unwrap();
     database.close().unwrap();
     let file = File::options().write(true).open(place.path().join(DATABASE)).unwrap();
     let at = file.metadata().unwrap().len() * 2 / 5;
@@ -30,7 +29,7 @@ fn damaged() -> tempfile::TempDir {
     place
 }
 
-/// What a start finds: chained rows, and how often the damage is told.
+/// Starts and returns the chained rows and the number of reports of the damage.
 fn start(place: &Path) -> (Counts, usize) {
     let now = document(1, 200, 1_800_000_100).stamp;
     let opening = Folder::new(place.to_owned(), 1000).open(&now).unwrap();
@@ -45,17 +44,17 @@ fn start(place: &Path) -> (Counts, usize) {
         .collect();
     assert!(names.is_empty(), "{names:?}");
     assert!(place.join("packwatch.db.damaged-1").exists() && !place.join("packwatch.db.damaged-2").exists());
-    let reader = Reader::open(place).unwrap();
+    let reader = HistoryReader::open(place).unwrap();
     assert_eq!(reader.verify().unwrap().broken, None);
-    let told = reader.entries(&Filter::default()).unwrap();
-    (counts, told.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
+    let rows = reader.entries(&HistoryQuery::default()).unwrap();
+    (counts, rows.iter().filter(|entry| entry.values.contains(&"damaged".into())).count())
 }
 
-/// When the power goes, and what is in the folder then.
+/// The time of the power cut, and the files in the folder then.
 type Cut<'a> = (&'a str, &'a dyn Fn(&Path));
 
 #[test]
-fn a_replacement_that_was_cut_short_is_begun_again_or_finished() {
+fn an_interrupted_replacement_is_repeated_or_finished() {
     let uncut = start(damaged().path());
     assert!(uncut.0.chained > 400 && uncut.0.chained < 800 && uncut.1 == 1, "{uncut:?}");
     let stamp = document(1, 150, 1_800_000_050).stamp;
@@ -94,16 +93,16 @@ fn a_history_is_no_place_for_a_replay_while_its_replacement_waits() {
 #[test]
 fn a_replacement_that_cannot_be_made_leaves_the_damaged_database_where_it_is() {
     let place = damaged();
-    // Nothing can be made under that name.
+    // No file can be created under that name.
     fs::create_dir_all(place.path().join("packwatch.db.new/x")).unwrap();
     let mut folder = Folder::new(place.path().to_owned(), 1000);
     let now = document(1, 150, 1_800_000_050).stamp;
-    folder.take().unwrap();
+    folder.lock().unwrap();
     assert!(matches!(folder.fill_replacement(WHY, &now), Err(OpenError::Unavailable(_))));
     assert!(place.path().join(DATABASE).exists());
-    // Not again and again.
-    let told = folder.fill_replacement(WHY, &now).unwrap_err().to_string();
-    assert!(told.contains("less than 600 s ago"), "{told}");
+    // Not at every attempt.
+    let error = folder.fill_replacement(WHY, &now).unwrap_err().to_string();
+    assert!(error.contains("less than 600 s ago"), "{error}");
     fs::remove_dir_all(place.path().join("packwatch.db.new")).unwrap();
     drop(folder);
     start(place.path());

@@ -1,8 +1,8 @@
-//! Rows that nothing proves, and a history larger than the memory.
+//! Rows without evidence, and a history larger than the memory.
 
 use super::super::folder::DATABASE;
 use super::super::rows::tests::{capacity, half_cycle};
-use super::super::rows::{Batch, Row};
+use super::super::rows::{HistoryRow, RowBatch};
 use super::*;
 use crate::monitor::EventKind;
 
@@ -12,12 +12,12 @@ fn open(path: &Path) -> Database {
 
 fn commit(database: &mut Database, seconds: f64, kinds: &[EventKind]) {
     let stamp = Stamp::replayed(Timestamp::from_secs(seconds));
-    let rows = kinds.iter().copied().map(Row::Event).collect();
-    database.commit(&[Batch { stamp, rows }], None).unwrap();
+    let rows = kinds.iter().copied().map(HistoryRow::Event).collect();
+    database.commit(&[RowBatch { stamp, rows }], None).unwrap();
 }
 
 #[test]
-fn a_number_of_a_pack_is_believed_from_rows_with_a_good_hash() {
+fn the_number_of_a_pack_is_accepted_from_rows_with_a_good_hash() {
     for odd in [3, 66, i64::MAX, 0, -1] {
         let place = tempfile::tempdir().unwrap();
         let (path, new) = (place.path().join(DATABASE), place.path().join("new.db"));
@@ -48,7 +48,7 @@ fn a_number_of_a_pack_is_believed_from_rows_with_a_good_hash() {
 }
 
 #[test]
-fn all_rows_of_a_sound_file_come_over_in_their_order() {
+fn all_rows_of_a_sound_file_are_copied_in_their_order() {
     let place = tempfile::tempdir().unwrap();
     let (path, new) = (place.path().join(DATABASE), place.path().join("new.db"));
     let mut database = open(&path);
@@ -66,7 +66,7 @@ fn all_rows_of_a_sound_file_come_over_in_their_order() {
     assert_eq!(moments, 100, "a moment is copied once");
 }
 
-/// Most memory this process has had since this was asked last, kB.
+/// Peak memory of this process since the last call, kB.
 fn peak_kb() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find(|line| line.starts_with("VmHWM:")).unwrap();

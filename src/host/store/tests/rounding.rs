@@ -1,16 +1,16 @@
-//! What a power cut leaves of the estimates: a state that went through JSON and a delta's rounding, of an age the clocks say.
+//! Estimates after a power cut: a state that went through JSON and the rounding of a delta, with an age from the clocks.
 
 use nalgebra::DMatrix;
 use serde_json::Value;
 
 use super::*;
 
-/// A state of `late` as the database gives it back, stored as what differs from `early`.
-fn from_the_disk(early: &Document, late: &Document) -> Document {
-    let parts = |document: &Document| Parts::of(&document.to_json().unwrap()).unwrap();
+/// The state `late` as the database returns it, stored as the difference to `early`.
+fn from_the_disk(early: &StateDocument, late: &StateDocument) -> StateDocument {
+    let parts = |document: &StateDocument| JsonParts::of(&serde_json::to_vec(document).unwrap()).unwrap();
     let base = parts(early);
     let stored = packed::delta(&parts(late), &base, 7);
-    Document::parse(&packed::read_delta(&stored, &base, 7).unwrap().join()).unwrap()
+    StateDocument::parse(&packed::read_delta(&stored, &base, 7).unwrap().join()).unwrap()
 }
 
 fn numbers(value: &Value) -> Vec<f64> {
@@ -48,10 +48,10 @@ fn compare(before: (&Value, &Value), after: (&Value, &Value), what: &str) {
 }
 
 #[test]
-fn means_and_covariances_outlive_a_power_cut() {
+fn means_and_covariances_survive_a_power_cut() {
     let taken = |seconds: i64, boottime_s: i64| {
         let snapshot = Box::new(snapshot(Some(seconds), None));
-        Document { snapshot, ..document(1, boottime_s, 1_800_000_000 + boottime_s) }
+        StateDocument { snapshot, ..document(1, boottime_s, 1_800_000_000 + boottime_s) }
     };
     let early = taken(600, 600);
     let now = document(2, 20, 1_800_010_000).stamp;
@@ -66,12 +66,12 @@ fn means_and_covariances_outlive_a_power_cut() {
         compare((&a["mean"], &a["covariance"]), (&b["mean"], &b["covariance"]), &format!("filter at {seconds} s"));
         let [a, b] = [drift(&before), drift(&after)];
         compare((&a["x"], &a["p"]), (&b["x"], &b["p"]), &format!("capacity at {seconds} s"));
-        // And it is taken up, as old as the clocks say.
-        let found = candidates(None, Some(back), &now, WallClock::Kept).remove(0);
+        // The state is restored, with the age that the clocks give.
+        let found = candidates(None, Some(back), &now, WallClock::Reliable).remove(0);
         let age_s = (10_000 - seconds) as f64;
-        assert_eq!(found.away, Downtime::Seconds(age_s));
+        assert_eq!(found.downtime, Downtime::Seconds(age_s));
         let mut monitor = Monitor::new(config().monitor);
-        monitor.restore(found.snapshot, found.away).unwrap();
+        monitor.restore(found.snapshot, found.downtime).unwrap();
         let time = late.snapshot.time.plus_secs(age_s);
         monitor.handle(Input::Tick { time }, &mut Outputs::default());
         assert_eq!(monitor.statistics().filter_resets, late_resets(&before));

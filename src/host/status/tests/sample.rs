@@ -1,4 +1,4 @@
-//! A document for tests: every value told, of a few nothing is known.
+//! A sample document for tests: every value is present, except a few that are unknown.
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
@@ -6,18 +6,18 @@ use crate::io::socket::LinkState;
 use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
-use crate::status::counters::LoopCounters;
+use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::status::document::{
-    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
-    StatusCount, Store, VERSION,
+    AlarmStatus, CellStatus, ConfigFile, InterfaceStatus, MessageFlood, MessageProtection, PackStatus, RemainingStatus,
+    StatusCount, StatusCounters, StatusDocument, StoreStatus, VERSION,
 };
 
-/// Of a pack with so many cells; the last one is silent and the one before it not trusted, when there are several.
-pub fn sample(cells: u16) -> Document {
-    let mut counters = LoopCounters::default();
-    [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| counters.latency.record(seconds));
+/// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
+pub(crate) fn sample(cells: u16) -> StatusDocument {
+    let mut latency = Latency::default();
+    [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| latency.record(seconds));
     let time = Timestamp::from_secs(1_800_000_000.0);
-    Document {
+    StatusDocument {
         version: VERSION,
         program_version: "1.2.3".to_owned(),
         pid: 4711,
@@ -31,7 +31,7 @@ pub fn sample(cells: u16) -> Document {
         pack: pack(cells),
         cells: (0..cells).map(|index| cell(index, cells)).collect(),
         alarms: alarms(),
-        counters: Counters {
+        counters: StatusCounters {
             core: core(),
             lifetime: Statistics { buses: Vec::new(), half_cycles: 1200, ..core() },
             readings: ReadingCounts { accepted: 123_456, out_of_range: 7, ..ReadingCounts::default() },
@@ -44,21 +44,21 @@ pub fn sample(cells: u16) -> Document {
                 reloads_refused: 0,
                 documents_skipped: 0,
             },
-            clients: Clients { connected: 1, served: 90, refused: 5, dropped: 2 },
+            clients: ClientCounts { connected: 1, served: 90, refused: 5, dropped: 2 },
         },
-        protection: vec![Protected {
+        protection: vec![MessageProtection {
             interface: "can0".to_owned(),
             id: "3E9".to_owned(),
             checks: vec![StatusCount { status: "ok".to_owned(), count: 99 }],
         }],
-        floods: vec![Flooded { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
-        latency: counters.latency.document(),
-        store: Some(Store {
+        floods: vec![MessageFlood { interface: "can0".to_owned(), id: "18FF0010".to_owned(), dropped: 12 }],
+        latency,
+        store: Some(StoreStatus {
             path: "/var/lib/packwatch/packwatch.db".to_owned(),
             works: Some(true),
             commits: 21,
             file_bytes: Some(65_536),
-            ..Store::default()
+            ..StoreStatus::default()
         }),
         events: vec![
             serde_json::json!({ "time": time.nanos(), "event": "mode", "from": "rest", "to": "discharge" }),
@@ -67,8 +67,8 @@ pub fn sample(cells: u16) -> Document {
     }
 }
 
-fn interface(name: &str, state: LinkState) -> Interface {
-    Interface {
+fn interface(name: &str, state: LinkState) -> InterfaceStatus {
+    InterfaceStatus {
         name: name.to_owned(),
         state,
         reconnects: 1,
@@ -84,8 +84,8 @@ fn interface(name: &str, state: LinkState) -> Interface {
     }
 }
 
-fn pack(cells: u16) -> Pack {
-    Pack {
+fn pack(cells: u16) -> PackStatus {
+    PackStatus {
         validity: Validity::Valid,
         mode: Mode::Discharge,
         soc: Some(0.632),
@@ -101,10 +101,7 @@ fn pack(cells: u16) -> Pack {
         capacity_std_ah: Some(0.021),
         soh: Some(0.928),
         shortest_lived_cell: Some(0),
-        remaining_cycles: Some(412.3),
-        remaining_cycles_low: Some(207.8),
-        remaining_cycles_high: Some(933.1),
-        remaining_days: Some(533.2),
+        remaining: remaining(412.3),
         usable_capacity_ah: Some(2.31),
         usable_capacity_std_ah: Some(0.04),
         recharge_period_s: None,
@@ -115,11 +112,20 @@ fn pack(cells: u16) -> Pack {
     }
 }
 
-fn cell(index: u16, cells: u16) -> Cell {
+fn remaining(cycles: f64) -> RemainingStatus {
+    RemainingStatus {
+        remaining_cycles: Some(cycles),
+        remaining_cycles_low: Some(207.8),
+        remaining_cycles_high: Some(933.1),
+        remaining_days: Some(533.2),
+    }
+}
+
+fn cell(index: u16, cells: u16) -> CellStatus {
     let wave = f64::from(index % 24) / 24.0;
     let is_silent = cells > 1 && index + 1 == cells;
     let known = |value: f64| (!is_silent).then_some(value);
-    Cell {
+    CellStatus {
         cell: index,
         voltage_v: known(3.6 + 0.1 * wave),
         current_a: Some(12.5),
@@ -130,10 +136,7 @@ fn cell(index: u16, cells: u16) -> Cell {
         capacity_std_ah: known(0.02),
         usable_capacity_ah: None,
         usable_capacity_std_ah: None,
-        remaining_cycles: known(412.3 + wave),
-        remaining_cycles_low: known(207.8),
-        remaining_cycles_high: known(933.1),
-        remaining_days: known(533.2),
+        remaining: if is_silent { RemainingStatus::default() } else { remaining(412.3 + wave) },
         remaining_unknown: is_silent.then(|| "0 capacity readings, needs 6".to_owned()),
         resistance_ratio: known(1.1 + 0.2 * wave),
         resistance_ratio_std: known(0.03),
@@ -141,7 +144,7 @@ fn cell(index: u16, cells: u16) -> Cell {
     }
 }
 
-fn alarms() -> Alarms {
+fn alarms() -> AlarmStatus {
     let raised = Alarm {
         rule: Rule::CapacityLow,
         severity: Severity::Severe,
@@ -159,7 +162,7 @@ fn alarms() -> Alarms {
     let past =
         Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: AlarmState::Cleared, ..raised };
     let past = Alarm { value: Some(0.632), threshold: 0.1, probability: None, is_acknowledged: true, ..past };
-    Alarms {
+    AlarmStatus {
         thresholds: 4,
         raised: 1,
         highest_severity: Some(Severity::Severe),

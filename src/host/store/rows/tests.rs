@@ -1,0 +1,136 @@
+//! Events as the tests of the store write them, and the rows they make.
+
+use super::*;
+use crate::alarm::{AlarmState, Change, Rule, Severity};
+use crate::quantity::{CellIndex, Mode};
+
+/// A capacity of a cell, measured or not.
+pub(in crate::store) fn capacity(cell: u16, measured_ah: Option<f64>, usable_ah: f64) -> EventKind {
+    EventKind::Capacity {
+        cell: CellIndex(cell),
+        measured_ah,
+        measured_std_ah: measured_ah.map(|_| 0.1),
+        capacity_ah: 2.5,
+        capacity_std_ah: 0.05,
+        usable_capacity_ah: Some(usable_ah),
+        usable_capacity_std_ah: Some(0.06),
+        resistance_ratio: 1.1,
+        resistance_ratio_std: 0.02,
+    }
+}
+
+/// A half-cycle of a cell.
+pub(in crate::store) fn half_cycle(cell: u16) -> EventKind {
+    EventKind::HalfCycle {
+        cell: CellIndex(cell),
+        mode: Mode::Charge,
+        charge_ah: 1.5,
+        swing: Some(0.6),
+        swing_std: None,
+        duration_s: 3600.0,
+        mean_current_a: -1.5,
+        mean_temperature_c: Some(25.0),
+    }
+}
+
+/// What remains of the pack's life, cycles.
+pub(in crate::store) fn remaining_life(cycles: f64) -> EventKind {
+    EventKind::RemainingLife {
+        cell: Some(CellIndex(2)),
+        cycles: Some(cycles),
+        cycles_low: Some(0.5 * cycles),
+        cycles_high: Some(2.0 * cycles),
+        days: None,
+        days_low: None,
+        days_high: None,
+    }
+}
+
+/// An alarm of the pack.
+pub(in crate::store) fn alarm(change: Change) -> EventKind {
+    EventKind::Alarm {
+        rule: Rule::SocLow,
+        cell: None,
+        change,
+        state: AlarmState::Active,
+        active: true,
+        severity: Severity::Warning,
+        value: Some(0.05),
+        probability: None,
+        threshold: 0.1,
+        occurrences: 1,
+        acknowledged: false,
+    }
+}
+
+#[test]
+fn every_row_has_a_value_per_column() {
+    let own = HistoryRow::Own { reason: "damaged", detail: "x".to_owned() };
+    let kinds = [
+        half_cycle(3),
+        capacity(3, None, 2.4),
+        remaining_life(100.0),
+        alarm(Change::Raised),
+        EventKind::AlarmDropped {
+            rule: Rule::SocLow,
+            severity: Severity::Severe,
+            cell: None,
+            active: true,
+            occurrences: 3,
+        },
+        EventKind::FilterReset { cell: CellIndex(1) },
+        EventKind::PackReplaced { capacity_ah: Some(2.0), capacity_std_ah: None },
+    ];
+    for row in kinds.into_iter().map(HistoryRow::Event).chain([own]) {
+        let (table, values) = row.values().unwrap();
+        assert_eq!(values.len(), table.columns().len(), "{row:?}");
+    }
+}
+
+#[test]
+fn values_have_the_types_of_their_columns() {
+    let text = |word: &str| Value::Text(word.to_owned());
+    let values = |kind: EventKind| HistoryRow::Event(kind).values().unwrap().1;
+    let expected = [
+        Value::Integer(3),
+        text("charge"),
+        Value::Real(1.5),
+        Value::Real(0.6),
+        Value::Null,
+        Value::Real(3600.0),
+        Value::Real(-1.5),
+        Value::Real(25.0),
+    ];
+    assert_eq!(values(half_cycle(3)), expected);
+    let [cell, rule, severity, change, state, active, value, ..] = &values(alarm(Change::Raised))[..] else { panic!() };
+    assert_eq!((cell, rule, severity), (&Value::Null, &text("soc_low"), &text("warning")));
+    assert_eq!((change, state), (&text("raised"), &text("active")));
+    assert_eq!((active, value), (&Value::Integer(1), &Value::Real(0.05)));
+    let (rule, severity) = (Rule::SocLow, Severity::Severe);
+    let dropped = EventKind::AlarmDropped { rule, severity, cell: None, active: true, occurrences: 3 };
+    let [_, _, _, change, state, active, .., occurrences, acknowledged] = &values(dropped)[..] else { panic!() };
+    assert_eq!((change, state), (&text("dropped"), &text("inactive")));
+    assert_eq!((active, occurrences, acknowledged), (&Value::Integer(0), &Value::Integer(3), &Value::Integer(0)));
+    for rule in Rule::ALL {
+        let EventKind::Alarm { cell, change, state, active, severity, value, probability, .. } = alarm(Change::Raised)
+        else {
+            panic!()
+        };
+        let (threshold, occurrences, acknowledged) = (f64::NAN, 1, false);
+        let kind = EventKind::Alarm {
+            rule,
+            cell,
+            change,
+            state,
+            active,
+            severity,
+            value,
+            probability,
+            threshold,
+            occurrences,
+            acknowledged,
+        };
+        let row = values(kind);
+        assert_eq!((&row[1], &row[8]), (&text(rule.name()), &Value::Null), "SQLite has no NaN");
+    }
+}

@@ -1,0 +1,61 @@
+//! A bound on how often something may happen: a number at once, then one per period.
+//!
+//! Bounds the rows and commits of an alarm that flickers (`store`) and the lines of the log (`logging`). In: the time of
+//! each request. Out: whether it may go. Times before the last one count as no time passed.
+
+use crate::quantity::Timestamp;
+
+/// A burst and a period.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct BucketSize {
+    /// Tokens at once, after a long quiet time.
+    pub(crate) burst: f64,
+    /// Time until the next token, s.
+    pub(crate) period_s: f64,
+}
+
+/// The tokens left.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct TokenBucket {
+    size: BucketSize,
+    tokens: f64,
+    filled: Option<Timestamp>,
+}
+
+impl TokenBucket {
+    /// A full bucket.
+    pub(crate) const fn new(size: BucketSize) -> Self {
+        Self { size, tokens: size.burst, filled: None }
+    }
+
+    /// Takes a token; `false` = none is left.
+    pub(crate) fn take(&mut self, now: Timestamp) -> bool {
+        let elapsed_s = self.filled.map_or(0.0, |filled| now.since(filled).max(0.0));
+        self.filled = Some(now);
+        self.tokens = (self.tokens + elapsed_s / self.size.period_s).min(self.size.burst);
+        let has_token = self.tokens >= 1.0;
+        self.tokens -= f64::from(u8::from(has_token));
+        has_token
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn after_the_burst_there_is_one_per_period() {
+        let mut bucket = TokenBucket::new(BucketSize { burst: 3.0, period_s: 10.0 });
+        let taken = (0..100).filter(|&second| bucket.take(Timestamp::from_secs(f64::from(second)))).count();
+        assert_eq!(taken, 3 + 9);
+        assert!(bucket.take(Timestamp::from_secs(1e6)));
+    }
+
+    #[test]
+    fn a_long_quiet_time_fills_it_to_the_burst_and_no_further() {
+        let mut bucket = TokenBucket::new(BucketSize { burst: 150.0, period_s: 2.0 });
+        let at = |ms: u32| Timestamp::from_secs(f64::from(ms) / 1e3);
+        assert_eq!((0..100_000).filter(|ms| bucket.take(at(*ms))).count(), 150 + 49);
+        assert_eq!((0..10_000).filter(|_| bucket.take(at(100_000_000))).count(), 150);
+    }
+}
