@@ -34,7 +34,6 @@ mod folds;
 mod inducing;
 mod jitter;
 mod kd_tree;
-mod kd_tree;
 mod kernel;
 mod linear_algebra;
 mod minimise;

@@ -27,6 +27,7 @@ use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::kd_tree::Tree;
 use super::plan::{Plan, Values, Work};
+use super::scale::StandardisedRows;
 
 /// Rows per task; sums are the same for any number of threads.
 const CHUNK: usize = 64;

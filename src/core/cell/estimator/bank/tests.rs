@@ -144,7 +144,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
             learned = learned
                 .max(near(bank.capacity(*cell), estimator.capacity()))
                 .max(near(bank.log_resistance(*cell), estimator.log_resistance()))
-                .max((bank.mean_nis(*cell) - estimator.mean_nis()).abs());
+                .max((bank.mean_nis(*cell) - estimator.memory.mean_nis).abs());
             for (ours, theirs) in bank.branch_v(*cell).into_iter().zip(estimator.branch_v()) {
                 learned = learned.max(if ours.is_nan() && theirs.is_nan() { 0.0 } else { (ours - theirs).abs() });
             }
