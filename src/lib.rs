@@ -1,31 +1,64 @@
 //! packwatch: streaming battery health monitoring over SocketCAN.
 //!
 //! # Map
-//! A lower layer never names a higher one; `tests/layering.rs` holds the code to this table.
+//! One folder under `src` is one crate, so that the compiler enforces what may use what; a folder inside is one room. Rooms use
+//! only rooms above them in this table (`tests/integration/layering.rs` checks it).
 //!
-//! | layer | module | what lives there |
+//! | crate | room | what lives there |
 //! | --- | --- | --- |
-//! | 0 | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
-//! | 1 | [`filter`] | unscented and linear Kalman filters, arithmetic of several lanes: pure numbers |
-//! | 1 | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
-//! | 1 | [`can`] | frame, signal layout, decode, encode, end-to-end protection, bound on frames, J1939 |
-//! | 2 | [`sample`] | plausibility, alignment of values of different times and rates |
-//! | 2 | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
-//! | 2 | [`health`] | transitions, capacity, recharge period, usable capacity, remaining life |
-//! | 2 | [`alarm`] | rules over named values, the life of an alarm |
-//! | 3 | [`monitor`] | the core's one face: `Input` in, `Outputs` out, snapshot and restore |
-//! | 3 | [`sim`] | truth model, sensor errors, scenarios |
-//! | 3 | [`doctor`] | what is probably wrong with the wiring or the configuration, from what comes over the bus |
-//! | 3 | `ident` | fit of cell models to measured data (feature `lab`) |
-//! | 4 | [`config`] | TOML to checked settings, all faults at once |
-//! | 5 | [`io`], [`daemon`] | log files, sockets, clock, service, state and history, control and status sockets, exporter |
-//! | 5 | `lab` | measured files against truth, remaining life of capacity histories, Gaussian processes on files, plots (feature `lab`) |
-//! | 6 | [`cli`] | one file per command |
+//! | `src/core` | [`quantity`] | time, cell numbers, faults, conventions of sign and unit |
+//! | | [`filter`] | unscented and linear Kalman filters, vector arithmetic: pure numbers |
+//! | | [`can`] | frame, signal, DBC, decode, encode, end-to-end protection, flood limit, J1939 |
+//! | | [`sample`] | plausibility of readings, alignment of values of different times and rates |
+//! | | [`cell`] | equivalent circuit, thermal model, estimator of one cell and of a whole pack at once |
+//! | | [`health`] | charge/discharge transitions, capacity, recharge period, usable capacity, remaining life |
+//! | | [`alarm`] | alarm rules over named values, debounce, hysteresis, latch |
+//! | | [`monitor`] | wires the stages above: `Input` in, `Outputs` out, snapshot and restore |
+//! | | [`sim`] | simulated truth, sensor errors, scenarios |
+//! | | [`doctor`] | judges wiring and configuration from the frames of a bus |
+//! | `src/regress` | `regress` | Gaussian process regression: pure numbers (feature `lab`) |
+//! | `src/host` | [`config`] | TOML to checked settings, all faults at once |
+//! | | [`io`] | log files, CSV, CAN sockets, clock, journal, files of results and events |
+//! | | [`store`] | learned state and history in SQLite |
+//! | | [`status`], [`control`], [`exporter`], [`logging`] | status document, metrics, command socket, Prometheus, log lines |
+//! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
+//! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
+//! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, plots (feature `lab`) |
+//! | `src/cli` | [`cli`] | one file per command, named like it; `main.rs` only calls it |
+//!
+//! # The path of a frame
+//! `host/io/socket` receives it, `host/service/live.rs` passes it on, then [`monitor`]: `intake` (protection, flood) → `can/decode`
+//! → `sampling` → `estimation` ([`cell`]) → `learning` ([`health`]) → `alarming` ([`alarm`]) → `sender` (`can/encode`). A replay enters
+//! at `host/replay.rs` instead; all after it is the same.
+//!
+//! # To change something, open
+//! | change | file |
+//! | --- | --- |
+//! | a new alarm rule | `core/alarm/rule.rs` (its table row); its value comes from `core/monitor/watch.rs` or `publisher.rs` |
+//! | when an alarm is raised, latched, cleared | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
+//! | a new event | `core/monitor/event.rs` |
+//! | a value in a sent frame | `config/packwatch.dbc`, `core/can/encode/output.rs` |
+//! | an end-to-end profile | `core/can/e2e.rs` (sender), `core/can/e2e/receiver.rs` |
+//! | plausibility of a reading | `core/sample/signal.rs` |
+//! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
+//! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
+//! | what a stored state holds | `core/monitor/snapshot.rs` |
+//! | a configuration key | `host/config/keys.rs` |
+//! | a status field | `host/status/document.rs`; its column on screen: `cli/status` |
+//! | a metric | `host/status/metrics.rs` |
+//! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
+//! | a command over the control socket | `host/control/protocol.rs` |
+//! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
+//! | a column of estimates or exports | `host/replay/rows.rs`; Parquet and CSV: `lab/fleet/export/columns.rs` |
+//! | a finding of the doctor | `core/doctor/judge` |
+//! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |
+//! | a command or its options | `cli/COMMAND.rs` |
 //!
 //! # Invariants
-//! * Layers 0 to 3 never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte for byte.
+//! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte
+//!   for byte.
 //! * Inside, current is positive for discharge, SOC is a fraction; wire units end in [`can`].
-//! * A bad reading is data with a fault; nothing unknown looks healthy.
+//! * A bad reading is data with a fault; an unknown value never looks healthy.
 
 pub use packwatch_core::{alarm, can, cell, doctor, filter, health, monitor, quantity, sample, sim};
 pub use packwatch_host::{config, control, diagnosis, exporter, io, logging, replay, service, status, store};

@@ -1,8 +1,8 @@
-//! `packwatch simulate`: a pack whose truth is known, as frames of the configured DBC.
+//! `packwatch simulate`: a pack with a known true state, as frames of the configured DBC.
 //!
 //! Out: a candump log (`-o`, compressed when the name ends in `.gz`) or frames onto an interface (`--to`), and the
-//! truth as CSV (`--truth`). One seed gives the same bytes on every machine. Frames of one moment follow each other
-//! at the pace of a 1 Mbit/s bus, and closer where many have to fit between two samples.
+//! truth as CSV (`--truth`). One seed gives the same bytes on every machine. Frames of one moment follow each other at the
+//! pace of a 1 Mbit/s bus, or closer where the next sample requires it.
 
 mod output;
 mod player;
@@ -27,7 +27,7 @@ const FRAME_SPACING_NS: i64 = 130_000;
 /// Arguments of `simulate`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// What happens to the pack
+    /// Scenario of the load
     scenario: settings::Name,
     /// Configuration whose DBC, cell model and number of cells are used
     #[arg(short, long, value_name = "FILE")]
@@ -54,9 +54,9 @@ pub(crate) struct Args {
     changes: settings::Changes,
 }
 
-/// What came of a run.
+/// Totals of a run.
 #[derive(Debug, Default)]
-struct Tally {
+struct Totals {
     frames: u64,
     moments: u64,
     end_s: f64,
@@ -74,26 +74,26 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => None,
     };
     let start = Timestamp::from_nanos(i64::from(args.start) * 1_000_000_000);
-    let mut frames = Frames::new(monitor, &settings, start);
-    let mut tally = Tally::default();
+    let mut frames = FrameMaker::new(monitor, &settings, start);
+    let mut totals = Totals::default();
     while let Some(moment) = sim.advance() {
         for (time, bus, frame) in frames.of(&sim, &moment) {
             sink.write(time, bus, frame)?;
-            tally.frames += 1;
+            totals.frames += 1;
         }
         if let Some(truth) = &mut truth {
             truth.write(start, &moment, &sim)?;
         }
-        tally.moments += 1;
-        tally.end_s = moment.time.secs();
+        totals.moments += 1;
+        totals.end_s = moment.time.secs();
     }
     sink.finish()?;
     truth.map_or(Ok(()), TruthWriter::finish)?;
-    eprintln!("{}", summary(&sim, &tally));
+    eprintln!("{}", summary(&sim, &totals));
     Ok(())
 }
 
-/// Where the frames go.
+/// Destination of the frames.
 enum Sink {
     Log(LogWriter),
     Bus(Player),
@@ -131,7 +131,7 @@ impl Sink {
 
 /// The scenario's defaults for the configured cell, with what the command line changes.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
-    let capacity_ah = args.changes.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
+    let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
     let mut settings = Settings::of(args.scenario.into(), capacity_ah);
     let series = cells_in_series(&config.monitor.sample);
     settings.pack.cells = series;
@@ -161,8 +161,8 @@ fn wiring(sample: &SampleConfig) -> Wiring {
     Wiring { strings: sample.strings.max(1), temperature_at: (0..sensors).map(cell_of).collect() }
 }
 
-/// Makes the frames of a moment, those with the current first: the voltages have its drop in them.
-struct Frames {
+/// Makes the frames of a moment, those with the current first: the voltages contain its drop.
+struct FrameMaker {
     encoder: InputEncoder,
     protector: InputProtector,
     with_current: Vec<(BusIndex, CanId)>,
@@ -171,7 +171,7 @@ struct Frames {
     period_ns: i64,
 }
 
-impl Frames {
+impl FrameMaker {
     fn new(monitor: &MonitorConfig, settings: &Settings, start: Timestamp) -> Self {
         let encoder = InputEncoder::new(&monitor.input);
         let mut made = Vec::new();
@@ -193,13 +193,13 @@ impl Frames {
     }
 }
 
-fn summary(sim: &Simulation, tally: &Tally) -> String {
+fn summary(sim: &Simulation, totals: &Totals) -> String {
     let pack = sim.pack();
     format!(
         "{:.0} s simulated, {} samples, {} frames, {} cycles completed; weakest cell {:.3} Ah, SOC {:.1} to {:.1} %",
-        tally.end_s,
-        tally.moments,
-        tally.frames,
+        totals.end_s,
+        totals.moments,
+        totals.frames,
         pack.cycles(),
         pack.lowest_capacity_ah(),
         100.0 * pack.lowest_soc(),

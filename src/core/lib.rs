@@ -1,5 +1,38 @@
-//! The pure core: frames in, estimates and alarms out. Never reads a clock, a file or a socket, and never logs: the same
-//! inputs give the same outputs, byte for byte. The crate has no dependency that could do otherwise.
+//! The pure core: frames in, estimates, alarms and frames out. Never reads a clock, a file or a socket, and never logs: the
+//! same inputs give the same outputs, byte for byte. The crate has no dependency that could do otherwise.
+//!
+//! # Data path
+//! [`monitor::Monitor`] takes every input. One file under `monitor/` is one stage; `stages.rs` alone knows their order.
+//!
+//! | stage | in → out | file | algorithms |
+//! | --- | --- | --- | --- |
+//! | intake | frame → readings, command | `monitor/intake.rs` | [`can`]: flood limit, protection, decoding |
+//! | sampling | reading → cell sample | `monitor/sampling.rs` | [`sample`]: limits, ages, charge |
+//! | estimation | cell samples → estimates | `monitor/batch.rs`, `monitor/estimation.rs` | [`cell`], [`filter`] |
+//! | learning | pack current, estimates → health values | `monitor/learning.rs`, `monitor/life.rs` | [`health`] |
+//! | alarming | values → changes of alarms | `monitor/watch.rs`, `monitor/alarming.rs` | [`alarm`] |
+//! | sending | alarms, values → frames | `monitor/sender.rs`, `monitor/j1939.rs` | [`can`]: encoding, J1939 |
+//!
+//! # Where a change belongs
+//! | change | file |
+//! | --- | --- |
+//! | a new alarm rule | `alarm/rule.rs` (number, unit, direction), `monitor/watch.rs` (its value) |
+//! | a transition or command of an alarm | `alarm/machine.rs` (table), `alarm/engine.rs` |
+//! | a new event, or a field of one | `monitor/event.rs` |
+//! | a new field of the live view | `monitor/view.rs` |
+//! | a new field of a stored state | the stage's state, `monitor/snapshot.rs` |
+//! | a setting that may change while running | `monitor/config.rs`, `monitor/reconfigure.rs` |
+//! | a field of a sent frame | `can/encode/output.rs`, `monitor/stages.rs` (its value) |
+//! | another end-to-end profile | `can/e2e.rs` |
+//! | a plausibility check of a signal | `sample/signal.rs` |
+//! | the cell's equations | `cell/circuit.rs`, `cell/estimator.rs`, `cell/estimator/bank/kernel.rs` |
+//! | a finding of the doctor | `doctor/judge/` |
+//! | a scenario of the simulator | `sim/scenario.rs` |
+//!
+//! # Invariants
+//! * Inside, current is positive for discharge and SOC is a fraction; wire units end in [`can`].
+//! * A bad reading is data with a fault; an unknown value never looks healthy.
+//! * Time never goes back, and a gap counts for no period.
 
 pub mod alarm;
 pub mod can;

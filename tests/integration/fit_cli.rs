@@ -66,7 +66,7 @@ fn a_simple_cell_is_found_and_the_model_loads() {
     assert!(first == second, "two runs, two models");
     let loaded = packwatch::config::cell_model::load(&model).unwrap();
     assert_eq!(loaded.name, "a \"cell\"");
-    let place = loaded.place(0.5, 25.0);
+    let place = loaded.grid_position(0.5, 25.0);
     assert!((loaded.settled_ohm(&place) - 0.05).abs() < 0.007, "{}", loaded.settled_ohm(&place));
     assert!((loaded.capacity_ah - 0.9444).abs() < 0.03, "{}", loaded.capacity_ah);
 }

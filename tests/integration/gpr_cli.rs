@@ -5,7 +5,7 @@ use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::Command;
-use packwatch::lab::gpr::{Missing, PartColumn, Table, Trained, Wanted};
+use packwatch::lab::gpr::{ColumnSelection, ColumnTable, MissingPolicy, PartColumn, TrainedModel};
 use packwatch::regress::{Form, GprSettings};
 use serde_json::Value;
 
@@ -123,8 +123,8 @@ fn means(text: &str) -> Vec<u64> {
 fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
     let table = |name: &str| {
         let columns = ["time", "temperature", "current", "voltage_v"].map(str::to_owned);
-        let wanted = Wanted { columns: &columns, optional: &[], missing: Missing::Refused };
-        Table::read(&[folder.join(name)], &wanted, &PartColumn::None).unwrap()
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing: MissingPolicy::Rejected };
+        ColumnTable::read(&[folder.join(name)], &wanted, &PartColumn::None).unwrap()
     };
     let mut settings = GprSettings::new("matern32".parse().unwrap(), 200);
     settings.form = match form {
@@ -132,7 +132,7 @@ fn means_of_a_model_never_saved(folder: &Path, form: &str) -> Vec<u64> {
         "nearest" => Form::Nearest { neighbours: 40 },
         _ => Form::Inducing { points: 60 },
     };
-    let trained = Trained::fit(&table("cell.csv"), &settings, &mut |_| ControlFlow::Continue(())).unwrap();
+    let trained = TrainedModel::fit(&table("cell.csv"), &settings, &mut |_| ControlFlow::Continue(())).unwrap();
     trained.predict(&table("later.csv")).unwrap().iter().map(|prediction| prediction.mean.to_bits()).collect()
 }
 
@@ -177,7 +177,7 @@ fn bad_input_is_refused_with_its_place_and_what_is_allowed() {
         "cell.csv:1: no column \"pressure\", must be one of time_s, current_a, voltage_v, temperature_c, voltage_mv\n"
     );
     assert!(cv("voltage", "time").contains("\"voltage\" is ambiguous, found voltage_v, voltage_mv"));
-    assert!(cv("voltage_v", "time,voltage_v").contains("column voltage_v is asked for twice"));
+    assert!(cv("voltage_v", "time,voltage_v").contains("column voltage_v is named twice"));
     assert!(refused(place, 1, &[&["cv", "nowhere.csv"], &COLUMNS[..]].concat()).starts_with("nowhere.csv: "));
     // A hole is refused with its line, or skipped and counted.
     let text = std::fs::read_to_string(place.join("cell.csv")).unwrap();

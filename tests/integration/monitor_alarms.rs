@@ -1,7 +1,7 @@
 //! Alarm rules through the whole core: from input frames to events and alarm frames, and commands back.
 
 use crate::support::rig::{NO_VALUE, Rig, WHOLE_PACK, Wire, command_frame, learned};
-use packwatch::alarm::{Change, Rule, Selector, State};
+use packwatch::alarm::{AlarmState, Change, Rule, Selector};
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{BusEvent, Command, EventKind, Input, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
@@ -176,7 +176,7 @@ fn another_pack_starts_from_the_configuration_and_its_predecessor_is_reported() 
     assert_eq!(reported, Some(old_ah));
     assert_eq!(rig.changes(Rule::CapacityLow)[2..], [Change::Forgotten, Change::Forgotten]);
     let alarm = rig.monitor.alarms().get(Rule::CapacityLow, Some(CellIndex(0))).unwrap();
-    assert_eq!((alarm.state, alarm.occurrences, rig.monitor.alarms().count()), (State::Unknown, 0, 0));
+    assert_eq!((alarm.state, alarm.occurrences, rig.monitor.alarms().count()), (AlarmState::Unknown, 0, 0));
     rig.seconds(2);
     assert_eq!((rig.unknown_rules(), rig.monitor.capacity(CellIndex(0)).mean), (2, 2.6));
 }

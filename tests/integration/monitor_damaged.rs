@@ -101,3 +101,36 @@ fn a_refused_state_names_the_number_and_its_range() {
     rig.seconds(5);
     assert!(rig.monitor.latest().flatten().count() == 2);
 }
+
+/// Names of a JSON object itself, in their order; no string in it holds a bracket.
+fn names_of(text: &str) -> Vec<&str> {
+    let (mut depth, mut names, mut rest) = (0, Vec::new(), text);
+    while let Some(at) = rest.find(['{', '}', '[', ']', '"']) {
+        let (mark, after) = (rest.as_bytes()[at], &rest[at + 1..]);
+        rest = after;
+        match mark {
+            b'{' | b'[' => depth += 1,
+            b'}' | b']' => depth -= 1,
+            _ => {
+                let (word, after) = after.split_once('"').unwrap();
+                rest = after;
+                if depth == 1 && after.starts_with(':') {
+                    names.push(word);
+                }
+            }
+        }
+    }
+    names
+}
+
+#[test]
+fn the_stored_form_keeps_its_names_and_their_order() {
+    let snapshot = learned().monitor.snapshot();
+    let expected = "version time cells waiting sampler detector learner learned_at recharge recharge_period_s \
+                    normalised_recharge pack updated_cells time_backwards alarms schedule intake buses identity statistics";
+    assert_eq!(names_of(&serde_json::to_string(&snapshot).unwrap()), expected.split_whitespace().collect::<Vec<_>>());
+    let mut document = serde_json::to_value(snapshot).unwrap();
+    assert!(serde_json::from_value::<Snapshot>(document.clone()).is_ok());
+    document["surprise"] = 1.into();
+    assert!(serde_json::from_value::<Snapshot>(document).is_err(), "a state of a later program is not half read");
+}

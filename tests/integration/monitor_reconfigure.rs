@@ -1,7 +1,7 @@
 //! Another configuration while the core runs: what is applied, what continues unchanged, and what needs a restart.
 
 use crate::support::rig::{Rig, learned, load};
-use packwatch::alarm::{Change, Rule, Severity, State};
+use packwatch::alarm::{AlarmState, Change, Rule, Severity};
 use packwatch::can::CanId;
 use packwatch::cell::CapacityState;
 use packwatch::health::{Axis, CapacityReading, Forecast, Usage};
@@ -11,7 +11,7 @@ use packwatch::quantity::CellIndex;
 const HOT: &str = "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\n";
 
 impl Rig {
-    fn state(&self, rule: Rule, cell: Option<CellIndex>) -> (State, u32, bool) {
+    fn state(&self, rule: Rule, cell: Option<CellIndex>) -> (AlarmState, u32, bool) {
         let alarm = self.monitor.alarms().get(rule, cell).unwrap();
         (alarm.state, alarm.occurrences, alarm.is_acknowledged)
     }
@@ -30,7 +30,7 @@ fn hot() -> Rig {
     let mut rig = Rig::new(HOT);
     rig.heat(60.0, 2);
     rig.give(Input::Command { time: rig.now(), command: Command::Acknowledge(Default::default()) });
-    assert_eq!(rig.state(Rule::TemperatureHigh, None), (State::Active, 1, true));
+    assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, true));
     rig.events.clear();
     rig.frames.clear();
     rig
@@ -43,7 +43,7 @@ fn a_raised_alarm_is_as_it_was_while_its_threshold_holds() {
     assert_eq!((done.changed, done.alarms_ended), (vec!["[transition]"], 0));
     assert!(matches!(rig.events[..], [event] if event.kind == EventKind::Reconfigured { alarms_ended: 0 }));
     rig.heat(60.0, 2);
-    assert_eq!(rig.state(Rule::TemperatureHigh, None), (State::Active, 1, true));
+    assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, true));
     assert_eq!(rig.changes(Rule::TemperatureHigh), []);
     rig.heat(40.0, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Cleared]);
@@ -57,10 +57,10 @@ fn a_changed_threshold_is_judged_at_once_and_keeps_the_past() {
     };
     assert_eq!(rig.reload(changed(70.0, 65.0)).unwrap().changed, ["[[alarm]]"]);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Cleared]);
-    assert_eq!(rig.state(Rule::TemperatureHigh, None), (State::Inactive, 1, true));
+    assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Inactive, 1, true));
     rig.reload(changed(55.0, 50.0)).unwrap();
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Cleared, Change::Raised]);
-    assert_eq!(rig.state(Rule::TemperatureHigh, None), (State::Active, 2, false));
+    assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 2, false));
 }
 
 #[test]
@@ -92,7 +92,7 @@ fn an_alarm_nothing_watches_any_more_ends_with_an_event_and_a_frame() {
     // The other severity's has a life of its own.
     rig.heat(60.0, 1);
     assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Forgotten, Change::Raised]);
-    assert_eq!(rig.state(Rule::TemperatureHigh, None), (State::Active, 1, false));
+    assert_eq!(rig.state(Rule::TemperatureHigh, None), (AlarmState::Active, 1, false));
     rig.reload(|config| config.rules.clear()).unwrap();
     assert_eq!((rig.monitor.alarms().count(), rig.monitor.alarms().all().count()), (0, 0));
 }
@@ -222,7 +222,7 @@ fn settings_that_need_a_restart_are_refused_by_name_and_change_nothing() {
         assert!(error.starts_with(said) && error.ends_with("needs a restart"), "{error}");
     }
     rig.heat(60.0, 2);
-    assert_eq!((rig.state(Rule::TemperatureHigh, None), rig.events.len()), ((State::Active, 1, true), 0));
+    assert_eq!((rig.state(Rule::TemperatureHigh, None), rig.events.len()), ((AlarmState::Active, 1, true), 0));
 }
 
 #[test]

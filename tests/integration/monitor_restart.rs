@@ -1,7 +1,7 @@
 //! What a restart and time asleep do to estimates and alarms, on hand-made frames of a pack of two cells.
 
 use crate::support::rig::{Rig, learned};
-use packwatch::alarm::{Change, Rule, Selector, State};
+use packwatch::alarm::{AlarmState, Change, Rule, Selector};
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{BusEvent, Command, Downtime, EventKind, Input, Outputs, Source};
 use packwatch::quantity::{BusIndex, CellIndex};
@@ -85,7 +85,7 @@ const HOT: &str =
     "[[alarm]]\nrule = \"temperature_high\"\nwarning = { set = 50, clear = 45 }\ndebounce_s = 10\nlatched = true\n";
 
 impl Rig {
-    fn stands(&self, rule: Rule) -> (State, u32, bool) {
+    fn stands(&self, rule: Rule) -> (AlarmState, u32, bool) {
         let cell = matches!(rule, Rule::CapacityLow | Rule::EstimateUntrusted).then_some(CellIndex(0));
         let alarm = self.monitor.alarms().get(rule, cell).unwrap();
         (alarm.state, alarm.occurrences, alarm.is_acknowledged)
@@ -120,21 +120,21 @@ fn raised_acknowledged_latched_and_past_alarms_come_back_as_they_were() {
         assert_eq!(rig.changes(Rule::TemperatureHigh), [Change::Raised]);
         rig.restart(away);
         rig.heat(60.0, 30);
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Active, 1, false), "{away:?}");
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Active, 1, false), "{away:?}");
         rig.ask(Command::Acknowledge(Selector::default()));
         rig.restart(away);
         rig.heat(60.0, 30);
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Active, 1, true), "{away:?}");
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Active, 1, true), "{away:?}");
         rig.heat(20.0, 12);
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Latched, 1, true));
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Latched, 1, true));
         rig.restart(away);
         rig.heat(20.0, 30);
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Latched, 1, true), "{away:?}");
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Latched, 1, true), "{away:?}");
         rig.ask(Command::Clear(Selector::default()));
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Inactive, 1, true));
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Inactive, 1, true));
         rig.restart(away);
         rig.heat(20.0, 5);
-        assert_eq!(rig.stands(Rule::TemperatureHigh), (State::Inactive, 1, true), "{away:?}");
+        assert_eq!(rig.stands(Rule::TemperatureHigh), (AlarmState::Inactive, 1, true), "{away:?}");
         let heard = rig.changes(Rule::TemperatureHigh);
         let count = |change| heard.iter().filter(|found| **found == change).count();
         assert_eq!((count(Change::Raised), count(Change::Latched), count(Change::Cleared)), (1, 1, 1), "{away:?}");
@@ -151,7 +151,7 @@ fn no_frame_after_a_restart_says_that_a_raised_alarm_is_over() {
         rig.seconds(20);
         let states = states(&rig);
         assert!(states.len() >= 20 && states.iter().all(|state| [1, 5].contains(state)), "{away:?}: {states:?}");
-        assert_eq!(rig.stands(Rule::CapacityLow), (State::Active, 1, false), "{away:?}");
+        assert_eq!(rig.stands(Rule::CapacityLow), (AlarmState::Active, 1, false), "{away:?}");
         assert!(!rig.changes(Rule::CapacityLow)[2..].contains(&Change::Raised));
     }
 }
@@ -161,7 +161,7 @@ fn the_count_of_a_debounce_is_kept_and_the_downtime_is_not_counted() {
     for away in [Downtime::Seconds(60.0), Downtime::Seconds(3e5)] {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 7);
-        assert_eq!(rig.stands(Rule::TemperatureHigh).0, State::Pending);
+        assert_eq!(rig.stands(Rule::TemperatureHigh).0, AlarmState::Pending);
         rig.restart(away);
         rig.heat(60.0, 2);
         assert_eq!(rig.changes(Rule::TemperatureHigh), [], "{away:?}: seven seconds and two");
@@ -203,7 +203,7 @@ fn a_missing_input_stays_missing_over_a_restart_until_it_is_back() {
         rig.seconds(20);
         let heard = rig.changes(Rule::InputMissing);
         assert!(heard[1..].iter().all(|c| [Change::Suppressed, Change::Resumed].contains(c)), "{away:?}: {heard:?}");
-        assert_eq!(rig.stands(Rule::InputMissing), (State::Active, 1, false), "{away:?}");
+        assert_eq!(rig.stands(Rule::InputMissing), (AlarmState::Active, 1, false), "{away:?}");
         (rig.current_a, rig.temperatures_c, rig.reported_soc) = (Some(0.0), [Some(25.0); 2], Some(0.5));
         rig.seconds(3);
         assert_eq!(rig.changes(Rule::InputMissing).last(), Some(&Change::Cleared), "{away:?}");
@@ -256,7 +256,7 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
         // Charged meanwhile. First come voltages alone: nothing says what they mean.
         (rig.voltages_v, rig.current_a) = ([Some(4.0); 2], None);
         rig.seconds(1);
-        assert_eq!(rig.stands(Rule::SocLow), (State::Suppressed, 1, false), "{restarted} {away_s}");
+        assert_eq!(rig.stands(Rule::SocLow), (AlarmState::Suppressed, 1, false), "{restarted} {away_s}");
         if away_s > 1e3 {
             rig.current_a = Some(0.0);
             rig.seconds(1);
@@ -270,11 +270,11 @@ fn a_low_soc_is_not_judged_by_the_one_before_the_sleep() {
     let mut rig = Rig::new("[[alarm]]\nrule = \"soc_low\"\nwarning = \"20 %\"\n");
     rig.voltages_v = [Some(4.0); 2];
     rig.seconds(60);
-    assert_eq!(rig.stands(Rule::SocLow).0, State::Inactive);
+    assert_eq!(rig.stands(Rule::SocLow).0, AlarmState::Inactive);
     rig.restart(Downtime::Seconds(36_000.0));
     (rig.voltages_v, rig.current_a) = ([Some(3.1); 2], None);
     rig.seconds(1);
-    assert_eq!(rig.stands(Rule::SocLow).0, State::Unknown, "the old SOC must not say that all is well");
+    assert_eq!(rig.stands(Rule::SocLow).0, AlarmState::Unknown, "the old SOC must not say that all is well");
     rig.current_a = Some(0.0);
     rig.seconds(1);
     assert_eq!(rig.changes(Rule::SocLow), [Change::Raised]);
@@ -305,16 +305,16 @@ fn a_latched_alarm_that_is_beyond_again_and_counting_is_not_cleared() {
         let mut rig = Rig::new(HOT);
         rig.heat(60.0, 12);
         rig.heat(20.0, 12);
-        assert_eq!(rig.stands(Rule::TemperatureHigh).0, State::Latched);
+        assert_eq!(rig.stands(Rule::TemperatureHigh).0, AlarmState::Latched);
         rig.heat(60.0, 5);
         if let Some(away) = away {
             rig.restart(away);
         }
         rig.ask(Command::Clear(Selector::default()));
-        assert_eq!((rig.stands(Rule::TemperatureHigh).0, rig.refused()), (State::Latched, Some(1)), "{away:?}");
+        assert_eq!((rig.stands(Rule::TemperatureHigh).0, rig.refused()), (AlarmState::Latched, Some(1)), "{away:?}");
         rig.heat(20.0, 1);
         rig.ask(Command::Clear(Selector::default()));
-        assert_eq!((rig.stands(Rule::TemperatureHigh).0, rig.refused()), (State::Inactive, Some(0)), "{away:?}");
+        assert_eq!((rig.stands(Rule::TemperatureHigh).0, rig.refused()), (AlarmState::Inactive, Some(0)), "{away:?}");
     }
 }
 

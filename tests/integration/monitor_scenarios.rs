@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use packwatch::alarm::{Rule, RuleConfig, Severity, When};
+use packwatch::alarm::{Comparison, Rule, RuleConfig, Severity};
 use packwatch::can::Frame;
 use packwatch::can::encode::InputEncoder;
 use packwatch::cell::circuit;
@@ -157,7 +157,7 @@ struct Status {
 }
 
 fn rule(rule: Rule, threshold: f64, debounce_s: f64) -> RuleConfig {
-    let (clear, severity, when) = (threshold, Severity::Warning, When::Mean);
+    let (clear, severity, when) = (threshold, Severity::Warning, Comparison::Mean);
     RuleConfig { rule, threshold, clear, severity, when, debounce_s, debounce_events: 1, is_latching: false }
 }
 fn alarm(kind: &EventKind, r: Rule, on: bool) -> bool {

@@ -9,8 +9,8 @@ use packwatch::alarm::Rule;
 use packwatch::can::dbc::Database;
 use packwatch::can::e2e::{Profile, Protection};
 use packwatch::can::encode::{
-    AlarmFields, Base, Command, CommandPlan, E2eSetting, HealthFields, LayoutSettings, MessageSettings, OutputPlan,
-    SendCounters, StatusFields, layout,
+    AlarmFields, Command, CommandPlan, E2eSetting, HealthFields, LayoutBase, LayoutSettings, MessageSettings,
+    OutputPlan, SendCounters, StatusFields, layout,
 };
 use packwatch::can::{CanId, Frame, FrameKind};
 use packwatch::quantity::{CellIndex, Mode};
@@ -84,7 +84,7 @@ impl Case {
             alarm: self.message(3),
             command: Some(self.message(4)),
         };
-        layout(Base::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
+        layout(LayoutBase::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
     }
 }
 

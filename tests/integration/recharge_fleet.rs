@@ -8,7 +8,7 @@
 
 use std::path::Path;
 
-use packwatch::alarm::{Rule, RuleConfig, Severity, When};
+use packwatch::alarm::{Comparison, Rule, RuleConfig, Severity};
 use packwatch::can::CanId;
 use packwatch::can::encode::InputEncoder;
 use packwatch::config;
@@ -376,7 +376,7 @@ fn alarms(usage: &Usage, alarm_on: RechargeAlarm) -> (u32, Option<[u8; 8]>) {
         severity: Severity::Warning,
         threshold: 3000.0,
         clear: 3060.0,
-        when: When::Mean,
+        when: Comparison::Mean,
         debounce_s: 0.0,
         debounce_events: 1,
         is_latching: false,

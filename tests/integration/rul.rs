@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::support::simulated_cell;
 use packwatch::config;
 use packwatch::health::Axis;
-use packwatch::lab::rul::{self, History, Row, Scored, Threshold};
+use packwatch::lab::rul::{self, History, HistoryScore, MeasuredCapacity, Threshold};
 use packwatch::monitor::EventKind;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
@@ -33,7 +33,7 @@ fn forecasts_of_measured_lives_cover_the_truth_and_beat_both_baselines() {
         let mut files: Vec<PathBuf> = files.map(|file| file.unwrap().path()).collect();
         files.sort();
         for file in files.iter().filter(|file| file.to_string_lossy().ends_with(ending)) {
-            let history = rul::read(file).unwrap();
+            let history = History::read(file).unwrap();
             let name = file.file_stem().unwrap().to_string_lossy();
             scored.extend(thresholds.iter().map(|&t| rul::score(&history, &name, t, &AT, ALPHA)));
         }
@@ -100,7 +100,7 @@ fn life(shape: Shape, axis: Axis, dice: &mut Dice) -> (History, f64) {
     let (wander_std, relaxation) = (dice.between(0.002, 0.012), dice.between(4.0, 12.0));
     let (bump, every) = (dice.between(0.01, 0.05), dice.between(25.0, 60.0));
     let kept = (-1.0 / relaxation).exp();
-    let (mut wander, mut recovered, mut row, mut rows) = (0.0, 0.0, Row::default(), Vec::new());
+    let (mut wander, mut recovered, mut row, mut rows) = (0.0, 0.0, MeasuredCapacity::default(), Vec::new());
     while row.used < 1.4 * readings * if axis == Axis::Cycles { 1.0 } else { days_each } {
         let unit = if axis == Axis::Cycles { 1.0 } else { days_each };
         wander = kept * wander + wander_std * (1.0 - kept * kept).sqrt() * dice.normal();
@@ -133,7 +133,7 @@ fn fades_of_many_shapes_lie_in_the_interval_as_often_as_it_says() {
     let (mut dice, mut all) = (Dice(6), Vec::new());
     for shape in shapes {
         for axis in [Axis::Cycles, Axis::Days] {
-            let scored: Vec<Scored> = (0..6)
+            let scored: Vec<HistoryScore> = (0..6)
                 .map(|_| {
                     let (history, end_ah) = life(shape, axis, &mut dice);
                     rul::score(&history, "simulated", Threshold::AmpereHours(end_ah), &AT, ALPHA)
@@ -194,7 +194,7 @@ fn a_life_on_board_is_forecast_from_what_its_half_cycles_say() {
     assert!(reported.last().is_some_and(|&(_, _, cycles, high)| cycles == 0.0 && high == 0.0), "{:?}", reported.last());
 }
 
-fn print(scored: &[Scored]) {
+fn print(scored: &[HistoryScore]) {
     for file in scored {
         println!("{} {:.3} Ah, end {:?}", file.name, file.threshold_ah, file.end_of_life);
         for one in &file.judged {

@@ -230,7 +230,7 @@ fn bad_input_is_reported_with_place_found_and_allowed() {
     assert!(of(&["missing.csv"]).contains("missing.csv: "));
     assert_eq!(
         of(&["drive.csv", "--told", "20"]).trim_end(),
-        "drive.csv: started at 100.0 % and told +20 points: 120.0 %, must be 0 to 100 %"
+        "drive.csv: initial SOC is 100.0 % and +20 points: 120.0 %, must be 0 to 100 %"
     );
     assert!(of(&["drive.csv", "--start", "middle"]).contains("drive.csv: never down to a SOC of 0.700"));
     assert!(of(&["drive.csv", "drive.csv"]).contains("drive.csv: named twice"));

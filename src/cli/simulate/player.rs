@@ -7,24 +7,24 @@ use crate::cli::Failure;
 use crate::io::socket::CanSender;
 use crate::quantity::Timestamp;
 
-/// Sends frames when their time has come.
+/// Sends frames at their time.
 pub(super) struct Player {
     sender: CanSender,
     speed: f64,
     /// Wall clock and stamp of the first frame.
-    begun: Option<(Instant, Timestamp)>,
+    started: Option<(Instant, Timestamp)>,
 }
 
 impl Player {
-    /// Opens `interface`; speed 0 waits for nothing.
+    /// Opens `interface`; speed 0 does not wait.
     pub(super) fn open(interface: &str, fd: bool, speed: f64) -> Result<Self, Failure> {
         let sender = CanSender::open(interface, fd).map_err(|error| Failure::new(error.to_string()))?;
-        Ok(Self { sender, speed, begun: None })
+        Ok(Self { sender, speed, started: None })
     }
 
     /// Waits until the frame is due, then sends it; every interface of the configuration goes onto this one.
     pub(super) fn play(&mut self, time: Timestamp, frame: &Frame) -> Result<(), Failure> {
-        let (start, first) = *self.begun.get_or_insert_with(|| (Instant::now(), time));
+        let (start, first) = *self.started.get_or_insert_with(|| (Instant::now(), time));
         if self.speed > 0.0 {
             let due = Duration::try_from_secs_f64(time.since(first) / self.speed).unwrap_or_default();
             if let Some(wait) = due.checked_sub(start.elapsed()) {

@@ -1,7 +1,7 @@
-//! What the command line changes in a scenario's settings.
+//! Changes of a scenario's settings by the command line.
 
 use crate::cli::Failure;
-use crate::sim::{Hysteresis, Scenario, Settings};
+use crate::sim::{Hysteresis, PackSettings, Scenario, Sensors, Settings};
 
 /// Scenarios by name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -27,8 +27,8 @@ impl From<Name> for Scenario {
     }
 }
 
-/// Every change; what is not given stays as the scenario has it. Amounts of a scenario (currents, losses) are stated
-/// for its source's cell and scale with the capacity.
+/// All changes; without one the scenario's setting applies. Amounts of a scenario (currents, losses) are stated for its
+/// source's cell and scale with the capacity.
 #[derive(Debug, clap::Args)]
 pub(super) struct Changes {
     /// Seed of all randomness
@@ -40,6 +40,24 @@ pub(super) struct Changes {
     /// End after this time, s (ev-day: 86400)
     #[arg(long, value_name = "S", value_parser = positive)]
     duration: Option<f64>,
+    #[command(flatten)]
+    pub(super) pack: PackChanges,
+    #[command(flatten)]
+    sensors: SensorChanges,
+    /// Time between current samples, ms (ev-day: 10, others: 1000)
+    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    period: Option<u32>,
+    /// Time between samples of the cells, ms, a multiple of --period (ev-day: 100) [default: --period]
+    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
+    cell_period: Option<u32>,
+    /// Random walk: loads before each pair of reference cycles (1500)
+    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
+    walk_steps: Option<u32>,
+}
+
+/// Changes of the pack.
+#[derive(Debug, clap::Args)]
+pub(super) struct PackChanges {
     /// Cells in series [default: as configured]
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..=1024))]
     cells: Option<u16>,
@@ -73,6 +91,11 @@ pub(super) struct Changes {
     /// Self-discharge, A
     #[arg(long, value_name = "A", value_parser = non_negative)]
     leakage: Option<f64>,
+}
+
+/// Changes of the sensors.
+#[derive(Debug, clap::Args)]
+struct SensorChanges {
     /// White noise of cell voltages, V (paper: 0.005)
     #[arg(long, value_name = "V", value_parser = non_negative)]
     noise_voltage: Option<f64>,
@@ -97,57 +120,18 @@ pub(super) struct Changes {
     /// Probability that a reading is missing
     #[arg(long, value_name = "P", value_parser = fraction)]
     dropout: Option<f64>,
-    /// Time between current samples, ms (ev-day: 10, others: 1000)
-    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
-    period: Option<u32>,
-    /// Time between samples of the cells, ms, a multiple of --period (ev-day: 100) [default: --period]
-    #[arg(long, value_name = "MS", value_parser = clap::value_parser!(u32).range(1..=3_600_000))]
-    cell_period: Option<u32>,
-    /// Random walk: loads before each pair of reference cycles (1500)
-    #[arg(long, value_parser = clap::value_parser!(u32).range(1..))]
-    walk_steps: Option<u32>,
 }
 
 impl Changes {
-    /// Changes `settings` as told.
+    /// Applies the changes to `settings`.
     pub(super) fn apply(&self, settings: &mut Settings) -> Result<(), Failure> {
         settings.seed = self.seed;
         settings.cycles = self.cycles.or(settings.cycles);
         settings.duration_s = self.duration.or(settings.duration_s);
         settings.walk_steps = self.walk_steps.unwrap_or(settings.walk_steps);
-        self.apply_to_pack(settings);
-        self.apply_to_sensors(settings);
+        self.pack.apply(&mut settings.pack);
+        self.sensors.apply(&mut settings.sensors);
         self.apply_periods(settings)
-    }
-
-    fn apply_to_pack(&self, settings: &mut Settings) {
-        let pack = &mut settings.pack;
-        pack.cells = self.cells.unwrap_or(pack.cells);
-        set(&mut pack.initial_soc, self.initial_soc);
-        set(&mut pack.ambient_c, self.ambient);
-        set(&mut pack.leakage_a, self.leakage);
-        set(&mut pack.ageing.capacity_loss_ah_per_cycle, self.loss_per_cycle);
-        set(&mut pack.ageing.resistance_growth_per_cycle, self.resistance_per_cycle);
-        set(&mut pack.spread.capacity, self.spread_capacity);
-        set(&mut pack.spread.resistance, self.spread_resistance);
-        set(&mut pack.spread.soc, self.spread_soc);
-        if let Some(magnitude_v) = self.hysteresis {
-            pack.hysteresis = Hysteresis { magnitude_v, ..Hysteresis::default() };
-        }
-    }
-
-    fn apply_to_sensors(&self, settings: &mut Settings) {
-        let sensors = &mut settings.sensors;
-        set(&mut sensors.voltage.noise_std, self.noise_voltage);
-        set(&mut sensors.voltage.offset, self.offset_voltage);
-        set(&mut sensors.voltage.resolution, self.resolution_voltage);
-        set(&mut sensors.current.noise_std, self.noise_current);
-        set(&mut sensors.current.offset, self.offset_current);
-        set(&mut sensors.current.gain, self.gain_current);
-        set(&mut sensors.temperature.noise_std, self.noise_temperature);
-        for sensor in [&mut sensors.current, &mut sensors.voltage, &mut sensors.temperature] {
-            set(&mut sensor.dropout, self.dropout);
-        }
     }
 
     fn apply_periods(&self, settings: &mut Settings) -> Result<(), Failure> {
@@ -164,6 +148,38 @@ impl Changes {
             )));
         }
         Ok(())
+    }
+}
+
+impl PackChanges {
+    fn apply(&self, pack: &mut PackSettings) {
+        pack.cells = self.cells.unwrap_or(pack.cells);
+        set(&mut pack.initial_soc, self.initial_soc);
+        set(&mut pack.ambient_c, self.ambient);
+        set(&mut pack.leakage_a, self.leakage);
+        set(&mut pack.ageing.capacity_loss_ah_per_cycle, self.loss_per_cycle);
+        set(&mut pack.ageing.resistance_growth_per_cycle, self.resistance_per_cycle);
+        set(&mut pack.spread.capacity, self.spread_capacity);
+        set(&mut pack.spread.resistance, self.spread_resistance);
+        set(&mut pack.spread.soc, self.spread_soc);
+        if let Some(magnitude_v) = self.hysteresis {
+            pack.hysteresis = Hysteresis { magnitude_v, ..Hysteresis::default() };
+        }
+    }
+}
+
+impl SensorChanges {
+    fn apply(&self, sensors: &mut Sensors) {
+        set(&mut sensors.voltage.noise_std, self.noise_voltage);
+        set(&mut sensors.voltage.offset, self.offset_voltage);
+        set(&mut sensors.voltage.resolution, self.resolution_voltage);
+        set(&mut sensors.current.noise_std, self.noise_current);
+        set(&mut sensors.current.offset, self.offset_current);
+        set(&mut sensors.current.gain, self.gain_current);
+        set(&mut sensors.temperature.noise_std, self.noise_temperature);
+        for sensor in [&mut sensors.current, &mut sensors.voltage, &mut sensors.temperature] {
+            set(&mut sensor.dropout, self.dropout);
+        }
     }
 }
 

@@ -2,14 +2,14 @@
 //!
 //! In: the text of a DBC file (grammar: the `can-dbc` crate). Out: a [`Database`] of messages with their signals,
 //! multiplexing resolved into conditions on raw selector codes, value tables, units, cycle times, frame formats and
-//! end-to-end protection. [`Database::to_dbc`] is the way back; what a `Database` holds survives it.
+//! end-to-end protection. [`Database::to_dbc`] writes it; the text reads back equal.
 //!
 //! A file that is not a DBC, an identifier out of range, a name defined twice or multiplexing that cannot be resolved is
-//! a [`DbcError`] with its line. A signal that reaches past its message's end stays (decoding it gives
-//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame)), and a layout that nothing can read stays too: it is
-//! refused when somebody wants to use it ([`SignalLayout::plan`]).
+//! a [`DbcError`] with its line. A signal that reaches past its message's end is accepted (decoding it gives
+//! [`Fault::ShortFrame`](crate::quantity::Fault::ShortFrame)), and so is an invalid layout: [`SignalLayout::plan`] rejects
+//! it.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use crate::can::CanId;
 use crate::can::e2e::Protection;
@@ -18,10 +18,10 @@ use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 mod attributes;
 mod write;
 
-/// Multiplexors that may hang one below the other; deeper nesting is taken for a loop.
+/// Most nested multiplexors; deeper nesting counts as a loop.
 const MAX_MULTIPLEX_DEPTH: usize = 8;
 
-/// Name of the pseudo message in which editors keep signals without a message.
+/// Pseudo message in which editors keep signals without a message.
 const ORPHANS: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 
 /// Why a text is not a usable DBC.
@@ -30,22 +30,22 @@ const ORPHANS: &str = "VECTOR__INDEPENDENT_SIG_MSG";
 pub struct DbcError {
     /// Counted from 1.
     pub line: usize,
-    /// What is wrong, what was found, what is allowed.
+    /// The fault: found and allowed.
     pub what: String,
 }
 
 /// Messages of one DBC, in the file's order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Database {
-    /// `BU_`: the units on the bus.
+    /// `BU_`: the nodes on the bus.
     pub nodes: Vec<String>,
-    /// `CM_` about the whole.
+    /// `CM_` of the database.
     pub comment: Option<String>,
     /// The messages.
     pub messages: Vec<Message>,
 }
 
-/// What kind of frame carries a message.
+/// Kind of frame that carries a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum FrameFormat {
     /// Classic, at most 8 bytes.
@@ -53,7 +53,7 @@ pub enum FrameFormat {
     Classic,
     /// CAN FD, at most 64 bytes.
     Fd {
-        /// Whether the data go at the higher bit rate.
+        /// Whether the data phase uses the higher bit rate.
         brs: bool,
     },
 }
@@ -67,11 +67,11 @@ pub struct Message {
     pub name: String,
     /// Payload length the DBC states, bytes.
     pub len_bytes: u16,
-    /// The node that sends it.
+    /// Sending node.
     pub sender: Option<String>,
     /// `VFrameFormat` and `CANFD_BRS`.
     pub format: FrameFormat,
-    /// `E2EProfile` and `E2EDataId`, as packwatch writes them.
+    /// `E2EProfile` and `E2EDataId`, packwatch's own attributes.
     pub e2e: Option<Protection>,
     /// In the file's order.
     pub signals: Vec<Signal>,
@@ -86,15 +86,15 @@ pub struct Message {
 pub struct Signal {
     /// Unique in its message.
     pub name: String,
-    /// Place and scaling.
+    /// Position and scaling.
     pub layout: SignalLayout,
     /// As written, may be empty.
     pub unit: String,
-    /// The nodes that read it.
+    /// Receiving nodes.
     pub receivers: Vec<String>,
     /// When the signal is in the payload.
     pub multiplex: Multiplex,
-    /// Whether other signals' presence depends on this one.
+    /// Whether the presence of other signals depends on this one.
     pub is_multiplexor: bool,
     /// `VAL_`: raw value (signed for signed signals) and its name.
     pub values: Vec<(i64, String)>,
@@ -109,7 +109,7 @@ pub struct Multiplex {
     pub conditions: Vec<MuxCondition>,
 }
 
-/// One multiplexor's part of the condition.
+/// Condition on one multiplexor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MuxCondition {
     /// Index of the multiplexor in its message's `signals`.
@@ -122,14 +122,14 @@ impl Database {
     /// Reads the text of a DBC.
     ///
     /// # Errors
-    /// The first thing wrong, with its line.
+    /// The first fault, with its line.
     pub fn parse(text: &str) -> Result<Self, DbcError> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-        // The grammar wants every statement closed by a line end.
+        // The grammar requires a line end after every statement.
         let closed = if text.ends_with('\n') { text.to_owned() } else { format!("{text}\n") };
         check_identifiers(&closed)?;
         let dbc = can_dbc::Dbc::try_from(closed.as_str()).map_err(|error| grammar_fault(&error))?;
-        let details = Details::new(&dbc);
+        let details = DetailTable::new(&dbc);
         let messages = dbc.messages.iter().filter(|message| message.name != ORPHANS);
         let messages: Result<Vec<_>, _> =
             messages.map(|message| read_message(&dbc, &details, message).map_err(|f| f.at(&closed))).collect();
@@ -162,19 +162,17 @@ impl Database {
         Some((message, message.signal(signal)?))
     }
 
-    fn check_names(&self) -> Result<(), Misfit> {
-        let mut messages = HashMap::new();
-        for message in &self.messages {
-            if messages.insert(message.name.as_str(), message.id).is_some() {
-                let what = format!("message {} is defined twice, names must be unique", message.name);
-                return Err(Misfit { message: message.name.clone(), signal: None, what });
+    fn check_names(&self) -> Result<(), MessageFault> {
+        let mut messages = HashSet::new();
+        for Message { name, signals, .. } in &self.messages {
+            if !messages.insert(name) {
+                let what = format!("message {name} is defined twice, names must be unique");
+                return Err(MessageFault { message: name.clone(), signal: None, what });
             }
-            let mut signals = HashMap::new();
-            for signal in &message.signals {
-                if signals.insert(signal.name.as_str(), ()).is_some() {
-                    let what = format!("signal {}.{} is defined twice", message.name, signal.name);
-                    return Err(Misfit { message: message.name.clone(), signal: Some(signal.name.clone()), what });
-                }
+            let mut names = HashSet::new();
+            if let Some(twice) = signals.iter().find(|signal| !names.insert(&signal.name)) {
+                let what = format!("signal {name}.{} is defined twice", twice.name);
+                return Err(MessageFault { message: name.clone(), signal: Some(twice.name.clone()), what });
             }
         }
         Ok(())
@@ -201,15 +199,15 @@ impl Signal {
     }
 }
 
-/// Something wrong with a message or signal, before its line is known.
-struct Misfit {
+/// A fault of a message or signal, before its line is known.
+struct MessageFault {
     message: String,
     signal: Option<String>,
     what: String,
 }
 
-impl Misfit {
-    /// Finds the last place where the text defines the message (and signal).
+impl MessageFault {
+    /// Adds the last line in which the text defines the message (or signal).
     fn at(self, text: &str) -> DbcError {
         let (mut line, mut inside) = (1, false);
         for (number, content) in (1..).zip(text.lines()) {
@@ -232,23 +230,23 @@ impl Misfit {
 fn grammar_fault(error: &can_dbc::DbcError) -> DbcError {
     match error {
         can_dbc::DbcError::Pest(error) => {
-            // The report's last line says what was expected; the lines before it draw the place.
+            // The report's last line states the expectation; the lines before it draw the position.
             let report = error.to_string();
             let expected = report.lines().rev().find_map(|line| line.trim().strip_prefix("= ")).unwrap_or("not a DBC");
-            let place = error_place(&report);
-            DbcError { line: place, what: format!("found \"{}\": {expected}", error.line().trim()) }
+            let line = error_line(&report);
+            DbcError { line, what: format!("found \"{}\": {expected}", error.line().trim()) }
         }
         other => DbcError { line: 1, what: other.to_string() },
     }
 }
 
 /// The line in pest's report, which opens ` --> line:column`.
-fn error_place(report: &str) -> usize {
+fn error_line(report: &str) -> usize {
     let place = report.lines().next().and_then(|first| first.split("--> ").nth(1));
     place.and_then(|place| place.split(':').next()).and_then(|line| line.trim().parse().ok()).unwrap_or(1)
 }
 
-/// Identifiers without the extended bit must have 11 bits (the grammar crate would cut off what is too much).
+/// Identifiers without the extended bit must have 11 bits (the grammar crate would drop the higher ones).
 fn check_identifiers(text: &str) -> Result<(), DbcError> {
     for (line, content) in (1..).zip(text.lines()) {
         let Some(rest) = content.trim_start().strip_prefix("BO_ ") else { continue };
@@ -261,52 +259,64 @@ fn check_identifiers(text: &str) -> Result<(), DbcError> {
     Ok(())
 }
 
-/// What a DBC says about signals outside their definition, by message and signal.
+/// Statements about a signal outside its definition.
+#[derive(Default)]
 struct Details<'a> {
-    comments: HashMap<(can_dbc::MessageId, &'a str), &'a str>,
-    values: HashMap<(can_dbc::MessageId, &'a str), &'a [can_dbc::ValDescription]>,
-    floats: HashMap<(can_dbc::MessageId, &'a str), can_dbc::SignalExtendedValueType>,
-    multiplex: HashMap<(can_dbc::MessageId, &'a str), Vec<&'a can_dbc::ExtendedMultiplex>>,
+    comment: Option<&'a str>,
+    values: &'a [can_dbc::ValDescription],
+    float: Option<can_dbc::SignalExtendedValueType>,
+    multiplex: Vec<&'a can_dbc::ExtendedMultiplex>,
 }
 
-impl<'a> Details<'a> {
+/// Details by message and signal.
+struct DetailTable<'a>(HashMap<(can_dbc::MessageId, &'a str), Details<'a>>);
+
+impl<'a> DetailTable<'a> {
     fn new(dbc: &'a can_dbc::Dbc) -> Self {
-        let mut details = Self {
-            comments: HashMap::new(),
-            values: HashMap::new(),
-            floats: HashMap::new(),
-            multiplex: HashMap::new(),
-        };
+        let mut table = Self(HashMap::new());
         for comment in &dbc.comments {
             if let can_dbc::Comment::Signal { message_id, name, comment } = comment {
-                details.comments.insert((*message_id, name), comment);
+                table.entry(*message_id, name).comment = Some(comment);
             }
         }
         for values in &dbc.value_descriptions {
             if let can_dbc::ValueDescription::Signal { message_id, name, value_descriptions } = values {
-                details.values.insert((*message_id, name), value_descriptions);
+                table.entry(*message_id, name).values = value_descriptions;
             }
         }
         for kind in &dbc.signal_extended_value_type_list {
-            details.floats.insert((kind.message_id, &kind.signal_name), kind.signal_extended_value_type);
+            table.entry(kind.message_id, &kind.signal_name).float = Some(kind.signal_extended_value_type);
         }
         for entry in &dbc.extended_multiplex {
-            details.multiplex.entry((entry.message_id, &entry.signal_name)).or_default().push(entry);
+            table.entry(entry.message_id, &entry.signal_name).multiplex.push(entry);
         }
-        details
+        table
+    }
+
+    fn entry(&mut self, message: can_dbc::MessageId, signal: &'a str) -> &mut Details<'a> {
+        self.0.entry((message, signal)).or_default()
+    }
+
+    fn get(&self, message: &can_dbc::Message, signal: &'a can_dbc::Signal) -> &Details<'a> {
+        const NONE: &Details<'_> = &Details { comment: None, values: &[], float: None, multiplex: Vec::new() };
+        self.0.get(&(message.id, signal.name.as_str())).unwrap_or(NONE)
     }
 }
 
-fn read_message(dbc: &can_dbc::Dbc, details: &Details, message: &can_dbc::Message) -> Result<Message, Misfit> {
-    let misfit = |what: String| Misfit { message: message.name.clone(), signal: None, what };
+fn read_message<'a>(
+    dbc: &'a can_dbc::Dbc,
+    details: &DetailTable<'a>,
+    message: &'a can_dbc::Message,
+) -> Result<Message, MessageFault> {
+    let fault = |what: String| MessageFault { message: message.name.clone(), signal: None, what };
     let id = match message.id {
         can_dbc::MessageId::Standard(id) => CanId::standard(u32::from(id)),
         can_dbc::MessageId::Extended(id) => CanId::extended(id),
     };
-    let id = id.ok_or_else(|| misfit(format!("message {}: identifier out of range", message.name)))?;
+    let id = id.ok_or_else(|| fault(format!("message {}: identifier out of range", message.name)))?;
     // Longer than a frame is kept: J1939 DBCs describe transport messages of up to 1,785 bytes.
     let len_bytes = u16::try_from(message.size)
-        .map_err(|_| misfit(format!("message {}: length {}, must be 0 to 65535", message.name, message.size)))?;
+        .map_err(|_| fault(format!("message {}: length {}, must be 0 to 65535", message.name, message.size)))?;
     let signals: Result<Vec<_>, _> =
         message.signals.iter().map(|signal| read_signal(details, message, signal)).collect();
     Ok(Message {
@@ -329,14 +339,18 @@ fn plain_comment(dbc: &can_dbc::Dbc) -> Option<String> {
     })
 }
 
-fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::Signal) -> Result<Signal, Misfit> {
-    let misfit = |what: String| Misfit {
+fn read_signal<'a>(
+    details: &DetailTable<'a>,
+    message: &'a can_dbc::Message,
+    signal: &'a can_dbc::Signal,
+) -> Result<Signal, MessageFault> {
+    let fault = |what: String| MessageFault {
         message: message.name.clone(),
         signal: Some(signal.name.clone()),
         what: format!("signal {}.{}: {what}", message.name, signal.name),
     };
-    let bits = |name: &str, n: u64| u16::try_from(n).map_err(|_| misfit(format!("{name} {n}, must be 0 to 65535")));
-    let key = (message.id, signal.name.as_str());
+    let bits = |name: &str, n: u64| u16::try_from(n).map_err(|_| fault(format!("{name} {n}, must be 0 to 65535")));
+    let own = details.get(message, signal);
     let layout = SignalLayout {
         start_bit: bits("start bit", signal.start_bit)?,
         length_bits: bits("length", signal.size)?,
@@ -344,7 +358,7 @@ fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::
             can_dbc::ByteOrder::LittleEndian => ByteOrder::LittleEndian,
             can_dbc::ByteOrder::BigEndian => ByteOrder::BigEndian,
         },
-        value_type: match (details.floats.get(&key), signal.value_type) {
+        value_type: match (own.float, signal.value_type) {
             (Some(can_dbc::SignalExtendedValueType::IEEEfloat32Bit), _) => ValueType::Float32,
             (Some(can_dbc::SignalExtendedValueType::IEEEdouble64bit), _) => ValueType::Float64,
             (_, can_dbc::ValueType::Signed) => ValueType::Signed,
@@ -355,16 +369,15 @@ fn read_signal(details: &Details, message: &can_dbc::Message, signal: &can_dbc::
         minimum: number(&signal.min),
         maximum: number(&signal.max),
     };
-    let values = details.values.get(&key).copied().unwrap_or_default();
     Ok(Signal {
         name: signal.name.clone(),
         layout,
         unit: signal.unit.clone(),
         receivers: signal.receivers.clone(),
-        multiplex: Multiplex { conditions: conditions(details, message, signal, 0).map_err(misfit)? },
+        multiplex: Multiplex { conditions: conditions(details, message, signal, 0).map_err(fault)? },
         is_multiplexor: is_multiplexor(signal),
-        values: values.iter().map(|value| (value.id, value.description.clone())).collect(),
-        comment: details.comments.get(&key).map(|comment| (*comment).to_owned()),
+        values: own.values.iter().map(|value| (value.id, value.description.clone())).collect(),
+        comment: own.comment.map(str::to_owned),
     })
 }
 
@@ -386,25 +399,24 @@ fn is_multiplexor(signal: &can_dbc::Signal) -> bool {
 
 /// The chain of conditions from the outermost multiplexor down to this signal. `SG_MUL_VAL_` names parent and
 /// ranges and overrules the number after `m`; without it the parent is the message's only `M`.
-fn conditions(
-    details: &Details,
-    message: &can_dbc::Message,
-    signal: &can_dbc::Signal,
+fn conditions<'a>(
+    details: &DetailTable<'a>,
+    message: &'a can_dbc::Message,
+    signal: &'a can_dbc::Signal,
     depth: usize,
 ) -> Result<Vec<MuxCondition>, String> {
     use can_dbc::MultiplexIndicator as Indicator;
     if depth > MAX_MULTIPLEX_DEPTH {
         return Err(format!("multiplexors nested more than {MAX_MULTIPLEX_DEPTH} deep, or in a loop"));
     }
-    let entries = details.multiplex.get(&(message.id, signal.name.as_str()));
-    let (selector, ranges) = match (entries.map(Vec::as_slice), signal.multiplexer_indicator) {
-        (Some([entry]), _) => {
+    let (selector, ranges) = match (details.get(message, signal).multiplex.as_slice(), signal.multiplexer_indicator) {
+        ([entry], _) => {
             let ranges = entry.mappings.iter().map(|range| (range.min_value, range.max_value)).collect();
             (position(message, &entry.multiplexor_signal_name)?, ranges)
         }
-        (Some(_), _) => return Err("more than one SG_MUL_VAL_ line, one is allowed".to_owned()),
-        (None, Indicator::Plain | Indicator::Multiplexor) => return Ok(Vec::new()),
-        (None, Indicator::MultiplexedSignal(code) | Indicator::MultiplexorAndMultiplexedSignal(code)) => {
+        ([_, ..], _) => return Err("more than one SG_MUL_VAL_ line, one is allowed".to_owned()),
+        ([], Indicator::Plain | Indicator::Multiplexor) => return Ok(Vec::new()),
+        ([], Indicator::MultiplexedSignal(code) | Indicator::MultiplexorAndMultiplexedSignal(code)) => {
             (only_multiplexor(message)?, vec![(code, code)])
         }
     };
@@ -420,8 +432,8 @@ fn position(message: &can_dbc::Message, name: &str) -> Result<usize, String> {
 }
 
 fn only_multiplexor(message: &can_dbc::Message) -> Result<usize, String> {
-    let plain = |signal: &can_dbc::Signal| signal.multiplexer_indicator == can_dbc::MultiplexIndicator::Multiplexor;
-    let mut candidates = message.signals.iter().enumerate().filter(|(_, signal)| plain(signal));
+    let is_plain = |signal: &can_dbc::Signal| signal.multiplexer_indicator == can_dbc::MultiplexIndicator::Multiplexor;
+    let mut candidates = message.signals.iter().enumerate().filter(|(_, signal)| is_plain(signal));
     match (candidates.next(), candidates.next()) {
         (Some((index, _)), None) => Ok(index),
         (None, _) => Err("multiplexed, but the message has no multiplexor (M)".to_owned()),

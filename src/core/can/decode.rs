@@ -1,15 +1,15 @@
 //! The plan that turns input frames into readings.
 //!
 //! Built once from the configured signals; per frame it is a look-up by interface and identifier, one by the selector's
-//! code, and a shift and a multiply-add per signal. A signal whose multiplexor says that it is not in this
-//! payload gives nothing; one that is there but unusable gives a reading with its fault. The same identifier on
-//! another interface is another message, and so is the extended identifier of the same number.
+//! code, and a shift and a multiply-add per signal. A signal that is not in the payload (by its multiplexor) gives no
+//! reading; one that is present but unusable gives a reading with its fault. The same identifier on another interface is
+//! another message, and so is the extended identifier of the same number.
 
-mod plan;
+mod fast;
 
 use std::ops::Range;
 
-use plan::Plans;
+use fast::FastDecoder;
 
 use crate::can::dbc::{Message, Signal};
 use crate::can::signal::{LayoutFault, SignalPlan};
@@ -21,9 +21,9 @@ pub use crate::quantity::{Channel, Reading, SensorIndex};
 /// One multiplexor a bound signal depends on: the selector's code must lie in one of the ranges (ends included).
 #[derive(Debug, Clone, PartialEq)]
 pub struct MuxTest {
-    /// Where the selector is.
+    /// The selector.
     pub plan: SignalPlan,
-    /// Codes for which the signal is there.
+    /// Codes with which the signal is present.
     pub ranges: Vec<(u64, u64)>,
 }
 
@@ -33,7 +33,7 @@ impl MuxTest {
     }
 }
 
-/// One configured signal: where it comes from and what it means.
+/// One configured signal: its source and meaning.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Binding {
     /// Interface.
@@ -44,9 +44,9 @@ pub struct Binding {
     pub len_bytes: u16,
     /// The signal.
     pub plan: SignalPlan,
-    /// All must hold; empty = always there.
+    /// All must hold; empty = always present.
     pub mux: Vec<MuxTest>,
-    /// What it feeds.
+    /// Channel of its readings.
     pub channel: Channel,
     /// Applied after the DBC's factor and offset: value x scale + offset (a current whose bus counts charging
     /// positive has scale -1).
@@ -60,11 +60,11 @@ pub struct Binding {
 }
 
 impl Binding {
-    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" as the value
-    /// table says. The caller changes what the configuration changes.
+    /// Binds a DBC signal to a channel: scale 1, offset 0, no range beyond the DBC's, "not available" from the value
+    /// table. The caller applies the configuration.
     ///
     /// # Errors
-    /// When the layout of the signal or of one of its multiplexors cannot be read.
+    /// When the layout of the signal or of one of its multiplexors is invalid.
     pub fn new(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Result<Self, LayoutFault> {
         let selectors = signal.multiplex.conditions.iter().filter_map(|condition| {
             let selector = message.signals.get(condition.selector)?;
@@ -110,11 +110,11 @@ impl Binding {
 pub struct InputMap {
     /// Sorted by message, then channel.
     bindings: Vec<Binding>,
-    /// Neighbours in `bindings` of one message and with equal multiplexors: there or not there together.
+    /// Neighbours in `bindings` of one message and with equal multiplexors: present or absent together.
     runs: Vec<Range<usize>>,
-    /// Per interface, sorted by identifier: where in `runs` the message's are.
-    messages: Vec<Vec<(CanId, Range<usize>)>>,
-    plans: Plans,
+    /// Runs of each message, sorted by interface and identifier.
+    messages: Vec<(BusIndex, CanId, Range<usize>)>,
+    fast: FastDecoder,
 }
 
 impl InputMap {
@@ -127,55 +127,46 @@ impl InputMap {
             let start = runs.last().map_or(0, |last| last.end);
             runs.push(start..start + run.len());
         }
-        let mut messages: Vec<Vec<(CanId, Range<usize>)>> = Vec::new();
+        let mut messages: Vec<(BusIndex, CanId, Range<usize>)> = Vec::new();
         for (index, run) in runs.iter().enumerate() {
             let Binding { bus, id, .. } = bindings[run.start];
-            if messages.len() <= bus.index() {
-                messages.resize(bus.index() + 1, Vec::new());
-            }
-            match messages[bus.index()].last_mut() {
-                Some((last, range)) if *last == id => range.end = index + 1,
-                _ => messages[bus.index()].push((id, index..index + 1)),
+            match messages.last_mut() {
+                Some((last_bus, last_id, range)) if (*last_bus, *last_id) == (bus, id) => range.end = index + 1,
+                _ => messages.push((bus, id, index..index + 1)),
             }
         }
-        Self { plans: Plans::new(&bindings, &runs), bindings, runs, messages }
+        Self { fast: FastDecoder::new(&bindings, &runs), bindings, runs, messages }
     }
 
-    /// Hands the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those
-    /// that are there. When a selector cannot be read, every signal that depends on it is a short frame. Frames
-    /// that are not configured, and remote frames, give nothing.
+    /// Passes the readings of one frame to `each`, in the order of [`Channel`]: of multiplexed signals only those that are
+    /// present. When a selector cannot be read, every signal that depends on it is a short frame. Frames that are not
+    /// configured, and remote frames, give no reading.
     #[inline]
     pub fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
         if frame.kind() != FrameKind::Remote {
-            self.plans.decode(&self.bindings, bus, frame, each);
+            self.fast.decode(&self.bindings, bus, frame, each);
         }
     }
 
-    /// What [`decode`](Self::decode) gives, found and computed signal by signal as the bindings say: slow and plain, what
-    /// the compiled plan is held against.
+    /// The readings of [`decode`](Self::decode), computed signal by signal from the bindings: the slow reference of the
+    /// compiled decoder.
     pub fn decode_plainly(&self, bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
-        let runs = self.messages.get(bus.index()).and_then(|ids| {
-            let found = ids.binary_search_by_key(&frame.id(), |(id, _)| *id).ok()?;
-            Some(&self.runs[ids[found].1.clone()])
-        });
-        if frame.kind() == FrameKind::Remote {
-            return;
-        }
-        for run in runs.unwrap_or_default() {
-            plan::decode_plainly(&self.bindings[run.clone()], frame.data(), &mut each);
+        let found = self.messages.binary_search_by_key(&(bus, frame.id()), |(bus, id, _)| (*bus, *id));
+        let Some(message) = found.ok().filter(|_| frame.kind() != FrameKind::Remote) else { return };
+        for run in &self.runs[self.messages[message].2.clone()] {
+            fast::decode_plainly(&self.bindings[run.clone()], frame.data(), &mut each);
         }
     }
 
-    /// Every configured message, by interface and identifier, with the number of its groups of signals that
-    /// come together: its multiplexer pages, or a few more; 1 without any.
+    /// Every configured message, by interface and identifier, with the number of its groups of signals that are present
+    /// together: its multiplexer pages, or a few more; 1 without pages.
     pub fn messages(&self) -> impl Iterator<Item = (BusIndex, CanId, usize)> + '_ {
-        let first = |runs: &Range<usize>| &self.bindings[self.runs[runs.start].start];
-        self.messages.iter().flatten().map(move |(id, runs)| (first(runs).bus, *id, runs.len()))
+        self.messages.iter().map(|(bus, id, runs)| (*bus, *id, runs.len()))
     }
 
     /// Identifiers configured on an interface, ascending, for kernel filters.
     pub fn ids(&self, bus: BusIndex) -> Vec<CanId> {
-        self.messages.get(bus.index()).map(|ids| ids.iter().map(|(id, _)| *id).collect()).unwrap_or_default()
+        self.messages().filter(|(other, ..)| *other == bus).map(|(_, id, _)| id).collect()
     }
 
     /// Every configured channel, ascending, each once.

@@ -1,8 +1,8 @@
 //! AUTOSAR end-to-end protection: Profile 1 (variants A and C) and Profile 5, the sender's and the receiver's half.
 //!
 //! A protected payload begins with a header: a CRC over an agreed data identifier and the rest of the payload, and a
-//! counter that moves by one from frame to frame. The receiver learns from it that a payload was damaged, repeated,
-//! lost, or is another message's. It finds faults; it does not stop an attacker, who can compute a CRC too.
+//! counter that rises by one from frame to frame. From it the receiver detects payloads that are damaged, repeated, lost or
+//! of another message. It detects faults; it does not stop an attacker, who can compute a CRC too.
 //!
 //! | profile | bytes of the header | CRC | counter |
 //! | --- | --- | --- | --- |
@@ -10,23 +10,23 @@
 //! | 1C | as 1A; 1, high nibble: low nibble of the id's high byte | CRC-8 0x1D, from 0, of id low, 0, payload from byte 1 | 0 to 14 |
 //! | 5 | 0, 1: CRC, low byte first; 2: counter | CRC-16 0x1021, from 0xFFFF, of payload from byte 2, id low, id high | 0 to 255 |
 //!
-//! In 1A the high nibble of byte 1 belongs to whoever lays out the message (a signal may lie there); `protect` leaves it.
+//! In 1A the high nibble of byte 1 is free for a signal of the message; `protect` does not change it.
 //! The CRC of profile 1 is the one of the AUTOSAR library with its start value and final XOR of 0xFF cancelled.
 //!
 //! A payload shorter than the header is an error when sending and a wrong CRC when receiving. Source: AUTOSAR "SWS E2E
-//! Library" as two peers and four open receivers have it; vectors in the tests.
+//! Library" as implemented by two peers and four open receivers; vectors in the tests.
 //!
 //! Deviation 1: profile 5 has no SYNC and INITIAL of its own in AUTOSAR (the state machine above it makes them). Here the
-//! receiver of profile 1 runs for it too, with the counter modulo 256: the same words and the same counts for both
-//! profiles. Effect: a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK; and
-//! its allowed step grows while frames are missed. As in AUTOSAR's own check of profile 5, a counter that jumped too far
-//! is gone on from (a sender that restarted costs one frame, not a turn of 256).
-//! Deviation 2: what a receiver may be told about repetitions (`max_no_new_or_repeated_data`) ends at 14 for both
-//! profiles, where it means "any number".
-//! Deviation 3: AUTOSAR calls its check once a period, frame or no frame. Here it is called once per frame, and once for each
-//! period without one where the period is known; where it is not, the allowed step grows with bad frames only.
+//! receiver of profile 1 serves it too, with the counter modulo 256: both profiles have the same statuses and counts.
+//! Effect: a first frame of profile 5 is INITIAL and not used, where AUTOSAR's check alone might call it OK; and its
+//! allowed step grows while frames are missing. As in AUTOSAR's own check of profile 5, the sequence continues from a
+//! counter that jumped too far (a sender that restarted costs one frame, not a turn of 256).
+//! Deviation 2: the setting for repetitions (`max_no_new_or_repeated_data`) ends at 14 for both profiles, where it means
+//! "any number".
+//! Deviation 3: AUTOSAR calls its check once a period, with or without a frame. Here it is called once per frame, and once
+//! for each period without one where the period is known; where it is unknown, the allowed step grows with bad frames only.
 //! Deviation 4: the counter 15 of profile 1, which no sender may use, has no status in AUTOSAR (its check returns an
-//! error). Here it is [`Status::WrongCrc`]: the payload is not one the sender can have made.
+//! error). Here it is [`Status::WrongCrc`]: no sender can have made the payload.
 
 mod receiver;
 
@@ -34,7 +34,7 @@ use serde::{Deserialize, Serialize};
 
 pub use receiver::{CheckConfig, Receiver, Status, StatusCounts};
 
-/// Which layout, CRC and counter protect a message.
+/// Layout, CRC and counter of a protection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Profile {
     /// Profile 1, variant A: the whole data identifier is in the CRC only.
@@ -49,7 +49,7 @@ pub enum Profile {
 }
 
 impl Profile {
-    /// The word for it in a configuration.
+    /// Name in a configuration.
     pub const fn name(self) -> &'static str {
         match self {
             Self::P01A => "1A",
@@ -58,12 +58,7 @@ impl Profile {
         }
     }
 
-    /// Leading bits of the payload that the profile lays out; of 1A's the upper four (bits 12 to 15) are free for a signal.
-    pub const fn header_bits(self) -> usize {
-        self.header_bytes() * 8
-    }
-
-    /// Which bits of the first three bytes the protection writes, least significant bit of each byte = bit 0.
+    /// Bits of the first three bytes that the protection writes; least significant bit of each byte = bit 0.
     pub const fn header_mask(self) -> [u8; 3] {
         match self {
             Self::P01A => [0xFF, 0x0F, 0],
@@ -80,7 +75,7 @@ impl Profile {
         }
     }
 
-    /// Longest payload the standard protects with this profile, bytes: 240 bits in profile 1; of profile 5 any frame.
+    /// Longest payload the standard protects with this profile, bytes: 240 bits in profile 1; any frame in profile 5.
     pub const fn max_bytes(self) -> usize {
         match self {
             Self::P01A | Self::P01C => 30,
@@ -109,7 +104,7 @@ impl Profile {
         if counter < self.max_counter() { counter + 1 } else { 0 }
     }
 
-    /// By how many steps `to` is after `from`, both valid: 0 to the largest counter.
+    /// Steps from `from` to `to`, both valid: 0 to the largest counter.
     const fn counter_delta(self, from: u8, to: u8) -> u8 {
         if to >= from { to - from } else { self.max_counter().wrapping_sub(from).wrapping_add(to).wrapping_add(1) }
     }
@@ -121,27 +116,27 @@ pub enum ProtectError {
     /// Shorter than the header.
     #[error("payload has {found} bytes, this end-to-end profile needs {needed} or more")]
     Short {
-        /// Bytes there are.
+        /// Bytes of the payload.
         found: usize,
         /// Bytes of the header.
         needed: usize,
     },
-    /// A counter the profile does not have.
+    /// A counter above the profile's largest.
     #[error("end-to-end counter {found}, must be 0 to {max}")]
     Counter {
-        /// The counter given.
+        /// The counter.
         found: u8,
         /// The largest.
         max: u8,
     },
 }
 
-/// What sender and receiver of one message agree on.
+/// Agreement between sender and receiver of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Protection {
     /// Layout, CRC and counter.
     pub profile: Profile,
-    /// Data identifier, unlike that of any other message; of it, 1C uses 12 bits.
+    /// Data identifier, unique among messages; 1C uses 12 bits of it.
     pub data_id: u16,
 }
 
@@ -184,7 +179,7 @@ impl Protection {
         (intact && counter <= self.profile.max_counter()).then_some(counter)
     }
 
-    /// The counter as it stands in the payload, whatever the CRC says; `None` = too short.
+    /// The counter in the payload, also with a wrong CRC; `None` = too short.
     pub fn counter(&self, payload: &[u8]) -> Option<u8> {
         match self.profile {
             Profile::P01A | Profile::P01C => payload.get(1).map(|byte| byte & 0x0F),
@@ -210,17 +205,22 @@ impl Protection {
     }
 }
 
-/// CRC-8 of each byte value, polynomial 0x1D. Static, so that there is one of it.
+/// CRC of one byte value, with a register of `bits` bits.
+const fn byte_crc(byte: usize, bits: u32, polynomial: u16) -> u16 {
+    let (mut crc, mut bit) = ((byte as u16) << (bits - 8), 0);
+    while bit < 8 {
+        crc = if crc >> (bits - 1) & 1 == 1 { crc << 1 ^ polynomial } else { crc << 1 };
+        bit += 1;
+    }
+    crc
+}
+
+/// CRC-8 of each byte value, polynomial 0x1D.
 static CRC8: [u8; 256] = {
-    let mut table = [0; 256];
-    let mut byte = 0;
+    let (mut table, mut byte) = ([0; 256], 0);
     while byte < 256 {
-        let (mut crc, mut bit) = (byte as u8, 0);
-        while bit < 8 {
-            crc = if crc & 0x80 != 0 { crc << 1 ^ 0x1D } else { crc << 1 };
-            bit += 1;
-        }
-        table[byte] = crc;
+        // The lowest byte is the register.
+        table[byte] = byte_crc(byte, 8, 0x1D) as u8;
         byte += 1;
     }
     table
@@ -228,15 +228,9 @@ static CRC8: [u8; 256] = {
 
 /// CRC-16 of each byte value, polynomial 0x1021.
 static CRC16: [u16; 256] = {
-    let mut table = [0; 256];
-    let mut byte = 0;
+    let (mut table, mut byte) = ([0; 256], 0);
     while byte < 256 {
-        let (mut crc, mut bit) = ((byte as u16) << 8, 0);
-        while bit < 8 {
-            crc = if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 };
-            bit += 1;
-        }
-        table[byte] = crc;
+        table[byte] = byte_crc(byte, 16, 0x1021);
         byte += 1;
     }
     table

@@ -1,10 +1,10 @@
-//! A bound on how many frames of one identifier are taken in: a sender gone wild must not take the time of the others.
+//! Limits the frames per identifier: a faulty sender must not use up the time for the others.
 //!
-//! In: the time and identifier of each frame that came. Out: whether it is taken in; what was not is counted, and a
+//! In: time and identifier of each received frame. Out: whether it is admitted; dropped frames are counted, and a
 //! [`FloodChange`] says when dropping began and ended. Per message it is a leaky bucket in one number (the time up to which
 //! the allowed rate is spent): a burst of one tenth of a second's frames passes at once, and in the long run the rate.
-//! Deterministic from the stamps; nothing is allocated after the start. Messages nobody configured pass: they cost next to
-//! nothing and nobody reads them.
+//! Deterministic from the stamps; nothing is allocated after the start. Messages that are not configured pass: they are not
+//! decoded and cost almost nothing.
 
 use std::num::NonZeroU32;
 
@@ -19,16 +19,16 @@ const BURST_NS: i64 = 100_000_000;
 /// Without a dropped frame for this long the flood is over, s: dropping that comes and goes is one flood.
 const OVER_AFTER_S: f64 = 1.0;
 
-/// How many frames of one identifier are taken in.
+/// Allowed frames of one identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FloodConfig {
-    /// Frames per second of one identifier on one interface.
+    /// Frames per second on one interface.
     pub max_frames_per_s: NonZeroU32,
 }
 
 impl Default for FloodConfig {
     /// 2,000: a saturated bus of 500 kbit/s carries about 4,000 frames a second in all, and no battery message is sent
-    /// more often than once a millisecond. Twice the fastest honest sender, half of what one wild sender can do.
+    /// more often than once a millisecond. Twice the fastest intended sender, half of what one faulty sender can send.
     fn default() -> Self {
         Self { max_frames_per_s: const { NonZeroU32::new(2000).unwrap() } }
     }
@@ -41,7 +41,7 @@ pub struct FloodChange {
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// Whether it began.
+    /// Whether dropping began.
     pub active: bool,
     /// Frames dropped in this flood so far: 1 when it begins, all of them when it ends.
     pub dropped: u64,
@@ -60,39 +60,39 @@ pub struct FloodCount {
 }
 
 #[derive(Debug, Clone)]
-struct Bucket {
+struct LeakyBucket {
     bus: BusIndex,
     id: CanId,
     /// Burst that passes at once, ns of the allowed rate.
     burst_ns: i64,
-    /// Up to when the allowed rate is spent.
+    /// Time up to which the allowed rate is spent.
     spent_until: Option<Timestamp>,
     dropped: u64,
-    /// The present flood: frames dropped in it, and when the last one was.
+    /// The present flood: frames dropped in it, and the time of the last one.
     flood: Option<(u64, Timestamp)>,
 }
 
-/// The bound for every configured message.
+/// The limit for every configured message.
 #[derive(Debug, Clone)]
 pub struct FloodGate {
-    /// Time one frame takes of the allowed rate, ns.
+    /// Time of one frame at the allowed rate, ns.
     frame_ns: i64,
     /// Sorted by interface and identifier.
-    buckets: Vec<Bucket>,
-    /// Which bucket is a message's.
+    buckets: Vec<LeakyBucket>,
+    /// Index of a message's bucket.
     numbers: IdTable,
     changes: Vec<FloodChange>,
 }
 
 impl FloodGate {
-    /// For these messages, each with the number of frames that make it up: a multiplexed message may send all its pages at
-    /// once, twice over.
+    /// A gate for these messages, each with its number of pages: a multiplexed message may send all its pages twice at
+    /// once.
     pub fn new(config: &FloodConfig, messages: impl IntoIterator<Item = (BusIndex, CanId, usize)>) -> Self {
         let frame_ns = (1_000_000_000 / i64::from(config.max_frames_per_s.get())).max(1);
         let bucket = |(bus, id, pages): (BusIndex, CanId, usize)| {
             let pages_ns = i64::try_from(2 * pages).unwrap_or(i64::MAX).saturating_mul(frame_ns);
             let burst_ns = BURST_NS.max(pages_ns).max(frame_ns);
-            Bucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
+            LeakyBucket { bus, id, burst_ns, spent_until: None, dropped: 0, flood: None }
         };
         let mut buckets: Vec<_> = messages.into_iter().map(bucket).collect();
         buckets.sort_by_key(|bucket| (bucket.bus, bucket.id));
@@ -101,9 +101,9 @@ impl FloodGate {
         Self { frame_ns, numbers, changes: Vec::with_capacity(buckets.len() + 1), buckets }
     }
 
-    /// With the counts, the spent budget and the floods of another gate for the messages that are in both.
+    /// Inherits counts, spent budget and floods of another gate for the messages that are in both.
     #[must_use]
-    pub fn going_on_from(mut self, old: &Self) -> Self {
+    pub fn inheriting(mut self, old: &Self) -> Self {
         for bucket in &mut self.buckets {
             if let Some(old) = old.buckets.iter().find(|old| (old.bus, old.id) == (bucket.bus, bucket.id)) {
                 (bucket.spent_until, bucket.dropped, bucket.flood) = (old.spent_until, old.dropped, old.flood);
@@ -112,7 +112,7 @@ impl FloodGate {
         self
     }
 
-    /// Whether a frame is taken in; time never runs backwards except after [`Self::restart`].
+    /// Whether a frame is admitted; time never runs backwards except after [`Self::restart`].
     #[inline]
     pub fn admit(&mut self, now: Timestamp, bus: BusIndex, id: CanId) -> bool {
         let Some(bucket) = self.buckets.get_mut(self.numbers.number(bus, id)) else { return true };
@@ -135,29 +135,29 @@ impl FloodGate {
         self.end(|last| now.since(last) >= OVER_AFTER_S);
     }
 
-    /// Time asleep, or the clock was set: the budget is whole again, and every flood is over.
+    /// After sleep or a step of the clock: the whole budget is available, and every flood is over.
     pub fn restart(&mut self) {
         self.end(|_| true);
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
-    /// Whether anything began or ended since.
+    /// Whether there are changes since the last [`Self::take_changes`].
     pub fn has_changes(&self) -> bool {
         !self.changes.is_empty()
     }
 
-    /// What began or ended since the last call.
+    /// The changes since the last call.
     pub fn take_changes(&mut self) -> impl Iterator<Item = FloodChange> + '_ {
         self.changes.drain(..)
     }
 
-    /// Messages of which frames were dropped, and how many.
+    /// Messages with dropped frames, and their number.
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
         dropped.map(|bucket| FloodCount { bus: bucket.bus, id: bucket.id, dropped: bucket.dropped })
     }
 
-    /// Takes up stored counts; those of messages that are no longer configured are left out.
+    /// Restores stored counts; those of messages that are no longer configured are dropped.
     pub fn restore(&mut self, counts: &[FloodCount]) {
         for bucket in &mut self.buckets {
             let stored = counts.iter().find(|count| (count.bus, count.id) == (bucket.bus, bucket.id));
@@ -190,14 +190,14 @@ mod tests {
         FloodGate::new(&FloodConfig { max_frames_per_s }, [(BUS, ID, pages), (BUS, CanId::Standard(0x101), 1)])
     }
 
-    /// Frames `gap_ns` apart from `from_ns` on; how many are taken in.
+    /// Frames `gap_ns` apart from `from_ns` on; the number admitted.
     fn taken(gate: &mut FloodGate, from_ns: i64, gap_ns: i64, frames: i64) -> usize {
         let at = |n: i64| Timestamp::from_nanos(from_ns + n * gap_ns);
         (0..frames).filter(|&n| gate.admit(at(n), BUS, ID)).count()
     }
 
     #[test]
-    fn the_allowed_rate_passes_for_ever() {
+    fn the_allowed_rate_always_passes() {
         let mut gate = gate(2000, 1);
         assert_eq!(taken(&mut gate, 0, 500_000, 100_000), 100_000);
         assert_eq!((gate.counts().count(), gate.take_changes().count()), (0, 0));
@@ -225,7 +225,7 @@ mod tests {
         assert!(!gate.admit(Timestamp::ZERO, BUS, ID));
         assert!(gate.admit(Timestamp::ZERO, BUS, CanId::Standard(0x101)), "another identifier");
         assert!(gate.admit(Timestamp::ZERO, BusIndex(1), ID), "another interface");
-        assert!(gate.admit(Timestamp::ZERO, BUS, CanId::Extended(0x100)), "nobody's message");
+        assert!(gate.admit(Timestamp::ZERO, BUS, CanId::Extended(0x100)), "not configured");
     }
 
     #[test]
@@ -238,7 +238,7 @@ mod tests {
         let mut gate = gate(100, 1);
         assert_eq!(taken(&mut gate, 0, 0, 15), 10);
         gate.poll(Timestamp::from_secs(0.9));
-        assert_eq!(taken(&mut gate, 900_000_000, 0, 12), 10, "it goes on");
+        assert_eq!(taken(&mut gate, 900_000_000, 0, 12), 10, "the flood continues");
         gate.poll(Timestamp::from_secs(1.8));
         let begun = FloodChange { bus: BUS, id: ID, active: true, dropped: 1 };
         assert_eq!(gate.take_changes().collect::<Vec<_>>(), [begun]);

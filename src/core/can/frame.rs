@@ -55,6 +55,11 @@ impl std::fmt::Display for CanId {
     }
 }
 
+/// Whether a frame, classic or FD, can have exactly this length.
+pub(crate) const fn is_frame_length(len: usize) -> bool {
+    matches!(len, 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64)
+}
+
 /// Kind of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum FrameKind {
@@ -94,8 +99,18 @@ impl Frame {
 
     /// An FD data frame, or `None` for a length FD cannot carry (more than 64, or a length between its steps).
     pub fn fd(id: CanId, brs: bool, esi: bool, data: &[u8]) -> Option<Self> {
-        matches!(data.len(), 0..=8 | 12 | 16 | 20 | 24 | 32 | 48 | 64)
-            .then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
+        is_frame_length(data.len()).then(|| Self::build(id, FrameKind::Fd { brs, esi }, data))
+    }
+
+    /// An FD frame of at least `len` bytes, rounded up to an FD length; `None` above 64.
+    pub(crate) fn fd_padded(id: CanId, brs: bool, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
+        let len = (len..=MAX_DATA).find(|len| is_frame_length(*len))?;
+        Self::fd(id, brs, false, &payload[..len])
+    }
+
+    /// A frame of at least `len` bytes: classic up to 8, FD above; `None` above 64.
+    pub(crate) fn padded(id: CanId, len: usize, payload: &[u8; MAX_DATA]) -> Option<Self> {
+        if len <= 8 { Self::classic(id, &payload[..len]) } else { Self::fd_padded(id, false, len, payload) }
     }
 
     /// A remote request for `len` bytes, or `None` for more than 8.

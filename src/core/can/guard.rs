@@ -1,16 +1,16 @@
-//! The protected input messages: who checks a frame, what became of each message, and when to tell somebody.
+//! Checks of the protected input messages: status, counts and changes per message.
 //!
-//! In: frames with their time and interface, in the order of their arrival, and now and then the time alone
-//! ([`Guards::poll`]). Out: the [`Status`] of a frame, per-message counts, and a [`GuardChange`] when a message turns from
-//! usable to failing or back (what happens in between is counted). Where a message's cycle time is known, each period
-//! without a frame counts as one NONEWDATA: at one and a half periods after the last frame (half a period of jitter
-//! is no loss), and then once a period. As many of them as the check allows to be lost turn nothing: the next frame will be
-//! good, and a sender with jitter would fill the log.
+//! In: frames with their time and interface, in the order of their arrival, and the time alone ([`Guards::poll`]). Out: the
+//! [`Status`] of a frame, per-message counts, and a [`GuardChange`] when a message turns from usable to failing or back
+//! (checks in between are only counted). Where a message's cycle time is known, each period without a frame counts as one
+//! NONEWDATA: at one and a half periods after the last frame (half a period of jitter is no loss), and then once a period.
+//! Up to the number of frames that the check allows to be lost this is no change: the next frame will be usable, and a
+//! sender with jitter would fill the log.
 //!
-//! What nobody listened to is no fault of the sender: after time asleep, a restart of the program or a step of the clock the
+//! Time without listening is no fault of the sender: after sleep, a restart of the program or a step of the clock the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a snapshot keeps the counts and not
-//! the counters. A stored counter says nothing about a sender that went on in the meantime: it would refuse good frames, or
-//! take for fresh an old one that happens to follow it.
+//! the counters: the sender has continued in the meantime, so a stored counter would reject good frames, or accept an old
+//! one that happens to follow it.
 
 use serde::{Deserialize, Serialize};
 
@@ -24,13 +24,13 @@ const MISSED_AFTER_PERIODS: f64 = 1.5;
 /// One protected message.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GuardConfig {
-    /// Interface it comes on.
+    /// Interface.
     pub bus: BusIndex,
-    /// Its identifier.
+    /// Identifier.
     pub id: CanId,
-    /// How it is checked.
+    /// Check.
     pub check: CheckConfig,
-    /// Its period, s, above 0; `None` = not known, then frames that do not come are not counted.
+    /// Period, s, above 0; `None` = unknown, missing frames are not counted.
     pub cycle_time_s: Option<f64>,
 }
 
@@ -41,11 +41,11 @@ pub struct GuardChange {
     pub bus: BusIndex,
     /// Message.
     pub id: CanId,
-    /// The status that turned it.
+    /// The status that caused the change.
     pub status: Status,
-    /// Whether the message is usable from here on.
+    /// Whether the message is usable now.
     pub usable: bool,
-    /// Checks without a usable frame since it was last usable: so far when it turns, all of them when it is back.
+    /// Checks without a usable frame since it was last usable: so far when it fails, all of them when it is usable again.
     pub count: u64,
 }
 
@@ -61,7 +61,7 @@ pub struct GuardCounts {
     pub counts: StatusCounts,
 }
 
-/// What is kept over a restart: counts, and no counters.
+/// State kept over a restart: counts, no counters.
 pub type GuardsState = Vec<GuardCounts>;
 
 #[derive(Debug, Clone)]
@@ -72,7 +72,7 @@ struct Guard {
     missed_at: Option<Timestamp>,
     /// Periods in a row without a frame.
     missed: u64,
-    /// Checks without a usable frame since the last usable one; 0 = usable, or nothing came yet.
+    /// Checks without a usable frame since the last usable one; 0 = usable, or no frame yet.
     failed: u64,
 }
 
@@ -85,19 +85,19 @@ pub struct Guards {
 }
 
 impl Guards {
-    /// For these messages; of two entries for one message the first counts.
+    /// Guards for these messages; of two entries for one message the first counts.
     pub fn new(mut configs: Vec<GuardConfig>) -> Self {
         configs.sort_by_key(|config| (config.bus, config.id));
         configs.dedup_by_key(|config| (config.bus, config.id));
         let guard = |config| Guard { config, receiver: Receiver::default(), missed_at: None, missed: 0, failed: 0 };
-        // A check makes one change, a poll one per message: the room is made here.
+        // A check makes one change, a poll one per message: nothing is allocated later.
         Self { changes: Vec::with_capacity(configs.len() + 1), guards: configs.into_iter().map(guard).collect() }
     }
 
-    /// With the counts of other guards for the messages that are in both; where a message is checked as before, with its
-    /// receiver as well, so that no frame is lost to a new beginning.
+    /// Inherits the counts of other guards for the messages that are in both. Where the check is the same, its receiver too:
+    /// then no frame is lost to a new first frame.
     #[must_use]
-    pub fn going_on_from(mut self, old: &Self) -> Self {
+    pub fn inheriting(mut self, old: &Self) -> Self {
         for guard in &mut self.guards {
             let same = |old: &&Guard| (old.config.bus, old.config.id) == (guard.config.bus, guard.config.id);
             match old.guards.iter().find(same) {
@@ -130,22 +130,22 @@ impl Guards {
         Some(status)
     }
 
-    /// Counts the frames that should have come by now.
+    /// Counts the frames that are missing by now.
     pub fn poll(&mut self, now: Timestamp) {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
-    /// Whether anything turned since.
+    /// Whether there are changes since the last [`Self::take_changes`].
     pub fn has_changes(&self) -> bool {
         !self.changes.is_empty()
     }
 
-    /// What turned since the last call, in the order in which it did.
+    /// The changes since the last call, in their order.
     pub fn take_changes(&mut self) -> impl Iterator<Item = GuardChange> + '_ {
         self.changes.drain(..)
     }
 
-    /// Nobody listened, or the clock was set: every receiver waits for a first frame again; the counts stay.
+    /// After time without listening, or a step of the clock: every receiver waits for a first frame again; counts stay.
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
             guard.receiver.restart();
@@ -153,7 +153,7 @@ impl Guards {
         }
     }
 
-    /// Per message, by interface and identifier: how often each status was given.
+    /// Counts per message, by interface and identifier.
     pub fn counts(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.guards.iter().map(|guard| GuardCounts {
             bus: guard.config.bus,
@@ -167,7 +167,7 @@ impl Guards {
         self.counts().collect()
     }
 
-    /// Takes up stored counts; those of a message that is no longer protected are dropped. The receivers start anew.
+    /// Restores stored counts and restarts the receivers. Counts of a message that is no longer protected are dropped.
     pub fn restore(&mut self, state: &GuardsState) {
         self.restart();
         for guard in &mut self.guards {
@@ -180,25 +180,25 @@ impl Guards {
 }
 
 impl Guard {
-    /// One NONEWDATA for each period that went by without a frame.
+    /// Counts one NONEWDATA for each period without a frame.
     fn count_missed(&mut self, now: Timestamp, changes: &mut Vec<GuardChange>) {
         let Some(period_s) = self.config.cycle_time_s else { return };
-        // Counting begins when listening does.
+        // Counting begins with listening.
         let missed_at = *self.missed_at.get_or_insert(now.plus_secs(MISSED_AFTER_PERIODS * period_s));
         if now < missed_at {
             return;
         }
-        // At least one nanosecond, so that the division is one.
+        // At least one nanosecond: never a division by 0.
         let period_ns = Timestamp::ZERO.plus_secs(period_s).nanos().max(1);
         let periods = now.nanos().saturating_sub(missed_at.nanos()) / period_ns + 1;
         self.missed_at = Some(missed_at.plus_nanos(periods.saturating_mul(period_ns)));
         let periods = u64::try_from(periods).unwrap_or(0);
         self.missed = self.missed.saturating_add(periods);
-        let status = self.receiver.miss(&self.config.check, periods);
+        let status = self.receiver.no_new_data(&self.config.check, periods);
         self.note(status, periods, changes);
     }
 
-    /// Tells a change.
+    /// Notes a status of one or more checks; adds a change where it turns.
     fn note(&mut self, status: Status, checks: u64, changes: &mut Vec<GuardChange>) {
         let GuardConfig { bus, id, check, .. } = self.config;
         if status.is_usable() {
@@ -213,7 +213,7 @@ impl Guard {
             return;
         }
         self.failed = match status {
-            // There is nothing yet to be wrong or right about, or no longer.
+            // A first frame is neither right nor wrong.
             Status::Initial => 0,
             Status::NoNewData if self.missed <= u64::from(check.max_delta_counter_init) => 0,
             Status::NoNewData => self.missed,

@@ -1,50 +1,50 @@
-//! Finds a message's number by interface and identifier: one load for a standard identifier, a binary search among the few
-//! extended ones.
+//! Index of a message by interface and identifier.
+//!
+//! One load for a standard identifier, a binary search for an extended one. Other messages have an index beyond the end.
 
 use crate::can::CanId;
 use crate::quantity::BusIndex;
 
-/// How many standard identifiers there are.
+/// Number of standard identifiers.
 const STANDARD_IDS: usize = 0x800;
 /// No message.
 const NONE: u32 = u32::MAX;
 
-/// Numbers of messages, in the order in which they were given.
+/// Indices of messages in their given order.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(crate) struct IdTable {
-    buses: Vec<Ids>,
+    buses: Vec<BusTable>,
 }
 
 /// The messages of one interface.
 #[derive(Debug, Clone, PartialEq)]
-struct Ids {
+struct BusTable {
     /// By identifier: 8 KiB, of which the lines of configured messages are in use.
     standard: Box<[u32; STANDARD_IDS]>,
     /// Every other message, sorted by identifier.
     others: Vec<(CanId, u32)>,
 }
 
-impl Ids {
+impl BusTable {
     fn new() -> Self {
         Self { standard: Box::new([NONE; STANDARD_IDS]), others: Vec::new() }
     }
 }
 
 impl IdTable {
-    /// The first message given is number 0; of two with the same interface and identifier the first counts.
+    /// A table of these messages; of two with the same interface and identifier the first counts.
     pub(crate) fn new(messages: impl IntoIterator<Item = (BusIndex, CanId)>) -> Self {
         let mut table = Self::default();
         for ((bus, id), number) in messages.into_iter().zip(0..NONE) {
             if table.buses.len() <= bus.index() {
-                table.buses.resize_with(bus.index() + 1, Ids::new);
+                table.buses.resize_with(bus.index() + 1, BusTable::new);
             }
             table.buses[bus.index()].put(id, number);
         }
         table
     }
 
-    /// Where among things that are numbered as the messages (at most `u32::MAX` of them) the message's is; beyond their end
-    /// for a message that has none.
+    /// Index of the message among the given ones; `u32::MAX` or more for any other message.
     #[inline]
     pub(crate) fn number(&self, bus: BusIndex, id: CanId) -> usize {
         let Some(ids) = self.buses.get(bus.index()) else { return usize::MAX };
@@ -57,7 +57,7 @@ impl IdTable {
     }
 }
 
-impl Ids {
+impl BusTable {
     fn put(&mut self, id: CanId, number: u32) {
         match id {
             CanId::Standard(raw) if usize::from(raw) < STANDARD_IDS => {

@@ -1,5 +1,8 @@
-//! CAN frames and what they mean: layouts from DBC files, decoding of what comes in, encoding of what
-//! goes out. Pure: no socket, no file, no clock. Wire units and wire signs end here.
+//! CAN frames and their contents: layouts from DBC files, decoding of received frames, encoding of sent frames, end-to-end
+//! protection, J1939.
+//!
+//! In: frames with interface and time. Out: readings in the program's units and signs, and frames. Any bytes are accepted:
+//! bad input becomes a fault of its reading. Pure: no socket, no file, no clock.
 
 pub mod dbc;
 pub mod decode;

@@ -1,4 +1,4 @@
-//! Signal layouts: where a number sits in a payload, and how to get it out and in.
+//! Signal layouts: position of a number in a payload, reading and writing it.
 //!
 //! In: a layout as a DBC gives it, and payload bytes. Out: raw codes (`u64`, the signal's bits, not sign-extended)
 //! and physical values (code x factor + offset, in the DBC's unit). A [`SignalPlan`] is a layout compiled once;
@@ -24,7 +24,7 @@ pub enum ByteOrder {
     BigEndian,
 }
 
-/// How a signal's bits make a number.
+/// Number format of a signal's bits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum ValueType {
     /// Unsigned integer.
@@ -37,7 +37,7 @@ pub enum ValueType {
     Float64,
 }
 
-/// A signal's place and meaning, as written in a DBC.
+/// Position and meaning of a signal, as in a DBC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalLayout {
     /// DBC numbering: bit 0 is the least significant bit of byte 0, bit 7 its most significant, bit 8 starts byte 1.
@@ -58,13 +58,13 @@ pub struct SignalLayout {
     pub maximum: f64,
 }
 
-/// Why a layout cannot be read or written.
+/// Why a layout is invalid.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum LayoutFault {
     /// Too few or too many bits.
     #[error("length is {0} bits, must be 1 to 64")]
     Length(u16),
-    /// Reaches past the longest payload there is.
+    /// Reaches past the longest payload.
     #[error("reaches to bit {0} of the payload, must end within 512 bits (64 bytes)")]
     Outside(u32),
     /// An IEEE float of another size.
@@ -90,22 +90,22 @@ pub enum LayoutFault {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalPlan {
     /// First byte of the eight-byte window that is loaded.
-    window: u8,
+    pub(crate) window: u8,
     /// Bytes the payload must have.
     bytes_needed: u8,
     /// The signal touches nine bytes: the window is widened to sixteen.
     wide: bool,
-    byte_order: ByteOrder,
+    pub(crate) byte_order: ByteOrder,
     value_type: ValueType,
     /// Shift that brings the signal's top bit to the word's top.
-    up: u8,
+    pub(crate) up: u8,
     /// Shift that then brings its lowest bit to the word's bottom; 64 - length.
-    down: u8,
-    factor: f64,
-    offset: f64,
-    /// Physical limits with half a code of room, so that rounding in factor and offset never refuses a code on the limit.
-    low: f64,
-    high: f64,
+    pub(crate) down: u8,
+    pub(crate) factor: f64,
+    pub(crate) offset: f64,
+    /// Physical limits widened by half a code, so that rounding in factor and offset never rejects a code on the limit.
+    pub(crate) low: f64,
+    pub(crate) high: f64,
     /// Codes (sign-extended) within both the DBC's range and the bits.
     low_code: i128,
     high_code: i128,
@@ -126,8 +126,8 @@ fn integer_of(whole: f64) -> i128 {
     whole as i128
 }
 
-/// The nearest integer, of two the one farther from 0: what `number.round()` gives, without a call. Saturates at the ends of
-/// `i64`, NaN gives 0.
+/// The nearest integer, of two the one farther from 0: as `number.round()`, without a call. Saturates at the ends of `i64`,
+/// NaN gives 0.
 fn nearest(number: f64) -> i64 {
     let towards_zero = number as i64;
     // Exact: numbers above 2^52 have no fraction.
@@ -148,7 +148,7 @@ fn low_64(code: i128) -> u64 {
 }
 
 impl SignalLayout {
-    /// Position of the first and last bit, counted in the order of the wire's bytes: within a byte from bit 0 up for
+    /// Positions of the first and last bit in the order of the bytes on the wire: within a byte from bit 0 up for
     /// little-endian signals, from bit 7 down for big-endian ones.
     pub(crate) fn span(&self) -> (u32, u32) {
         let start = u32::from(self.start_bit);
@@ -159,7 +159,7 @@ impl SignalLayout {
         (first, first + u32::from(self.length_bits) - 1)
     }
 
-    /// Whether minimum and maximum say anything (`[0|0]` does not).
+    /// Whether minimum and maximum are stated (`[0|0]` is no range).
     pub fn has_range(&self) -> bool {
         self.minimum != 0.0 || self.maximum != 0.0
     }
@@ -202,7 +202,7 @@ impl SignalLayout {
 
     /// Smallest and largest code within the bits and the stated range; only the bits when no code lies in the range.
     fn code_limits(&self) -> (i128, i128) {
-        /// Share of a code by which rounding in the DBC's decimal numbers may miss a whole code.
+        /// Tolerance of the DBC's decimal numbers, in codes.
         const ROUNDING: f64 = 1e-6;
         let (lowest, highest) = self.representable();
         if !self.has_range() {
@@ -218,7 +218,7 @@ impl SignalLayout {
     /// Physical limits widened by half a code (floats: by 1e-6 of the range's ends).
     fn physical_limits(&self) -> (f64, f64) {
         if !self.has_range() {
-            // Still refuses what factor and offset make infinite.
+            // Still rejects values that factor and offset make infinite.
             return (f64::MIN, f64::MAX);
         }
         let room = match self.value_type {
@@ -231,7 +231,7 @@ impl SignalLayout {
     /// Compiles the layout.
     ///
     /// # Errors
-    /// When no payload can carry it, or factor, offset or range make no sense.
+    /// When no payload can carry it, or factor, offset or range are invalid.
     pub fn plan(&self) -> Result<SignalPlan, LayoutFault> {
         self.check()?;
         let (first, last) = self.span();
@@ -273,20 +273,16 @@ impl SignalPlan {
         usize::from(self.bytes_needed)
     }
 
-    /// For reading only, where the signal is one of the usual ones.
-    pub(crate) fn shifts(&self) -> Option<Shifts> {
+    /// Whether it is an integer of at most 63 bits within eight bytes.
+    pub(crate) fn is_simple(&self) -> bool {
         let is_integer = matches!(self.value_type, ValueType::Unsigned | ValueType::Signed);
-        (is_integer && !self.wide && self.down > 0).then_some(Shifts {
-            window: self.window,
-            is_big_endian: self.byte_order == ByteOrder::BigEndian,
-            is_signed: self.value_type == ValueType::Signed,
-            up: self.up,
-            down: self.down,
-            factor: self.factor,
-            offset: self.offset,
-            low: self.low,
-            high: self.high,
-        })
+        is_integer && !self.wide && self.down > 0
+    }
+
+    /// Smallest and largest code the bits of a simple signal can hold.
+    pub(crate) fn codes(&self) -> (i64, i64) {
+        let highest = (u64::MAX >> self.down).cast_signed();
+        if self.value_type == ValueType::Signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 
     /// Length of the signal in bits, 1 to 64.
@@ -347,7 +343,7 @@ impl SignalPlan {
         u64::try_from(top).unwrap_or(u64::MAX)
     }
 
-    /// The physical value, in the DBC's unit, without looking at the DBC's range.
+    /// The physical value, in the DBC's unit, without the DBC's range.
     ///
     /// # Errors
     /// [`Fault::ShortFrame`], [`Fault::NotFinite`].
@@ -391,7 +387,7 @@ impl SignalPlan {
     }
 
     /// As [`Self::code`], but saturated only at what the bits can hold: a value outside the DBC's range stays
-    /// outside it, so that its reader sees the fault.
+    /// outside it, so that its receiver detects the fault.
     pub fn code_beyond_range(&self, value: f64) -> Option<u64> {
         let bits = self.length_bits();
         match self.value_type {
@@ -485,32 +481,6 @@ impl SignalPlan {
         };
         let bytes = changed(padded(payload, from));
         payload.iter_mut().skip(from).zip(bytes).for_each(|(to, byte)| *to = byte);
-    }
-}
-
-/// An integer signal of at most 63 bits within eight bytes: where it is and what it means, for a plan that reads many.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Shifts {
-    /// First of the eight bytes.
-    pub(crate) window: u8,
-    pub(crate) is_big_endian: bool,
-    pub(crate) is_signed: bool,
-    /// Brings the signal's top bit to the word's top.
-    pub(crate) up: u8,
-    /// Then brings its lowest bit to the word's bottom.
-    pub(crate) down: u8,
-    pub(crate) factor: f64,
-    pub(crate) offset: f64,
-    /// Smallest and largest physical value in the DBC's unit.
-    pub(crate) low: f64,
-    pub(crate) high: f64,
-}
-
-impl Shifts {
-    /// Smallest and largest code the bits can hold.
-    pub(crate) fn codes(&self) -> (i64, i64) {
-        let highest = (u64::MAX >> self.down).cast_signed();
-        if self.is_signed { (-(highest >> 1) - 1, highest >> 1) } else { (0, highest) }
     }
 }
 

@@ -165,6 +165,11 @@ impl Sampler {
         }
     }
 
+    /// Returns the settings.
+    pub fn config(&self) -> &SampleConfig {
+        &self.config
+    }
+
     /// Replaces the limits of the same signals.
     ///
     /// # Panics

@@ -1,8 +1,9 @@
-//! The course of the current: what the scenario asks of the pack next, from the pack's true state.
+//! The course of the current: the scenario's next demand, from the pack's true state.
 //!
-//! Each course is asked once per current sample and answers with the current that flows until the next one.
+//! Each course is called once per current sample and returns the current that flows until the next one.
 
 mod cycle;
+mod demand;
 mod drive;
 mod walk;
 
@@ -10,22 +11,9 @@ use super::noise::{Noise, Stream};
 use super::scenario::{Scenario, Settings};
 use super::truth::Pack;
 use cycle::CycleCourse;
+pub(super) use demand::Demand;
 use drive::DayCourse;
 use walk::WalkCourse;
-
-/// What happens next.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Demand {
-    /// This cell current flows until the next sample, A, positive = discharge.
-    Current(f64),
-    /// The vehicle sleeps: no current, nobody measures.
-    Asleep {
-        /// For how long, s.
-        duration_s: f64,
-    },
-    /// The scenario is over.
-    Finished,
-}
 
 /// The course of one scenario.
 #[derive(Debug, Clone)]
@@ -47,7 +35,7 @@ impl Course {
         }
     }
 
-    /// The demand for the next `dt_s` seconds. Tells the pack when a cycle is complete.
+    /// The demand for the next `dt_s` seconds. Completes a cycle of the pack where it ends.
     pub(crate) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
         match self {
             Self::Cycle(course) => course.next(pack, dt_s),

@@ -1,15 +1,15 @@
-//! The simulator: a pack whose true state is known, the sensors that look at it, and the scenarios that load it.
+//! The simulator: a pack with a known true state, its sensors, and the scenarios that load it.
 //!
-//! In: a cell model, settings and a seed. Out: readings (as a BMS would measure them) at their sampling times,
-//! beside the true state. Everything is seeded and uses `libm`: one seed gives the same bytes on every machine.
+//! In: a cell model, settings and a seed. Out: readings (as a BMS would measure them) at their sampling times, and the true
+//! state. All randomness is seeded and all functions are `libm`'s: one seed gives the same bytes on every machine.
 //!
-//! | file | what |
+//! | file | purpose |
 //! | --- | --- |
-//! | [`truth`] | the cells as they really are: circuit, hysteresis, heat, ageing, spread |
-//! | [`sensor`] | what a sensor makes of a true value: gain, offset, noise, resolution, dropout |
+//! | [`truth`] | the true cells: circuit, hysteresis, heat, ageing, spread |
+//! | [`sensor`] | sensor errors: gain, offset, noise, resolution, dropout |
 //! | `noise` | the seeded generator |
 //! | [`scenario`] | the named scenarios and their settings |
-//! | `course` | what a scenario asks of the pack next |
+//! | `course` | the current a scenario demands next |
 //! | [`run`] | the loop: truth, course and sensors stepped together |
 mod course;
 mod noise;

@@ -1,14 +1,14 @@
 //! Seeded random numbers that are bit-identical on every machine.
 //!
-//! Generator: ChaCha with 8 rounds, key from the seed, one stream per use, so that more cells or another scenario
-//! do not move anybody else's numbers. Uniform: the upper 53 bits of a 64-bit word over 2^53, in [0, 1). Normal:
+//! Generator: ChaCha with 8 rounds, key from the seed, one stream per use, so that more cells or another scenario do not
+//! change the numbers of other streams. Uniform: the upper 53 bits of a 64-bit word over 2^53, in [0, 1). Normal:
 //! Box-Muller (both values of a pair are used) with `libm`'s ln, sin and cos.
 
 use rand::Rng;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// What a stream of random numbers is for. The number is part of the reproducible result: never reused.
+/// Use of a stream of random numbers. Its number is part of the reproducible result and never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Stream {
     /// Spread of the cells.
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_seed_and_stream_gives_these_very_numbers() {
+    fn one_seed_and_stream_always_gives_the_same_numbers() {
         let mut noise = Noise::new(1, Stream::Current);
         let first = [noise.normal(), noise.normal(), noise.uniform()];
         let mut again = Noise::new(1, Stream::Current);

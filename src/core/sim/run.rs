@@ -13,10 +13,10 @@ use super::truth::Pack;
 use crate::cell::CellModel;
 use crate::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
-/// Longest step of the truth while nobody measures, s: the tables and the temperature are followed this finely.
+/// Longest step of the truth during sleep, s: the resolution of tables and temperature.
 const ASLEEP_STEP_S: f64 = 60.0;
 
-/// How the pack is wired and which sensors it has.
+/// Wiring and sensors of the pack.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wiring {
     /// Parallel strings: the pack current is this times the cell current.
@@ -35,12 +35,37 @@ impl Wiring {
 /// One sampling moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
-    /// When, from the start.
+    /// Time since the start.
     pub time: Timestamp,
     /// True cell current from now on, A, positive = discharge.
     pub current_a: f64,
     /// Whether the cells were sampled too.
     pub cells_sampled: bool,
+}
+
+/// The sensors of the pack, each with its own noise.
+#[derive(Debug, Clone)]
+struct PackSensors {
+    current: Sensor,
+    pack_voltage: Sensor,
+    temperatures: Vec<Sensor>,
+    voltages: Vec<Sensor>,
+}
+
+impl PackSensors {
+    fn new(settings: &Settings, temperatures: usize) -> Self {
+        let (seed, errors, cells) = (settings.seed, settings.sensors, settings.pack.cells);
+        let noise_std = errors.voltage.noise_std * f64::from(cells).sqrt();
+        let pack_voltage = SensorError { noise_std, offset: 0.0, ..errors.voltage };
+        let temperature = |i| Sensor::new(errors.temperature, seed, Stream::Temperature(i));
+        let voltage = |i| Sensor::new(errors.voltage, seed, Stream::CellVoltage(i));
+        Self {
+            current: Sensor::new(errors.current, seed, Stream::Current),
+            pack_voltage: Sensor::new(pack_voltage, seed, Stream::PackVoltage),
+            temperatures: (0..u16::try_from(temperatures).unwrap_or(u16::MAX)).map(temperature).collect(),
+            voltages: (0..cells).map(voltage).collect(),
+        }
+    }
 }
 
 /// A running simulation.
@@ -50,15 +75,12 @@ pub struct Simulation {
     wiring: Wiring,
     pack: Pack,
     course: Course,
-    current_sensor: Sensor,
-    pack_voltage_sensor: Sensor,
-    temperature_sensors: Vec<Sensor>,
-    voltage_sensors: Vec<Sensor>,
+    sensors: PackSensors,
     readings: Vec<(Channel, Option<f64>)>,
     time: Timestamp,
     current_a: f64,
-    pending_charge_as: f64,
-    pending_ns: i64,
+    /// Charge, A s, and time, ns, since the last step of the cells.
+    pending: (f64, i64),
     cells_due: bool,
     started: bool,
 }
@@ -66,26 +88,14 @@ pub struct Simulation {
 impl Simulation {
     /// A simulation at its start. The pack's cells have `settings.pack.capacity_ah`; all else follows `model`.
     pub fn new(model: CellModel, settings: Settings, wiring: Wiring) -> Self {
-        let (seed, errors) = (settings.seed, settings.sensors);
-        let pack_noise = errors.voltage.noise_std * f64::from(settings.pack.cells).sqrt();
-        let pack_voltage = SensorError { noise_std: pack_noise, offset: 0.0, ..errors.voltage };
-        let sensor_count = u16::try_from(wiring.temperature_at.len()).unwrap_or(u16::MAX);
         Self {
-            pack: Pack::new(model, settings.pack, seed),
+            pack: Pack::new(model, settings.pack, settings.seed),
             course: Course::new(&settings),
-            current_sensor: Sensor::new(errors.current, seed, Stream::Current),
-            pack_voltage_sensor: Sensor::new(pack_voltage, seed, Stream::PackVoltage),
-            temperature_sensors: (0..sensor_count)
-                .map(|i| Sensor::new(errors.temperature, seed, Stream::Temperature(i)))
-                .collect(),
-            voltage_sensors: (0..settings.pack.cells)
-                .map(|i| Sensor::new(errors.voltage, seed, Stream::CellVoltage(i)))
-                .collect(),
+            sensors: PackSensors::new(&settings, wiring.temperature_at.len()),
             readings: Vec::new(),
             time: Timestamp::ZERO,
             current_a: 0.0,
-            pending_charge_as: 0.0,
-            pending_ns: 0,
+            pending: (0.0, 0),
             cells_due: true,
             started: false,
             settings,
@@ -93,7 +103,7 @@ impl Simulation {
         }
     }
 
-    /// Goes on to the next sampling moment; `None` = the scenario is over.
+    /// Advances to the next sampling moment; `None` = the scenario is over.
     pub fn advance(&mut self) -> Option<Moment> {
         if self.started {
             self.pass_period();
@@ -118,12 +128,12 @@ impl Simulation {
         Some(Moment { time: self.time, current_a: self.current_a, cells_sampled })
     }
 
-    /// What the sensors said at the latest moment; `None` = dropped out.
+    /// Readings of the latest moment; `None` = dropped out.
     pub fn readings(&self) -> &[(Channel, Option<f64>)] {
         &self.readings
     }
 
-    /// The pack as it really is.
+    /// The true pack.
     pub fn pack(&self) -> &Pack {
         &self.pack
     }
@@ -136,19 +146,20 @@ impl Simulation {
     fn pass_period(&mut self) {
         let dt_ns = self.settings.current_period_ns;
         self.time = self.time.plus_nanos(dt_ns);
-        self.pending_charge_as += self.current_a * dt_ns as f64 * 1e-9;
-        self.pending_ns += dt_ns;
-        if self.pending_ns >= self.settings.cell_period_ns {
+        self.pending.0 += self.current_a * dt_ns as f64 * 1e-9;
+        self.pending.1 += dt_ns;
+        if self.pending.1 >= self.settings.cell_period_ns {
             self.step_pending();
         }
     }
 
     fn step_pending(&mut self) {
-        let dt_s = self.pending_ns as f64 * 1e-9;
+        let (charge_as, ns) = std::mem::take(&mut self.pending);
+        let dt_s = ns as f64 * 1e-9;
         if dt_s > 0.0 {
-            self.pack.step(self.pending_charge_as / dt_s, dt_s);
+            self.pack.step(charge_as / dt_s, dt_s);
         }
-        (self.pending_charge_as, self.pending_ns, self.cells_due) = (0.0, 0, true);
+        self.cells_due = true;
     }
 
     fn sleep(&mut self, duration_s: f64) {
@@ -163,22 +174,22 @@ impl Simulation {
     fn measure(&mut self, cells: bool) {
         self.readings.clear();
         let pack_current_a = self.current_a * f64::from(self.wiring.strings);
-        self.readings.push((Channel::Current, self.current_sensor.read(pack_current_a)));
+        self.readings.push((Channel::Current, self.sensors.current.read(pack_current_a)));
         if !cells {
             return;
         }
-        for (i, sensor) in (0..).zip(&mut self.temperature_sensors) {
+        for (i, sensor) in (0..).zip(&mut self.sensors.temperatures) {
             let cell = self.wiring.temperature_at[usize::from(i)].and_then(|c| self.pack.cells().get(c.index()));
             let truth = cell.map_or(self.settings.pack.ambient_c, |cell| cell.temperature_c);
             self.readings.push((Channel::Temperature(SensorIndex(i)), sensor.read(truth)));
         }
         let mut total_v = 0.0;
         let voltages = self.pack.voltages_v(self.current_a);
-        for (i, (sensor, voltage_v)) in (0..).zip(self.voltage_sensors.iter_mut().zip(voltages)) {
+        for (i, (sensor, voltage_v)) in (0..).zip(self.sensors.voltages.iter_mut().zip(voltages)) {
             total_v += voltage_v;
             self.readings.push((Channel::CellVoltage(CellIndex(i)), sensor.read(voltage_v)));
         }
-        self.readings.push((Channel::PackVoltage, self.pack_voltage_sensor.read(total_v)));
+        self.readings.push((Channel::PackVoltage, self.sensors.pack_voltage.read(total_v)));
     }
 }
 

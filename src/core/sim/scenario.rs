@@ -4,17 +4,17 @@
 //! cell model at hand, so that any configuration can be driven; with a cell of the nominal capacity they are the
 //! source's own numbers.
 //!
-//! | scenario | nominal | source | what happens |
+//! | scenario | nominal | source | course |
 //! | --- | --- | --- | --- |
 //! | `paper` | 2.6 Ah | the paper's own run | 1.325 A both ways between SOC 0.3 and 0.9, 0.05 Ah lost per cycle, until 0.25 Ah: 48 cycles, 2.23e5 s |
 //! | `reference` | 30 Ah | the published example | discharge by random pulses (15 A mean), charge by 15 A, 0.3 to 0.9, 1 Ah lost per cycle |
 //! | `random-walk` | 2.1 Ah | the protocol of NASA's randomized set | 5 min loads of -4.5 to 4.5 A within 3.2 to 4.2 V; two reference cycles after every 1,500 of them |
-//! | `ev-day` | 50 Ah | made up | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
+//! | `ev-day` | 50 Ah | own | drive, park (bus asleep), drive, fast charge, drive, park; 96 cells |
 
 use super::sensor::{SensorError, Sensors};
 use super::truth::{Ageing, Hysteresis, PackSettings, Spread};
 
-/// Which scenario.
+/// A named scenario.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scenario {
     /// The paper's run: 2.6 Ah, -0.05 Ah per cycle, SOC 30-90 %, until 0.25 Ah.
@@ -27,14 +27,14 @@ pub enum Scenario {
     EvDay,
 }
 
-/// Everything that decides a simulation. Made by [`Settings::of`], then changed as wished.
+/// All settings of a simulation: the defaults of [`Settings::of`], then changed by the caller.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Which course the current takes.
+    /// Scenario: course of the current.
     pub scenario: Scenario,
     /// Seed of all randomness.
     pub seed: u64,
-    /// The pack as it really is.
+    /// The true pack.
     pub pack: PackSettings,
     /// Errors of the sensors.
     pub sensors: Sensors,
@@ -66,7 +66,7 @@ impl Scenario {
     }
 }
 
-/// Sensor errors that the paper's scenario is judged with (issue 2).
+/// Sensor errors of the paper's scenario in the accuracy requirement.
 const PAPER_SENSORS: Sensors = Sensors {
     current: SensorError { noise_std: 0.02, offset: 0.01, gain: 0.005, resolution: 0.0, dropout: 0.0 },
     voltage: SensorError { noise_std: 0.005, offset: 0.0, gain: 0.0, resolution: 0.0, dropout: 0.0 },
@@ -110,7 +110,7 @@ impl Settings {
     }
 }
 
-/// The example has no sensor errors but the voltage noise its filter is told of (R = 1e-3: 32 mV).
+/// The example has one sensor error: the voltage noise that its filter assumes (R = 1e-3: 32 mV).
 fn reference(mut s: Settings, scale: f64) -> Settings {
     s.pack.initial_soc = 1.0;
     s.pack.ageing.capacity_loss_ah_per_cycle = scale;
@@ -133,7 +133,7 @@ fn random_walk(mut s: Settings) -> Settings {
     s
 }
 
-/// Current every 10 ms, cells every 100 ms; errors of a usual pack: 0.5 % gain, 1 mV, cells within 1 %.
+/// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV, cells within 1 %.
 fn ev_day(mut s: Settings, capacity_ah: f64) -> Settings {
     s.pack.cells = 96;
     s.pack.initial_soc = 0.85;

@@ -1,4 +1,4 @@
-//! What a sensor makes of a true value.
+//! Sensors: readings of true values with errors.
 //!
 //! `reading = round_to_resolution(truth (1 + gain) + offset + noise_std n)`, n normal and independent from sample to
 //! sample; or no reading at all with probability `dropout`. Resolution 0 leaves quantisation to the signal's own

@@ -1,9 +1,9 @@
-//! The pack as it really is: what the estimator has to find out and never sees.
+//! The true pack, which the estimator must infer from readings.
 //!
-//! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with things the
+//! Each cell is the circuit of [`CellModel`] with its own capacity, resistance and temperature, and with effects that the
 //! estimator does not model. Current positive = discharge. Over one step of `dt` seconds the current and the tables'
 //! values are constant, and within that every equation is solved exactly:
-//! * `SOC -= (I + I_leak) dt / (3600 C)`; it is not clamped, 0 and 1 are open-circuit voltages and not walls;
+//! * `SOC -= (I + I_leak) dt / (3600 C)`; it is not clamped: 0 and 1 are open-circuit voltages, not limits;
 //! * `U_i = U_i a + R_i I (1 - a)`, `a = exp(-dt / tau_i)`; ageing scales every resistance, time constants stay;
 //! * hysteresis, one state h in [-1, 1] (Plett): `h = h e - (1 - e) sign(I)`, `e = exp(-|I dt| gamma / (3600 C))`;
 //! * heat: `T = T_end + (T - T_end) exp(-dt / (R_th C_th))`, `T_end = T_ambient + R_th (I^2 R0 + sum U_i^2 / R_i)`.
@@ -19,7 +19,7 @@ use crate::cell::{CellModel, MAX_BRANCHES};
 pub struct Hysteresis {
     /// Distance of the settled discharge and charge curves from the OCV, V; 0 = none.
     pub magnitude_v: f64,
-    /// How fast a change of direction takes hold: e-foldings per full charge moved.
+    /// Speed of a change of direction: e-foldings per full charge moved.
     pub rate: f64,
 }
 
@@ -29,7 +29,7 @@ impl Default for Hysteresis {
     }
 }
 
-/// How a cell grows old.
+/// Ageing of a cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Ageing {
     /// Capacity lost at the end of each cycle, Ah.
@@ -42,7 +42,7 @@ pub struct Ageing {
     pub resistance_growth_per_ah: f64,
 }
 
-/// Standard deviations of what differs from cell to cell.
+/// Standard deviations from cell to cell.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Spread {
     /// Capacity, relative.
@@ -53,7 +53,7 @@ pub struct Spread {
     pub soc: f64,
 }
 
-/// A pack of equal cells in series, but for their spread.
+/// A pack of cells in series, equal except for their spread.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PackSettings {
     /// Cells in series, at least 1.
@@ -62,7 +62,7 @@ pub struct PackSettings {
     pub capacity_ah: f64,
     /// SOC at the start, fraction.
     pub initial_soc: f64,
-    /// What differs from cell to cell.
+    /// Spread of the cells.
     pub spread: Spread,
     /// Ageing.
     pub ageing: Ageing,
@@ -79,7 +79,7 @@ const CAPACITY_FLOOR: f64 = 0.01;
 /// Spread beyond this many standard deviations is cut off, so that no cell gets a negative capacity.
 const SPREAD_LIMIT: f64 = 3.0;
 
-/// One cell as it really is.
+/// True state of one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TruthCell {
     /// State of charge, fraction.
@@ -190,7 +190,7 @@ impl Pack {
         }
     }
 
-    /// A cycle is over: the ageing that comes per cycle happens now.
+    /// Completes a cycle: applies the ageing per cycle.
     pub fn complete_cycle(&mut self) {
         self.cycles += 1;
         let ageing = self.settings.ageing;
@@ -199,12 +199,12 @@ impl Pack {
         }
     }
 
-    /// From here on the cells grow old in another way: fade is rarely a straight line.
+    /// Changes the ageing from now on: fade is rarely a straight line.
     pub fn set_ageing(&mut self, ageing: Ageing) {
         self.settings.ageing = ageing;
     }
 
-    /// From here on the surroundings have this temperature, degrees C; the cells follow where their model has heat.
+    /// Changes the temperature of the surroundings, degrees C; the cells follow where their model has heat.
     pub fn set_ambient(&mut self, ambient_c: f64) {
         self.settings.ambient_c = ambient_c;
     }
@@ -239,7 +239,7 @@ impl Pack {
         self.voltages_v(current_a).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// The current, A, at which no cell is above `voltage_v` and the highest is just there.
+    /// The current, A, at which the highest cell has `voltage_v`.
     pub fn current_at_highest_a(&self, voltage_v: f64) -> f64 {
         let at = |cell: &TruthCell| cell.current_at_a(&self.model, &self.settings.hysteresis, voltage_v);
         self.cells.iter().map(at).fold(f64::NEG_INFINITY, f64::max)

@@ -4,7 +4,8 @@ use super::document::Faults;
 use super::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
 use super::tables::RawTables;
 use super::threshold::{Level, Threshold};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
+
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 
 /// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.
@@ -29,7 +30,7 @@ impl RatedCell {
 
     /// The value that is 100 % for a rule; `None` where none is.
     fn whole(&self, rule: Rule) -> Option<f64> {
-        match (rule, rule.row().unit) {
+        match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
             (Rule::RechargePeriodLow, _) => Some(self.recharge_period_s),
             (Rule::ResistanceHigh, _) | (_, Unit::Fraction) => Some(1.0),
@@ -95,7 +96,7 @@ fn lasts_only_while_there(rule: Rule) -> bool {
 
 /// 1 where larger values are worse, -1 where smaller ones are.
 fn beyond_sign(rule: Rule) -> f64 {
-    match rule.row().direction {
+    match rule.spec().direction {
         Direction::Below => -1.0,
         Direction::Above => 1.0,
     }
@@ -139,7 +140,7 @@ fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
     }
     let is_raw_period = alarm.rule == Rule::RechargePeriodLow
         && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
-    if alarm.when != When::Mean && (!alarm.rule.row().has_deviation || is_raw_period) {
+    if alarm.when != Comparison::Mean && (!alarm.rule.spec().has_deviation || is_raw_period) {
         let what = if is_raw_period {
             "must be \"mean\" with recharge.alarm_on = \"raw\": that period has no standard deviation"
         } else {
@@ -187,7 +188,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
         return;
     }
     let Some(clear) = alarm.clear(rated, set, threshold) else { return };
-    let (low, high) = match alarm.rule.row().unit {
+    let (low, high) = match alarm.rule.spec().unit {
         Unit::Fraction => (0.0, 1.0),
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
@@ -205,7 +206,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, thresh
 
 /// Notes a percent written without its sign: such a threshold is always or never passed.
 fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
-    if alarm.rule.row().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
+    if alarm.rule.spec().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
         alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
     }
 }

@@ -8,7 +8,7 @@ use super::keys::TemperatureInput;
 use super::resolve::{ResolvedSignal, channel_words};
 use super::tables::RawTables;
 use super::{Config, InterfaceConfig, protect};
-use crate::alarm::{Direction, Rule, RuleConfig, Unit, When};
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
@@ -287,7 +287,7 @@ fn alarms(config: &Config) -> Vec<String> {
 }
 
 fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String {
-    let row = rule.rule.row();
+    let row = rule.rule.spec();
     let what = match (rule.rule, recharge.alarm_on) {
         (Rule::RechargePeriodLow, RechargeAlarm::Normalised) => "the normalised recharge period",
         _ => row.about,
@@ -303,8 +303,8 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
     };
     let (set, clear) = (amount(rule.threshold, row.unit), amount(rule.clear, row.unit));
     let mut words = match rule.when {
-        When::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
-        When::Probability(level) => {
+        Comparison::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
+        Comparison::Probability(level) => {
             format!(
                 "{severity} when {what} is {side} {set}{of_rated} with a probability above {} %",
                 round(100.0 * level)

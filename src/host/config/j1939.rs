@@ -129,7 +129,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         | Rule::SocLow
         | Rule::TemperatureHigh
         | Rule::CellImbalance
-        | Rule::RemainingLifeLow => match (rule.row().direction, severity) {
+        | Rule::RemainingLifeLow => match (rule.spec().direction, severity) {
             // Data valid, but beyond normal: least, moderately, most severe.
             (Direction::Below, Severity::Info) => 17,
             (Direction::Below, Severity::Warning) => 18,

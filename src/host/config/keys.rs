@@ -14,7 +14,8 @@ use super::schema::section;
 use super::setting::ValueRange::{self, Above, Any, Between, NotEmpty};
 use super::setting::{CellRanges, choice};
 use super::threshold::Threshold;
-use crate::alarm::{Rule, When};
+
+use crate::alarm::{Comparison, Rule};
 use crate::can::e2e::Profile;
 use crate::cell::{CapacityState, Discretisation};
 use crate::health::RechargeAlarm;
@@ -132,7 +133,7 @@ section! {
         /// The alarm clears when the value is back on the healthy side of the threshold by this much, where the threshold has no `clear`. Without it: 2 % of the threshold.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
         /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the probability that the true value is beyond the threshold exceeds that level, and clears when the probability that it is beyond the clear threshold is at most that level and at most one half. A level above one half raises the alarm later and less often wrongly; a level below it raises it earlier.
-        when: When, "", Any, Default("\"mean\"");
+        when: Comparison, "", Any, Default("\"mean\"");
         /// The value must be beyond the threshold this long before the alarm is raised, and healthy this long before it clears.
         debounce_s: f64, "s", Between(0.0, 1e9), Default("0.0");
         /// As many new values must agree before the alarm is raised or cleared.

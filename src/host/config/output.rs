@@ -8,10 +8,11 @@ use super::keys::{Commands, E2eKey, FrameKeys, Output};
 use super::resolve::{ResolvedSignal, read_dbc};
 use super::tables::RawTables;
 use super::{ReadFile, beside};
+
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
-use crate::can::encode::{Base, E2eSetting, LaidOut, LayoutSettings, MessageSettings, OutputPlan, layout};
+use crate::can::encode::{E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, layout};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
 use crate::quantity::BusIndex;
@@ -46,7 +47,7 @@ pub(super) fn output(
     let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
     // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
     let rated_capacity_ah = rated.unwrap_or(1.0);
-    let base = own.as_ref().map_or(Base::BuiltIn { rated_capacity_ah }, Base::Own);
+    let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
     let database = database(base, &settings, &laid_out, faults)?;
     let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
     let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
@@ -100,7 +101,7 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
 
 /// The layout; a setting that does not fit it is noted at its key.
 fn database(
-    base: Base<'_>,
+    base: LayoutBase<'_>,
     settings: &LayoutSettings,
     frames: &[FrameKeys<'_>],
     faults: &mut Faults,
@@ -110,7 +111,7 @@ fn database(
         Err(refused) => refused,
     };
     for fault in refused {
-        let frame = LaidOut::ALL.iter().zip(frames).find(|(which, _)| **which == fault.message);
+        let frame = LayoutMessage::ALL.iter().zip(frames).find(|(which, _)| **which == fault.message);
         if let Some((_, frame)) = frame {
             frame.place.fault(faults, fault.key, &fault.what);
         }

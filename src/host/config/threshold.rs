@@ -4,7 +4,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use super::setting::{Setting, ValueFault, ValueRange};
-use crate::alarm::When;
+use crate::alarm::Comparison;
 
 /// A value to compare with: in the rule's unit, or relative.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,7 +53,7 @@ impl Setting for Threshold {
     }
 }
 
-impl Setting for When {
+impl Setting for Comparison {
     const KIND: &'static str = "\"mean\", or { probability = ... } above 0 and below 1";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
@@ -67,7 +67,7 @@ impl Setting for When {
     }
 }
 
-fn probability(table: &DeTable<'_>) -> Option<When> {
+fn probability(table: &DeTable<'_>) -> Option<Comparison> {
     let level = f64::read(table.get("probability")?, &ValueRange::Any).ok()?;
-    (level > 0.0 && level < 1.0).then_some(When::Probability(level))
+    (level > 0.0 && level < 1.0).then_some(Comparison::Probability(level))
 }

@@ -13,10 +13,10 @@ use tokio::time::{Instant, sleep};
 
 use super::client::ControlClient;
 use super::protocol::{Done, Request};
-use crate::alarm::{Rule, State};
+use crate::alarm::{AlarmState, Rule};
 use crate::can::dbc::Message;
 use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
-use crate::can::j1939::{Dm1Receiver, HeardDm1, TroubleCode};
+use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
@@ -199,14 +199,14 @@ impl Seen {
             Some((rule, _, true)) if rule != wanted as u8 => self.foreign += 1,
             Some((_, state, true)) => {
                 self.note_test(time);
-                self.ended = state == State::Inactive.wire_code();
+                self.ended = state == AlarmState::Inactive.wire_code();
             }
         }
     }
 
     /// The test has ended when its code, once seen, is no longer there.
-    fn note_dm1(&mut self, test_code: TroubleCode, time: Timestamp, heard: &HeardDm1) {
-        let HeardDm1::Codes(codes) = heard else {
+    fn note_dm1(&mut self, test_code: TroubleCode, time: Timestamp, heard: &ReceivedDm1) {
+        let ReceivedDm1::Codes(codes) = heard else {
             self.unreadable += 1;
             return;
         };
@@ -252,7 +252,7 @@ fn open(config: &Config) -> Result<Vec<Channel>, String> {
     let nothing = || format!("{path}: nothing is sent, must have a table [output] that is enabled");
     let output = config.monitor.output.as_ref().ok_or_else(nothing)?;
     let layout = config.output_layout.as_ref().ok_or_else(nothing)?;
-    let message = layout.message(crate::can::encode::LaidOut::Alarm.message()).ok_or_else(nothing)?;
+    let message = layout.message(crate::can::encode::LayoutMessage::Alarm.message()).ok_or_else(nothing)?;
     let reader = AlarmReader::new(message).ok_or_else(nothing)?;
     let interfaces = output.buses.iter().filter_map(|bus| config.interfaces.get(bus.index()));
     let channels: Result<Vec<Channel>, String> =
@@ -345,7 +345,7 @@ mod tests {
         let at = |seconds: f64| Timestamp::from_secs(seconds);
         let mut seen = Seen::default();
         let mut hear = |seconds, codes: &[TroubleCode]| {
-            seen.note_dm1(test_code, at(seconds), &HeardDm1::Codes(codes.to_vec()));
+            seen.note_dm1(test_code, at(seconds), &ReceivedDm1::Codes(codes.to_vec()));
             seen.ended
         };
         assert!(!hear(1.0, &[]), "not begun is not ended");
@@ -355,7 +355,7 @@ mod tests {
         assert!(hear(5.0, &[other]));
         assert!(!hear(6.0, &[test_code]), "it came back");
         assert!(hear(7.0, &[]));
-        seen.note_dm1(test_code, at(8.0), &HeardDm1::Unreadable);
+        seen.note_dm1(test_code, at(8.0), &ReceivedDm1::Unreadable);
         let real = [(520_196, 9, 2), (524_286, 2, 1)];
         let real = real.map(|(spn, fmi, count)| (Real::Code { spn, fmi }, count)).into();
         let (first, last) = (Some(at(3.0)), Some(at(6.0)));

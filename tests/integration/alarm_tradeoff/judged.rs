@@ -1,6 +1,6 @@
 //! A life judged by one rule: when it was raised, how long before the end, whether the truth was beyond then.
 
-use packwatch::alarm::{AlarmEngine, Change, Observation, Rule, RuleConfig, Severity, When};
+use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
 use packwatch::quantity::CellIndex;
 
 use super::life::{Life, Look, RATED_AH, THRESHOLD};
@@ -12,24 +12,24 @@ const HYSTERESIS: f64 = 0.02;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Candidate {
     pub(crate) name: &'static str,
-    pub(crate) when: When,
+    pub(crate) when: Comparison,
     pub(crate) debounce_events: u32,
 }
 
-const fn candidate(name: &'static str, when: When, debounce_events: u32) -> Candidate {
+const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -> Candidate {
     Candidate { name, when, debounce_events }
 }
 
 /// The rules compared. `MONITORED` are also run by the Monitor itself, by severity.
 pub(crate) const CANDIDATES: [Candidate; 8] = [
-    candidate("p = 0.05", When::Probability(0.05), 1),
-    candidate("p = 0.2", When::Probability(0.2), 1),
-    candidate("p = 0.5", When::Probability(0.5), 1),
-    candidate("mean", When::Mean, 1),
-    candidate("mean, 2 events", When::Mean, 2),
-    candidate("p = 0.8", When::Probability(0.8), 1),
-    candidate("p = 0.95", When::Probability(0.95), 1),
-    candidate("p = 0.99", When::Probability(0.99), 1),
+    candidate("p = 0.05", Comparison::Probability(0.05), 1),
+    candidate("p = 0.2", Comparison::Probability(0.2), 1),
+    candidate("p = 0.5", Comparison::Probability(0.5), 1),
+    candidate("mean", Comparison::Mean, 1),
+    candidate("mean, 2 events", Comparison::Mean, 2),
+    candidate("p = 0.8", Comparison::Probability(0.8), 1),
+    candidate("p = 0.95", Comparison::Probability(0.95), 1),
+    candidate("p = 0.99", Comparison::Probability(0.99), 1),
 ];
 
 /// Candidates that the study's configuration gives to the Monitor as info, warning and severe.

@@ -1,7 +1,7 @@
-//! What a DBC says in attributes: cycle time, frame format, end-to-end protection.
+//! Attributes of a DBC: cycle time, frame format, end-to-end protection.
 //!
-//! The names and the order of `VFrameFormat`'s words are those DBC editors use; the two about end-to-end protection
-//! are packwatch's own. An attribute that makes no sense counts as not written.
+//! The names and the order of `VFrameFormat`'s words are those of DBC editors; the two about end-to-end protection are
+//! packwatch's own. An invalid attribute counts as missing.
 
 use can_dbc::{AttributeDefinition, AttributeValue, AttributeValueType, Dbc, MessageId};
 
@@ -13,24 +13,14 @@ pub(super) const CYCLE_TIME: &str = "GenMsgCycleTime";
 /// Standard or extended, classic or FD.
 pub(super) const FRAME_FORMAT: &str = "VFrameFormat";
 /// The words of [`FRAME_FORMAT`].
-pub(super) const FRAME_FORMATS: [&str; 16] = [
-    "StandardCAN",
-    "ExtendedCAN",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "reserved",
-    "StandardCAN_FD",
-    "ExtendedCAN_FD",
-];
+pub(super) const FRAME_FORMATS: [&str; 16] = {
+    let mut words = ["reserved"; 16];
+    (words[0], words[1]) = ("StandardCAN", "ExtendedCAN");
+    (words[FIRST_FD_FORMAT], words[FIRST_FD_FORMAT + 1]) = ("StandardCAN_FD", "ExtendedCAN_FD");
+    words
+};
+/// Place of the first FD word among the words of [`FRAME_FORMAT`].
+pub(super) const FIRST_FD_FORMAT: usize = 14;
 /// Bit rate switch.
 pub(super) const BIT_RATE_SWITCH: &str = "CANFD_BRS";
 /// The words of [`BIT_RATE_SWITCH`].
@@ -44,11 +34,7 @@ pub(super) const E2E_DATA_ID: &str = "E2EDataId";
 
 /// The profile's place among the words of [`E2E_PROFILE`].
 pub(super) fn profile_index(profile: Profile) -> usize {
-    match profile {
-        Profile::P01A => 1,
-        Profile::P01C => 2,
-        Profile::P05 => 3,
-    }
+    E2E_PROFILES.iter().position(|name| *name == profile.name()).unwrap_or(0)
 }
 
 /// The cycle time, when above 0.
@@ -56,7 +42,7 @@ pub(super) fn cycle_time_ms(dbc: &Dbc, id: MessageId) -> Option<u32> {
     let whole = match dbc.resolved_message_attribute(id, CYCLE_TIME)? {
         AttributeValue::Uint(ms) => u32::try_from(*ms).ok(),
         AttributeValue::Int(ms) => u32::try_from(*ms).ok(),
-        // Editors that export every number as a float write 100.0 as 100: read its digits.
+        // Some editors export every number as a float: 100.0 reads as 100.
         AttributeValue::Double(ms) => format!("{:.0}", ms.round()).parse().ok(),
         AttributeValue::String(ms) => ms.parse().ok(),
     };
@@ -73,14 +59,10 @@ pub(super) fn format(dbc: &Dbc, id: MessageId) -> FrameFormat {
     }
 }
 
-/// The protection, when both attributes say one.
+/// The protection, when both attributes are valid.
 pub(super) fn e2e(dbc: &Dbc, id: MessageId) -> Option<Protection> {
-    let profile = match word(dbc, id, E2E_PROFILE)?.as_str() {
-        "1A" => Profile::P01A,
-        "1C" => Profile::P01C,
-        "5" => Profile::P05,
-        _ => return None,
-    };
+    let name = word(dbc, id, E2E_PROFILE)?;
+    let profile = [Profile::P01A, Profile::P01C, Profile::P05].into_iter().find(|profile| profile.name() == name)?;
     let data_id = match dbc.resolved_message_attribute(id, E2E_DATA_ID)? {
         AttributeValue::Uint(id) => u16::try_from(*id).ok()?,
         AttributeValue::Int(_) | AttributeValue::Double(_) | AttributeValue::String(_) => return None,

@@ -6,21 +6,21 @@
 use std::fmt::Write as _;
 
 use super::attributes::{
-    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FRAME_FORMAT, FRAME_FORMATS, NO_YES,
-    profile_index,
+    BIT_RATE_SWITCH, CYCLE_TIME, E2E_DATA_ID, E2E_PROFILE, E2E_PROFILES, FIRST_FD_FORMAT, FRAME_FORMAT, FRAME_FORMATS,
+    NO_YES, profile_index,
 };
 use super::{Database, FrameFormat, Message, MuxCondition, Signal};
 use crate::can::CanId;
 use crate::can::signal::{ByteOrder, ValueType};
 
-/// What stands for no node.
-const NOBODY: &str = "Vector__XXX";
+/// Name of no node.
+const NO_NODE: &str = "Vector__XXX";
 
 /// Longest cycle time an editor will accept, ms: an hour.
 const MAX_CYCLE_TIME_MS: u32 = 3_600_000;
 
 impl Database {
-    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as those that were read do.
+    /// The text of the DBC. A signal's conditions must name multiplexors of its message, as after reading.
     pub fn to_dbc(&self) -> String {
         let mut text = String::from("VERSION \"\"\n\nNS_ :\n\nBS_:\n\nBU_:");
         for node in &self.nodes {
@@ -42,11 +42,11 @@ impl Database {
         text
     }
 
-    /// The DBC as bytes: one per character, as DBC tools expect, unless a character or their sequence forbids it.
+    /// The DBC as bytes: Latin-1, as DBC tools expect, or UTF-8 where Latin-1 cannot hold the text.
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        // Bytes that happen to be good UTF-8 would be read as that.
+        // Latin-1 bytes that happen to be valid UTF-8 would be read as UTF-8.
         latin
             .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
             .unwrap_or_else(|| text.into_bytes())
@@ -61,7 +61,7 @@ impl Database {
             let _ = writeln!(text, "CM_ \"{}\";", quoted(comment));
         }
         for message in &self.messages {
-            let id = number(message.id);
+            let id = message.id.dbc_number();
             for signal in &message.signals {
                 if let Some(comment) = &signal.comment {
                     let _ = writeln!(text, "CM_ SG_ {id} {} \"{}\";", signal.name, quoted(comment));
@@ -75,23 +75,20 @@ impl Database {
 
     fn attributes(&self, text: &mut String) {
         let is_fd = |message: &Message| message.format != FrameFormat::Classic;
-        let has_format = |message: &Message| is_fd(message) || matches!(message.id, CanId::Extended(_));
-        let mut list = Attributes { messages: &self.messages, text };
-        list.add(CYCLE_TIME, &format!("INT 0 {MAX_CYCLE_TIME_MS}"), "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()));
-        let formats = format!("ENUM {}", words(&FRAME_FORMATS));
-        list.add(FRAME_FORMAT, &formats, &words(&FRAME_FORMATS[..1]), |m| {
-            let (extended, fd) = (matches!(m.id, CanId::Extended(_)), is_fd(m));
-            has_format(m).then(|| (usize::from(extended) + if fd { 14 } else { 0 }).to_string())
-        });
-        list.add(BIT_RATE_SWITCH, &format!("ENUM {}", words(&NO_YES)), &words(&NO_YES[..1]), |m| match m.format {
+        let format = |m: &Message| {
+            let place = usize::from(matches!(m.id, CanId::Extended(_))) + if is_fd(m) { FIRST_FD_FORMAT } else { 0 };
+            (place > 0).then(|| place.to_string())
+        };
+        let rate = |m: &Message| match m.format {
             FrameFormat::Fd { brs } => Some(u8::from(brs).to_string()),
             FrameFormat::Classic => None,
-        });
-        let profiles = format!("ENUM {}", words(&E2E_PROFILES));
-        list.add(E2E_PROFILE, &profiles, &words(&E2E_PROFILES[..1]), |m| {
-            m.e2e.map(|e2e| profile_index(e2e.profile).to_string())
-        });
-        list.add(E2E_DATA_ID, "INT 0 65535", "0", |m| m.e2e.map(|e2e| e2e.data_id.to_string()));
+        };
+        let cycle_time = format!("INT 0 {MAX_CYCLE_TIME_MS}");
+        self.attribute(CYCLE_TIME, &cycle_time, "0", |m| m.cycle_time_ms.map(|ms| ms.to_string()), text);
+        self.choice(FRAME_FORMAT, &FRAME_FORMATS, format, text);
+        self.choice(BIT_RATE_SWITCH, &NO_YES, rate, text);
+        self.choice(E2E_PROFILE, &E2E_PROFILES, |m| Some(profile_index(m.e2e?.profile).to_string()), text);
+        self.attribute(E2E_DATA_ID, "INT 0 65535", "0", |m| Some(m.e2e?.data_id.to_string()), text);
         if self.messages.iter().any(is_fd) {
             text.push_str(
                 "BA_DEF_ \"BusType\" STRING ;\nBA_DEF_DEF_ \"BusType\" \"CAN\";\nBA_ \"BusType\" \"CAN FD\";\n",
@@ -99,9 +96,33 @@ impl Database {
         }
     }
 
+    /// Defines an attribute and writes its values, if a message has one.
+    fn attribute(
+        &self,
+        name: &str,
+        kind: &str,
+        default: &str,
+        value: impl Fn(&Message) -> Option<String>,
+        text: &mut String,
+    ) {
+        let values = self.messages.iter().filter_map(|message| Some((message.id.dbc_number(), value(message)?)));
+        for (index, (id, value)) in values.enumerate() {
+            if index == 0 {
+                let _ = writeln!(text, "BA_DEF_ BO_ \"{name}\" {kind};\nBA_DEF_DEF_ \"{name}\" {default};");
+            }
+            let _ = writeln!(text, "BA_ \"{name}\" BO_ {id} {value};");
+        }
+    }
+
+    /// An attribute with a choice between words; the first is the default.
+    fn choice(&self, name: &str, words: &[&str], value: impl Fn(&Message) -> Option<String>, text: &mut String) {
+        let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
+        self.attribute(name, &format!("ENUM {}", quoted.join(",")), &quoted[0], value, text);
+    }
+
     fn value_tables(&self, text: &mut String) {
         for (message, signal) in self.signals().filter(|(_, signal)| !signal.values.is_empty()) {
-            let _ = write!(text, "VAL_ {} {}", number(message.id), signal.name);
+            let _ = write!(text, "VAL_ {} {}", message.id.dbc_number(), signal.name);
             for (code, name) in &signal.values {
                 let _ = write!(text, " {code} \"{}\"", quoted(name));
             }
@@ -116,45 +137,12 @@ impl Database {
                 ValueType::Float32 => 1,
                 ValueType::Float64 => 2,
             };
-            let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", number(message.id), signal.name);
+            let _ = writeln!(text, "SIG_VALTYPE_ {} {} : {kind};", message.id.dbc_number(), signal.name);
         }
     }
 }
 
-/// Writes attributes that some message has.
-struct Attributes<'a> {
-    messages: &'a [Message],
-    text: &'a mut String,
-}
-
-impl Attributes<'_> {
-    fn add(&mut self, name: &str, kind: &str, default: &str, value: impl Fn(&Message) -> Option<String>) {
-        let values = self.messages.iter().filter_map(|message| Some((number(message.id), value(message)?)));
-        let values: Vec<_> = values.collect();
-        if values.is_empty() {
-            return;
-        }
-        let _ = writeln!(self.text, "BA_DEF_ BO_ \"{name}\" {kind};\nBA_DEF_DEF_ \"{name}\" {default};");
-        for (id, value) in values {
-            let _ = writeln!(self.text, "BA_ \"{name}\" BO_ {id} {value};");
-        }
-    }
-}
-
-fn words(words: &[&str]) -> String {
-    let quoted: Vec<String> = words.iter().map(|word| format!("\"{word}\"")).collect();
-    quoted.join(",")
-}
-
-/// The identifier as a DBC writes it: bit 31 says extended.
-fn number(id: CanId) -> u32 {
-    match id {
-        CanId::Standard(id) => u32::from(id),
-        CanId::Extended(id) => id | 0x8000_0000,
-    }
-}
-
-/// A text that no quote ends too early. A text that was read has its quotes escaped already.
+/// The text with its quotes escaped. A text that was read has escaped quotes already.
 fn quoted(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -170,8 +158,8 @@ fn quoted(text: &str) -> String {
 }
 
 fn write_message(message: &Message, text: &mut String) {
-    let sender = message.sender.as_deref().unwrap_or(NOBODY);
-    let _ = writeln!(text, "BO_ {} {}: {} {sender}", number(message.id), message.name, message.len_bytes);
+    let sender = message.sender.as_deref().unwrap_or(NO_NODE);
+    let _ = writeln!(text, "BO_ {} {}: {} {sender}", message.id.dbc_number(), message.name, message.len_bytes);
     for signal in &message.signals {
         let layout = &signal.layout;
         let order = match layout.byte_order {
@@ -182,7 +170,7 @@ fn write_message(message: &Message, text: &mut String) {
             ValueType::Unsigned => '+',
             ValueType::Signed | ValueType::Float32 | ValueType::Float64 => '-',
         };
-        let receivers = if signal.receivers.is_empty() { NOBODY.to_owned() } else { signal.receivers.join(",") };
+        let receivers = if signal.receivers.is_empty() { NO_NODE.to_owned() } else { signal.receivers.join(",") };
         let _ = writeln!(
             text,
             " SG_ {}{} : {}|{}@{order}{sign} ({},{}) [{}|{}] \"{}\" {receivers}",
@@ -210,7 +198,7 @@ fn indicator(signal: &Signal) -> String {
     }
 }
 
-/// Whether `m3` does not say all: ranges, nested multiplexors, or several side by side.
+/// Whether `m3` is not sufficient: ranges, nested multiplexors, or several next to each other.
 fn needs_ranges(message: &Message) -> bool {
     let mut conditions = message.signals.iter().map(|signal| signal.multiplex.conditions.as_slice());
     let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.multiplex.conditions.is_empty());
@@ -227,7 +215,7 @@ fn write_ranges(message: &Message, text: &mut String) {
         let Some(condition) = signal.multiplex.conditions.last() else { continue };
         let Some(selector) = message.signals.get(condition.selector) else { continue };
         let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| format!("{low}-{high}")).collect();
-        let (id, ranges) = (number(message.id), ranges.join(", "));
+        let (id, ranges) = (message.id.dbc_number(), ranges.join(", "));
         let _ = writeln!(text, "SG_MUL_VAL_ {id} {} {} {ranges};", signal.name, selector.name);
     }
 }

@@ -1,4 +1,4 @@
-//! What an input map hands on, and what it passes over.
+//! Frames an input map decodes, and frames it ignores.
 
 use proptest::prelude::*;
 
@@ -77,8 +77,8 @@ pub(crate) fn nested() -> InputMap {
 #[test]
 fn every_message_is_told_with_no_fewer_groups_than_pages() {
     let both = InputMap::new([map().bindings(), nested().bindings()].concat());
-    let told: Vec<_> = both.messages().map(|(bus, id, groups)| (bus.0, id.to_string(), groups)).collect();
-    assert_eq!(told, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
+    let found: Vec<_> = both.messages().map(|(bus, id, groups)| (bus.0, id.to_string(), groups)).collect();
+    assert_eq!(found, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
 }
 
 /// All readings of one frame.
@@ -150,7 +150,7 @@ fn a_short_frame_spoils_only_the_signals_it_does_not_reach() {
     let short = Err(Fault::ShortFrame);
     assert_eq!(values(&[0, 0x10, 0x0E]), [short, Ok(3.6), short]);
     assert_eq!(values(&[1, 0x10]), [short, short]);
-    // Without the selector nobody knows which page it is: all of them are short.
+    // Without the selector the page is unknown: all of them are short.
     assert_eq!(values(&[]), [short; 4]);
     assert_eq!(values(&[0, 0x10, 0x0E, 0x11, 0x0E, 0, 0, 0xFF]), [Ok(0.0), Ok(3.6), Ok(3.601)], "too long is no harm");
 }

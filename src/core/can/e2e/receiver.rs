@@ -1,9 +1,9 @@
 //! The receiver of one protected message: E2E_P01Check of AUTOSAR, called once per frame (or once per period without one).
 //!
-//! In: payloads in the order of their arrival. Out: a [`Status`] each, and how often each was given. States, in AUTOSAR's
-//! words: WaitForFirstData (`last_valid` is `None`); LastValidCounter; MaxDeltaCounter, which grows by one with each call,
-//! since each call may be a frame that was lost, and falls back with each valid frame; NoNewOrRepeatedDataCounter; and
-//! SyncCounter, the valid frames still wanted before the sequence is believed again after it broke.
+//! In: payloads in the order of their arrival. Out: a [`Status`] each, and the count of each status. State, with AUTOSAR's
+//! names: WaitForFirstData (`last_valid` is `None`); LastValidCounter; MaxDeltaCounter, which grows by one with each call,
+//! because each call may stand for a lost frame, and is reset by each valid frame; NoNewOrRepeatedDataCounter; and
+//! SyncCounter, the valid frames still required before a broken sequence is trusted again.
 
 use serde::{Deserialize, Serialize};
 
@@ -12,38 +12,38 @@ use super::{Profile, Protection};
 /// NoNewOrRepeatedDataCounter stops here, as in AUTOSAR: a `max_no_new_or_repeated_data` of 14 allows any number.
 const MAX_REPEATED: u8 = 14;
 
-/// How one message is checked.
+/// Settings of the check of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CheckConfig {
     /// Profile and data identifier.
     pub protection: Protection,
     /// Frames that may be lost between two calls; each call without a valid frame allows one more.
     pub max_delta_counter_init: u8,
-    /// Calls in a row without a new frame after which the sequence must be shown anew; 14 = any number.
+    /// Calls in a row without a new frame after which the sequence is broken; 14 = any number.
     pub max_no_new_or_repeated_data: u8,
-    /// Valid frames in sequence that show it: as many are [`Status::Sync`]; 0 = none is asked for.
+    /// Valid frames required after a broken sequence: each of them is [`Status::Sync`]; 0 = none.
     pub sync_counter_init: u8,
 }
 
 impl CheckConfig {
-    /// One frame may be lost, repetitions do not break the sequence, a broken sequence is believed again at once.
+    /// One frame may be lost, repetitions do not break the sequence, a broken sequence is trusted again at once.
     pub const fn new(protection: Protection) -> Self {
         Self { protection, max_delta_counter_init: 1, max_no_new_or_repeated_data: MAX_REPEATED, sync_counter_init: 0 }
     }
 }
 
-/// What the check says of one frame.
+/// Result of the check of one frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
 pub enum Status {
     /// Intact and the next in sequence.
     Ok = 0,
-    /// No frame came in its period.
+    /// No frame in its period.
     NoNewData = 1,
-    /// Damaged, too short, another message's, or with a counter no sender may use.
+    /// Damaged, too short, of another message, or with an invalid counter.
     WrongCrc = 2,
-    /// Intact and in sequence, after the sequence had broken: it is being shown anew.
+    /// Intact and in sequence, one of those required after a broken sequence.
     Sync = 3,
     /// The first intact frame: nothing to compare its counter with.
     Initial = 4,
@@ -56,7 +56,7 @@ pub enum Status {
 }
 
 impl Status {
-    /// All of them, in the order of their numbers.
+    /// All statuses, in the order of their numbers.
     pub const ALL: [Self; 8] = [
         Self::Ok,
         Self::NoNewData,
@@ -76,7 +76,7 @@ impl Status {
         }
     }
 
-    /// The word for it in events and reports.
+    /// Name in events and reports.
     pub const fn name(self) -> &'static str {
         match self {
             Self::Ok => "ok",
@@ -91,13 +91,13 @@ impl Status {
     }
 }
 
-/// How often each status was given.
+/// Count of each status.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct StatusCounts([u64; Status::ALL.len()]);
 
 impl StatusCounts {
-    /// How often `status` was given.
+    /// Count of `status`.
     pub const fn get(&self, status: Status) -> u64 {
         self.0[status as usize]
     }
@@ -107,7 +107,7 @@ impl StatusCounts {
         Status::ALL.into_iter().map(|status| (status, self.get(status)))
     }
 
-    /// Every status given so far, whichever.
+    /// Sum over all statuses.
     pub fn total(&self) -> u64 {
         self.0.iter().fold(0, |sum, count| sum.saturating_add(*count))
     }
@@ -128,7 +128,7 @@ pub struct Receiver {
     max_delta: u8,
     /// Calls in a row without a new frame.
     no_new_or_repeated: u8,
-    /// Valid frames still wanted.
+    /// Valid frames still required.
     sync: u8,
     /// Frames lost before the last valid one.
     lost: u8,
@@ -147,13 +147,8 @@ impl Receiver {
         status
     }
 
-    /// A period went by without a frame.
-    pub fn no_new_data(&mut self, config: &CheckConfig) -> Status {
-        self.miss(config, 1)
-    }
-
-    /// So many periods went by without a frame.
-    pub(crate) fn miss(&mut self, config: &CheckConfig, periods: u64) -> Status {
+    /// Takes a number of periods without a frame.
+    pub(crate) fn no_new_data(&mut self, config: &CheckConfig, periods: u64) -> Status {
         self.grow(config.protection.profile, periods);
         self.count_repeated(periods);
         self.counts.add(Status::NoNewData, periods);
@@ -170,7 +165,7 @@ impl Receiver {
         *self = Self::with_counts(self.counts);
     }
 
-    /// How often each status was given.
+    /// Count of each status.
     pub const fn counts(&self) -> &StatusCounts {
         &self.counts
     }
@@ -180,7 +175,7 @@ impl Receiver {
         self.lost
     }
 
-    /// Each call may stand for a frame of the sender's that was lost.
+    /// Each call may stand for a lost frame.
     fn grow(&mut self, profile: Profile, calls: u64) {
         self.max_delta = grown(self.max_delta, calls, profile.max_counter());
     }
@@ -192,7 +187,7 @@ impl Receiver {
     /// An intact frame with this counter.
     fn take(&mut self, config: &CheckConfig, counter: u8) -> Status {
         let Some(last) = self.last_valid else {
-            self.believe(config, counter);
+            self.accept(config, counter);
             return Status::Initial;
         };
         let delta = config.protection.profile.counter_delta(last, counter);
@@ -203,14 +198,14 @@ impl Receiver {
         if delta > self.max_delta {
             self.no_new_or_repeated = 0;
             self.sync = config.sync_counter_init;
-            // Profile 5 goes on from any intact frame, and so does a synchronisation that is to come. Profile 1 without one
-            // keeps the last counter it believed, until the sender comes round to it or the allowed step reaches that far.
+            // Profile 5 continues from any intact frame, and so does a synchronisation. Profile 1 without one keeps the last
+            // accepted counter until the sender reaches it again or the allowed step reaches the sender.
             if self.sync > 0 || config.protection.profile == Profile::P05 {
-                self.believe(config, counter);
+                self.accept(config, counter);
             }
             return Status::WrongSequence;
         }
-        self.believe(config, counter);
+        self.accept(config, counter);
         self.lost = delta - 1;
         match (self.synchronise(config), delta) {
             (true, _) => Status::Sync,
@@ -219,24 +214,24 @@ impl Receiver {
         }
     }
 
-    fn believe(&mut self, config: &CheckConfig, counter: u8) {
+    fn accept(&mut self, config: &CheckConfig, counter: u8) {
         self.last_valid = Some(counter);
         self.max_delta = config.max_delta_counter_init;
     }
 
-    /// Whether this frame, in sequence, is one of those that must show the sequence anew.
+    /// Whether this frame, in sequence, is one of those required after a broken sequence.
     fn synchronise(&mut self, config: &CheckConfig) -> bool {
         if self.no_new_or_repeated > config.max_no_new_or_repeated_data {
             self.sync = config.sync_counter_init;
         }
         self.no_new_or_repeated = 0;
-        let wanted = self.sync > 0;
+        let is_required = self.sync > 0;
         self.sync = self.sync.saturating_sub(1);
-        wanted
+        is_required
     }
 }
 
-/// `from` and `by` more, at most `limit`.
+/// `from + by`, at most `limit`.
 fn grown(from: u8, by: u64, limit: u8) -> u8 {
     from.saturating_add(u8::try_from(by).unwrap_or(u8::MAX)).min(limit)
 }

@@ -107,7 +107,7 @@ fn the_mask_is_what_protect_writes() {
         }
         assert_eq!(written[..3], profile.header_mask());
         assert!(written[3..].iter().all(|byte| *byte == 0));
-        assert_eq!(profile.header_bits(), 8 * profile.header_mask().iter().filter(|byte| **byte != 0).count());
+        assert_eq!(profile.header_bytes(), profile.header_mask().iter().filter(|byte| **byte != 0).count());
     }
 }
 

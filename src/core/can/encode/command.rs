@@ -1,9 +1,9 @@
-//! The command frame, received: another ECU acknowledges or clears alarms, or says that the pack was replaced.
+//! The received command frame: another ECU acknowledges or clears alarms, or reports that the pack was replaced.
 //!
-//! In: a frame that the caller has checked against its end-to-end protection. Out: what is asked, "all" as `None`. A
-//! code that has no meaning is refused: a command that is understood in part is not carried out in part.
+//! In: a frame whose end-to-end protection the caller has checked. Out: the command, "all" as `None`. A code without a
+//! meaning is an error: a command is applied as a whole or not at all.
 
-use super::layout::LaidOut;
+use super::layout::LayoutMessage;
 use super::output::{PlanFaults, RULES};
 use crate::can::dbc::{Database, Message};
 use crate::can::e2e::Protection;
@@ -11,21 +11,21 @@ use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame, FrameKind};
 use crate::quantity::{CellIndex, MAX_CELLS};
 
-/// What is asked for.
+/// Kind of command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Command {
-    /// Note has been taken of alarms.
+    /// Acknowledges alarms.
     Acknowledge,
-    /// Latched alarms end, as far as their cause has.
+    /// Clears latched alarms whose cause has ended.
     Clear,
-    /// Another pack is in the vehicle.
+    /// Reports another pack in the vehicle.
     PackReplaced,
 }
 
-/// A command, and the alarms it is about; `None` = all.
+/// A command and its alarms; `None` = all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CommandFields {
-    /// What to do.
+    /// Kind.
     pub command: Command,
     /// Number of the rule.
     pub rule: Option<u8>,
@@ -59,26 +59,26 @@ pub enum CommandFault {
     },
 }
 
-/// How to read the command frame.
+/// The command frame, ready for reading.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CommandPlan {
     id: CanId,
     len: usize,
     protection: Option<Protection>,
     command: SignalPlan,
-    rule: Selector,
-    severity: Selector,
-    cell: Selector,
+    rule: SelectorSignal,
+    severity: SelectorSignal,
+    cell: SelectorSignal,
 }
 
-/// A signal that says which alarms.
+/// A signal that selects alarms.
 #[derive(Debug, Clone, PartialEq)]
-struct Selector {
+struct SelectorSignal {
     name: &'static str,
     plan: SignalPlan,
-    /// The code that says all of them.
+    /// The code for all alarms.
     all: Option<u64>,
-    /// Other codes that have a meaning.
+    /// Other valid codes.
     codes: std::ops::RangeInclusive<u64>,
 }
 
@@ -88,15 +88,15 @@ impl CommandPlan {
     /// # Errors
     /// All that is missing or cannot be read, by name.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
-        let name = LaidOut::Command.message();
+        let name = LayoutMessage::Command.message();
         let message = database.message(name).ok_or_else(|| PlanFaults(vec![format!("message {name} is missing")]))?;
         let mut faults = Vec::new();
         let command = signal(message, "Command", &mut faults).map(|(plan, _)| plan);
         let most_cells = u64::try_from(MAX_CELLS).unwrap_or(u64::MAX);
         let last_rule = u64::try_from(RULES.len()).unwrap_or(u64::MAX);
-        let rule = Selector::new(message, "Rule", 1..=last_rule, &mut faults);
-        let severity = Selector::new(message, "Severity", 1..=3, &mut faults);
-        let cell = Selector::new(message, "Cell", 0..=most_cells - 1, &mut faults);
+        let rule = SelectorSignal::new(message, "Rule", 1..=last_rule, &mut faults);
+        let severity = SelectorSignal::new(message, "Severity", 1..=3, &mut faults);
+        let cell = SelectorSignal::new(message, "Cell", 0..=most_cells - 1, &mut faults);
         match (command, rule, severity, cell) {
             (Some(command), Some(rule), Some(severity), Some(cell)) => {
                 let (id, len) = (message.id, usize::from(message.len_bytes));
@@ -116,7 +116,7 @@ impl CommandPlan {
         self.protection
     }
 
-    /// What the frame asks. Its protection is not looked at.
+    /// Reads a command. The protection is not checked.
     ///
     /// # Errors
     /// When it is another message, too short, or has a code without meaning.
@@ -144,7 +144,7 @@ impl CommandPlan {
     }
 }
 
-impl Selector {
+impl SelectorSignal {
     fn new(
         message: &Message,
         name: &'static str,
@@ -165,7 +165,7 @@ impl Selector {
     }
 }
 
-/// A signal that is always there, and the code its value table calls "all".
+/// A signal that is always present, and the code of "all" in its value table.
 fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(SignalPlan, Option<u64>)> {
     let mut fault = |what: String| faults.push(format!("signal {}.{name}{what}", message.name));
     let Some(signal) = message.signal(name) else {
@@ -187,11 +187,11 @@ fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(Si
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::can::encode::{Base, LayoutSettings, MessageSettings, layout};
+    use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
 
     fn plan() -> CommandPlan {
         let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-        CommandPlan::new(&layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap()
+        CommandPlan::new(&layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap()).unwrap()
     }
 
     /// Codes of command, rule, severity and cell in a frame.
@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_says_what_and_which_alarms() {
+    fn a_command_has_a_kind_and_selects_alarms() {
         let fields = plan().decode(&frame([2, 14, 3, 95])).unwrap();
         let wanted =
             CommandFields { command: Command::Clear, rule: Some(14), severity: Some(3), cell: Some(CellIndex(95)) };

@@ -1,14 +1,13 @@
-//! Input frames made from channel values: the way in of CSV replay and of the simulator.
+//! Input frames made from channel values, for CSV replay and the simulator.
 //!
 //! Each message and multiplexer page that has a value makes one frame. A signal of that frame without a value is
-//! written as its "not available" code, or else as a code that its reader refuses (NaN, out of range); where
-//! there is no such code the whole frame is left out and its values are counted as not carried. A frame without
-//! any value is not sent, except to say "not available" to signals that have such a code. Values outside what the bits
-//! can hold saturate; values outside the DBC's range stay outside, so that their reader sees the fault.
+//! written as its "not available" code, or else as a code that its receiver rejects (NaN, out of range); where there is no
+//! such code the whole frame is left out and its values are counted as not carried. A frame without any value is sent only
+//! if one of its signals has a "not available" code. Values beyond the bits saturate; values outside the DBC's range stay
+//! outside, so that their receiver detects the fault.
 
 use std::collections::BTreeMap;
 
-use super::frame_of;
 use crate::can::decode::{Binding, Channel, InputMap};
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
@@ -17,35 +16,35 @@ use crate::quantity::BusIndex;
 /// Makes input frames from values.
 #[derive(Debug, Clone)]
 pub struct InputEncoder {
-    pages: Vec<Page>,
+    pages: Vec<InputPage>,
 }
 
 /// One message, or one multiplexer page of it.
 #[derive(Debug, Clone)]
-struct Page {
+struct InputPage {
     bus: BusIndex,
     id: CanId,
     len: usize,
-    /// Selectors written, everything else 0.
+    /// Payload with the selectors, all else 0.
     template: [u8; MAX_DATA],
-    fields: Vec<Field>,
+    fields: Vec<InputField>,
 }
 
 #[derive(Debug, Clone)]
-struct Field {
+struct InputField {
     channel: Channel,
     plan: SignalPlan,
     scale: f64,
     offset: f64,
     /// Code for "no value".
     missing: Option<u64>,
-    /// That code is a configured "not available", worth a frame of its own.
-    told: bool,
+    /// `missing` is a configured "not available", which makes a frame even without any value.
+    has_not_available: bool,
 }
 
-impl Field {
+impl InputField {
     fn new(binding: &Binding) -> Self {
-        let told = binding.not_available.first().copied();
+        let not_available = binding.not_available.first().copied();
         let length = binding.plan.length_bits();
         let lowest = 1_u64 << (length - 1);
         let candidates = match binding.plan.value_type() {
@@ -63,8 +62,8 @@ impl Field {
             plan: binding.plan,
             scale: binding.scale,
             offset: binding.offset,
-            missing: told.or_else(|| candidates.into_iter().find(refused)),
-            told: told.is_some(),
+            missing: not_available.or_else(|| candidates.into_iter().find(refused)),
+            has_not_available: not_available.is_some(),
         }
     }
 
@@ -75,17 +74,17 @@ impl Field {
 }
 
 impl InputEncoder {
-    /// One page per message and selector codes that some signal asks for.
+    /// One page per message and combination of selector codes.
     pub fn new(map: &InputMap) -> Self {
         let same_message = |a: &Binding, b: &Binding| (a.bus, a.id) == (b.bus, b.id);
         let pages = map.bindings().chunk_by(same_message).flat_map(|message| {
-            // Signals that are always there ride on the pages of the others, when there are any.
+            // Signals that are always present are on the pages of the others, if any.
             let paged = message.iter().any(|binding| !binding.mux.is_empty());
             let of_a_page = message.iter().filter(|binding| !paged || !binding.mux.is_empty());
             let mut templates: Vec<_> = of_a_page.map(template).collect();
             templates.sort_unstable();
             templates.dedup();
-            templates.into_iter().map(|template| Page::new(message, template))
+            templates.into_iter().map(|template| InputPage::new(message, template))
         });
         Self { pages: pages.collect() }
     }
@@ -107,26 +106,26 @@ impl InputEncoder {
     }
 }
 
-impl Page {
-    /// The page of `template` with every signal whose multiplexors are so.
+impl InputPage {
+    /// The page of `template` with every signal that is present with its selectors.
     fn new(message: &[Binding], template: [u8; MAX_DATA]) -> Self {
         let (bus, id) = (message[0].bus, message[0].id);
-        let there: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
+        let present: Vec<_> = message.iter().filter(|binding| binding.holds(&template) == Ok(true)).collect();
         let needed = |binding: &&Binding| {
             let plans = binding.mux.iter().map(|test| &test.plan).chain([&binding.plan]);
             plans.map(SignalPlan::bytes_needed).fold(usize::from(binding.len_bytes), usize::max)
         };
-        let len = there.iter().map(needed).max().unwrap_or(0).min(MAX_DATA);
-        Self { bus, id, len, template, fields: there.into_iter().map(Field::new).collect() }
+        let len = present.iter().map(needed).max().unwrap_or(0).min(MAX_DATA);
+        Self { bus, id, len, template, fields: present.into_iter().map(InputField::new).collect() }
     }
 
     fn frame(&self, given: &BTreeMap<Channel, Option<f64>>) -> Option<Frame> {
-        let worth = |field: &Field| match given.get(&field.channel) {
+        let is_sent = |field: &InputField| match given.get(&field.channel) {
             Some(Some(_)) => true,
-            Some(None) => field.told,
+            Some(None) => field.has_not_available,
             None => false,
         };
-        if !self.fields.iter().any(worth) {
+        if !self.fields.iter().any(is_sent) {
             return None;
         }
         let mut payload = self.template;
@@ -134,7 +133,7 @@ impl Page {
             let code = field.code(given.get(&field.channel).copied().flatten())?;
             field.plan.encode_raw(&mut payload, code).ok()?;
         }
-        frame_of(self.id, self.len, &payload)
+        Frame::padded(self.id, self.len, &payload)
     }
 }
 
@@ -143,7 +142,7 @@ fn template(binding: &Binding) -> [u8; MAX_DATA] {
     let mut payload = [0; MAX_DATA];
     for test in &binding.mux {
         let code = test.ranges.first().map_or(0, |range| range.0);
-        // A code the selector cannot hold leaves 0: no frame of that page can exist on a bus either.
+        // A code beyond the selector's bits leaves 0: no frame of that page can exist.
         let _ = test.plan.encode_raw(&mut payload, code);
     }
     payload

@@ -1,28 +1,27 @@
-//! The layout of what is sent and of the command that is taken: one [`Database`] for encoder and consumers.
+//! The layout of the sent frames and of the command frame: one [`Database`] for encoder and consumers.
 //!
-//! In: a base (the built-in `config/packwatch.dbc`, or a DBC of one's own) and settings per message. Out: the base's
+//! In: a base (the built-in `config/packwatch.dbc`, or the user's own DBC) and settings per message. Out: the base's
 //! messages with identifiers, frame formats, cycle times and end-to-end protection as set, the header's signals
-//! included. The encoder is made from it and `packwatch dbc` writes it, so that the two cannot disagree.
+//! included. The encoder is made from it and `packwatch dbc` writes it, so that the two always agree.
 //!
 //! The built-in base is fitted: steps of Ah signals grow with the cell, and profile 5, whose header is a byte longer
-//! than the room kept free, moves the signals up by that byte. A DBC of one's own is not moved: its signals must leave
-//! the header free. Everything that does not fit is told at once.
+//! than the free space, moves the signals up by that byte. The user's own DBC is not moved: its signals must leave the
+//! header free. All settings that do not fit are reported together.
 
 use crate::can::dbc::{Database, DbcError, FrameFormat, Message, Signal};
 use crate::can::e2e::{Profile, Protection};
+use crate::can::frame::is_frame_length;
 use crate::can::signal::{ByteOrder, SignalLayout, ValueType};
 use crate::can::{CanId, FrameKind};
 
-use super::is_frame_length;
-
-/// Names of the signals that the protection fills; no value of the daemon's has one of these.
+/// Names of the signals that the protection writes; no value of the daemon has one of these.
 pub(super) const HEADER_SIGNALS: [&str; 3] = ["E2eCrc", "E2eCounter", "E2eDataIdNibble"];
 
-/// Length of a built-in message whose signals were moved for profile 5: what FD has above 8.
+/// Length of a built-in message whose signals were moved for profile 5: the next FD length above 8.
 const MOVED_LEN_BYTES: u16 = 12;
 
-/// Cycle time of a sent message for which neither settings nor base say one, ms.
-pub(super) const USUAL_PERIOD_MS: u32 = 1000;
+/// Cycle time of a sent message without one in the settings or the base, ms.
+pub(super) const DEFAULT_PERIOD_MS: u32 = 1000;
 
 /// The DBC that ships with the program.
 ///
@@ -34,7 +33,7 @@ pub fn default_database() -> Result<Database, DbcError> {
 
 /// A message of the layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LaidOut {
+pub enum LayoutMessage {
     /// Status frame.
     Status,
     /// Health frame.
@@ -45,7 +44,7 @@ pub enum LaidOut {
     Command,
 }
 
-impl LaidOut {
+impl LayoutMessage {
     /// All of them, in the order of the layout.
     pub const ALL: [Self; 4] = [Self::Status, Self::Health, Self::Alarm, Self::Command];
 
@@ -63,7 +62,7 @@ impl LaidOut {
 /// End-to-end protection of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum E2eSetting {
-    /// What the base says; the built-in one: none.
+    /// As in the base; the built-in one has none.
     #[default]
     AsBase,
     /// None.
@@ -72,14 +71,14 @@ pub enum E2eSetting {
     On(Protection),
 }
 
-/// What is set for a message; `None` = as the base says.
+/// Settings of a message; `None` = as in the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct MessageSettings {
     /// Identifier.
     pub id: Option<CanId>,
-    /// Whether FD frames carry it.
+    /// Whether it is sent in FD frames.
     pub fd: Option<bool>,
-    /// Whether their data go at the higher bit rate.
+    /// Whether the data phase uses the higher bit rate.
     pub brs: Option<bool>,
     /// Cycle time, ms.
     pub period_ms: Option<u32>,
@@ -87,19 +86,19 @@ pub struct MessageSettings {
     pub e2e: E2eSetting,
 }
 
-/// What a layout is made from.
+/// Base of a layout.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Base<'d> {
-    /// The DBC that ships with the program, fitted to a cell of this rated capacity, Ah.
+pub enum LayoutBase<'d> {
+    /// The shipped DBC, fitted to a cell of this rated capacity, Ah.
     BuiltIn {
         /// Ah.
         rated_capacity_ah: f64,
     },
-    /// Another one, taken as it is.
+    /// Another DBC, unchanged.
     Own(&'d Database),
 }
 
-/// What is set for each message.
+/// Settings of all messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LayoutSettings {
     /// Status frame.
@@ -108,17 +107,17 @@ pub struct LayoutSettings {
     pub health: MessageSettings,
     /// Alarm frame.
     pub alarm: MessageSettings,
-    /// Command frame; `None` = no command is taken.
+    /// Command frame; `None` = commands are not accepted.
     pub command: Option<MessageSettings>,
 }
 
 impl LayoutSettings {
-    fn of(&self, message: LaidOut) -> Option<&MessageSettings> {
+    fn of(&self, message: LayoutMessage) -> Option<&MessageSettings> {
         match message {
-            LaidOut::Status => Some(&self.status),
-            LaidOut::Health => Some(&self.health),
-            LaidOut::Alarm => Some(&self.alarm),
-            LaidOut::Command => self.command.as_ref(),
+            LayoutMessage::Status => Some(&self.status),
+            LayoutMessage::Health => Some(&self.health),
+            LayoutMessage::Alarm => Some(&self.alarm),
+            LayoutMessage::Command => self.command.as_ref(),
         }
     }
 }
@@ -127,31 +126,31 @@ impl LayoutSettings {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}: {what}", .message.message())]
 pub struct SettingFault {
-    /// Which message.
-    pub message: LaidOut,
+    /// Message.
+    pub message: LayoutMessage,
     /// Key of the setting: `id`, `fd`, `brs`, `e2e`, `data_id`.
     pub key: &'static str,
-    /// What is wrong, what is allowed.
+    /// The fault: found and allowed.
     pub what: String,
 }
 
-/// Makes the layout. A message the base does not have is left out: the plans say what is missing.
+/// Makes the layout. A message that the base does not have is left out: the plans report what is missing.
 ///
 /// # Errors
 /// All settings that do not fit.
-pub fn layout(base: Base<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
+pub fn layout(base: LayoutBase<'_>, settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
     let shipped;
     let (database, rated_capacity_ah) = match base {
-        Base::BuiltIn { rated_capacity_ah } => {
+        LayoutBase::BuiltIn { rated_capacity_ah } => {
             // Cannot fail: a test reads the shipped file.
             shipped = default_database().unwrap_or_default();
             (&shipped, Some(rated_capacity_ah))
         }
-        Base::Own(database) => (database, None),
+        LayoutBase::Own(database) => (database, None),
     };
     let mut faults = Vec::new();
     let mut messages = Vec::new();
-    for which in LaidOut::ALL {
+    for which in LayoutMessage::ALL {
         if let (Some(settings), Some(message)) = (settings.of(which), database.message(which.message())) {
             let mut laid_out = message.clone();
             if let Some(rated_capacity_ah) = rated_capacity_ah {
@@ -159,8 +158,8 @@ pub fn layout(base: Base<'_>, settings: &LayoutSettings) -> Result<Database, Vec
             }
             let mut note = |key, what: String| faults.push(SettingFault { message: which, key, what });
             apply(&mut laid_out, settings, rated_capacity_ah.is_some(), &mut note);
-            if which != LaidOut::Command {
-                laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(USUAL_PERIOD_MS));
+            if which != LayoutMessage::Command {
+                laid_out.cycle_time_ms = laid_out.cycle_time_ms.or(Some(DEFAULT_PERIOD_MS));
             }
             messages.push(laid_out);
         }
@@ -213,7 +212,7 @@ fn apply(
 
 fn format(message: &Message, settings: &MessageSettings) -> FrameFormat {
     let (was_fd, was_brs) = match message.format {
-        // A DBC that does not state the format still says it by a length that classic frames do not have.
+        // A DBC without a format attribute implies FD by a length that classic frames do not have.
         FrameFormat::Classic => (message.len_bytes > 8, false),
         FrameFormat::Fd { brs } => (true, brs),
     };
@@ -231,11 +230,11 @@ fn move_up(message: &mut Message) {
     message.len_bytes = MOVED_LEN_BYTES;
 }
 
-/// Puts the header's signals in place of those that may be there.
+/// Replaces the header's signals.
 fn set_header(message: &mut Message) {
     let header = message.e2e.map(header_signals).unwrap_or_default();
     let is_kept = |signal: &Signal| !HEADER_SIGNALS.contains(&signal.name.as_str());
-    // Conditions name multiplexors by their place, which changes.
+    // Conditions name multiplexors by their index, which changes.
     let mut next = header.len();
     let places = message.signals.iter().map(|signal| {
         let place = is_kept(signal).then_some(next);
@@ -252,7 +251,7 @@ fn set_header(message: &mut Message) {
     }));
 }
 
-/// The header as signals, so that a consumer can check it with nothing but the DBC.
+/// The header as signals, so that a consumer can check it with the DBC alone.
 fn header_signals(protection: Protection) -> Vec<Signal> {
     let Protection { profile, data_id } = protection;
     let crc = format!("CRC of end-to-end profile {}, data id {data_id}.", profile.name());
@@ -349,7 +348,7 @@ fn fit_steps(message: &mut Message, rated_capacity_ah: f64) {
 
 /// The smallest of 1, 2, 5, 10, ... that is not below `needed`; the largest where none is.
 fn times(needed: f64) -> f64 {
-    /// No cell needs more: that many times 40 Ah.
+    /// No cell needs more: a million times 40 Ah.
     const LARGEST: f64 = 1e6;
     let ladder = std::iter::successors(Some(1.0), |decade| Some(decade * 10.0)).take_while(|decade| *decade < LARGEST);
     let mut ladder = ladder.flat_map(|decade| [decade, 2.0 * decade, 5.0 * decade]);
@@ -362,7 +361,7 @@ fn decimal(value: f64) -> f64 {
 }
 
 impl FrameFormat {
-    /// The frame kind that goes out.
+    /// Kind of the sent frame.
     pub const fn kind(self) -> FrameKind {
         match self {
             Self::Classic => FrameKind::Classic,

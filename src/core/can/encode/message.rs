@@ -1,37 +1,39 @@
-//! A message of a layout, ready to be filled: signals, codes for "not available", pages, protection.
+//! A message of a layout, ready for encoding: signals, codes for "not available", pages, protection.
+//!
+//! In: values by signal name. Out: frames. A message that cannot be encoded is rejected with all its faults.
 
 use crate::can::dbc::{Database, FrameFormat, Message, Signal};
 use crate::can::e2e::Protection;
+use crate::can::frame::is_frame_length;
 use crate::can::signal::{SignalPlan, ValueType};
 use crate::can::{CanId, Frame, MAX_DATA};
 
-use super::layout::{HEADER_SIGNALS, USUAL_PERIOD_MS};
-use super::{fd_frame, is_frame_length};
+use super::layout::{DEFAULT_PERIOD_MS, HEADER_SIGNALS};
 
-/// How to make the frames of a message.
+/// One message to send.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct MessagePlan {
+pub(super) struct OutputMessage {
     pub(super) id: CanId,
     pub(super) format: FrameFormat,
     pub(super) protection: Option<Protection>,
     pub(super) cycle_time_ms: u32,
     len: usize,
-    fields: Vec<Field>,
+    fields: Vec<OutputField>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-struct Field {
+struct OutputField {
     name: String,
     plan: SignalPlan,
     not_available: u64,
     /// 100 where the DBC's unit is %.
     per_inside_unit: f64,
-    /// Codes of the message's multiplexor for which the signal is there; empty = always.
+    /// Codes of the message's multiplexor with which the signal is present; empty = always.
     pages: Vec<(u64, u64)>,
     is_multiplexor: bool,
 }
 
-impl MessagePlan {
+impl OutputMessage {
     /// The message of that name, with all `required` signals.
     pub(super) fn new(database: &Database, name: &str, required: &[&str], faults: &mut Vec<String>) -> Option<Self> {
         let Some(message) = database.message(name) else {
@@ -42,9 +44,9 @@ impl MessagePlan {
         for signal in required.iter().filter(|signal| message.signal(signal).is_none()) {
             faults.push(format!("signal {name}.{signal} is missing"));
         }
-        let of_the_header = |signal: &&Signal| HEADER_SIGNALS.contains(&signal.name.as_str());
-        let fields = message.signals.iter().filter(|signal| !of_the_header(signal)).filter_map(|signal| {
-            Field::new(message, signal)
+        let is_header = |signal: &&Signal| HEADER_SIGNALS.contains(&signal.name.as_str());
+        let fields = message.signals.iter().filter(|signal| !is_header(signal)).filter_map(|signal| {
+            OutputField::new(message, signal)
                 .map_err(|fault| faults.push(format!("signal {name}.{}: {fault}", signal.name)))
                 .ok()
         });
@@ -54,7 +56,7 @@ impl MessagePlan {
             id: message.id,
             format: message.format,
             protection: message.e2e,
-            cycle_time_ms: message.cycle_time_ms.unwrap_or(USUAL_PERIOD_MS),
+            cycle_time_ms: message.cycle_time_ms.unwrap_or(DEFAULT_PERIOD_MS),
             len: usize::from(message.len_bytes),
             fields,
         })
@@ -89,17 +91,17 @@ impl MessagePlan {
         if codes.is_empty() { vec![0] } else { codes }
     }
 
-    /// A frame of the page, with what `value` gives each signal. `counter` is the protection's next, and moves on.
+    /// A frame of the page with `value` of each signal's name. `counter` is the protection's next; it is advanced.
     pub(super) fn frame(&self, page: u64, counter: &mut u8, value: impl Fn(&str) -> Option<f64>) -> Frame {
         let mut payload = [0; MAX_DATA];
         for field in self.fields.iter().filter(|field| field.is_on(page)) {
             let code =
                 if field.is_multiplexor { page.min(field.plan.all_ones()) } else { field.code(value(&field.name)) };
-            // Cannot fail: the plan was checked against the message's length, and the code fits the signal.
+            // Cannot fail: the message was checked against the message's length, and the code fits the signal.
             let _ = field.plan.encode_raw(&mut payload, code);
         }
         if let (Some(protection), Some(payload)) = (self.protection, payload.get_mut(..self.len)) {
-            // Taken up from a snapshot of another profile it may be beyond this one's last.
+            // A counter restored from another profile may be beyond this one's last.
             let now = (*counter).min(protection.profile.max_counter());
             // Cannot fail: length and data id were checked when the plan was made.
             let _ = protection.protect(payload, now);
@@ -107,7 +109,7 @@ impl MessagePlan {
         }
         let frame = match self.format {
             FrameFormat::Classic => Frame::classic(self.id, payload.get(..self.len).unwrap_or(&[])),
-            FrameFormat::Fd { brs } => fd_frame(self.id, brs, self.len, &payload),
+            FrameFormat::Fd { brs } => Frame::fd_padded(self.id, brs, self.len, &payload),
         };
         frame.unwrap_or_else(|| empty_frame(self.id))
     }
@@ -132,14 +134,14 @@ fn check_length(message: &Message, faults: &mut Vec<String>) {
     }
 }
 
-/// The multiplexor must be able to say every page, or a page would go out under another one's number.
-fn check_pages(message: &str, fields: &[Field], faults: &mut Vec<String>) {
+/// The multiplexor must have a code for every page, or a page would be sent with another one's number.
+fn check_pages(message: &str, fields: &[OutputField], faults: &mut Vec<String>) {
     for selector in fields.iter().filter(|field| field.is_multiplexor) {
         let highest = selector.plan.all_ones();
         for field in fields.iter().filter(|field| field.pages.iter().any(|(first, _)| *first > highest)) {
             let (name, selector) = (&field.name, &selector.name);
             faults
-                .push(format!("signal {message}.{name} is on a page above {highest}, the highest {selector} can say"));
+                .push(format!("signal {message}.{name} is on a page above {highest}, the highest code of {selector}"));
         }
     }
 }
@@ -149,7 +151,7 @@ fn empty_frame(id: CanId) -> Frame {
     Frame::classic(id, &[]).expect("a classic frame may be empty")
 }
 
-impl Field {
+impl OutputField {
     fn new(message: &Message, signal: &Signal) -> Result<Self, String> {
         let plan = signal.layout.plan().map_err(|fault| fault.to_string())?;
         if plan.bytes_needed() > usize::from(message.len_bytes) {
@@ -184,14 +186,14 @@ impl Field {
         let code = value.and_then(|value| self.plan.code(value * self.per_inside_unit));
         match code {
             None => self.not_available,
-            // One bit cannot spare a code.
-            Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.beside(code),
+            // One bit has no code to spare.
+            Some(code) if code == self.not_available && self.plan.length_bits() > 1 => self.neighbour(code),
             Some(code) => code,
         }
     }
 
-    /// The code next to one that is taken: one below, or above where there is none below.
-    fn beside(&self, taken: u64) -> u64 {
+    /// The code next to one that is taken: below, or above where there is none below.
+    fn neighbour(&self, taken: u64) -> u64 {
         let lowest = match self.plan.value_type() {
             ValueType::Signed => 1 << (self.plan.length_bits() - 1),
             ValueType::Unsigned | ValueType::Float32 | ValueType::Float64 => 0,

@@ -1,42 +1,57 @@
 //! The frames the daemon sends, as a layout gives them.
 //!
-//! Any DBC serves that has the message and signal names of the shipped `config/packwatch.dbc`. An unknown value is sent
+//! Any DBC with the message and signal names of the shipped `config/packwatch.dbc` can be used. An unknown value is sent
 //! as the code the DBC's value table calls "not available", else as all ones (unsigned), the lowest code (signed) or
-//! NaN (float). A known value never takes that code: it saturates before it. Where the layout has end-to-end protection,
-//! its header is written with the counter that the caller keeps ([`SendCounters`]).
+//! NaN (float). A known value never has that code: it saturates before it. End-to-end headers are written with the counters
+//! that the caller keeps ([`SendCounters`]).
 //!
-//! A DBC that lacks something, or in which a value could be read as another rule's or page's, is refused with all its
-//! faults at once.
+//! A DBC with missing signals, or in which a value could be read as another rule's or page's, is rejected with all its
+//! faults.
 
 use serde::{Deserialize, Serialize};
 
-use super::layout::LaidOut;
-use super::message::MessagePlan;
+use super::layout::LayoutMessage;
+use super::message::OutputMessage;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::Protection;
 use crate::can::{CanId, Frame};
 use crate::quantity::{CellIndex, Mode};
 
-/// Everything an [`OutputPlan`] misses in its DBC, one line each.
+/// All faults of a DBC for an [`OutputPlan`], one line each.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{}", .0.join("\n"))]
 pub struct PlanFaults(pub Vec<String>);
 
-/// Signals of the status frame.
-const STATUS: [&str; 8] =
-    ["Soc", "SocStd", "Mode", "Validity", "HighestSeverity", "ActiveAlarms", "LimitingCell", "UnknownRules"];
+/// Signals of a message with their values.
+type SignalTable<T, const N: usize> = [(&'static str, fn(&T) -> Option<f64>); N];
 
-/// Signals of the health frame, whatever its pages.
-const HEALTH: [&str; 8] = [
-    "Capacity",
-    "CapacityStd",
-    "Soh",
-    "RechargePeriod",
-    "NormalizedRechargePeriod",
-    "UsableCapacity",
-    "UsableCapacityStd",
-    "ResistanceRatio",
+/// Signals of the status frame.
+const STATUS: SignalTable<StatusFields, 8> = [
+    ("Soc", |f| f.soc),
+    ("SocStd", |f| f.soc_std),
+    ("Mode", |f| f.mode.map(mode_code)),
+    ("Validity", |f| Some(f.validity.into())),
+    ("HighestSeverity", |f| f.highest_severity.map(f64::from)),
+    ("ActiveAlarms", |f| f.active_alarms.map(f64::from)),
+    ("LimitingCell", |f| f.limiting_cell.map(|cell| cell.0.into())),
+    ("UnknownRules", |f| f.unknown_rules.map(f64::from)),
 ];
+
+/// Signals of the health frame, whatever its pages; the first [`HEALTH_REQUIRED`] are required.
+const HEALTH: SignalTable<HealthFields, 11> = [
+    ("Capacity", |f| f.capacity_ah),
+    ("CapacityStd", |f| f.capacity_std_ah),
+    ("Soh", |f| f.soh),
+    ("RechargePeriod", |f| f.recharge_period_s),
+    ("NormalizedRechargePeriod", |f| f.normalized_recharge_period_s),
+    ("UsableCapacity", |f| f.usable_capacity_ah),
+    ("UsableCapacityStd", |f| f.usable_capacity_std_ah),
+    ("ResistanceRatio", |f| f.resistance_ratio),
+    ("RemainingCycles", |f| f.remaining_cycles),
+    ("RemainingCyclesLow", |f| f.remaining_cycles_low),
+    ("RemainingDays", |f| f.remaining_days),
+];
+const HEALTH_REQUIRED: usize = 8;
 
 /// Signals on every page of the alarm frame.
 const ALARM: [&str; 6] = ["Rule", "State", "Severity", "Test", "Cell", "Acknowledged"];
@@ -67,7 +82,7 @@ pub struct StatusFields {
     pub soc: Option<f64>,
     /// Fraction.
     pub soc_std: Option<f64>,
-    /// What the pack does.
+    /// Operating mode of the pack.
     pub mode: Option<Mode>,
     /// Code of the wire: 0 unavailable, 1 valid, 2 degraded, 3 untrusted.
     pub validity: u8,
@@ -100,7 +115,7 @@ pub struct HealthFields {
     pub usable_capacity_std_ah: Option<f64>,
     /// Relative to new, 1 = as new.
     pub resistance_ratio: Option<f64>,
-    /// Equivalent full cycles until the end of life, median. As the next two, only where the DBC has a signal for it.
+    /// Equivalent full cycles until the end of life, median. As the next two, sent only if the DBC has its signal.
     pub remaining_cycles: Option<f64>,
     /// Its 5 % quantile.
     pub remaining_cycles_low: Option<f64>,
@@ -118,20 +133,20 @@ pub struct AlarmFields {
     pub state: Option<u8>,
     /// Code of the wire: 1 info, 2 warning, 3 severe; `None` = unknown.
     pub severity: Option<u8>,
-    /// A test, not a real alarm.
+    /// Whether it is a test, not a real alarm.
     pub test: bool,
-    /// Somebody has taken note of it.
+    /// Whether it is acknowledged.
     pub acknowledged: bool,
     /// `None` = the pack as a whole.
     pub cell: Option<CellIndex>,
-    /// In the rule's inside unit.
+    /// In the rule's internal unit.
     pub value: Option<f64>,
-    /// In the rule's inside unit.
+    /// In the rule's internal unit.
     pub threshold: Option<f64>,
 }
 
-/// The next counter of each message's end-to-end protection. To be kept over a restart: a receiver that sees the counter
-/// jump back takes the frame for an old one.
+/// The next counter of each message's end-to-end protection, to be kept over a restart: for a receiver, a counter that
+/// jumps back marks an old frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SendCounters {
@@ -140,12 +155,12 @@ pub struct SendCounters {
     alarm: u8,
 }
 
-/// How to make the daemon's frames.
+/// The daemon's frames, ready for encoding.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputPlan {
-    status: MessagePlan,
-    health: MessagePlan,
-    alarm: MessagePlan,
+    status: OutputMessage,
+    health: OutputMessage,
+    alarm: OutputMessage,
     /// Selector codes of the health frame, ascending.
     pages: Vec<u64>,
 }
@@ -157,10 +172,12 @@ impl OutputPlan {
     /// All that is missing or cannot be written, by name.
     pub fn new(database: &Database) -> Result<Self, PlanFaults> {
         let mut faults = Vec::new();
-        let mut message =
-            |which: LaidOut, required: &[&str]| MessagePlan::new(database, which.message(), required, &mut faults);
-        let (status, health) = (message(LaidOut::Status, &STATUS), message(LaidOut::Health, &HEALTH));
-        let alarm = message(LaidOut::Alarm, &ALARM);
+        let mut message = |which: LayoutMessage, required: &[&str]| {
+            OutputMessage::new(database, which.message(), required, &mut faults)
+        };
+        let status = message(LayoutMessage::Status, &STATUS.map(|(name, _)| name));
+        let health = message(LayoutMessage::Health, &HEALTH.map(|(name, _)| name)[..HEALTH_REQUIRED]);
+        let alarm = message(LayoutMessage::Alarm, &ALARM);
         if let Some(alarm) = &alarm {
             alarm.check_rules(&RULES, &mut faults);
         }
@@ -173,7 +190,7 @@ impl OutputPlan {
         }
     }
 
-    fn messages(&self) -> [&MessagePlan; 3] {
+    fn messages(&self) -> [&OutputMessage; 3] {
         [&self.status, &self.health, &self.alarm]
     }
 
@@ -204,42 +221,13 @@ impl OutputPlan {
 
     /// The status frame.
     pub fn status(&self, fields: &StatusFields, counters: &mut SendCounters) -> Frame {
-        let mode = fields.mode.map(|mode| match mode {
-            Mode::Unknown => 0.0,
-            Mode::Charge => 1.0,
-            Mode::Rest => 2.0,
-            Mode::Discharge => 3.0,
-        });
-        self.status.frame(0, &mut counters.status, |name| match name {
-            "Soc" => fields.soc,
-            "SocStd" => fields.soc_std,
-            "Mode" => mode,
-            "Validity" => Some(f64::from(fields.validity)),
-            "HighestSeverity" => fields.highest_severity.map(f64::from),
-            "ActiveAlarms" => fields.active_alarms.map(f64::from),
-            "LimitingCell" => fields.limiting_cell.map(|cell| f64::from(cell.0)),
-            "UnknownRules" => fields.unknown_rules.map(f64::from),
-            _ => None,
-        })
+        self.status.frame(0, &mut counters.status, |name| value_of(&STATUS, fields, name))
     }
 
     /// One page of the health frame, counted from 0; beyond the last it starts again.
     pub fn health(&self, page: usize, fields: &HealthFields, counters: &mut SendCounters) -> Frame {
         let code = self.pages.get(page % self.pages.len().max(1)).copied().unwrap_or(0);
-        self.health.frame(code, &mut counters.health, |name| match name {
-            "Capacity" => fields.capacity_ah,
-            "CapacityStd" => fields.capacity_std_ah,
-            "Soh" => fields.soh,
-            "RechargePeriod" => fields.recharge_period_s,
-            "NormalizedRechargePeriod" => fields.normalized_recharge_period_s,
-            "UsableCapacity" => fields.usable_capacity_ah,
-            "UsableCapacityStd" => fields.usable_capacity_std_ah,
-            "ResistanceRatio" => fields.resistance_ratio,
-            "RemainingCycles" => fields.remaining_cycles,
-            "RemainingCyclesLow" => fields.remaining_cycles_low,
-            "RemainingDays" => fields.remaining_days,
-            _ => None,
-        })
+        self.health.frame(code, &mut counters.health, |name| value_of(&HEALTH, fields, name))
     }
 
     /// One alarm. Value and threshold go into the rule's own `Value_...` and `Threshold_...`.
@@ -255,6 +243,20 @@ impl OutputPlan {
             name if name.starts_with("Threshold_") => fields.threshold,
             _ => None,
         })
+    }
+}
+
+fn value_of<T>(signals: &[(&str, fn(&T) -> Option<f64>)], fields: &T, name: &str) -> Option<f64> {
+    signals.iter().find(|(signal, _)| *signal == name).and_then(|(_, value)| value(fields))
+}
+
+/// Code of the wire.
+fn mode_code(mode: Mode) -> f64 {
+    match mode {
+        Mode::Unknown => 0.0,
+        Mode::Charge => 1.0,
+        Mode::Rest => 2.0,
+        Mode::Discharge => 3.0,
     }
 }
 

@@ -1,7 +1,7 @@
-//! Protection of input frames that were made here (CSV replay, simulator): what the sender of a protected message adds.
+//! Protection of generated input frames (CSV replay, simulator): the sender's half of the end-to-end check.
 //!
-//! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC;
-//! every other frame stays as it is, and so does one too short for the header (its reader sees the fault).
+//! In: frames in the order in which they are sent. Each frame of a protected message gets the next counter and its CRC.
+//! Every other frame is unchanged, also one too short for the header (its receiver detects the fault).
 
 use crate::can::e2e::Protection;
 use crate::can::guard::GuardConfig;
@@ -11,11 +11,11 @@ use crate::quantity::BusIndex;
 /// The sending half of every protected input message.
 #[derive(Debug, Clone, Default)]
 pub struct InputProtector {
-    senders: Vec<Sender>,
+    senders: Vec<MessageSender>,
 }
 
 #[derive(Debug, Clone)]
-struct Sender {
+struct MessageSender {
     bus: BusIndex,
     id: CanId,
     protection: Protection,
@@ -25,7 +25,7 @@ struct Sender {
 impl InputProtector {
     /// For the messages that `guards` check; every counter begins at 0.
     pub fn new(guards: &[GuardConfig]) -> Self {
-        let sender = |guard: &GuardConfig| Sender {
+        let sender = |guard: &GuardConfig| MessageSender {
             bus: guard.bus,
             id: guard.id,
             protection: guard.check.protection,

@@ -1,82 +1,86 @@
 //! Claiming the address, defending it, falling silent (J1939-81), as a machine of four states.
 //!
-//! | state | started | lower or same NAME claims it | higher NAME claims it | asked who has it | 300 ms passed |
+//! | state | started | lower or same NAME claims it | higher NAME claims it | request for claims | 300 ms passed |
 //! | --- | --- | --- | --- | --- | --- |
 //! | idle | claim | - | - | - | - |
 //! | claiming | claim | lost | claim, wait again | claim | claimed |
 //! | claimed | claim | lost | claim | claim | - |
 //! | lost | claim | - | - | cannot claim | - |
 //!
-//! A NAME equal to ours is a second node configured as this one. Arbitration cannot part the two, and broadcasts of two
-//! nodes under one address would destroy each other: who hears its own NAME falls silent. (A socket does not hear its own frames.)
+//! An equal NAME is a second node with this node's configuration. Arbitration cannot separate the two, and broadcasts of two
+//! nodes under one address would destroy each other: a node that receives its own NAME falls silent. (A socket does not
+//! receive its own frames.)
 
+use super::event::NodeEvent;
 use super::id::{GLOBAL_ADDRESS, NULL_ADDRESS, PGN_ADDRESS_CLAIMED, PRIORITY, can_id};
 use super::name::Name;
-use super::node::NodeEvent;
 use crate::can::Frame;
 use crate::quantity::Timestamp;
 
-/// How long nobody must object before the address is ours, ns: the 250 ms of J1939-81, and 50 ms because a frame is on the
-/// wire a little later than its time here (interfaces come up, queues empty; 12 ms were seen).
+/// Time without objection after which the node has the address, ns: the 250 ms of J1939-81, and 50 ms because a frame is on
+/// the wire a little later than its time here (interfaces start, queues empty; 12 ms were measured).
 const CONTENTION_NS: i64 = 300_000_000;
-/// Shortest time between two claims, ns: five in the time the other side waits, and a flood of claims is not answered by one.
+/// Shortest time between two claims, ns: five in the time the other node waits; a flood of claims causes no flood of answers.
 const CLAIM_SPACING_NS: i64 = 50_000_000;
 /// "Cannot claim" waits 0 to 153 ms, so that several losers do not collide with equal identifiers (J1939-81).
 const MAX_LOSER_DELAY_MS: u64 = 153;
 
-/// Where the node stands.
+/// State of the claim.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum State {
+pub(super) enum ClaimState {
     /// Not started.
     Idle,
     /// Has claimed, waits for objections.
     Claiming,
-    /// The address is ours.
+    /// The node has the address.
     Claimed,
-    /// The address is somebody else's.
+    /// Another node has the address.
     Lost,
 }
 
-/// What happens to it.
+/// Input of the machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ClaimEvent {
-    /// The program starts, or was away.
+    /// The program starts, or continues after time without listening.
     Started,
-    /// A NAME that beats ours, or equals it, claims our address.
+    /// A lower or equal NAME claims the address.
     ClaimedByStronger,
-    /// A NAME that ours beats claims our address.
+    /// A higher NAME claims the address.
     ClaimedByWeaker,
-    /// Somebody asks who has which address.
-    Asked,
-    /// Nobody objected for the time of contention.
+    /// A node requests address claims.
+    Requested,
+    /// No objection for the time of contention.
     Unopposed,
 }
 
-/// What is sent about the address.
+/// Frame to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Answer {
+enum ClaimAnswer {
     Nothing,
     Claim,
     CannotClaim,
 }
 
 /// The table above.
-fn next(state: State, happening: ClaimEvent) -> (State, Answer) {
-    match (state, happening) {
-        (State::Idle | State::Claiming | State::Claimed | State::Lost, ClaimEvent::Started)
-        | (State::Claiming, ClaimEvent::ClaimedByWeaker | ClaimEvent::Asked) => (State::Claiming, Answer::Claim),
-        (State::Claimed, ClaimEvent::ClaimedByWeaker | ClaimEvent::Asked) => (State::Claimed, Answer::Claim),
-        (State::Claiming | State::Claimed, ClaimEvent::ClaimedByStronger) | (State::Lost, ClaimEvent::Asked) => {
-            (State::Lost, Answer::CannotClaim)
+fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
+    match (state, event) {
+        (ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost, ClaimEvent::Started)
+        | (ClaimState::Claiming, ClaimEvent::ClaimedByWeaker | ClaimEvent::Requested) => {
+            (ClaimState::Claiming, ClaimAnswer::Claim)
         }
-        (State::Claiming, ClaimEvent::Unopposed) => (State::Claimed, Answer::Nothing),
+        (ClaimState::Claimed, ClaimEvent::ClaimedByWeaker | ClaimEvent::Requested) => {
+            (ClaimState::Claimed, ClaimAnswer::Claim)
+        }
+        (ClaimState::Claiming | ClaimState::Claimed, ClaimEvent::ClaimedByStronger)
+        | (ClaimState::Lost, ClaimEvent::Requested) => (ClaimState::Lost, ClaimAnswer::CannotClaim),
+        (ClaimState::Claiming, ClaimEvent::Unopposed) => (ClaimState::Claimed, ClaimAnswer::Nothing),
         (
-            State::Idle,
-            ClaimEvent::ClaimedByStronger | ClaimEvent::ClaimedByWeaker | ClaimEvent::Asked | ClaimEvent::Unopposed,
+            ClaimState::Idle,
+            ClaimEvent::ClaimedByStronger | ClaimEvent::ClaimedByWeaker | ClaimEvent::Requested | ClaimEvent::Unopposed,
         )
-        | (State::Claimed, ClaimEvent::Unopposed)
-        | (State::Lost, ClaimEvent::ClaimedByStronger | ClaimEvent::ClaimedByWeaker | ClaimEvent::Unopposed) => {
-            (state, Answer::Nothing)
+        | (ClaimState::Claimed, ClaimEvent::Unopposed)
+        | (ClaimState::Lost, ClaimEvent::ClaimedByStronger | ClaimEvent::ClaimedByWeaker | ClaimEvent::Unopposed) => {
+            (state, ClaimAnswer::Nothing)
         }
     }
 }
@@ -86,13 +90,13 @@ fn next(state: State, happening: ClaimEvent) -> (State, Answer) {
 pub(super) struct AddressClaim {
     name: Name,
     address: u8,
-    state: State,
+    state: ClaimState,
     /// When contention ends, while claiming.
     unopposed_at: Timestamp,
-    /// When a claim (or "cannot claim", in state lost) is to be sent.
+    /// Time to send a claim (in state lost: "cannot claim").
     send_at: Option<Timestamp>,
     last_sent: Option<Timestamp>,
-    /// The claim that begins the contention is still to be sent.
+    /// The claim that begins the contention is not yet sent.
     is_first: bool,
 }
 
@@ -101,7 +105,7 @@ impl AddressClaim {
         Self {
             name,
             address,
-            state: State::Idle,
+            state: ClaimState::Idle,
             unopposed_at: Timestamp::ZERO,
             send_at: None,
             last_sent: None,
@@ -109,51 +113,51 @@ impl AddressClaim {
         }
     }
 
-    pub(super) const fn state(&self) -> State {
+    pub(super) const fn state(&self) -> ClaimState {
         self.state
     }
 
-    /// Starts, or starts again after time nobody saw.
+    /// Starts, or starts again after time without listening.
     pub(super) fn start(&mut self, now: Timestamp) {
         self.last_sent = None;
         self.send_at = None;
         self.is_first = true;
-        self.happens(now, ClaimEvent::Started);
+        self.handle(now, ClaimEvent::Started);
     }
 
-    /// Another node claims our address.
+    /// Takes a claim of the address by another node.
     pub(super) fn contend(&mut self, now: Timestamp, by: Name) -> Option<NodeEvent> {
         let (before, was_answered) = (self.state, self.send_at.is_none());
-        self.happens(now, if by <= self.name { ClaimEvent::ClaimedByStronger } else { ClaimEvent::ClaimedByWeaker });
+        self.handle(now, if by <= self.name { ClaimEvent::ClaimedByStronger } else { ClaimEvent::ClaimedByWeaker });
         match (before, self.state) {
-            (State::Claiming | State::Claimed, State::Lost) => Some(NodeEvent::AddressLost { to: by }),
-            // Told once per answer: a flood of claims is answered at a limited rate.
-            (State::Claiming | State::Claimed, State::Claiming | State::Claimed) => {
+            (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Lost) => Some(NodeEvent::AddressLost { to: by }),
+            // One event per answer: a flood of claims is answered at a limited rate.
+            (ClaimState::Claiming | ClaimState::Claimed, ClaimState::Claiming | ClaimState::Claimed) => {
                 was_answered.then_some(NodeEvent::AddressDefended { against: by })
             }
-            (State::Idle | State::Lost, _) | (_, State::Idle) => None,
+            (ClaimState::Idle | ClaimState::Lost, _) | (_, ClaimState::Idle) => None,
         }
     }
 
-    /// Somebody asks for claims.
-    pub(super) fn asked(&mut self, now: Timestamp) {
-        self.happens(now, ClaimEvent::Asked);
+    /// Takes a request for claims.
+    pub(super) fn handle_request(&mut self, now: Timestamp) {
+        self.handle(now, ClaimEvent::Requested);
     }
 
-    fn happens(&mut self, now: Timestamp, happening: ClaimEvent) {
+    fn handle(&mut self, now: Timestamp, event: ClaimEvent) {
         let before = self.state;
-        let (state, answer) = next(before, happening);
+        let (state, answer) = next(before, event);
         self.state = state;
         let spaced = self.last_sent.map_or(now, |sent| now.max(sent.plus_nanos(CLAIM_SPACING_NS)));
         match answer {
-            Answer::Nothing => {}
-            Answer::Claim => self.send_at = Some(self.send_at.map_or(spaced, |due| due.min(spaced))),
-            // What was to be sent before the loss was a claim.
-            Answer::CannotClaim if before == State::Lost && self.send_at.is_some() => {}
-            Answer::CannotClaim => self.send_at = Some(spaced.plus_nanos(self.loser_delay_ns())),
+            ClaimAnswer::Nothing => {}
+            ClaimAnswer::Claim => self.send_at = Some(self.send_at.map_or(spaced, |due| due.min(spaced))),
+            // A frame that was due before the loss was a claim.
+            ClaimAnswer::CannotClaim if before == ClaimState::Lost && self.send_at.is_some() => {}
+            ClaimAnswer::CannotClaim => self.send_at = Some(spaced.plus_nanos(self.loser_delay_ns())),
         }
-        // Only the beginning counts: requests and weaker claims, however many, must not keep the node silent.
-        if happening == ClaimEvent::Started {
+        // Only the start counts: requests and weaker claims must not keep the node silent.
+        if event == ClaimEvent::Started {
             self.unopposed_at = now.plus_nanos(CONTENTION_NS);
         }
     }
@@ -165,7 +169,7 @@ impl AddressClaim {
         1_000_000 * i64::try_from(mixed % (MAX_LOSER_DELAY_MS + 1)).unwrap_or(0)
     }
 
-    /// What is due: a frame to send, or the news that the address is ours.
+    /// The frame that is due, or the event that the node has the address.
     pub(super) fn poll(&mut self, now: Timestamp) -> (Option<Frame>, Option<NodeEvent>) {
         if let Some(due) = self.send_at {
             if now < due {
@@ -173,13 +177,13 @@ impl AddressClaim {
             }
             self.send_at = None;
             self.last_sent = Some(now);
-            if self.state == State::Claiming && std::mem::take(&mut self.is_first) {
+            if self.state == ClaimState::Claiming && std::mem::take(&mut self.is_first) {
                 self.unopposed_at = now.plus_nanos(CONTENTION_NS);
             }
             return (self.frame(), None);
         }
-        if self.state == State::Claiming && now >= self.unopposed_at {
-            self.happens(now, ClaimEvent::Unopposed);
+        if self.state == ClaimState::Claiming && now >= self.unopposed_at {
+            self.handle(now, ClaimEvent::Unopposed);
             return (None, Some(NodeEvent::Claimed { address: self.address }));
         }
         (None, None)
@@ -187,16 +191,16 @@ impl AddressClaim {
 
     fn frame(&self) -> Option<Frame> {
         let source = match self.state {
-            State::Idle => return None,
-            State::Claiming | State::Claimed => self.address,
-            State::Lost => NULL_ADDRESS,
+            ClaimState::Idle => return None,
+            ClaimState::Claiming | ClaimState::Claimed => self.address,
+            ClaimState::Lost => NULL_ADDRESS,
         };
         Frame::classic(can_id(PRIORITY, PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS, source), &self.name.to_bytes())
     }
 
     /// When `poll` has something to do.
     pub(super) fn next_due(&self) -> Option<Timestamp> {
-        self.send_at.or((self.state == State::Claiming).then_some(self.unopposed_at))
+        self.send_at.or((self.state == ClaimState::Claiming).then_some(self.unopposed_at))
     }
 }
 
@@ -204,12 +208,12 @@ impl AddressClaim {
 mod tests {
     use super::*;
 
-    const STATES: [State; 4] = [State::Idle, State::Claiming, State::Claimed, State::Lost];
-    const HAPPENINGS: [ClaimEvent; 5] = [
+    const STATES: [ClaimState; 4] = [ClaimState::Idle, ClaimState::Claiming, ClaimState::Claimed, ClaimState::Lost];
+    const EVENTS: [ClaimEvent; 5] = [
         ClaimEvent::Started,
         ClaimEvent::ClaimedByStronger,
         ClaimEvent::ClaimedByWeaker,
-        ClaimEvent::Asked,
+        ClaimEvent::Requested,
         ClaimEvent::Unopposed,
     ];
 
@@ -231,9 +235,9 @@ mod tests {
     }
 
     #[test]
-    fn every_state_answers_every_happening_as_the_table_says() {
-        use Answer::{CannotClaim, Claim, Nothing};
-        use State::{Claimed, Claiming, Idle, Lost};
+    fn every_state_answers_every_event_as_the_table_says() {
+        use ClaimAnswer::{CannotClaim, Claim, Nothing};
+        use ClaimState::{Claimed, Claiming, Idle, Lost};
         let wanted = [
             [(Claiming, Claim), (Idle, Nothing), (Idle, Nothing), (Idle, Nothing), (Idle, Nothing)],
             [(Claiming, Claim), (Lost, CannotClaim), (Claiming, Claim), (Claiming, Claim), (Claimed, Nothing)],
@@ -241,8 +245,8 @@ mod tests {
             [(Claiming, Claim), (Lost, Nothing), (Lost, Nothing), (Lost, CannotClaim), (Lost, Nothing)],
         ];
         for (state, row) in STATES.into_iter().zip(wanted) {
-            for (happening, wanted) in HAPPENINGS.into_iter().zip(row) {
-                assert_eq!(next(state, happening), wanted, "{state:?}, {happening:?}");
+            for (event, wanted) in EVENTS.into_iter().zip(row) {
+                assert_eq!(next(state, event), wanted, "{state:?}, {event:?}");
             }
         }
     }
@@ -257,14 +261,14 @@ mod tests {
     }
 
     #[test]
-    fn a_higher_name_is_answered_by_our_claim_and_lengthens_no_wait() {
+    fn a_higher_name_is_answered_by_a_claim_and_lengthens_no_wait() {
         let mut claim = AddressClaim::new(name(10), 0xF9);
         claim.start(at(0));
         assert!(claim.poll(at(0)).0.is_some());
         assert_eq!(claim.contend(at(100), name(11)), Some(NodeEvent::AddressDefended { against: name(11) }));
         assert_eq!(claim.poll(at(100)).0.unwrap().id().raw(), 0x18EE_FFF9);
-        // Somebody asks for claims all the time: the address is ours all the same.
-        claim.asked(at(250));
+        // Requests for claims do not delay the address.
+        claim.handle_request(at(250));
         assert!(claim.poll(at(250)).0.is_some());
         assert_eq!(claim.poll(at(299)), (None, None));
         assert_eq!(claim.poll(at(300)).1, Some(NodeEvent::Claimed { address: 0xF9 }));
@@ -283,30 +287,30 @@ mod tests {
     }
 
     #[test]
-    fn our_own_name_from_another_node_silences_us() {
+    fn an_equal_name_from_another_node_silences_this_one() {
         let mut claim = claimed(10);
         assert_eq!(claim.contend(at(1000), name(10)), Some(NodeEvent::AddressLost { to: name(10) }));
-        assert_eq!(claim.state(), State::Lost);
+        assert_eq!(claim.state(), ClaimState::Lost);
     }
 
     #[test]
     fn a_flood_of_claims_is_answered_every_50_ms() {
         let mut claim = claimed(10);
-        let (mut sent, mut told) = (0, 0);
+        let (mut sent, mut events) = (0, 0);
         for ms in 1000..2000 {
-            told += usize::from(claim.contend(at(ms), name(11)).is_some());
+            events += usize::from(claim.contend(at(ms), name(11)).is_some());
             sent += usize::from(claim.poll(at(ms)).0.is_some());
         }
         assert_eq!(sent, 20);
-        assert!(told <= 21, "told once per answer, not {told} times");
+        assert!(events <= 21, "one event per answer, not {events}");
     }
 
     #[test]
-    fn a_loser_asked_for_its_claim_says_that_it_has_none() {
+    fn a_loser_answers_a_request_with_cannot_claim() {
         let mut claim = claimed(10);
         claim.contend(at(1000), name(9));
         assert!(claim.poll(at(1153)).0.is_some());
-        claim.asked(at(5000));
+        claim.handle_request(at(5000));
         assert_eq!(claim.poll(at(5153)).0.unwrap().id().raw(), 0x18EE_FFFE);
     }
 

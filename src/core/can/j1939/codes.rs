@@ -1,10 +1,10 @@
-//! Which codes the bus is shown, beside those that are active: at most one change a second each (J1939-73).
+//! The codes as sent, which follow the active codes: at most one change a second each (J1939-73).
 //!
-//! A code is shown as soon as it becomes active, and taken away as soon as it no longer is, unless the bus saw this code
-//! change less than a second ago: then the change waits. What became active while it waited is not lost: a code that
-//! came and went in between is shown all the same, for at least a second. One that went and came stays shown; its count tells.
+//! A code is sent as soon as it becomes active, and removed as soon as it is no longer active, unless its last change on the
+//! bus is less than a second ago: then the change waits. A code that was active only while it waited is still sent, for at
+//! least a second. One that was inactive only while it waited stays, with a higher count.
 //!
-//! Whether everything is known is shown the same way, but only good news waits: unknown is told at once.
+//! The state "everything is known" follows the same rule, but only towards known: unknown is sent at once.
 
 use super::trouble_code::{Lamp, Lamps, TroubleCode};
 use crate::quantity::Timestamp;
@@ -12,10 +12,10 @@ use crate::quantity::Timestamp;
 /// Shortest time between two changes of one code on the bus, ns.
 const CHANGE_SPACING_NS: i64 = 1_000_000_000;
 
-/// Codes followed at a time: more than a configuration can name (14 rules of three severities are 42), few enough to search.
+/// Most codes followed at a time: more than a configuration has (14 rules of three severities are 42), few enough to search.
 const MAX_FOLLOWED: usize = 64;
 
-/// A code that is active and the lamp it lights.
+/// An active code and its lamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ActiveCode {
     /// The code.
@@ -24,28 +24,28 @@ pub struct ActiveCode {
     pub lamp: Lamp,
 }
 
-/// One code's way to the bus.
+/// One code, active and as sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Followed {
+struct FollowedCode {
     code: TroubleCode,
     /// Active now.
     is_active: bool,
-    /// Became active since the bus last saw it change.
+    /// Became active since its last change on the bus.
     is_unseen: bool,
-    /// Worst lamp since the bus last saw it change.
+    /// Most severe lamp since its last change on the bus.
     lamp: Lamp,
-    /// Lamp as it is now.
+    /// Lamp now.
     lamp_now: Lamp,
-    /// As the bus was told; `None` = not active.
+    /// Lamp as sent; `None` = not active.
     shown: Option<Lamp>,
-    /// When the bus last saw it change.
+    /// Time of its last change on the bus.
     changed_at: Option<Timestamp>,
-    /// Its change is in the message that is being sent.
+    /// Its change is in the message that is being transferred.
     is_in_flight: bool,
 }
 
-impl Followed {
-    /// One that has just become active.
+impl FollowedCode {
+    /// A code that has just become active.
     fn new(active: &ActiveCode) -> Self {
         Self {
             code: active.code,
@@ -63,18 +63,18 @@ impl Followed {
         (self.is_active || self.is_unseen).then_some(self.lamp)
     }
 
-    /// When the bus may see the change; `None` = there is none to see.
+    /// Time of the next change on the bus; `None` = no change.
     fn due(&self) -> Option<Timestamp> {
         (self.wanted() != self.shown).then_some(spaced(self.changed_at))
     }
 
-    /// What the bus would be told at this time.
+    /// The lamp in a message at this time.
     fn shown_at(&self, now: Timestamp) -> Option<Lamp> {
         if self.due().is_some_and(|due| due <= now) { self.wanted() } else { self.shown }
     }
 
-    fn is_active_again(&mut self, active: &ActiveCode) {
-        // Named twice in one list: the worse lamp and the higher count hold.
+    fn activate(&mut self, active: &ActiveCode) {
+        // Twice in one list: the more severe lamp and the higher count hold.
         let (lamp_before, count_before) = match self.is_active {
             true => (self.lamp_now, self.code.occurrence_count()),
             false => (Lamp::None, 0),
@@ -85,7 +85,7 @@ impl Followed {
         self.code = active.code.with_occurrences(active.code.occurrence_count().max(count_before).into());
     }
 
-    /// After the new list was read: keeps the worst lamp that the bus has not seen yet.
+    /// After a new list: keeps the most severe lamp that was not yet sent.
     fn settle_lamp(&mut self) {
         if self.is_active {
             let is_unseen = self.shown.is_none_or(|shown| self.lamp > shown);
@@ -94,22 +94,22 @@ impl Followed {
     }
 }
 
-/// The time from which a change may be seen again.
+/// Earliest time of the next change.
 fn spaced(changed_at: Option<Timestamp>) -> Timestamp {
     changed_at.map_or(Timestamp::from_nanos(i64::MIN), |changed| changed.plus_nanos(CHANGE_SPACING_NS))
 }
 
-/// All of them.
+/// All codes.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) struct Codes {
-    followed: Vec<Followed>,
+    followed: Vec<FollowedCode>,
     all_known: bool,
     all_known_shown: bool,
     known_changed_at: Option<Timestamp>,
 }
 
 impl Codes {
-    /// Takes what is active now; tells how many codes could not be followed.
+    /// Takes the active codes. Returns the number of codes that could not be followed.
     pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) -> usize {
         self.forget_settled(now);
         let mut not_followed = 0;
@@ -119,8 +119,8 @@ impl Codes {
         }
         for active in active {
             match self.followed.iter().position(|followed| followed.code.is_same_failure(active.code)) {
-                Some(index) => self.followed[index].is_active_again(active),
-                None if self.followed.len() < MAX_FOLLOWED => self.followed.push(Followed::new(active)),
+                Some(index) => self.followed[index].activate(active),
+                None if self.followed.len() < MAX_FOLLOWED => self.followed.push(FollowedCode::new(active)),
                 None => not_followed += 1,
             }
         }
@@ -130,7 +130,7 @@ impl Codes {
         not_followed
     }
 
-    /// Lets go of codes of which the bus need hear nothing any more.
+    /// Removes codes that are inactive and no longer sent.
     fn forget_settled(&mut self, now: Timestamp) {
         self.followed.retain(|f| {
             let is_settled = f.wanted().is_none() && f.shown.is_none() && !f.is_in_flight;
@@ -138,32 +138,32 @@ impl Codes {
         });
     }
 
-    /// The bus is to be told from the beginning: it was away, or we were.
+    /// Begins again after time without the bus: active codes count as new.
     pub(super) fn restart(&mut self) {
         self.followed.retain(|followed| followed.is_active);
         for followed in &mut self.followed {
-            *followed = Followed::new(&ActiveCode { code: followed.code, lamp: followed.lamp_now });
+            *followed = FollowedCode::new(&ActiveCode { code: followed.code, lamp: followed.lamp_now });
         }
         self.all_known_shown = false;
         self.known_changed_at = None;
     }
 
-    /// When the bus may see the next change; `None` = it has seen all.
+    /// Time of the next change; `None` = all changes are sent.
     pub(super) fn change_due(&self) -> Option<Timestamp> {
         let known = match (self.all_known, self.all_known_shown) {
             (true, true) | (false, false) => None,
             (true, false) => Some(spaced(self.known_changed_at)),
             (false, true) => Some(Timestamp::from_nanos(i64::MIN)),
         };
-        self.followed.iter().filter_map(Followed::due).chain(known).min()
+        self.followed.iter().filter_map(FollowedCode::due).chain(known).min()
     }
 
-    /// How many codes a message at this time would have.
+    /// Number of codes of a message at this time.
     pub(super) fn count_at(&self, now: Timestamp) -> usize {
         self.followed.iter().filter(|followed| followed.shown_at(now).is_some()).count()
     }
 
-    /// The bus is told at this time: every change that is due counts as seen.
+    /// A message is made at this time: every change that is due is in it.
     pub(super) fn show(&mut self, now: Timestamp) {
         for followed in &mut self.followed {
             if followed.due().is_some_and(|due| due <= now) {
@@ -180,7 +180,7 @@ impl Codes {
         }
     }
 
-    /// The message went out to its last byte at this time: what changed with it was seen only now.
+    /// The last byte of the message was sent at this time: its changes count from now.
     pub(super) fn sent(&mut self, now: Timestamp) {
         for followed in self.followed.iter_mut().filter(|followed| followed.is_in_flight) {
             followed.changed_at = Some(now);
@@ -188,12 +188,12 @@ impl Codes {
         }
     }
 
-    /// The lamps as shown, those of all codes, however many a message holds.
+    /// The lamps as sent: those of all codes, also of codes beyond one message.
     pub(super) fn lamps(&self) -> Lamps {
         Lamps::of(self.followed.iter().filter_map(|followed| followed.shown), self.all_known_shown)
     }
 
-    /// The codes as shown, the most severe lamp first, then by number.
+    /// The codes as sent, most severe lamp first, then by number.
     pub(super) fn shown(&self) -> Vec<TroubleCode> {
         let mut shown: Vec<(Lamp, TroubleCode)> =
             self.followed.iter().filter_map(|followed| Some((followed.shown?, followed.code))).collect();
@@ -235,7 +235,7 @@ mod tests {
     }
 
     #[test]
-    fn a_code_that_comes_and_goes_while_it_waits_is_still_shown_for_a_second() {
+    fn a_code_active_only_while_it_waits_is_still_shown_for_a_second() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
         assert_eq!(step(&mut codes, 1000, &[]), [] as [u32; 0]);
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_goes_and_comes_while_it_waits_stays_shown_with_its_new_count() {
+    fn a_code_inactive_only_while_it_waits_stays_shown_with_its_new_count() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1)]);
         assert_eq!(step(&mut codes, 100, &[]), [1]);
@@ -307,19 +307,19 @@ mod tests {
     }
 
     #[test]
-    fn unknown_is_told_at_once_and_known_again_after_a_second() {
+    fn unknown_is_sent_at_once_and_known_again_after_a_second() {
         let mut codes = Codes::default();
         let show = |codes: &mut Codes, ms, all_known| {
             codes.set(at(ms), &[], all_known);
             codes.show(at(ms));
             codes.lamps() == Lamps::default()
         };
-        assert!(!Codes::default().all_known_shown, "nothing is known before anybody said so");
+        assert!(!Codes::default().all_known_shown, "unknown at the start");
         assert!(show(&mut codes, 0, true));
         assert!(!show(&mut codes, 10, false));
         assert!(!show(&mut codes, 1009, true));
         assert!(show(&mut codes, 1010, true));
-        assert!(!show(&mut codes, 1011, false), "bad news does not wait");
+        assert!(!show(&mut codes, 1011, false), "unknown does not wait");
     }
 
     #[test]
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_restart_what_is_over_is_forgotten_and_what_is_active_is_new() {
+    fn after_a_restart_inactive_codes_are_forgotten_and_active_ones_are_new() {
         let mut codes = Codes::default();
         step(&mut codes, 0, &[active(1, Lamp::Amber, 1), active(2, Lamp::Red, 1)]);
         codes.set(at(10), &[active(2, Lamp::Amber, 1)], true);

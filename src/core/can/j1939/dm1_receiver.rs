@@ -1,8 +1,8 @@
-//! The listening side of DM1: what one address tells, in one frame or in packets (BAM), put together again.
+//! Receiver of the DM1 of one address, in one frame or in packets (BAM).
 //!
-//! In: frames as received, any of the bus. Out: the codes of each complete DM1, or that one could not be read: too short,
-//! in an old layout, with a packet missing. A transfer whose beginning was not heard is passed over; so is what belongs
-//! to another group. Any bytes are taken; memory is bounded by the longest transfer, 1785 bytes.
+//! In: any frames of the bus. Out: the codes of each complete DM1, or that it cannot be read: too short, in an old layout,
+//! with a packet missing. Other groups, and transfers without their announcement, are ignored. Any bytes are accepted;
+//! memory is bounded by the longest transfer, 1785 bytes.
 
 use super::id::{
     GLOBAL_ADDRESS, Header, PGN_DM1, PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, WITHOUT_PRIORITY, can_id, pgn_of,
@@ -14,16 +14,16 @@ use crate::can::{Frame, FrameKind};
 /// Bytes of a transfer: more than a frame holds, no more than 255 packets do.
 const TRANSFER_BYTES: std::ops::RangeInclusive<usize> = 9..=255 * PACKET_BYTES;
 
-/// A DM1 that was heard.
+/// A received DM1.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum HeardDm1 {
-    /// Its codes; none is good news.
+pub enum ReceivedDm1 {
+    /// Its codes; an empty list = no active code.
     Codes(Vec<TroubleCode>),
-    /// It could not be read.
+    /// It cannot be read.
     Unreadable,
 }
 
-impl HeardDm1 {
+impl ReceivedDm1 {
     fn of(payload: &[u8]) -> Self {
         dm_codes(payload).map_or(Self::Unreadable, Self::Codes)
     }
@@ -31,21 +31,21 @@ impl HeardDm1 {
 
 /// A transfer that has begun.
 #[derive(Debug, Clone, PartialEq, Eq)]
-struct Incoming {
+struct IncomingTransfer {
     size: usize,
     next_packet: u8,
     bytes: Vec<u8>,
 }
 
-/// Hears the DM1 of one address.
+/// Receives the DM1 of one address.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Dm1Receiver {
     address: u8,
-    transfer: Option<Incoming>,
+    transfer: Option<IncomingTransfer>,
 }
 
 impl Dm1Receiver {
-    /// For the DM1 of this address.
+    /// A receiver for this address.
     pub const fn new(address: u8) -> Self {
         Self { address, transfer: None }
     }
@@ -56,47 +56,47 @@ impl Dm1Receiver {
             .map(|pgn| (can_id(0, pgn, GLOBAL_ADDRESS, self.address).raw(), WITHOUT_PRIORITY))
     }
 
-    /// Takes a frame; tells of the DM1 that ends with it, well or badly.
-    pub fn take(&mut self, frame: &Frame) -> Option<HeardDm1> {
+    /// Takes a frame. Returns the DM1 that ends with it.
+    pub fn take(&mut self, frame: &Frame) -> Option<ReceivedDm1> {
         let header = Header::of(frame.id()).filter(|header| header.source == self.address)?;
         if frame.kind() != FrameKind::Classic || header.destination != GLOBAL_ADDRESS {
             return None;
         }
         match header.pgn {
-            PGN_DM1 => Some(HeardDm1::of(frame.data())),
+            PGN_DM1 => Some(ReceivedDm1::of(frame.data())),
             PGN_TRANSPORT_CONTROL => self.take_announcement(frame.data()),
             PGN_TRANSPORT_DATA => self.take_packet(frame.data()),
             _ => None,
         }
     }
 
-    /// A new transfer ends the one before it, whole or not.
-    fn take_announcement(&mut self, data: &[u8]) -> Option<HeardDm1> {
+    /// A new transfer ends the previous one, complete or not.
+    fn take_announcement(&mut self, data: &[u8]) -> Option<ReceivedDm1> {
         let &[BAM, size_low, size_high, packets, _, low, middle, high] = data else { return None };
-        let broken = self.transfer.take().map(|_| HeardDm1::Unreadable);
+        let broken = self.transfer.take().map(|_| ReceivedDm1::Unreadable);
         if pgn_of([low, middle, high]) != PGN_DM1 {
             return broken;
         }
         let size = usize::from(u16::from_le_bytes([size_low, size_high]));
         if !TRANSFER_BYTES.contains(&size) || size.div_ceil(PACKET_BYTES) != usize::from(packets) {
-            return Some(HeardDm1::Unreadable);
+            return Some(ReceivedDm1::Unreadable);
         }
-        self.transfer = Some(Incoming { size, next_packet: 1, bytes: Vec::with_capacity(size + PACKET_BYTES) });
+        self.transfer = Some(IncomingTransfer { size, next_packet: 1, bytes: Vec::with_capacity(size + PACKET_BYTES) });
         broken
     }
 
-    fn take_packet(&mut self, data: &[u8]) -> Option<HeardDm1> {
+    fn take_packet(&mut self, data: &[u8]) -> Option<ReceivedDm1> {
         let mut transfer = self.transfer.take()?;
         match data {
             [number, bytes @ ..] if *number == transfer.next_packet && bytes.len() == PACKET_BYTES => {
                 transfer.bytes.extend_from_slice(bytes);
             }
-            _ => return Some(HeardDm1::Unreadable),
+            _ => return Some(ReceivedDm1::Unreadable),
         }
         if let Some(payload) = transfer.bytes.get(..transfer.size) {
-            return Some(HeardDm1::of(payload));
+            return Some(ReceivedDm1::of(payload));
         }
-        // Less than the whole has come, so this was not the last of at most 255 packets.
+        // Incomplete, so this was not the last of at most 255 packets.
         transfer.next_packet = transfer.next_packet.saturating_add(1);
         self.transfer = Some(transfer);
         None
@@ -135,25 +135,25 @@ mod tests {
         announcement.into_iter().chain(packets).collect()
     }
 
-    fn heard(frames: &[Frame]) -> Vec<HeardDm1> {
+    fn received(frames: &[Frame]) -> Vec<ReceivedDm1> {
         let mut receiver = Dm1Receiver::new(ADDRESS);
         frames.iter().filter_map(|frame| receiver.take(frame)).collect()
     }
 
     #[test]
-    fn what_the_node_sends_is_heard_with_every_number_of_codes() {
+    fn messages_of_the_node_are_received_with_every_number_of_codes() {
         for priority in [0, 3, 6] {
             let single = |count| frame(priority << 26 | 0x00FE_CAF9, payload(count).as_slice());
-            let wanted = [HeardDm1::Codes(vec![]), HeardDm1::Codes(codes(1))];
-            assert_eq!(heard(&[single(0), single(1)]), wanted, "priority {priority}");
+            let wanted = [ReceivedDm1::Codes(vec![]), ReceivedDm1::Codes(codes(1))];
+            assert_eq!(received(&[single(0), single(1)]), wanted, "priority {priority}");
         }
         for count in 2..=27 {
-            assert_eq!(heard(&transfer(PGN_DM1, count)), [HeardDm1::Codes(codes(count))], "{count} codes");
+            assert_eq!(received(&transfer(PGN_DM1, count)), [ReceivedDm1::Codes(codes(count))], "{count} codes");
         }
     }
 
     #[test]
-    fn other_addresses_groups_and_kinds_of_frame_are_passed_over() {
+    fn other_addresses_groups_and_kinds_of_frame_are_ignored() {
         let data = payload(1);
         let other = [
             frame(0x18FE_CAF8, data.as_slice()),
@@ -162,31 +162,31 @@ mod tests {
             frame(0x1CEB_21F9, data.as_slice()),
             Frame::fd(CanId::Extended(0x18FE_CAF9), false, false, data.as_slice()).unwrap(),
         ];
-        assert_eq!(heard(&other), []);
-        assert_eq!(heard(&transfer(PGN_DM2, 5)), []);
-        assert_eq!(heard(&transfer(PGN_DM1, 5)[1..]), [], "its beginning was not heard");
+        assert_eq!(received(&other), []);
+        assert_eq!(received(&transfer(PGN_DM2, 5)), []);
+        assert_eq!(received(&transfer(PGN_DM1, 5)[1..]), [], "without its announcement");
     }
 
     #[test]
-    fn a_missing_packet_is_told_and_the_next_transfer_is_whole() {
+    fn a_missing_packet_is_reported_and_the_next_transfer_is_complete() {
         let mut frames = transfer(PGN_DM1, 5);
         frames.remove(2);
         frames.extend(transfer(PGN_DM1, 2));
-        assert_eq!(heard(&frames), [HeardDm1::Unreadable, HeardDm1::Codes(codes(2))]);
+        assert_eq!(received(&frames), [ReceivedDm1::Unreadable, ReceivedDm1::Codes(codes(2))]);
     }
 
     #[test]
-    fn a_transfer_that_another_cuts_short_is_told() {
+    fn a_transfer_that_another_cuts_short_is_reported() {
         let mut frames = transfer(PGN_DM1, 5);
         frames.pop();
         frames.extend(transfer(PGN_DM2, 5));
-        assert_eq!(heard(&frames), [HeardDm1::Unreadable]);
+        assert_eq!(received(&frames), [ReceivedDm1::Unreadable]);
     }
 
     #[test]
-    fn an_announcement_that_contradicts_itself_is_told() {
+    fn an_announcement_that_contradicts_itself_is_reported() {
         let announce = |size: u8, packets| frame(0x1CEC_FFF9, &[32, size, 0, packets, 0xFF, 0xCA, 0xFE, 0]);
-        assert_eq!(heard(&[announce(22, 3), announce(8, 2)]), [HeardDm1::Unreadable, HeardDm1::Unreadable]);
+        assert_eq!(received(&[announce(22, 3), announce(8, 2)]), [ReceivedDm1::Unreadable, ReceivedDm1::Unreadable]);
     }
 
     #[test]
@@ -197,7 +197,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_frames_are_taken(
+        fn any_frames_are_accepted(
             frames in prop::collection::vec((0_usize..4, prop::collection::vec(any::<u8>(), 0..=8)), 0..100),
         ) {
             let mut receiver = Dm1Receiver::new(ADDRESS);

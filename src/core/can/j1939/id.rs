@@ -1,4 +1,4 @@
-//! The 29-bit identifier as J1939 reads it: priority, parameter group number (PGN), destination, source.
+//! The 29-bit identifier in J1939: priority, parameter group number (PGN), destination, source.
 
 use crate::can::CanId;
 
@@ -6,7 +6,7 @@ use crate::can::CanId;
 pub const PGN_REQUEST: u32 = 59_904;
 /// Acknowledges, or here only refuses, a request.
 pub const PGN_ACKNOWLEDGEMENT: u32 = 59_392;
-/// Says who has an address ("cannot claim" from [`NULL_ADDRESS`]).
+/// Claims an address ("cannot claim" from [`NULL_ADDRESS`]).
 pub const PGN_ADDRESS_CLAIMED: u32 = 60_928;
 /// Transport protocol, connection management: announces a broadcast in packets.
 pub const PGN_TRANSPORT_CONTROL: u32 = 60_416;
@@ -17,7 +17,7 @@ pub const PGN_DM1: u32 = 65_226;
 /// Previously active trouble codes.
 pub const PGN_DM2: u32 = 65_227;
 
-/// Destination of what is meant for all.
+/// Destination of frames to all nodes.
 pub const GLOBAL_ADDRESS: u8 = 255;
 /// Source of a node that has no address.
 pub const NULL_ADDRESS: u8 = 254;
@@ -34,19 +34,19 @@ pub(super) const WITHOUT_PRIORITY: u32 = 0x03FF_FFFF;
 /// PDU formats from here on (240) carry no destination: their last byte belongs to the PGN.
 const FIRST_BROADCAST_FORMAT: u8 = 240;
 
-/// An identifier taken apart.
+/// Parts of an identifier.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Header {
     /// Parameter group number, 18 bits.
     pub(super) pgn: u32,
-    /// Whom it is for; [`GLOBAL_ADDRESS`] for a group without destination.
+    /// Receiver; [`GLOBAL_ADDRESS`] for a group without destination.
     pub(super) destination: u8,
-    /// Who sent it.
+    /// Sender.
     pub(super) source: u8,
 }
 
 impl Header {
-    /// Takes an extended identifier apart; `None` for a standard one.
+    /// Splits an extended identifier; `None` for a standard one.
     pub(super) fn of(id: CanId) -> Option<Self> {
         let CanId::Extended(raw) = id else { return None };
         let [page, format, specific, source] = (raw & WITHOUT_PRIORITY).to_be_bytes();
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn every_identifier_comes_apart_as_it_was_put_together() {
+    fn every_identifier_splits_into_the_parts_it_was_made_of() {
         for (pgn, destination, read) in
             [(PGN_REQUEST, 0x21, 0x21), (PGN_DM1, 0x21, GLOBAL_ADDRESS), (0x3_EF00, 0x21, 0x21), (0x1_FECA, 7, 255)]
         {

@@ -1,32 +1,35 @@
-//! J1939 beside the plain frames: this program as one node that claims an address and tells its trouble codes.
+//! J1939: this program as one node that claims an address and sends its trouble codes.
 //!
-//! In: times, received frames, the codes that are active now. Out: frames to send and events to log. Pure as the rest
-//! of [`can`](crate::can): everything the node does follows from what is handed to it, so replay gives the same frames.
+//! In: times, received frames, the codes that are active now. Out: frames to send and events to log. Pure as the rest of
+//! [`can`](crate::can): the output depends on the input alone, so replay gives the same frames.
 //!
-//! | part | what |
+//! | file | purpose |
 //! | --- | --- |
 //! | `name` | the 64-bit NAME of J1939-81 |
 //! | `id` | priorities, parameter group numbers and addresses in an extended identifier |
 //! | `trouble_code` | a code, the lamps, and the payload of DM1 and DM2 |
-//! | `codes` | which codes the bus is shown: at most one change a second each, nothing lost in between |
+//! | `codes` | the codes as sent: at most one change a second each, no short activity lost |
 //! | `transport` | payloads of more than 8 bytes, broadcast in packets (BAM) |
-//! | `dm1_receiver` | the other side, for tests of what goes out: puts the DM1 of one address together again |
+//! | `dm1_receiver` | the receiving side, to check sent messages: reassembles the DM1 of one address |
 //! | `address` | claiming the address, defending it, falling silent |
-//! | `node` | all of it together |
+//! | `event` | events of the node |
+//! | `node` | the node that consists of these parts |
 //!
-//! Promise: no frame but an address claim is sent before the address is ours or after it was lost; unknown frames,
-//! short frames and floods of requests are counted, answered at a limited rate and never panic.
+//! Promise: without its address the node sends only address claims. Unknown frames are ignored, short frames are counted,
+//! requests are answered at a limited rate; no input causes a panic.
 //!
 //! Deviations from the standard:
-//! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of taking
-//!    another. A battery monitor whose address wanders cannot be told from another one by a consumer that knows it by address.
-//! 2. Every payload of more than 8 bytes goes by BAM, also when one node asked for it alone (the standard has a connection
-//!    with flow control for that). Who asks hears the broadcast as well; the effect is bus load, bounded by [`MAX_CODES`].
+//! 1. The arbitrary address capability is not used: a node that loses its address falls silent instead of taking another.
+//!    A consumer that knows battery monitors by address cannot distinguish them when addresses change.
+//! 2. Every payload of more than 8 bytes is sent by BAM, also when a single node requested it (the standard has a connection
+//!    with flow control for that). That node receives the broadcast as well; the effect is bus load, limited by
+//!    [`MAX_CODES`].
 //! 3. The delay before "cannot claim" is drawn from the NAME, not at random, so that replay equals live.
 
 mod address;
 mod codes;
 mod dm1_receiver;
+mod event;
 mod id;
 mod name;
 mod node;
@@ -34,11 +37,12 @@ mod transport;
 mod trouble_code;
 
 pub use codes::ActiveCode;
-pub use dm1_receiver::{Dm1Receiver, HeardDm1};
+pub use dm1_receiver::{Dm1Receiver, ReceivedDm1};
+pub use event::NodeEvent;
 pub use id::{
     GLOBAL_ADDRESS, MAX_ADDRESS, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
     PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA,
 };
 pub use name::{Name, NameFields, OutOfRange};
-pub use node::{Node, NodeConfig, NodeCounters, NodeEvent, NodeOutputs};
+pub use node::{Node, NodeConfig, NodeCounters, NodeOutputs};
 pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_codes, dm_payload};

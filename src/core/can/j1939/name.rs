@@ -1,4 +1,4 @@
-//! The NAME of J1939-81: 64 bits that say what a node is and which one; the smaller NAME wins an address.
+//! The NAME of J1939-81: 64 bits that identify a node; the smaller NAME wins an address.
 
 use std::fmt;
 
@@ -9,24 +9,24 @@ use serde::{Deserialize, Serialize};
 #[serde(transparent)]
 pub struct Name(u64);
 
-/// What a NAME is made of.
+/// Fields of a NAME.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct NameFields {
-    /// Whether the node would take another address when it loses its own. This program never does.
+    /// Whether the node takes another address when it loses its own. This program never does.
     pub arbitrary_address_capable: bool,
     /// 0 global, 1 on-highway, 2 agriculture, 3 construction, 4 marine, 5 industrial; 3 bits.
     pub industry_group: u8,
-    /// Which one of several equal vehicle systems; 4 bits.
+    /// Number among equal vehicle systems; 4 bits.
     pub vehicle_system_instance: u8,
     /// Vehicle system within the industry group; 7 bits, 127 = not available.
     pub vehicle_system: u8,
-    /// What the node does; 8 bits, 255 = not available.
+    /// Function; 8 bits, 255 = not available.
     pub function: u8,
-    /// Which one of several nodes of this function; 5 bits.
+    /// Number among nodes of this function; 5 bits.
     pub function_instance: u8,
-    /// Which one of several computers that share a function; 3 bits.
+    /// Number among computers that share a function; 3 bits.
     pub ecu_instance: u8,
-    /// Who made it, a number SAE assigns; 11 bits.
+    /// Manufacturer, assigned by SAE; 11 bits.
     pub manufacturer_code: u16,
     /// Serial number, unique within the maker; 21 bits.
     pub identity_number: u32,
@@ -36,9 +36,9 @@ pub struct NameFields {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("{field} = {found}, must be {lowest} to {highest}")]
 pub struct OutOfRange {
-    /// Which number.
+    /// Name of the number.
     pub field: &'static str,
-    /// What it is.
+    /// Its value.
     pub found: u64,
     /// Smallest allowed.
     pub lowest: u64,
@@ -47,7 +47,7 @@ pub struct OutOfRange {
 }
 
 impl Name {
-    /// A NAME of its fields.
+    /// Makes a NAME of its fields.
     ///
     /// # Errors
     /// The first field that does not fit its bits.
@@ -77,24 +77,24 @@ impl Name {
         Ok(Self(name))
     }
 
-    /// A NAME as received.
+    /// The NAME of received bytes.
     pub const fn from_bytes(bytes: [u8; 8]) -> Self {
         Self(u64::from_le_bytes(bytes))
     }
 
-    /// As sent: lowest byte first.
+    /// The bytes to send, lowest first.
     pub const fn to_bytes(self) -> [u8; 8] {
         self.0.to_le_bytes()
     }
 
-    /// As a number; the smaller wins.
+    /// The number; the smaller wins.
     pub const fn raw(self) -> u64 {
         self.0
     }
 }
 
 impl fmt::Display for Name {
-    /// 16 hex digits, as the kernel's tools write it.
+    /// 16 hex digits, as in the kernel's tools.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{:016X}", self.0)
     }
@@ -126,14 +126,14 @@ mod tests {
     }
 
     #[test]
-    fn bytes_go_out_lowest_first() {
+    fn bytes_are_sent_lowest_first() {
         let name = Name::new(&NameFields { identity_number: 0x12345, function: 0xAB, ..Default::default() }).unwrap();
         assert_eq!(name.to_bytes(), [0x45, 0x23, 0x01, 0, 0, 0xAB, 0, 0]);
         assert_eq!(name.to_string(), "0000AB0000012345");
     }
 
     #[test]
-    fn a_field_that_does_not_fit_is_an_error_that_says_so() {
+    fn a_field_that_does_not_fit_is_an_error() {
         let none = NameFields::default();
         for (fields, text) in [
             (NameFields { identity_number: 1 << 21, ..none }, "identity_number = 2097152, must be 0 to 2097151"),

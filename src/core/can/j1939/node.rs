@@ -1,18 +1,17 @@
-//! The node: claims its address, tells DM1 once a second and on every change, answers requests.
+//! The node: claims its address, sends DM1 once a second and on every change, answers requests.
 //!
-//! * DM1 goes out once a second, also with no code, and at once on a change (how often one code may change: `codes`).
-//! * DM2 goes out only when asked for.
-//! * Messages of more than 8 bytes go one after the other; while one is being transferred a changed DM1 waits for its
-//!   end. When both wait, DM1 and DM2 take turns, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2.
-//!   A DM1 of one frame passes a DM2 that is being transferred.
-//! * A request to this node alone for anything it does not have is refused; one to all is then not for us.
+//! * DM1 is sent once a second, also without any code, and at once on a change (`codes` limits the changes of one code).
+//! * DM2 is sent only on request.
+//! * Messages of more than 8 bytes are transferred one after the other: a changed DM1 waits for the end of a transfer. When
+//!   both wait, DM1 and DM2 take turns, so that neither a flood of requests stops DM1 nor a long DM1 stops DM2. A DM1 of
+//!   one frame passes a DM2 that is being transferred.
+//! * A request to this node alone for a group it does not have is refused; such a request to all is ignored.
 
 use std::collections::VecDeque;
 
-use serde::{Deserialize, Serialize};
-
-use super::address::{AddressClaim, State};
+use super::address::{AddressClaim, ClaimState};
 use super::codes::{ActiveCode, Codes};
+use super::event::NodeEvent;
 use super::id::{
     GLOBAL_ADDRESS, Header, NULL_ADDRESS, PGN_ACKNOWLEDGEMENT, PGN_ADDRESS_CLAIMED, PGN_DM1, PGN_DM2, PGN_REQUEST,
     PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, PRIORITY, TRANSPORT_PRIORITY, can_id, filter, pgn_bytes, pgn_of,
@@ -27,24 +26,24 @@ use crate::quantity::Timestamp;
 const DM1_PERIOD_NS: i64 = 1_000_000_000;
 /// Shortest time between two answers to requests, ns: a flood of requests brings at most 20 frames a second.
 const ANSWER_SPACING_NS: i64 = 50_000_000;
-/// Answers that may wait: the fifth would come more than 200 ms after its request, when who asked has given up (J1939-21).
+/// Most waiting answers: a fifth would come more than 200 ms after its request, when the requester has given up (J1939-21).
 const MAX_WAITING_ANSWERS: usize = 4;
 /// Control byte of a negative acknowledgement.
 const NEGATIVE: u8 = 1;
-/// Earlier than anything.
+/// Earlier than any frame.
 const LONG_AGO: Timestamp = Timestamp::from_nanos(i64::MIN);
 
-/// Who a node is.
+/// Identity of a node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NodeConfig {
-    /// Its NAME.
+    /// NAME.
     pub name: Name,
-    /// The address it claims, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
+    /// Claimed address, 0 to [`MAX_ADDRESS`](super::MAX_ADDRESS).
     pub address: u8,
 }
 
 impl NodeConfig {
-    /// Every identifier the node sends with.
+    /// Identifiers of all frames the node sends.
     pub fn sent_ids(&self) -> [CanId; 7] {
         let id = |priority, pgn, source| can_id(priority, pgn, GLOBAL_ADDRESS, source);
         [
@@ -59,44 +58,18 @@ impl NodeConfig {
     }
 }
 
-/// Something worth a line in a log.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case", tag = "node_event")]
-pub enum NodeEvent {
-    /// The address is ours; codes are told from now on.
-    Claimed {
-        /// The address.
-        address: u8,
-    },
-    /// Another node took the address; nothing is told any more.
-    AddressLost {
-        /// Its NAME; our own when two nodes are configured as one.
-        to: Name,
-    },
-    /// Another node wanted the address and must give way.
-    AddressDefended {
-        /// Its NAME.
-        against: Name,
-    },
-    /// The number of active codes that are beyond what one message holds changed.
-    CodesLeftOut {
-        /// How many; 0 = all are told again.
-        codes: usize,
-    },
-}
-
-/// What the node had to leave undone.
+/// Messages the node could not handle or send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct NodeCounters {
-    /// Claims and requests too short to be read.
+    /// Claims and requests that are too short.
     pub malformed_frames: u64,
-    /// Requests not answered: too many at a time, or the address was lost before their turn.
+    /// Requests without answer: too many at a time, or the address was lost before.
     pub answers_dropped: u64,
-    /// Codes not told, summed over messages.
+    /// Codes left out, summed over messages.
     pub codes_left_out: u64,
 }
 
-/// Where the node puts what came out; the caller empties it.
+/// Output of the node; the caller empties it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct NodeOutputs {
     /// Frames to send, in this order.
@@ -105,9 +78,9 @@ pub struct NodeOutputs {
     pub events: Vec<NodeEvent>,
 }
 
-/// An answer that is owed.
+/// An answer to a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Answer {
+enum PendingAnswer {
     Dm1,
     Dm2,
     Refusal { pgn: u32, to: u8 },
@@ -124,7 +97,7 @@ pub struct Node {
     transfer: Option<Transfer>,
     transport_free_at: Timestamp,
     last_transferred: u32,
-    answers: VecDeque<Answer>,
+    answers: VecDeque<PendingAnswer>,
     next_answer_at: Timestamp,
     polled_at: Timestamp,
     codes_left_out: usize,
@@ -151,7 +124,7 @@ impl Node {
         }
     }
 
-    /// Claims the address. Codes are told after 300 ms without objection (`address` says why not 250).
+    /// Claims the address. Codes are sent after 300 ms without objection (reason: see `address`).
     pub fn start(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.fall_silent();
         self.codes.restart();
@@ -161,14 +134,14 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// Time passed that nobody saw (asleep, the interface was away): whatever was said about the address may have
-    /// changed, so it is claimed again, also after a loss.
+    /// After time without listening (sleep, the interface was away): another node may have claimed the address, so it is
+    /// claimed again, also after a loss.
     pub fn handle_gap(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.start(now, out);
     }
 
-    /// What the bus shall be told: the codes that are active now, those that were, most severe or latest first, and
-    /// whether every value that could raise one is known. Sent by the next [`poll`](Self::poll).
+    /// Sets the codes to send: active ones and previously active ones, most severe or latest first, and whether every value
+    /// that could raise one is known. The next [`poll`](Self::poll) sends them.
     pub fn set_codes(
         &mut self,
         now: Timestamp,
@@ -176,13 +149,13 @@ impl Node {
         previously_active: &[TroubleCode],
         all_known: bool,
     ) {
-        let not_followed = self.codes.set(now, active, all_known);
-        self.counters.codes_left_out += count(not_followed);
+        let left_out = self.codes.set(now, active, all_known);
+        self.counters.codes_left_out += count(left_out);
         self.previously_active.clear();
         self.previously_active.extend_from_slice(previously_active);
     }
 
-    /// A frame was received; those that do not concern the node are ignored.
+    /// Takes a received frame; frames that do not concern the node are ignored.
     pub fn handle_frame(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
         let Some(header) = Header::of(frame.id()).filter(|_| frame.kind() == FrameKind::Classic) else { return };
         match header.pgn {
@@ -201,7 +174,7 @@ impl Node {
             return;
         };
         out.events.extend(self.claim.contend(now, Name::from_bytes(bytes)));
-        if self.claim.state() == State::Lost {
+        if self.claim.state() == ClaimState::Lost {
             self.fall_silent();
         }
     }
@@ -212,30 +185,30 @@ impl Node {
             return;
         };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
-        let owed = match (pgn_of([low, middle, high]), self.claim.state()) {
-            // Who lost the address answers only what is asked of all: the address is another's.
-            (PGN_ADDRESS_CLAIMED, State::Lost) if !is_for_all => return,
-            (PGN_ADDRESS_CLAIMED, State::Idle | State::Claiming | State::Claimed | State::Lost) => {
-                return self.claim.asked(now);
+        let answer = match (pgn_of([low, middle, high]), self.claim.state()) {
+            // After a loss the address belongs to another node: only requests to all are for this one.
+            (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
+            (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
+                return self.claim.handle_request(now);
             }
-            (_, State::Idle | State::Claiming | State::Lost) => return,
-            (PGN_DM1, State::Claimed) => Answer::Dm1,
-            (PGN_DM2, State::Claimed) => Answer::Dm2,
-            (_, State::Claimed) if is_for_all => return,
-            (pgn, State::Claimed) => Answer::Refusal { pgn, to: header.source },
+            (_, ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost) => return,
+            (PGN_DM1, ClaimState::Claimed) => PendingAnswer::Dm1,
+            (PGN_DM2, ClaimState::Claimed) => PendingAnswer::Dm2,
+            (_, ClaimState::Claimed) if is_for_all => return,
+            (pgn, ClaimState::Claimed) => PendingAnswer::Refusal { pgn, to: header.source },
         };
-        // The answer is a broadcast: one serves all who asked.
-        if self.answers.contains(&owed) {
+        // The answer is a broadcast: one serves all requesters.
+        if self.answers.contains(&answer) {
             return;
         }
         if self.answers.len() < MAX_WAITING_ANSWERS {
-            self.answers.push_back(owed);
+            self.answers.push_back(answer);
         } else {
             self.counters.answers_dropped += 1;
         }
     }
 
-    /// Sends what is due.
+    /// Sends the frames that are due.
     pub fn poll(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.polled_at = now;
         let (frame, event) = self.claim.poll(now);
@@ -261,7 +234,7 @@ impl Node {
         let Some(transfer) = &mut self.transfer else { return };
         out.frames.extend(transfer.poll(now, self.address));
         if transfer.is_complete() {
-            // The next announcement keeps its distance too.
+            // The next announcement keeps the packet spacing too.
             self.transport_free_at = transfer.due;
             self.last_transferred = transfer.pgn;
             if transfer.pgn == PGN_DM1 {
@@ -275,10 +248,9 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // On time, the next one keeps the rhythm; otherwise it is counted from now.
-            let rhythm = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
-            let keeps_rhythm = is_cyclic && now < rhythm;
-            self.next_dm1 = if keeps_rhythm { rhythm } else { now.plus_nanos(DM1_PERIOD_NS) };
+            // On time, the next one keeps the cycle; otherwise a new cycle begins now.
+            let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
+            self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);
         }
     }
@@ -288,16 +260,16 @@ impl Node {
             return;
         }
         let ready = self.answers.iter().position(|answer| match answer {
-            Answer::Dm1 => self.can_start(now, PGN_DM1),
-            Answer::Dm2 => self.can_start(now, PGN_DM2),
-            Answer::Refusal { .. } => true,
+            PendingAnswer::Dm1 => self.can_start(now, PGN_DM1),
+            PendingAnswer::Dm2 => self.can_start(now, PGN_DM2),
+            PendingAnswer::Refusal { .. } => true,
         });
         let Some(answer) = ready.and_then(|index| self.answers.remove(index)) else { return };
         self.next_answer_at = now.plus_nanos(ANSWER_SPACING_NS);
         match answer {
-            Answer::Dm1 => self.send_dm1(now, out),
-            Answer::Dm2 => self.send(now, PGN_DM2, dm_payload(self.codes.lamps(), &self.previously_active), out),
-            Answer::Refusal { pgn, to } => {
+            PendingAnswer::Dm1 => self.send_dm1(now, out),
+            PendingAnswer::Dm2 => self.send(now, PGN_DM2, dm_payload(self.codes.lamps(), &self.previously_active), out),
+            PendingAnswer::Refusal { pgn, to } => {
                 let [low, middle, high] = pgn_bytes(pgn);
                 let refusal = [NEGATIVE, 0xFF, 0xFF, 0xFF, to, low, middle, high];
                 let id = can_id(PRIORITY, PGN_ACKNOWLEDGEMENT, GLOBAL_ADDRESS, self.address);
@@ -333,7 +305,7 @@ impl Node {
 
     /// After a DM1 in packets a DM2 that waits goes first.
     fn is_turn_of_dm2(&self) -> bool {
-        self.last_transferred == PGN_DM1 && self.answers.contains(&Answer::Dm2)
+        self.last_transferred == PGN_DM1 && self.answers.contains(&PendingAnswer::Dm2)
     }
 
     /// Whether a message of this group may go out now.
@@ -363,34 +335,34 @@ impl Node {
         let dm1 = self.codes.change_due().map_or(self.next_dm1, |change| change.min(self.next_dm1));
         let dm1 = self.startable_from(PGN_DM1, dm1);
         let answers = self.answers.iter().filter_map(|answer| match answer {
-            Answer::Dm1 => self.startable_from(PGN_DM1, self.next_answer_at),
-            Answer::Dm2 => self.startable_from(PGN_DM2, self.next_answer_at),
-            Answer::Refusal { .. } => Some(self.next_answer_at),
+            PendingAnswer::Dm1 => self.startable_from(PGN_DM1, self.next_answer_at),
+            PendingAnswer::Dm2 => self.startable_from(PGN_DM2, self.next_answer_at),
+            PendingAnswer::Refusal { .. } => Some(self.next_answer_at),
         });
         let transfer = self.transfer.map(|transfer| transfer.due);
         claim.into_iter().chain(transfer).chain(dm1).chain(answers).min()
     }
 
-    /// When a message wanted at `wanted` can go out.
+    /// When a message that is due at `wanted` can be sent.
     fn startable_from(&self, pgn: u32, wanted: Timestamp) -> Option<Timestamp> {
         self.start_at(wanted.max(self.polled_at), pgn).map(|start| start.max(wanted))
     }
 
-    /// Whether nothing but address claims may be sent: the address is not ours (yet, or any more).
+    /// Whether only address claims may be sent: the node does not have its address.
     pub fn is_silent(&self) -> bool {
         match self.claim.state() {
-            State::Idle | State::Claiming | State::Lost => true,
-            State::Claimed => false,
+            ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost => true,
+            ClaimState::Claimed => false,
         }
     }
 
-    /// What had to be left undone since the beginning.
+    /// Counters since the beginning.
     pub fn counters(&self) -> NodeCounters {
         self.counters
     }
 
-    /// Extended identifiers the node must receive, as identifier and mask: claims of its address, requests to it and to
-    /// all, at any priority. Claims of other addresses do not concern it.
+    /// Extended identifiers the node must receive, as identifier and mask at any priority: claims of its address, requests
+    /// to it and to all.
     pub fn wanted(&self) -> [(u32, u32); 3] {
         let (claim, mask) = filter(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS);
         [
@@ -400,7 +372,7 @@ impl Node {
         ]
     }
 
-    /// Ends what was under way.
+    /// Drops the transfer and the waiting answers.
     fn fall_silent(&mut self) {
         self.transfer = None;
         self.counters.answers_dropped += count(self.answers.len());

@@ -1,7 +1,7 @@
 //! A payload of more than 8 bytes, broadcast in packets (BAM of J1939-21): an announcement, then 7 bytes a packet.
 //!
-//! The standard wants 50 to 200 ms between packets. The next frame is due 50 ms after the last one really went, so a
-//! late poll never brings two packets too close together.
+//! The standard requires 50 to 200 ms between packets. The next frame is due 50 ms after the last one was sent, so packets
+//! keep their distance after a late poll.
 
 use super::id::{GLOBAL_ADDRESS, PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA, TRANSPORT_PRIORITY, can_id, pgn_bytes};
 use super::trouble_code::{DmPayload, MAX_PAYLOAD};
@@ -22,7 +22,7 @@ const _: () = assert!(MAX_PAYLOAD <= 255 * PACKET_BYTES);
 /// A transfer under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Transfer {
-    /// What is transferred.
+    /// Transferred parameter group.
     pub(super) pgn: u32,
     /// When the next packet is due.
     pub(super) due: Timestamp,
@@ -31,7 +31,7 @@ pub(super) struct Transfer {
 }
 
 impl Transfer {
-    /// Starts one: the transfer and its announcement.
+    /// Starts a transfer. Returns it with its announcement.
     pub(super) fn start(now: Timestamp, pgn: u32, payload: DmPayload, source: u8) -> (Self, Option<Frame>) {
         let transfer = Self { pgn, due: now.plus_nanos(PACKET_SPACING_NS), payload, sent_packets: 0 };
         let bytes = payload.as_slice().len();

@@ -6,7 +6,7 @@
 //! then, each  SPN 7..0 | SPN 15..8 | SPN 18..16 and FMI | occurrence count
 //! ```
 //! No code: four zero bytes. Up to one code: filled with 0xFF to 8 bytes. The highest bit of an occurrence count is the
-//! conversion method: set, the number is laid out in one of three older ways that cannot be told apart.
+//! conversion method: set, the number has one of three older layouts, which cannot be distinguished.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use super::name::OutOfRange;
 
 /// Most codes in one message: 27, so 110 bytes in 16 packets. With 50 ms between packets, each up to one tick of 10 ms
 /// late, a transfer ends within 0.96 s, before the next DM1 is due. Of a rule's thresholds that share a
-/// parameter number only the gravest is told: fourteen rules are 14.
+/// parameter number only the most severe is sent: fourteen rules are 14.
 pub const MAX_CODES: usize = 27;
 
 /// Bytes of a message with [`MAX_CODES`] codes.
@@ -28,14 +28,14 @@ const MAX_FMI: u8 = 31;
 const MAX_OCCURRENCES: u8 = 126;
 /// No lamp flashes.
 const NO_FLASH: u8 = 0xFF;
-/// Conversion method, beside the occurrence count.
+/// Conversion method, in the byte of the occurrence count.
 const OLD_CONVERSION: u8 = 0x80;
 /// In place of a code: there is none.
 const NO_CODE: [u8; 4] = [0x00; 4];
 /// In place of a code: not available, or filled up.
 const NOT_AVAILABLE: [u8; 4] = [0xFF; 4];
 
-/// What went wrong, and how often.
+/// A failure and its number of occurrences.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct TroubleCode {
     spn: u32,
@@ -65,22 +65,22 @@ impl TroubleCode {
         Self { occurrence_count, ..self }
     }
 
-    /// Suspect parameter number: what is wrong.
+    /// Suspect parameter number: the failed part.
     pub const fn spn(self) -> u32 {
         self.spn
     }
 
-    /// Failure mode identifier: how it is wrong.
+    /// Failure mode identifier: the kind of failure.
     pub const fn fmi(self) -> u8 {
         self.fmi
     }
 
-    /// How often it became active, 126 = 126 times or more.
+    /// Occurrences, 126 = 126 or more.
     pub const fn occurrence_count(self) -> u8 {
         self.occurrence_count
     }
 
-    /// Whether both are about the same failure, however often it came.
+    /// Whether both are about the same failure, whatever their counts.
     pub const fn is_same_failure(self, other: Self) -> bool {
         self.spn == other.spn && self.fmi == other.fmi
     }
@@ -106,28 +106,28 @@ impl TroubleCode {
 pub enum Lamp {
     /// None.
     None,
-    /// Protect: something is amiss, not the electronics.
+    /// Protect: a fault outside the electronics.
     Protect,
-    /// Amber warning: see to it, the vehicle need not stop.
+    /// Amber warning: service is needed, the vehicle need not stop.
     Amber,
     /// Red stop: stop the vehicle.
     Red,
 }
 
-/// What a lamp shows; the numbers are those on the wire.
+/// State of a lamp; the numbers are those on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[repr(u8)]
 pub enum LampState {
-    /// Nothing is wrong.
+    /// No fault.
     #[default]
     Off = 0b00,
-    /// Something is wrong.
+    /// A fault.
     On = 0b01,
-    /// It is not known whether something is wrong.
+    /// Unknown whether there is a fault.
     NotAvailable = 0b11,
 }
 
-/// The lamps of a message. The malfunction lamp is always off: this program never speaks for emissions.
+/// The lamps of a message. The malfunction lamp is always off: this program does not monitor emissions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Lamps {
     /// Protect lamp.
@@ -140,7 +140,7 @@ pub struct Lamps {
 
 impl Lamps {
     /// The lamps for active codes. While not everything is known (`all_known` false) a lamp that no code lights is
-    /// not off but not available: unknown never looks healthy.
+    /// not off but not available: unknown never reads as healthy.
     pub fn of(lit: impl IntoIterator<Item = Lamp>, all_known: bool) -> Self {
         let dark = if all_known { LampState::Off } else { LampState::NotAvailable };
         let mut lamps = Self { protect: dark, amber: dark, red: dark };
@@ -156,12 +156,7 @@ impl Lamps {
     }
 
     fn to_byte(self) -> u8 {
-        let bits = |state| match state {
-            LampState::Off => 0b00,
-            LampState::On => 0b01,
-            LampState::NotAvailable => 0b11,
-        };
-        (bits(self.red) << 4) | (bits(self.amber) << 2) | bits(self.protect)
+        (self.red as u8) << 4 | (self.amber as u8) << 2 | self.protect as u8
     }
 }
 
@@ -185,7 +180,8 @@ impl DmPayload {
     }
 }
 
-/// Lays out lamps and codes. Of more than [`MAX_CODES`] codes the first are taken: the caller brings the most severe first.
+/// Payload of lamps and codes. Of more than [`MAX_CODES`] codes the first are taken: the caller passes the most severe
+/// first.
 pub fn dm_payload(lamps: Lamps, codes: &[TroubleCode]) -> DmPayload {
     let mut bytes = [0xFF; MAX_PAYLOAD];
     bytes[0] = lamps.to_byte();
@@ -288,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn no_code_reads_as_none_and_what_cannot_be_read_is_not_taken_for_none() {
+    fn no_code_reads_as_none_and_an_unreadable_one_does_not() {
         assert_eq!(dm_codes(&[0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]), Some(vec![]));
         assert_eq!(dm_codes(&[0x00, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]), Some(vec![]), "not available");
         assert_eq!(dm_codes(&[0x04, 0xFF, 0x01, 0xF0, 0xF2, 3, 0xFF, 0xFF]), Some(vec![code(520_193, 18, 3)]));

@@ -102,6 +102,11 @@ impl EstimatorBank {
         *self = new;
     }
 
+    /// The cell model.
+    pub fn model(&self) -> &CellModel {
+        &self.model
+    }
+
     /// The settings.
     pub fn config(&self) -> &EstimatorConfig {
         &self.config

@@ -1,27 +1,27 @@
 //! Cycling between two SOC limits: the paper's scenario and the published example.
 
-use super::super::noise::Noise;
-use super::super::scenario::Settings;
-use super::super::truth::Pack;
-use super::Demand;
+use super::demand::Demand;
+use crate::sim::noise::Noise;
+use crate::sim::scenario::Settings;
+use crate::sim::truth::Pack;
 
 /// Current of the paper's scenario in both directions, A for 2.6 Ah: with it 48 cycles take the paper's 2.23e5 s.
 const PAPER_CURRENT_A: f64 = 1.325;
-/// Charging current of the example, A for 30 Ah (it says constant, not how much; half the capacity per hour).
+/// Charging current of the example, A for 30 Ah (the source states a constant without its size; half the capacity per hour).
 const REFERENCE_CHARGE_A: f64 = 15.0;
 /// Discharge pulses of the example, A for 30 Ah: uniform in this range, 15 A mean.
 const PULSE_A: (f64, f64) = (0.0, 30.0);
 /// Length of a pulse, s.
 const PULSE_S: f64 = 60.0;
 
-/// How the cell is discharged.
+/// Discharge of a cycle.
 #[derive(Debug, Clone)]
 enum Load {
     Constant { current_a: f64 },
     Pulses(Box<Pulses>),
 }
 
-/// Constant for [`PULSE_S`], then another strength.
+/// A current that changes every [`PULSE_S`].
 #[derive(Debug, Clone)]
 struct Pulses {
     noise: Noise,
@@ -46,7 +46,7 @@ impl Load {
     }
 }
 
-/// Discharge to the low SOC, charge to the high one, age, again.
+/// Discharges to the low SOC, charges to the high one, ages, repeats.
 #[derive(Debug, Clone)]
 pub(crate) struct CycleCourse {
     load: Load,

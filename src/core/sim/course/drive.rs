@@ -3,9 +3,9 @@
 //! The car is a point mass that follows random target speeds with bounded acceleration; its electric power is scaled
 //! from a 60 kWh car to the pack at hand, so that every cell sees the same share of its capacity per hour.
 
-use super::super::noise::Noise;
-use super::super::truth::Pack;
-use super::Demand;
+use super::demand::Demand;
+use crate::sim::noise::Noise;
+use crate::sim::truth::Pack;
 
 /// Mass with two people, kg.
 const MASS_KG: f64 = 1900.0;
@@ -17,7 +17,7 @@ const DRAG_KG_PER_M: f64 = 0.5 * 1.2 * 0.25 * 2.3;
 const DRIVE_EFFICIENCY: f64 = 0.90;
 /// Wheel to battery.
 const REGEN_EFFICIENCY: f64 = 0.70;
-/// Everything that is not propulsion, W.
+/// Power of all other consumers, W.
 const AUXILIARY_W: f64 = 600.0;
 /// Energy of the pack these numbers are for, Wh.
 const PACK_WH: f64 = 60_000.0;
@@ -29,16 +29,16 @@ const SPEEDS_KMH: [f64; 8] = [0.0, 30.0, 50.0, 50.0, 70.0, 90.0, 110.0, 120.0];
 const ACCELERATION_M_S2: (f64, f64) = (1.2, 1.5);
 /// Limits of the power electronics, capacities per hour: regeneration and traction.
 const CURRENT_LIMIT_C: (f64, f64) = (0.8, 2.5);
-/// A drive ends at this SOC with a charge, whatever the plan says.
+/// A drive ends at this SOC with a charge, before its planned end.
 const RESERVE_SOC: f64 = 0.10;
 /// Fast charging ends here.
 const CHARGE_TO_SOC: f64 = 0.80;
 /// Fast charging current, capacities per hour: up to SOC 0.4, then falling in a line to the second at 0.8.
 const CHARGE_C: (f64, f64) = (1.5, 0.6);
 
-/// One stretch of the day.
+/// One part of the day.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Phase {
+enum DayPhase {
     Drive {
         left_s: f64,
     },
@@ -49,26 +49,26 @@ enum Phase {
     FastCharge,
 }
 
-/// Shortest sleep, s, when drives and charges have eaten up the time.
+/// Shortest sleep, s, when drives and charges have used up the time.
 const MIN_SLEEP_S: f64 = 60.0;
 /// Length of a day, s.
 const DAY_S: f64 = 86_400.0;
 
 /// The plan of a day that begins at 7:30: to work, back at 17:00 with a stop at the charger, night.
-const DAY: [Phase; 6] = [
-    Phase::Drive { left_s: 3300.0 },
-    Phase::Park { until_s: 9.5 * 3600.0 },
-    Phase::Drive { left_s: 3300.0 },
-    Phase::FastCharge,
-    Phase::Drive { left_s: 900.0 },
-    Phase::Park { until_s: DAY_S },
+const DAY: [DayPhase; 6] = [
+    DayPhase::Drive { left_s: 3300.0 },
+    DayPhase::Park { until_s: 9.5 * 3600.0 },
+    DayPhase::Drive { left_s: 3300.0 },
+    DayPhase::FastCharge,
+    DayPhase::Drive { left_s: 900.0 },
+    DayPhase::Park { until_s: DAY_S },
 ];
 
-/// Days, one after the other; each completed one counts as a cycle.
+/// Repeated days; each completed day counts as a cycle.
 #[derive(Debug, Clone)]
 pub(crate) struct DayCourse {
     plan: usize,
-    phase: Phase,
+    phase: DayPhase,
     day_s: f64,
     noise: Noise,
     capacity_ah: f64,
@@ -83,25 +83,25 @@ impl DayCourse {
     }
 
     pub(super) fn next(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {
-        if matches!(self.phase, Phase::Drive { .. }) && pack.lowest_soc() < RESERVE_SOC {
-            self.phase = Phase::FastCharge;
+        if matches!(self.phase, DayPhase::Drive { .. }) && pack.lowest_soc() < RESERVE_SOC {
+            self.phase = DayPhase::FastCharge;
         }
         match self.phase {
-            Phase::Drive { left_s } if left_s <= 0.0 => {
+            DayPhase::Drive { left_s } if left_s <= 0.0 => {
                 self.speed_m_s = 0.0;
                 self.next_phase(pack, dt_s)
             }
-            Phase::Drive { left_s } => {
-                self.phase = Phase::Drive { left_s: left_s - dt_s };
+            DayPhase::Drive { left_s } => {
+                self.phase = DayPhase::Drive { left_s: left_s - dt_s };
                 self.day_s += dt_s;
                 Demand::Current(self.drive_a(pack, dt_s))
             }
-            Phase::FastCharge if pack.highest_soc() >= CHARGE_TO_SOC => self.next_phase(pack, dt_s),
-            Phase::FastCharge => {
+            DayPhase::FastCharge if pack.highest_soc() >= CHARGE_TO_SOC => self.next_phase(pack, dt_s),
+            DayPhase::FastCharge => {
                 self.day_s += dt_s;
                 Demand::Current(self.charge_a(pack))
             }
-            Phase::Park { until_s } => {
+            DayPhase::Park { until_s } => {
                 let duration_s = (until_s - self.day_s).max(MIN_SLEEP_S);
                 self.day_s += duration_s;
                 self.advance_plan(pack);

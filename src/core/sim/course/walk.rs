@@ -1,9 +1,9 @@
 //! The random walk: 5-minute loads of random strength within voltage limits, and reference cycles in between.
 
-use super::super::noise::Noise;
-use super::super::scenario::Settings;
-use super::super::truth::Pack;
-use super::Demand;
+use super::demand::Demand;
+use crate::sim::noise::Noise;
+use crate::sim::scenario::Settings;
+use crate::sim::truth::Pack;
 
 /// The loads, A for 2.1 Ah.
 const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.25, 3.0, 3.75, 4.5];
@@ -11,7 +11,7 @@ const LOADS_A: [f64; 12] = [-4.5, -3.75, -3.0, -2.25, -1.5, -0.75, 0.75, 1.5, 2.
 const LOAD_S: f64 = 300.0;
 /// Voltage range of the walk, V (narrowed to the cell's own limits).
 const RANGE_V: (f64, f64) = (3.2, 4.2);
-/// Draws for a load within the voltage range before a rest takes its place: 12 loads, half of them of either sign.
+/// Most draws for a load within the voltage range, then a rest: 12 loads, half of them of either sign.
 const MAX_DRAWS: u32 = 32;
 /// Reference current in both directions, A for 2.1 Ah.
 const REFERENCE_A: f64 = 2.0;
@@ -23,7 +23,7 @@ const REST_S: f64 = 1800.0;
 const REFERENCE_CYCLES: u32 = 2;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Phase {
+enum WalkPhase {
     Walk { steps_left: u32, current_a: f64, left_s: f64 },
     Charge { cycles_left: u32 },
     RestFull { cycles_left: u32, left_s: f64 },
@@ -34,7 +34,7 @@ enum Phase {
 /// Blocks of random loads, each followed by reference cycles; a block with its reference is the cycle that counts.
 #[derive(Debug, Clone)]
 pub(crate) struct WalkCourse {
-    phase: Phase,
+    phase: WalkPhase,
     noise: Noise,
     scale: f64,
     steps: u32,
@@ -45,7 +45,7 @@ pub(crate) struct WalkCourse {
 impl WalkCourse {
     pub(super) fn new(settings: &Settings, scale: f64, noise: Noise) -> Self {
         Self {
-            phase: Phase::Walk { steps_left: settings.walk_steps, current_a: 0.0, left_s: 0.0 },
+            phase: WalkPhase::Walk { steps_left: settings.walk_steps, current_a: 0.0, left_s: 0.0 },
             noise,
             scale,
             steps: settings.walk_steps,
@@ -58,52 +58,52 @@ impl WalkCourse {
         let low_v = RANGE_V.0.max(pack.model().voltage_min_v);
         let high_v = RANGE_V.1.min(pack.model().voltage_max_v);
         match self.phase {
-            Phase::Walk { steps_left, current_a, left_s } => {
+            WalkPhase::Walk { steps_left, current_a, left_s } => {
                 let inside = pack.lowest_v(current_a) > low_v && pack.highest_v(current_a) < high_v;
                 if inside && left_s > 0.0 {
-                    self.phase = Phase::Walk { steps_left, current_a, left_s: left_s - dt_s };
+                    self.phase = WalkPhase::Walk { steps_left, current_a, left_s: left_s - dt_s };
                     return Demand::Current(current_a);
                 }
                 if steps_left == 0 {
-                    return self.enter(Phase::Charge { cycles_left: REFERENCE_CYCLES }, pack, dt_s);
+                    return self.enter(WalkPhase::Charge { cycles_left: REFERENCE_CYCLES }, pack, dt_s);
                 }
                 let current_a = self.draw_load(pack, low_v, high_v);
-                self.phase = Phase::Walk { steps_left: steps_left - 1, current_a, left_s: LOAD_S - dt_s };
+                self.phase = WalkPhase::Walk { steps_left: steps_left - 1, current_a, left_s: LOAD_S - dt_s };
                 Demand::Current(current_a)
             }
-            Phase::Charge { cycles_left } => {
+            WalkPhase::Charge { cycles_left } => {
                 let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
                 if current_a > -TAPER_END_A * self.scale {
-                    return self.enter(Phase::RestFull { cycles_left, left_s: REST_S }, pack, dt_s);
+                    return self.enter(WalkPhase::RestFull { cycles_left, left_s: REST_S }, pack, dt_s);
                 }
                 Demand::Current(current_a)
             }
-            Phase::RestFull { cycles_left, left_s } if left_s > 0.0 => {
-                self.rest(Phase::RestFull { cycles_left, left_s: left_s - dt_s })
+            WalkPhase::RestFull { cycles_left, left_s } if left_s > 0.0 => {
+                self.rest(WalkPhase::RestFull { cycles_left, left_s: left_s - dt_s })
             }
-            Phase::RestFull { cycles_left, .. } => self.enter(Phase::Discharge { cycles_left }, pack, dt_s),
-            Phase::Discharge { cycles_left } => {
+            WalkPhase::RestFull { cycles_left, .. } => self.enter(WalkPhase::Discharge { cycles_left }, pack, dt_s),
+            WalkPhase::Discharge { cycles_left } => {
                 let current_a = REFERENCE_A * self.scale;
                 if pack.lowest_v(current_a) <= low_v {
                     let cycles_left = cycles_left - 1;
-                    return self.enter(Phase::RestEmpty { cycles_left, left_s: REST_S }, pack, dt_s);
+                    return self.enter(WalkPhase::RestEmpty { cycles_left, left_s: REST_S }, pack, dt_s);
                 }
                 Demand::Current(current_a)
             }
-            Phase::RestEmpty { cycles_left, left_s } if left_s > 0.0 => {
-                self.rest(Phase::RestEmpty { cycles_left, left_s: left_s - dt_s })
+            WalkPhase::RestEmpty { cycles_left, left_s } if left_s > 0.0 => {
+                self.rest(WalkPhase::RestEmpty { cycles_left, left_s: left_s - dt_s })
             }
-            Phase::RestEmpty { cycles_left: 0, .. } => self.next_block(pack, dt_s),
-            Phase::RestEmpty { cycles_left, .. } => self.enter(Phase::Charge { cycles_left }, pack, dt_s),
+            WalkPhase::RestEmpty { cycles_left: 0, .. } => self.next_block(pack, dt_s),
+            WalkPhase::RestEmpty { cycles_left, .. } => self.enter(WalkPhase::Charge { cycles_left }, pack, dt_s),
         }
     }
 
-    fn enter(&mut self, phase: Phase, pack: &mut Pack, dt_s: f64) -> Demand {
+    fn enter(&mut self, phase: WalkPhase, pack: &mut Pack, dt_s: f64) -> Demand {
         self.phase = phase;
         self.next(pack, dt_s)
     }
 
-    fn rest(&mut self, phase: Phase) -> Demand {
+    fn rest(&mut self, phase: WalkPhase) -> Demand {
         self.phase = phase;
         Demand::Current(0.0)
     }
@@ -114,7 +114,7 @@ impl WalkCourse {
         {
             return Demand::Finished;
         }
-        self.enter(Phase::Walk { steps_left: self.steps, current_a: 0.0, left_s: 0.0 }, pack, dt_s)
+        self.enter(WalkPhase::Walk { steps_left: self.steps, current_a: 0.0, left_s: 0.0 }, pack, dt_s)
     }
 
     fn draw_load(&mut self, pack: &Pack, low_v: f64, high_v: f64) -> f64 {

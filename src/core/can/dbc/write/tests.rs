@@ -5,7 +5,7 @@ use proptest::prelude::*;
 use super::*;
 use crate::can::dbc::Multiplex;
 use crate::can::e2e::{Profile, Protection};
-use crate::can::encode::{Base, LayoutSettings, MessageSettings, layout};
+use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
 use crate::can::signal::SignalLayout;
 
 const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
@@ -13,7 +13,7 @@ const SHIPPED: &str = include_str!("../../../../../config/packwatch.dbc");
 #[test]
 fn the_shipped_file_is_what_the_writer_makes_of_the_default_layout() {
     let settings = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-    let written = layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap().to_dbc();
+    let written = layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, &settings).unwrap().to_dbc();
     for (number, (shipped, written)) in (1..).zip(SHIPPED.lines().zip(written.lines())) {
         assert_eq!(shipped, written, "line {number} of config/packwatch.dbc");
     }

@@ -6,12 +6,12 @@ use super::*;
 
 const LAST: u8 = 7;
 
-/// Classes of state the receiver tells apart; LastValidCounter is 7 in all but the first.
+/// Classes of state the receiver distinguishes; LastValidCounter is 7 in all but the first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
     /// WaitForFirstData.
     Waiting,
-    /// Believed, nothing missed: the next call allows a step of 2.
+    /// Accepted, nothing missed: the next call allows a step of 2.
     Following,
     /// The sequence broke and 2 more frames must show it.
     Syncing,
@@ -59,7 +59,7 @@ fn frame(config: &CheckConfig, counter: u8) -> [u8; 8] {
 
 fn happens(receiver: &mut Receiver, config: &CheckConfig, what: What) -> Status {
     let counter = match what {
-        What::NoFrame => return receiver.no_new_data(config),
+        What::NoFrame => return receiver.no_new_data(config, 1),
         What::Short => return receiver.check(config, &[0]),
         What::Damaged => {
             let mut payload = frame(config, LAST + 1);
@@ -100,7 +100,7 @@ fn wanted(profile: Profile, state: State, what: What, sync: u8) -> (Status, (Opt
     let at = |step: u8| Some(LAST + step);
     // A silence too long asks for the synchronisation, and this frame is the first of it.
     let left = sync.saturating_sub(1);
-    let after_silence = |otherwise| if sync > 0 { Status::Sync } else { otherwise };
+    let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {
         (_, NoFrame) => (Status::NoNewData, (last, grown, repeated + 1, syncing)),
         (_, Short | Damaged | Invalid15) => (Status::WrongCrc, (last, grown, repeated, syncing)),
@@ -158,7 +158,7 @@ fn lost_frames_are_counted_up_to_the_allowed_step() {
 fn profile_1_without_a_synchronisation_waits_until_the_sender_comes_round() {
     let config = config(Profile::P01A, 0);
     let mut receiver = in_state(State::Following);
-    // The sender is 6 ahead and goes on by 1 a frame, as fast as the allowed step grows.
+    // The sender is 6 ahead and continues by 1 a frame, as fast as the allowed step grows.
     let statuses: Vec<_> = (0..11).map(|n| receiver.check(&config, &frame(&config, (LAST + 6 + n) % 15))).collect();
     assert!(statuses[..9].iter().all(|status| *status == Status::WrongSequence), "{statuses:?}");
     assert_eq!(statuses[9..], [Status::Repeated, Status::Ok]);
@@ -185,7 +185,7 @@ fn silence_without_end_stays_in_range() {
     for profile in [Profile::P01A, Profile::P05] {
         let config = CheckConfig::new(config(profile, 0).protection);
         let mut receiver = in_state(State::Following);
-        (0..1000).for_each(|_| assert_eq!(receiver.no_new_data(&config), Status::NoNewData));
+        (0..1000).for_each(|_| assert_eq!(receiver.no_new_data(&config, 1), Status::NoNewData));
         assert_eq!((receiver.no_new_or_repeated, receiver.max_delta), (14, profile.max_counter()));
         assert_eq!(receiver.check(&config, &frame(&config, 3)), Status::OkSomeLost, "any counter but the last");
     }

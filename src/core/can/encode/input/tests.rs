@@ -41,7 +41,7 @@ fn every_message_and_page_decodes_to_the_values_it_was_made_from() {
     let found = round_trip(&map(), &values);
     for (channel, wanted) in &values {
         let readings: Vec<_> = found.iter().filter(|(name, _)| name == channel).collect();
-        // The temperature beside the cells is on both pages.
+        // The temperature next to the cells is on both pages.
         assert_eq!(readings.len(), if *channel == sensor(1) { 2 } else { 1 }, "{channel:?}");
         assert!(readings.iter().all(|(_, value)| near(*value, wanted.unwrap(), 1e-9)), "{channel:?}: {readings:?}");
     }
@@ -61,8 +61,8 @@ fn pages_below_pages_of_a_long_frame_come_back_and_no_page_says_zero_for_another
             assert!(near(*value, wanted.unwrap(), 1e-9), "{channel:?} in {frame:?}: {value:?}");
         }
     }
-    let told = round_trip(&nested(), &values);
-    assert!(values.iter().all(|(channel, _)| told.iter().any(|(name, _)| name == channel)), "{told:?}");
+    let decoded = round_trip(&nested(), &values);
+    assert!(values.iter().all(|(channel, _)| decoded.iter().any(|(name, _)| name == channel)), "{decoded:?}");
 }
 
 #[test]

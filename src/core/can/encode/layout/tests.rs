@@ -6,7 +6,7 @@ use crate::can::encode::{CommandPlan, OutputPlan};
 const TEXT: &str = include_str!("../../../../../config/packwatch.dbc");
 
 fn built_in(settings: &LayoutSettings) -> Result<Database, Vec<SettingFault>> {
-    layout(Base::BuiltIn { rated_capacity_ah: 2.6 }, settings)
+    layout(LayoutBase::BuiltIn { rated_capacity_ah: 2.6 }, settings)
 }
 
 fn on(profile: Profile, data_id: u16) -> MessageSettings {
@@ -21,8 +21,8 @@ fn with_status(status: MessageSettings) -> LayoutSettings {
 fn own_fault(from: &str, to: &str, status: MessageSettings) -> (&'static str, String) {
     assert!(TEXT.contains(from), "{from}");
     let own = Database::parse(&TEXT.replace(from, to)).unwrap();
-    let faults = layout(Base::Own(&own), &with_status(status)).unwrap_err();
-    assert_eq!((faults.len(), faults[0].message), (1, LaidOut::Status), "{faults:?}");
+    let faults = layout(LayoutBase::Own(&own), &with_status(status)).unwrap_err();
+    assert_eq!((faults.len(), faults[0].message), (1, LayoutMessage::Status), "{faults:?}");
     (faults[0].key, faults[0].what.clone())
 }
 
@@ -112,14 +112,14 @@ fn a_layout_made_again_from_its_own_text_is_the_same_without_any_setting() {
         alarm: MessageSettings { id: CanId::extended(9), period_ms: Some(50), ..on(Profile::P01A, 3) },
         command: Some(fd(on(Profile::P05, 4))),
     };
-    let made = layout(Base::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
+    let made = layout(LayoutBase::BuiltIn { rated_capacity_ah: 280.0 }, &settings).unwrap();
     let read = Database::parse(&made.to_dbc()).unwrap();
     assert_eq!(read, made);
     let as_it_is = LayoutSettings { command: Some(MessageSettings::default()), ..Default::default() };
-    assert_eq!(layout(Base::Own(&read), &as_it_is).unwrap(), made);
-    assert_eq!(layout(Base::Own(&read), &settings).unwrap(), made, "set again");
+    assert_eq!(layout(LayoutBase::Own(&read), &as_it_is).unwrap(), made);
+    assert_eq!(layout(LayoutBase::Own(&read), &settings).unwrap(), made, "set again");
     let off = MessageSettings { e2e: E2eSetting::Off, ..Default::default() };
-    let plain = layout(Base::Own(&read), &with_status(off)).unwrap();
+    let plain = layout(LayoutBase::Own(&read), &with_status(off)).unwrap();
     assert_eq!((plain.messages[0].e2e, &*plain.messages[0].signals[0].name), (None, "Soc"));
 }
 
@@ -138,12 +138,15 @@ fn an_own_dbc_is_not_moved_and_must_leave_the_header_free() {
 #[test]
 fn profile_1a_leaves_the_upper_half_of_the_second_byte_to_a_signal() {
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 12|4@1+")).unwrap();
-    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok());
-    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01C, 1))).is_err());
+    assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok());
+    assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01C, 1))).is_err());
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|4@0+")).unwrap();
-    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok(), "the same bits, the other order");
+    assert!(
+        layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_ok(),
+        "the same bits, the other order"
+    );
     let own = Database::parse(&TEXT.replace("SocStd : 28|8@1+", "SocStd : 15|5@0+")).unwrap();
-    assert!(layout(Base::Own(&own), &with_status(on(Profile::P01A, 1))).is_err());
+    assert!(layout(LayoutBase::Own(&own), &with_status(on(Profile::P01A, 1))).is_err());
 }
 
 #[test]
@@ -160,7 +163,7 @@ fn lengths_that_a_frame_or_a_profile_does_not_have_are_refused() {
 #[test]
 fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
     let own = Database::parse(&TEXT.replace("PACKWATCH_Status: 8", "PACKWATCH_Status: 12")).unwrap();
-    let made = layout(Base::Own(&own), &LayoutSettings::default()).unwrap();
+    let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].format, FrameFormat::Fd { brs: false });
     assert_eq!(made.messages[1].format, FrameFormat::Classic);
 }
@@ -168,7 +171,7 @@ fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
 #[test]
 fn a_frame_without_a_cycle_time_gets_the_usual_one_and_consumers_are_told() {
     let text = TEXT.replace("BA_ \"GenMsgCycleTime\" BO_ 1712 100;\n", "");
-    let made = layout(Base::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
+    let made = layout(LayoutBase::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].cycle_time_ms, Some(1000));
 }
 
@@ -182,14 +185,14 @@ fn settings_that_do_not_fit_are_all_told_with_their_keys() {
     let faults = built_in(&wrong).unwrap_err();
     assert_eq!(
         faults.iter().map(|fault| (fault.message, fault.key)).collect::<Vec<_>>(),
-        [(LaidOut::Status, "brs"), (LaidOut::Health, "data_id")]
+        [(LayoutMessage::Status, "brs"), (LayoutMessage::Health, "data_id")]
     );
 }
 
 #[test]
 fn steps_in_ah_fit_the_cell() {
     let steps = |rated_capacity_ah| {
-        let made = layout(Base::BuiltIn { rated_capacity_ah }, &LayoutSettings::default()).unwrap();
+        let made = layout(LayoutBase::BuiltIn { rated_capacity_ah }, &LayoutSettings::default()).unwrap();
         let step = |name: &str| {
             let layout = made.signal(name).unwrap().1.layout;
             let share = if name.ends_with("Std") { 0.5 } else { 2.0 };
@@ -215,7 +218,7 @@ fn steps_in_ah_fit_the_cell() {
 fn an_own_dbc_keeps_its_steps_and_loses_messages_that_are_not_the_daemons() {
     let text = format!("{TEXT}\nBO_ 5 Other: 8 PACKWATCH\n SG_ X : 0|8@1+ (1,0) [0|0] \"Ah\" PACKWATCH\n");
     let own = Database::parse(&text).unwrap();
-    let made = layout(Base::Own(&own), &LayoutSettings::default()).unwrap();
+    let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages, own.messages[..3]);
     assert_eq!((&made.nodes, &made.comment), (&own.nodes, &own.comment));
 }

@@ -1,4 +1,4 @@
-//! The node on a fake bus with a fake clock, heard by a receiver that puts transfers together again.
+//! The node on a fake bus with a fake clock, with a receiver that reassembles transfers.
 
 mod peer_log;
 mod properties;
@@ -6,7 +6,7 @@ mod properties;
 use super::super::{Lamp, MAX_CODES, NameFields};
 use super::*;
 
-const OURS: u8 = 0xF9;
+const ADDRESS: u8 = 0xF9;
 const OTHER: u8 = 0x21;
 
 fn at(ms: i64) -> Timestamp {
@@ -30,7 +30,7 @@ fn request(pgn: u32, to: u8) -> Frame {
 }
 
 fn claim_of(identity_number: u32) -> Frame {
-    frame(0x18EE_FF00 | u32::from(OURS), &name(identity_number).to_bytes())
+    frame(0x18EE_FF00 | u32::from(ADDRESS), &name(identity_number).to_bytes())
 }
 
 /// A complete message as a receiver has it.
@@ -48,7 +48,7 @@ impl Message {
     }
 }
 
-/// A node, its bus, and what was heard.
+/// A node, its bus, and the received messages.
 struct Bench {
     node: Node,
     now_ms: i64,
@@ -63,7 +63,7 @@ struct Bench {
 impl Bench {
     fn new() -> Self {
         Self {
-            node: Node::new(&NodeConfig { name: name(100), address: OURS }),
+            node: Node::new(&NodeConfig { name: name(100), address: ADDRESS }),
             now_ms: 0,
             out: NodeOutputs::default(),
             frames: Vec::new(),
@@ -85,7 +85,7 @@ impl Bench {
         bench.set(&[]);
         bench.start();
         bench.run_to(250);
-        assert_eq!(bench.events, [NodeEvent::Claimed { address: OURS }]);
+        assert_eq!(bench.events, [NodeEvent::Claimed { address: ADDRESS }]);
         bench
     }
 
@@ -116,12 +116,12 @@ impl Bench {
     fn take(&mut self) {
         self.events.append(&mut self.out.events);
         for frame in std::mem::take(&mut self.out.frames) {
-            self.hear(&frame);
+            self.deliver(&frame);
             self.frames.push((self.now_ms, frame));
         }
     }
 
-    fn hear(&mut self, frame: &Frame) {
+    fn deliver(&mut self, frame: &Frame) {
         let header = Header::of(frame.id()).unwrap();
         let (pgn, data) = match (header.pgn, frame.data()) {
             (super::super::PGN_TRANSPORT_CONTROL, &[32, low, high, packets, 0xFF, a, b, c]) => {
@@ -150,7 +150,7 @@ impl Bench {
     }
 
     /// When each DM of a group was complete, and its codes.
-    fn told(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
+    fn received(&self, pgn: u32) -> Vec<(i64, Vec<u32>)> {
         self.messages.iter().filter(|m| m.pgn == pgn).map(|m| (m.ms, m.codes())).collect()
     }
 
@@ -172,7 +172,7 @@ fn nothing_is_sent_before_the_start() {
 fn the_first_dm1_comes_300_ms_after_the_claim_and_then_one_a_second_without_any_code() {
     let mut bench = Bench::claimed();
     bench.run_to(3500);
-    let dm1 = 0x18FE_CA00 | u32::from(OURS);
+    let dm1 = 0x18FE_CA00 | u32::from(ADDRESS);
     assert_eq!(bench.ids(), [(-50, 0x18EE_FFF9), (250, dm1), (1250, dm1), (2250, dm1), (3250, dm1)]);
     assert_eq!(bench.frames[1].1.data(), [0x00, 0xFF, 0, 0, 0, 0, 0xFF, 0xFF]);
 }
@@ -191,7 +191,7 @@ fn a_change_is_sent_at_once_and_the_rhythm_starts_again_from_it() {
     bench.run_to(600);
     bench.set(&[active(1, Lamp::Amber)]);
     bench.run_to(1700);
-    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (601, vec![1]), (1601, vec![1])]);
+    assert_eq!(bench.received(PGN_DM1), [(250, vec![]), (601, vec![1]), (1601, vec![1])]);
 }
 
 #[test]
@@ -204,7 +204,7 @@ fn a_flickering_code_changes_once_a_second_on_the_bus() {
     }
     let mut changes = Vec::new();
     let mut before = vec![];
-    for (ms, codes) in bench.told(PGN_DM1) {
+    for (ms, codes) in bench.received(PGN_DM1) {
         if codes != before {
             changes.push(ms);
             before = codes;
@@ -232,7 +232,7 @@ fn a_changed_set_waits_for_the_transfers_end() {
     bench.run_to(300);
     bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red), active(3, Lamp::Red)]);
     bench.run_to(700);
-    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (351, vec![1, 2]), (501, vec![1, 2, 3])]);
+    assert_eq!(bench.received(PGN_DM1), [(250, vec![]), (351, vec![1, 2]), (501, vec![1, 2, 3])]);
 }
 
 #[test]
@@ -243,33 +243,33 @@ fn a_transfer_counts_as_seen_at_its_end() {
     bench.set(&[]);
     bench.run_to(3000);
     let wanted = [(351, vec![1, 2]), (1351, vec![1, 2]), (1351, vec![])];
-    assert_eq!(bench.told(PGN_DM1)[1..4], wanted, "a second after its last packet, behind the cyclic one");
+    assert_eq!(bench.received(PGN_DM1)[1..4], wanted, "a second after its last packet, behind the cyclic one");
 }
 
 #[test]
-fn dm2_comes_only_when_asked_for_and_with_the_lamps_of_now() {
+fn dm2_is_sent_only_on_request_and_with_the_present_lamps() {
     let mut bench = Bench::claimed();
     bench.set_dm2(&[active(9, Lamp::Amber)], 7..=7);
     bench.run_to(5000);
-    assert_eq!(bench.told(PGN_DM2), []);
-    for to in [OURS, GLOBAL_ADDRESS] {
+    assert_eq!(bench.received(PGN_DM2), []);
+    for to in [ADDRESS, GLOBAL_ADDRESS] {
         bench.receive(&request(PGN_DM2, to));
         bench.run_to(bench.now_ms + 100);
     }
-    assert_eq!(bench.told(PGN_DM2), [(5000, vec![7]), (5100, vec![7])]);
+    assert_eq!(bench.received(PGN_DM2), [(5000, vec![7]), (5100, vec![7])]);
     assert_eq!(bench.messages.iter().find(|m| m.pgn == PGN_DM2).unwrap().data[..2], [0x04, 0xFF]);
     bench.receive(&request(PGN_DM2, OTHER));
     bench.run_to(6000);
-    assert_eq!(bench.told(PGN_DM2).len(), 2, "what another is asked for is not ours");
+    assert_eq!(bench.received(PGN_DM2).len(), 2, "a request to another node is ignored");
 }
 
 #[test]
-fn dm1_asked_for_is_sent_between_two_cyclic_ones() {
+fn a_requested_dm1_is_sent_between_two_cyclic_ones() {
     let mut bench = Bench::claimed();
     bench.run_to(700);
-    bench.receive(&request(PGN_DM1, OURS));
+    bench.receive(&request(PGN_DM1, ADDRESS));
     bench.run_to(1300);
-    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (700, vec![]), (1250, vec![])]);
+    assert_eq!(bench.received(PGN_DM1), [(250, vec![]), (700, vec![]), (1250, vec![])]);
 }
 
 #[test]
@@ -279,7 +279,7 @@ fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
     bench.receive(&request(0xFEE5, OTHER));
     bench.run_to(300);
     assert_eq!(bench.frames.len(), 2, "claim and DM1");
-    bench.receive(&request(0xFEE5, OURS));
+    bench.receive(&request(0xFEE5, ADDRESS));
     let (_, refusal) = bench.frames[2];
     assert_eq!(refusal.id().raw(), 0x18E8_FFF9);
     assert_eq!(refusal.data(), [1, 0xFF, 0xFF, 0xFF, OTHER, 0xE5, 0xFE, 0x00]);
@@ -287,7 +287,7 @@ fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
 
 #[test]
 fn whoever_asks_hears_who_has_the_address() {
-    for to in [OURS, GLOBAL_ADDRESS] {
+    for to in [ADDRESS, GLOBAL_ADDRESS] {
         let mut bench = Bench::claimed();
         bench.receive(&request(PGN_ADDRESS_CLAIMED, to));
         assert_eq!(bench.ids()[2], (250, 0x18EE_FFF9));
@@ -298,17 +298,17 @@ fn whoever_asks_hears_who_has_the_address() {
 #[test]
 fn a_flood_of_requests_is_answered_every_50_ms_and_what_is_dropped_is_counted() {
     let mut bench = Bench::claimed();
-    let mut asked = 0;
+    let mut requests = 0;
     while bench.now_ms < 1250 {
-        bench.receive(&request(0xF000 + asked, OURS));
-        asked += 1;
+        bench.receive(&request(0xF000 + requests, ADDRESS));
+        requests += 1;
         bench.run_to(bench.now_ms + 1);
     }
     bench.run_to(1500);
     let refused = bench.ids().iter().filter(|(_, id)| *id == 0x18E8_FFF9).count();
     assert_eq!(refused, 24, "20 in the second and the 4 that waited");
-    assert_eq!(bench.node.counters().answers_dropped, u64::from(asked) - 24);
-    assert_eq!(bench.told(PGN_DM1).len(), 2, "DM1 does not suffer");
+    assert_eq!(bench.node.counters().answers_dropped, u64::from(requests) - 24);
+    assert_eq!(bench.received(PGN_DM1).len(), 2, "DM1 does not suffer");
 }
 
 #[test]
@@ -320,7 +320,7 @@ fn equal_requests_are_answered_once() {
         bench.receive(&request(PGN_DM2, GLOBAL_ADDRESS));
     }
     bench.run_to(1000);
-    assert_eq!(bench.told(PGN_DM2).len(), 1);
+    assert_eq!(bench.received(PGN_DM2).len(), 1);
     assert_eq!(bench.node.counters(), NodeCounters::default());
 }
 
@@ -330,11 +330,11 @@ fn long_dm1_and_dm2_take_turns_under_a_flood() {
     let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
     bench.set_dm2(&codes, 28..=54);
     while bench.now_ms < 20_000 {
-        bench.receive(&request(PGN_DM2, OURS));
-        bench.receive(&request(0xF000, OURS));
+        bench.receive(&request(PGN_DM2, ADDRESS));
+        bench.receive(&request(0xF000, ADDRESS));
         bench.run_to(bench.now_ms + 10);
     }
-    let (dm1, dm2) = (bench.told(PGN_DM1), bench.told(PGN_DM2));
+    let (dm1, dm2) = (bench.received(PGN_DM1), bench.received(PGN_DM2));
     assert!(dm1.len() >= 11 && dm2.len() >= 10, "{} {}", dm1.len(), dm2.len());
     assert!(dm1.windows(2).all(|pair| pair[1].0 - pair[0].0 <= 2000), "{dm1:?}");
     assert!(dm1[1..].iter().all(|(_, codes)| codes.len() == 27));
@@ -344,24 +344,24 @@ fn long_dm1_and_dm2_take_turns_under_a_flood() {
 fn a_dm1_of_one_frame_passes_a_dm2_under_way() {
     let mut bench = Bench::claimed();
     bench.set_dm2(&[], 1..=27);
-    bench.receive(&request(PGN_DM2, OURS));
+    bench.receive(&request(PGN_DM2, ADDRESS));
     bench.run_to(400);
     bench.set_dm2(&[active(99, Lamp::Red)], 1..=27);
     bench.run_to(402);
-    assert_eq!(bench.told(PGN_DM1), [(250, vec![]), (401, vec![99])]);
+    assert_eq!(bench.received(PGN_DM1), [(250, vec![]), (401, vec![99])]);
     bench.run_to(2000);
-    assert_eq!(bench.told(PGN_DM2), [(1050, (1..=27).collect())]);
+    assert_eq!(bench.received(PGN_DM2), [(1050, (1..=27).collect())]);
 }
 
 #[test]
-fn of_too_many_codes_the_most_severe_are_told_and_the_rest_is_counted() {
+fn of_too_many_codes_the_most_severe_are_sent_and_the_rest_is_counted() {
     let mut bench = Bench::claimed();
     let codes: Vec<_> = (1..=30).map(|spn| active(spn, if spn > 5 { Lamp::Red } else { Lamp::Protect })).collect();
     bench.set(&codes);
     bench.run_to(1200);
-    let told = bench.told(PGN_DM1);
-    assert_eq!(told[1].1, (6..=30).chain(1..=2).collect::<Vec<u32>>());
-    assert_eq!(told[1].1.len(), MAX_CODES);
+    let received = bench.received(PGN_DM1);
+    assert_eq!(received[1].1, (6..=30).chain(1..=2).collect::<Vec<u32>>());
+    assert_eq!(received[1].1.len(), MAX_CODES);
     assert_eq!(bench.messages[1].data[0], 0x11, "the lamps are those of all");
     assert_eq!(bench.events[1..], [NodeEvent::CodesLeftOut { codes: 3 }]);
     assert_eq!(bench.node.counters().codes_left_out, 3);
@@ -376,7 +376,7 @@ fn the_longest_dm1_still_comes_once_a_second() {
     let codes: Vec<_> = (1..=27).map(|spn| active(spn, Lamp::Amber)).collect();
     bench.set(&codes);
     bench.run_to(10_300);
-    let ends: Vec<i64> = bench.told(PGN_DM1)[1..].iter().map(|(ms, _)| *ms).collect();
+    let ends: Vec<i64> = bench.received(PGN_DM1)[1..].iter().map(|(ms, _)| *ms).collect();
     assert_eq!(ends.len(), 10);
     assert!(ends.windows(2).all(|pair| pair[1] - pair[0] == 1000), "{ends:?}");
 }
@@ -386,7 +386,7 @@ fn losing_the_address_stops_everything_even_within_a_transfer() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red), active(2, Lamp::Red)]);
     bench.run_to(310);
-    bench.receive(&request(PGN_DM2, OURS));
+    bench.receive(&request(PGN_DM2, ADDRESS));
     bench.receive(&claim_of(99));
     let sent = bench.frames.len();
     bench.run_to(10_000);
@@ -395,10 +395,10 @@ fn losing_the_address_stops_everything_even_within_a_transfer() {
     assert_eq!(bench.ids()[sent].1, 0x18EE_FFFE, "cannot claim");
     assert!(bench.node.is_silent());
     for pgn in [PGN_DM1, PGN_DM2, 0xF000] {
-        bench.receive(&request(pgn, OURS));
+        bench.receive(&request(pgn, ADDRESS));
         bench.receive(&request(pgn, GLOBAL_ADDRESS));
     }
-    bench.receive(&request(PGN_ADDRESS_CLAIMED, OURS));
+    bench.receive(&request(PGN_ADDRESS_CLAIMED, ADDRESS));
     bench.run_to(11_000);
     assert_eq!(bench.frames.len(), sent + 1, "the address is another's, it answers");
     bench.receive(&request(PGN_ADDRESS_CLAIMED, GLOBAL_ADDRESS));
@@ -413,11 +413,11 @@ fn a_weaker_contender_is_answered_and_dm1_goes_on() {
     bench.run_to(1300);
     assert_eq!(bench.events[1..], [NodeEvent::AddressDefended { against: name(101) }]);
     assert_eq!(bench.ids()[2], (250, 0x18EE_FFF9));
-    assert_eq!(bench.told(PGN_DM1).len(), 2);
+    assert_eq!(bench.received(PGN_DM1).len(), 2);
 }
 
 #[test]
-fn after_a_gap_the_address_is_claimed_again_and_the_codes_told_again() {
+fn after_a_gap_the_address_is_claimed_again_and_the_codes_are_sent_again() {
     let mut bench = Bench::claimed();
     bench.set(&[active(1, Lamp::Red)]);
     bench.run_to(300);
@@ -425,19 +425,19 @@ fn after_a_gap_the_address_is_claimed_again_and_the_codes_told_again() {
     bench.run_to(5000);
     bench.node.handle_gap(at(5000), &mut bench.out);
     bench.run_to(5300);
-    assert_eq!(bench.events[2..], [NodeEvent::Claimed { address: OURS }]);
-    assert_eq!(bench.told(PGN_DM1).last(), Some(&(5300, vec![1])));
+    assert_eq!(bench.events[2..], [NodeEvent::Claimed { address: ADDRESS }]);
+    assert_eq!(bench.received(PGN_DM1).last(), Some(&(5300, vec![1])));
 }
 
 #[test]
-fn what_was_active_while_the_address_was_being_claimed_is_told() {
+fn a_code_active_during_the_address_claim_is_sent() {
     let mut bench = Bench::new();
     bench.start();
     bench.set(&[active(1, Lamp::Red)]);
     bench.run_to(100);
     bench.set(&[]);
     bench.run_to(1300);
-    assert_eq!(bench.told(PGN_DM1), [(250, vec![1]), (1250, vec![])]);
+    assert_eq!(bench.received(PGN_DM1), [(250, vec![1]), (1250, vec![])]);
 }
 
 #[test]

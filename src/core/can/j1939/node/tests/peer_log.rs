@@ -34,7 +34,7 @@ fn played() -> Bench {
         let previously: Vec<_> = five[..dm2].iter().map(|active| active.code).collect();
         bench.node.set_codes(at(ms), &[five[0]], &previously, true);
         bench.run_to(ms + 100);
-        bench.receive(&request(PGN_DM2, OURS));
+        bench.receive(&request(PGN_DM2, ADDRESS));
     }
     bench.run_to(18_000);
     bench
@@ -47,5 +47,5 @@ fn the_log_that_peers_are_played_is_what_the_node_sends() {
         let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
         let _ = writeln!(log, "({}.{:03}000) vcan0 {}#{data}", 1_700_000_000 + ms / 1000, ms % 1000, frame.id());
     }
-    assert!(log == LOG, "write tests/vcan/j1939_peers.log anew:\n{log}");
+    assert!(log == LOG, "write tests/vcan/j1939_peers.log again:\n{log}");
 }

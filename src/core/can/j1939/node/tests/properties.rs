@@ -107,14 +107,14 @@ proptest! {
 
     #[test]
     fn whatever_happens_the_node_keeps_its_promises(acts in proptest::collection::vec(act(), 1..120)) {
-        let sent_ids = NodeConfig { name: name(100), address: OURS }.sent_ids();
+        let sent_ids = NodeConfig { name: name(100), address: ADDRESS }.sent_ids();
         let mut bench = Bench::new();
         for act in &acts {
-            let heard = bench.frames.len();
+            let before = bench.frames.len();
             let was_silent = bench.node.is_silent();
             perform(&mut bench, act);
             let claims_only = was_silent && bench.node.is_silent() && !matches!(act, Act::Wait(_));
-            for (_, frame) in &bench.frames[heard..] {
+            for (_, frame) in &bench.frames[before..] {
                 let is_claim = frame.id().raw() & 0x00FF_FF00 == 0x00EE_FF00;
                 prop_assert!(is_claim || !claims_only, "{frame:?} from a silent node");
                 prop_assert!(sent_ids.contains(&frame.id()));
@@ -149,14 +149,14 @@ proptest! {
             before = spns;
         }
         bench.run_to(bench.now_ms + 4000);
-        let told = bench.told(PGN_DM1);
-        let last: std::collections::BTreeSet<u32> = told.last().unwrap().1.iter().copied().collect();
+        let received = bench.received(PGN_DM1);
+        let last: std::collections::BTreeSet<u32> = received.last().unwrap().1.iter().copied().collect();
         prop_assert_eq!(&last, &before, "in the end the bus knows what is");
         for (spn, from) in became_active {
-            prop_assert!(told[from..].iter().any(|(_, codes)| codes.contains(&spn)), "{} was never told", spn);
+            prop_assert!(received[from..].iter().any(|(_, codes)| codes.contains(&spn)), "{} was never sent", spn);
             let mut changes = Vec::new();
             let mut shown = false;
-            for (ms, codes) in &told {
+            for (ms, codes) in &received {
                 if codes.contains(&spn) != shown {
                     shown = !shown;
                     changes.push(*ms);

@@ -1,8 +1,8 @@
-//! The bindings compiled for reading: which message, which page of it, and per signal shifts, factors and limits.
+//! The bindings compiled for reading: message, page, and per signal shifts, factors and limits.
 //!
-//! Everything here only finds sooner, and computes with fewer branches, what [`Binding`] says; results are the same bit
-//! for bit. What is rare (floats, signals of 64 bits or over nine bytes, a scale that is 0 or not finite, codes beyond one for
-//! "not available" amid the good ones, a selector with too many codes for a table) goes the binding's own way.
+//! In: frames. Out: the same readings as from [`Binding`], bit for bit, with fewer look-ups and branches. Rare cases take the
+//! binding's own path: floats, signals of 64 bits or over nine bytes, a scale that is 0 or not finite, several codes for
+//! "not available" between the good ones, a selector with too many codes for a table.
 
 use std::hint::cold_path;
 use std::ops::Range;
@@ -11,82 +11,81 @@ use std::sync::Arc;
 use super::{Binding, Channel, MuxTest, Reading};
 use crate::can::Frame;
 use crate::can::id_table::IdTable;
-use crate::can::signal::{Shifts, SignalPlan, float_of_signed};
+use crate::can::signal::{ByteOrder, SignalPlan, ValueType, float_of_signed};
 use crate::quantity::{BusIndex, Fault};
 
-/// Codes a selector may have to be looked up in a table: ten bits. Selectors have 4 to 8.
+/// Most codes of a selector with a table: ten bits. Selectors have 4 to 8.
 const MAX_CODES: u64 = 1024;
-/// Entries of all tables of one message, so that wide ranges on many signals take no memory to speak of.
-const MAX_VISITS: usize = 1 << 16;
+/// Most entries of all tables of one message, so that wide ranges on many signals take little memory.
+const MAX_GROUPS: usize = 1 << 16;
 
-/// All messages, ready to be read.
+/// All messages, ready for reading.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub(super) struct Plans {
-    numbers: IdTable,
-    messages: Vec<MessagePlan>,
+pub(super) struct FastDecoder {
+    indices: IdTable,
+    messages: Vec<MessageGroups>,
 }
 
 /// One message.
 #[derive(Debug, Clone, PartialEq)]
-struct MessagePlan {
+struct MessageGroups {
     /// Every group of signals, in order.
-    all: Vec<Visit>,
-    pages: Option<Pages>,
+    all: Vec<SignalGroup>,
+    pages: Option<PageTable>,
 }
 
-/// Neighbours among the bindings that are there or not there together.
+/// Neighbours among the bindings that are present or absent together.
 #[derive(Debug, Clone, PartialEq)]
-struct Visit {
-    /// Those bindings, compiled; one list however many pages have it.
-    plans: Arc<[Plan]>,
-    /// The first of them among all bindings.
+struct SignalGroup {
+    /// The bindings, compiled; pages share the list.
+    signals: Arc<[FastSignal]>,
+    /// Index of the first among all bindings.
     first: usize,
-    /// Payloads of this length carry them all; [`NEVER`] where it is still to be found out whether they are there.
+    /// Payloads of this length carry them all; [`NEVER`] where the binding must decide whether they are present.
     bytes_needed: usize,
 }
 
-/// More than any payload has.
+/// Longer than any payload.
 const NEVER: usize = usize::MAX;
 
-/// What a selector's codes bring.
+/// Groups by the selector's code.
 #[derive(Debug, Clone, PartialEq)]
-struct Pages {
-    selector: Place,
-    /// A payload of this length carries every selector of the message; of shorter ones, each signal is judged for itself.
+struct PageTable {
+    selector: BitPosition,
+    /// A payload of this length carries every selector of the message; in shorter ones each binding decides.
     bytes_needed: usize,
-    /// Per code, and last for every code above: where its visits are.
+    /// Per code, and last for every code above: where its groups are.
     codes: Vec<Range<usize>>,
-    visits: Vec<Visit>,
+    groups: Vec<SignalGroup>,
 }
 
-/// How many [`Wire::words`] there are.
+/// Number of [`PayloadWords::words`].
 const FAR: u8 = 2;
 
-/// Where the bits of a number are.
+/// Position of a number's bits.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Place {
-    /// Which of [`Wire::words`]; for a signal that is in none of them, [`FAR`] more.
+struct BitPosition {
+    /// Index among [`PayloadWords::words`]; for a signal that is in none of them, [`FAR`] more.
     word: u8,
-    /// Eight bytes of the payload from here on hold the signal.
+    /// First of eight payload bytes that hold the signal.
     window: u8,
     up: u8,
     down: u8,
 }
 
-impl Place {
-    fn new(shifts: &Shifts) -> Self {
-        let order = u8::from(shifts.is_big_endian);
-        let word = if shifts.window == 0 { order } else { FAR + order };
-        Self { word, window: shifts.window, up: shifts.up, down: shifts.down }
+impl BitPosition {
+    fn new(plan: &SignalPlan) -> Self {
+        let order = u8::from(plan.byte_order == ByteOrder::BigEndian);
+        let word = if plan.window == 0 { order } else { FAR + order };
+        Self { word, window: plan.window, up: plan.up, down: plan.down }
     }
 }
 
-/// One signal: what a good code becomes. Whatever is not certainly good is left to the binding. 64 bytes, the least that is
-/// loaded at once.
+/// One signal: conversion of good codes. Any other code is left to its binding. 64 bytes, one cache line.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Plan {
+struct FastSignal {
     channel: Channel,
-    place: Place,
+    position: BitPosition,
     /// The highest bit of a signed signal, 0 for an unsigned one: flipped and subtracted it extends the sign.
     sign: u64,
     /// Good codes, those within the DBC's and the configured range: the first, its sign flipped, and how many follow it.
@@ -98,15 +97,15 @@ struct Plan {
     shift: f64,
 }
 
-/// A payload as signals are taken from it.
-struct Wire<'a> {
+/// The first bytes of a payload as words.
+struct PayloadWords<'a> {
     frame: &'a Frame,
     /// The first eight bytes, zeros where the payload ends: the first byte lowest, and highest.
     words: [u64; FAR as usize],
 }
 
-impl<'a> Wire<'a> {
-    /// Of a frame with a payload.
+impl<'a> PayloadWords<'a> {
+    /// The words of a frame with a payload.
     #[inline(always)]
     fn new(frame: &'a Frame) -> Self {
         let word = frame.padded_data().first_chunk().map_or(0, |bytes| u64::from_le_bytes(*bytes));
@@ -118,59 +117,59 @@ impl<'a> Wire<'a> {
         self.frame.len() >= bytes
     }
 
-    /// The bits at a place, the lowest at the bottom.
+    /// The bits at a position, the lowest at the bottom.
     #[inline(always)]
-    fn bits(&self, place: &Place) -> u64 {
-        let word = match self.words.get(usize::from(place.word)) {
+    fn bits(&self, position: &BitPosition) -> u64 {
+        let word = match self.words.get(usize::from(position.word)) {
             Some(word) => *word,
             None => {
                 cold_path();
-                self.far_word(place)
+                self.far_word(position)
             }
         };
-        word << (place.up & 63) >> (place.down & 63)
+        word << (position.up & 63) >> (position.down & 63)
     }
 
     /// A word that does not begin with the payload.
     #[inline(always)]
-    fn far_word(&self, place: &Place) -> u64 {
-        let from = usize::from(place.window);
+    fn far_word(&self, position: &BitPosition) -> u64 {
+        let from = usize::from(position.window);
         // The window of a signal lies within the longest payload.
         let bytes = self.frame.padded_data().get(from..).and_then(|rest| rest.first_chunk());
         let word = bytes.map_or(0, |bytes| u64::from_le_bytes(*bytes));
-        if place.word == FAR { word } else { word.swap_bytes() }
+        if position.word == FAR { word } else { word.swap_bytes() }
     }
 }
 
-impl Plans {
-    /// Bindings sorted by message and channel, and their runs.
+impl FastDecoder {
+    /// Compiles bindings sorted by message and channel, and their runs.
     pub(super) fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
         let message = |run: &Range<usize>| (bindings[run.start].bus, bindings[run.start].id);
         let messages: Vec<_> = runs.chunk_by(|a, b| message(a) == message(b)).collect();
         Self {
-            numbers: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
-            messages: messages.iter().map(|runs| MessagePlan::new(bindings, runs)).collect(),
+            indices: IdTable::new(messages.iter().map(|runs| message(&runs[0]))),
+            messages: messages.iter().map(|runs| MessageGroups::new(bindings, runs)).collect(),
         }
     }
 
     /// See [`super::InputMap::decode`].
     #[inline]
     pub(super) fn decode(&self, bindings: &[Binding], bus: BusIndex, frame: &Frame, mut each: impl FnMut(Reading)) {
-        let Some(message) = self.messages.get(self.numbers.number(bus, frame.id())) else { return };
-        let wire = Wire::new(frame);
-        for visit in message.visits(&wire) {
-            if !wire.has(visit.bytes_needed) {
+        let Some(message) = self.messages.get(self.indices.number(bus, frame.id())) else { return };
+        let words = PayloadWords::new(frame);
+        for group in message.groups(&words) {
+            if !words.has(group.bytes_needed) {
                 cold_path();
-                decode_plainly(&bindings[visit.first..][..visit.plans.len()], frame.data(), &mut each);
+                decode_plainly(&bindings[group.first..][..group.signals.len()], frame.data(), &mut each);
                 continue;
             }
-            for (n, plan) in visit.plans.iter().enumerate() {
-                // Two places rather than one value made of both: the good one then stays in a register.
-                match plan.good(&wire) {
+            for (n, plan) in group.signals.iter().enumerate() {
+                // Two calls of `each`, not one value made of both: the good one then stays in a register.
+                match plan.good(&words) {
                     Some(value) => each(Reading { channel: plan.channel, value: Ok(value) }),
                     None => {
                         cold_path();
-                        let value = plain_value(&bindings[visit.first + n], frame.data());
+                        let value = plain_value(&bindings[group.first + n], frame.data());
                         each(Reading { channel: plan.channel, value });
                     }
                 }
@@ -179,21 +178,21 @@ impl Plans {
     }
 }
 
-/// Whether the payload carries bindings that are there or not there together.
+/// Whether the payload carries bindings that are present together.
 #[cold]
 #[inline(never)]
 fn present(bindings: &[Binding], payload: &[u8]) -> Result<bool, Fault> {
     bindings.first().map_or(Ok(false), |first| first.holds(payload))
 }
 
-/// What a binding that is there says, in full.
+/// The value of a binding that is present.
 #[cold]
 #[inline(never)]
 fn plain_value(binding: &Binding, payload: &[u8]) -> Result<f64, Fault> {
     binding.value(payload)
 }
 
-/// Bindings that are there or not there together, as they say.
+/// Readings of bindings that are present together, from the bindings themselves.
 #[inline(always)]
 pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut impl FnMut(Reading)) {
     let present = present(bindings, payload);
@@ -206,68 +205,68 @@ pub(super) fn decode_plainly(bindings: &[Binding], payload: &[u8], each: &mut im
     }
 }
 
-impl Visit {
-    /// Of neighbours that are certainly there.
+impl SignalGroup {
+    /// A group that is certainly present.
     fn new(bindings: &[Binding], run: &Range<usize>) -> Self {
         let bindings = &bindings[run.clone()];
         let bytes_needed = bindings.iter().map(|binding| binding.plan.bytes_needed()).max().unwrap_or(0);
-        Self { plans: bindings.iter().map(Plan::new).collect(), first: run.start, bytes_needed }
+        Self { signals: bindings.iter().map(FastSignal::new).collect(), first: run.start, bytes_needed }
     }
 
-    /// Of the same, of which it is still to be found out.
+    /// The same group, whose presence its binding decides.
     fn to_be_checked(&self) -> Self {
         Self { bytes_needed: NEVER, ..self.clone() }
     }
 }
 
-impl MessagePlan {
+impl MessageGroups {
     fn new(bindings: &[Binding], runs: &[Range<usize>]) -> Self {
-        let visits: Vec<_> = runs.iter().map(|run| Visit::new(bindings, run)).collect();
-        let pages = Pages::new(bindings, runs, &visits);
+        let groups: Vec<_> = runs.iter().map(|run| SignalGroup::new(bindings, run)).collect();
+        let pages = PageTable::new(bindings, runs, &groups);
         let tests = |run: &Range<usize>| bindings[run.start].mux.len();
         let all =
-            visits.into_iter().zip(runs).map(|(visit, run)| if tests(run) > 0 { visit.to_be_checked() } else { visit });
+            groups.into_iter().zip(runs).map(|(group, run)| if tests(run) > 0 { group.to_be_checked() } else { group });
         Self { all: all.collect(), pages }
     }
 
     #[inline]
-    fn visits(&self, wire: &Wire<'_>) -> &[Visit] {
+    fn groups(&self, words: &PayloadWords<'_>) -> &[SignalGroup] {
         match &self.pages {
-            Some(pages) if wire.has(pages.bytes_needed) => pages.of(wire),
+            Some(pages) if words.has(pages.bytes_needed) => pages.of(words),
             _ => &self.all,
         }
     }
 }
 
-impl Pages {
-    /// By the selector most runs depend on; `None` without one, or when a table would be too large.
-    fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[Visit]) -> Option<Self> {
+impl PageTable {
+    /// By the selector that most runs depend on; `None` without one, or when a table would be too large.
+    fn new(bindings: &[Binding], runs: &[Range<usize>], all: &[SignalGroup]) -> Option<Self> {
         let tests = |run: &Range<usize>| bindings[run.start].mux.as_slice();
         let dependents = |plan: SignalPlan| runs.iter().flat_map(tests).filter(|test| test.plan == plan).count();
         let selector = runs.iter().flat_map(tests).map(|test| test.plan).max_by_key(|plan| dependents(*plan))?;
         let highest = runs.iter().flat_map(tests).filter(|test| test.plan == selector).flat_map(|test| &test.ranges);
         let codes = highest.map(|(_, high)| high.saturating_add(1)).max()?;
-        if codes > MAX_CODES {
+        if codes > MAX_CODES || !selector.is_simple() {
             return None;
         }
         let mut pages = Self {
-            selector: Place::new(&selector.shifts()?),
+            selector: BitPosition::new(&selector),
             bytes_needed: runs.iter().flat_map(tests).map(|test| test.plan.bytes_needed()).max()?,
             codes: Vec::new(),
-            visits: Vec::new(),
+            groups: Vec::new(),
         };
-        // The last code stands for every one above: no range reaches it.
+        // The last code stands for every code above: no range reaches it.
         for code in 0..=codes {
-            let start = pages.visits.len();
-            for (run, visit) in runs.iter().zip(all) {
+            let start = pages.groups.len();
+            for (run, group) in runs.iter().zip(all) {
                 if !may_hold(selector, tests(run), code) {
                     continue;
                 }
                 let check = tests(run).iter().any(|test| test.plan != selector);
-                pages.visits.push(if check { visit.to_be_checked() } else { visit.clone() });
+                pages.groups.push(if check { group.to_be_checked() } else { group.clone() });
             }
-            pages.codes.push(start..pages.visits.len());
-            if pages.visits.len() > MAX_VISITS {
+            pages.codes.push(start..pages.groups.len());
+            if pages.groups.len() > MAX_GROUPS {
                 return None;
             }
         }
@@ -275,26 +274,26 @@ impl Pages {
     }
 
     #[inline]
-    fn of(&self, wire: &Wire<'_>) -> &[Visit] {
-        let code = usize::try_from(wire.bits(&self.selector)).unwrap_or(usize::MAX);
-        // There is one code at least: the one that stands for every one above.
-        let visits = &self.codes[code.min(self.codes.len() - 1)];
-        &self.visits[visits.clone()]
+    fn of(&self, words: &PayloadWords<'_>) -> &[SignalGroup] {
+        let code = usize::try_from(words.bits(&self.selector)).unwrap_or(usize::MAX);
+        // There is at least the code that stands for every code above.
+        let groups = &self.codes[code.min(self.codes.len() - 1)];
+        &self.groups[groups.clone()]
     }
 }
 
-/// Whether the selector's code leaves room for the run to be there.
+/// Whether the run may be present with this code of the selector.
 fn may_hold(selector: SignalPlan, tests: &[MuxTest], code: u64) -> bool {
     tests.iter().filter(|test| test.plan == selector).all(|test| test.allows(code))
 }
 
-impl Plan {
+impl FastSignal {
     fn new(binding: &Binding) -> Self {
         let Binding { channel, scale, offset: shift, .. } = *binding;
         let nothing = Self {
             channel,
             // One bit, and no code is good.
-            place: Place { word: 0, window: 0, up: 0, down: 63 },
+            position: BitPosition { word: 0, window: 0, up: 0, down: 63 },
             sign: 0,
             first_good: u64::MAX,
             more_good: 0,
@@ -303,38 +302,38 @@ impl Plan {
             scale,
             shift,
         };
-        let is_usual = scale.is_finite() && scale != 0.0 && shift.is_finite();
-        let Some(shifts) = binding.plan.shifts().filter(|_| is_usual) else { return nothing };
-        let limits = [shifts.low, shifts.high, binding.range.0, binding.range.1];
-        if limits.iter().any(|limit| limit.is_nan()) {
+        let is_regular = scale.is_finite() && scale != 0.0 && shift.is_finite();
+        let plan = &binding.plan;
+        let limits = [plan.low, plan.high, binding.range.0, binding.range.1];
+        if !is_regular || !plan.is_simple() || limits.iter().any(|limit| limit.is_nan()) {
             return nothing;
         }
-        let sign = if shifts.is_signed { 1 << (63 - shifts.down) } else { 0 };
-        let good = good_codes(binding, &shifts).and_then(|good| available_codes(binding, sign, good));
+        let sign = if plan.value_type() == ValueType::Signed { 1 << (63 - plan.down) } else { 0 };
+        let good = good_codes(binding).and_then(|good| available_codes(binding, sign, good));
         let Some((first, last)) = good else { return nothing };
         Self {
-            place: Place::new(&shifts),
+            position: BitPosition::new(plan),
             sign,
             first_good: first.cast_unsigned().wrapping_add(sign),
             more_good: first.abs_diff(last),
-            factor: shifts.factor,
-            offset: shifts.offset,
+            factor: plan.factor,
+            offset: plan.offset,
             ..nothing
         }
     }
 
-    /// The value in the program's unit and sign, if it is good; the payload carries the signal.
+    /// The value in the program's unit and sign, if its code is good; the payload carries the signal.
     #[inline(always)]
-    fn good(&self, wire: &Wire<'_>) -> Option<f64> {
-        let flipped = wire.bits(&self.place) ^ self.sign;
+    fn good(&self, words: &PayloadWords<'_>) -> Option<f64> {
+        let flipped = words.bits(&self.position) ^ self.sign;
         let code = flipped.wrapping_sub(self.sign).cast_signed();
         let is_good = flipped.wrapping_sub(self.first_good) <= self.more_good;
         is_good.then(|| (float_of_signed(code) * self.factor + self.offset) * self.scale + self.shift)
     }
 }
 
-/// Of the good codes the longest run without one that means "not available": those are at the ends almost always, and what
-/// lies beyond one in the midst goes the binding's own way.
+/// The longest run of good codes without one that means "not available". Those are nearly always at the ends; codes beyond
+/// one in the middle take the binding's own path.
 fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> Option<(i64, i64)> {
     let possible = binding.not_available.iter().filter(|code| **code <= binding.plan.all_ones());
     let signed = possible.map(|code| (code ^ sign).wrapping_sub(sign).cast_signed());
@@ -346,19 +345,19 @@ fn available_codes(binding: &Binding, sign: u64, (first, last): (i64, i64)) -> O
     begins.zip(ends).filter(|(begin, end)| begin <= end).max_by_key(|(begin, end)| begin.abs_diff(*end))
 }
 
-/// The first and the last code whose value is within both ranges. Every step from the code to the value keeps the order
-/// (or turns it round), rounding included, so that the good codes are neighbours and halving finds their ends exactly.
-fn good_codes(binding: &Binding, shifts: &Shifts) -> Option<(i64, i64)> {
-    let physical = |code: i64| float_of_signed(code) * shifts.factor + shifts.offset;
+/// The first and the last code with a value within both ranges. Every step from the code to the value keeps the order (or
+/// reverses it), rounding included, so that the good codes are neighbours and bisection finds their ends exactly.
+fn good_codes(binding: &Binding) -> Option<(i64, i64)> {
+    let plan = &binding.plan;
+    let physical = |code: i64| float_of_signed(code) * plan.factor + plan.offset;
     let value = |code: i64| physical(code) * binding.scale + binding.offset;
-    let (lowest, highest) = shifts.codes();
+    let (lowest, highest) = plan.codes();
     let is_rising = |of: &dyn Fn(i64) -> f64| of(lowest) <= of(highest);
     let mut good = (lowest, highest);
     type Map<'a> = &'a dyn Fn(i64) -> f64;
-    let both: [(Map<'_>, f64, f64); 2] =
-        [(&physical, shifts.low, shifts.high), (&value, binding.range.0, binding.range.1)];
+    let both: [(Map<'_>, f64, f64); 2] = [(&physical, plan.low, plan.high), (&value, binding.range.0, binding.range.1)];
     for (of, low, high) in both {
-        // Along rising values: not below the lower limit any more, and above the upper one.
+        // Along rising values: first not below the lower limit, then above the upper one.
         let (first, end) = if is_rising(of) {
             (first_where(good, |code| of(code) >= low), first_where(good, |code| of(code) > high))
         } else {
@@ -372,7 +371,7 @@ fn good_codes(binding: &Binding, shifts: &Shifts) -> Option<(i64, i64)> {
     Some(good)
 }
 
-/// The first of neighbouring codes for which something holds that holds for all after it.
+/// The first of neighbouring codes with a property that all later ones have too.
 fn first_where((mut low, mut high): (i64, i64), holds: impl Fn(i64) -> bool) -> Option<i64> {
     if !holds(high) {
         return None;

@@ -1,0 +1,15 @@
+//! The demand of a course: the current until the next sample, sleep, or the end.
+
+/// Next demand of a scenario.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Demand {
+    /// This cell current flows until the next sample, A, positive = discharge.
+    Current(f64),
+    /// The vehicle sleeps: no current, no measurements.
+    Asleep {
+        /// Duration, s.
+        duration_s: f64,
+    },
+    /// The scenario is over.
+    Finished,
+}
