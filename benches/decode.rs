@@ -1,11 +1,11 @@
 //! Time of one frame through [`InputMap::decode`], and of the frames of one set of values through [`InputEncoder`].
 
 use divan::{Bencher, black_box};
-use packwatch::can::dbc::Database;
-use packwatch::can::decode::{Binding, InputMap};
-use packwatch::can::encode::InputEncoder;
-use packwatch::can::{CanId, Frame};
-use packwatch::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+use packwatch_host::can::dbc::Database;
+use packwatch_host::can::decode::{Binding, InputMap};
+use packwatch_host::can::encode::InputEncoder;
+use packwatch_host::can::{CanId, Frame};
+use packwatch_host::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
 
 /// Cells of the shipped example pack, three on each of 32 pages.
 const CELLS: u16 = 96;
@@ -86,7 +86,7 @@ fn decode_a_page_of_96_multiplexed_cells_plainly(bencher: Bencher) {
 }
 
 #[divan::bench]
-fn decode_a_frame_nobody_asked_for(bencher: Bencher) {
+fn decode_an_unmapped_frame(bencher: Bencher) {
     decode(bencher, &cells(), &Frame::classic(CanId::Standard(0x595), &[0; 8]).expect("8 bytes"));
 }
 

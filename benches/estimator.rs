@@ -1,10 +1,10 @@
 //! One estimator step, and one round of a 96-cell pack through the whole core (frames in, frames out).
 
 use common::{example, reading};
-use packwatch::can::encode::InputEncoder;
-use packwatch::cell::{CellEstimator, CellModel};
-use packwatch::monitor::{Input, Monitor, Outputs};
-use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
+use packwatch_host::can::encode::InputEncoder;
+use packwatch_host::cell::{CellEstimator, CellModel};
+use packwatch_host::monitor::{Input, Monitor, Outputs};
+use packwatch_host::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
 
 mod common;
 

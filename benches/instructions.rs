@@ -10,14 +10,14 @@ use std::io::Write;
 use std::time::Instant;
 
 use common::{example, reading};
-use packwatch::can::Frame;
-use packwatch::can::dbc::Database;
-use packwatch::can::decode::{Binding, InputMap};
-use packwatch::can::encode::InputEncoder;
-use packwatch::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
-use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
-use packwatch::quantity::{BusIndex, CellIndex, Channel};
+use packwatch_host::can::Frame;
+use packwatch_host::can::dbc::Database;
+use packwatch_host::can::decode::{Binding, InputMap};
+use packwatch_host::can::encode::InputEncoder;
+use packwatch_host::cell::{CellEstimator, CellModel, EstimatorBank, EstimatorConfig};
+use packwatch_host::io::csv_log::CsvOptions;
+use packwatch_host::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch_host::quantity::{BusIndex, CellIndex, Channel};
 use tempfile::NamedTempFile;
 
 mod common;

@@ -4,12 +4,12 @@
 
 use divan::Bencher;
 use divan::counter::ItemsCount;
-use packwatch::can::dbc::Database;
-use packwatch::can::decode::{Binding, InputMap};
-use packwatch::io::candump::{Line, parse_line};
-use packwatch::io::csv_log::CsvOptions;
-use packwatch::io::log::{Batch, LogOptions, LogSource, Record};
-use packwatch::quantity::{BusIndex, CellIndex, Channel, Reading, SensorIndex};
+use packwatch_host::can::dbc::Database;
+use packwatch_host::can::decode::{Binding, InputMap};
+use packwatch_host::io::candump::{Line, parse_line};
+use packwatch_host::io::csv_log::CsvOptions;
+use packwatch_host::io::log::{Batch, LogOptions, LogSource, Record};
+use packwatch_host::quantity::{BusIndex, CellIndex, Channel, Reading, SensorIndex};
 
 fn main() {
     divan::main();

@@ -6,8 +6,8 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use common::{example, reading};
-use packwatch::cell::{CellEstimator, EstimatorBank};
-use packwatch::config::Config;
+use packwatch_host::cell::{CellEstimator, EstimatorBank};
+use packwatch_host::config::Config;
 
 mod common;
 

@@ -1,5 +1,5 @@
 //! In steady state nothing on the way of a frame allocates: reading a log, the core with the example's 96 cells, its ticks
-//! and the frames it sends. What comes first (growing buffers), what is learned at a transition, and what is told as an event may.
+//! and the frames it sends. The first frames (growing buffers), transitions, and events may allocate.
 //!
 //! Every thread of the process counts. When a test fails, `dhat-heap.json` says where it allocated.
 

@@ -1,11 +1,11 @@
 //! The estimators' work that benches share: the example pack's cells, and what is measured of them.
 
-use packwatch::cell::CellStep;
-use packwatch::config::{self, Config};
+use packwatch_host::cell::CellStep;
+use packwatch_host::config::{self, Config};
 
 /// `config/example.toml`.
 pub(crate) fn example() -> Config {
-    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/config/example.toml"));
+    let path = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/example.toml"));
     config::load(path).unwrap_or_else(|faults| panic!("{faults:?}"))
 }
 

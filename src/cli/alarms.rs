@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::Failure;
 use super::control_args::{ControlArgs, print};
-use crate::alarm::{Alarm, Rule, Severity, State, Unit};
+use crate::alarm::{Alarm, AlarmState, Rule, Severity, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
@@ -110,7 +110,7 @@ pub(super) fn cell(cell: Option<CellIndex>) -> String {
 
 /// A value of a rule with its unit; fractions as percent.
 pub(super) fn with_unit(rule: Rule, value: f64) -> String {
-    let unit = rule.row().unit;
+    let unit = rule.spec().unit;
     match unit {
         Unit::Fraction => format!("{:.1} %", 100.0 * value),
         Unit::Ratio => format!("{value:.2}"),
@@ -129,16 +129,16 @@ pub(super) fn severity(severity: Severity) -> &'static str {
 }
 
 /// Where an alarm is, in a word.
-pub(super) fn state_name(state: State) -> &'static str {
+pub(super) fn state_name(state: AlarmState) -> &'static str {
     match state {
-        State::Unknown => "unknown",
-        State::Inactive => "inactive",
-        State::Pending => "pending",
-        State::Active => "active",
-        State::Clearing => "clearing",
-        State::Suppressed => "suppressed",
-        State::Latched => "latched",
-        State::Cleared => "cleared",
+        AlarmState::Unknown => "unknown",
+        AlarmState::Inactive => "inactive",
+        AlarmState::Pending => "pending",
+        AlarmState::Active => "active",
+        AlarmState::Clearing => "clearing",
+        AlarmState::Suppressed => "suppressed",
+        AlarmState::Latched => "latched",
+        AlarmState::Cleared => "cleared",
     }
 }
 
@@ -153,7 +153,7 @@ mod tests {
             rule: Rule::SocLow,
             severity: Severity::Warning,
             cell: None,
-            state: State::Active,
+            state: AlarmState::Active,
             value: Some(0.084),
             probability: Some(0.973),
             threshold: 0.1,
@@ -170,7 +170,7 @@ mod tests {
         let missing = Alarm {
             rule: Rule::InputMissing,
             cell: Some(CellIndex(0)),
-            state: State::Suppressed,
+            state: AlarmState::Suppressed,
             value: None,
             probability: None,
             threshold: 2.0,

@@ -1,4 +1,4 @@
-//! `packwatch check`: says whether a configuration is good, and what it means.
+//! `packwatch check`: checks a configuration and describes it.
 //!
 //! Opens everything the configuration names. Good: the meaning on standard output, exit 0. Bad: every fault,
 //! one a line, on standard error, exit 78.
@@ -56,7 +56,7 @@ fn show(description: &Description, page: &mut String) {
     page.push_str("\nsignals\n");
     table(&description.signals.iter().map(signal).collect::<Vec<_>>(), page);
     list("plausible readings", &description.limits, page);
-    list("taken in", &description.intake, page);
+    list("checks of frames", &description.intake, page);
     page.push_str("\noutputs\n");
     if description.outputs.is_empty() {
         page.push_str("  nothing is sent\n");

@@ -1,8 +1,8 @@
 //! `packwatch demo`: a short ageing life on an in-process bus, ending in alarms. Needs no CAN, no root, no file.
 //!
 //! A simulated cell loses 0.1 Ah per cycle. Its sensors' readings become frames of `config/measured.dbc`; the frames go
-//! through the same core as live ones; what the core sends is read by a consumer that knows nothing but
-//! `config/packwatch.dbc`. Exit code 0 when both a capacity and a recharge-period alarm were raised, else 1.
+//! through the same core as live ones; a consumer that has only `config/packwatch.dbc` decodes the frames that the core
+//! sends. Exit code 0 when both a capacity and a recharge-period alarm were raised, else 1.
 
 mod consumer;
 mod table;
@@ -21,7 +21,7 @@ use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use consumer::Consumer;
-use table::{Row, Table};
+use table::{Table, TableRow};
 
 /// Files built into the binary, by the path the configuration calls them.
 const FILES: [(&str, &str); 3] = [
@@ -29,9 +29,9 @@ const FILES: [(&str, &str); 3] = [
     ("measured.dbc", include_str!("../../config/measured.dbc")),
     ("cells/example_nmc_2600.toml", include_str!("../../config/cells/example_nmc_2600.toml")),
 ];
-/// What the receiving ECU knows.
+/// DBC of the receiving ECU.
 const OUTPUT_DBC: &str = include_str!("../../config/packwatch.dbc");
-/// What the cell loses per cycle, Ah: both alarms come within some ten cycles.
+/// Loss of capacity per cycle, Ah: both alarms come within some ten cycles.
 const LOSS_AH_PER_CYCLE: f64 = 0.1;
 /// SOC range of the cycling; wider than the recharge window, so that every charge covers it.
 const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
@@ -39,7 +39,7 @@ const SOC_WINDOW: (f64, f64) = (0.2, 0.95);
 const MAX_CYCLES: u32 = 14;
 /// Cycles shown after the last alarm.
 const CYCLES_AFTER: u32 = 1;
-/// Samples between two looks at the live row.
+/// Samples between two updates of the live row.
 const LIVE_SAMPLES: u64 = 400;
 /// Time of the bus when the demo starts: a Unix time, as in any log.
 const START: Timestamp = Timestamp::from_nanos(1_700_000_000_000_000_000);
@@ -58,8 +58,8 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let config = config::load_with(Path::new("demo.toml"), &read_built_in)?;
     let mut demo = Demo::new(config, args.seed)?;
-    demo.tell().map_err(|error| Failure::new(format!("standard output: {error}")))?;
-    demo.verdict()
+    demo.run().map_err(|error| Failure::new(format!("standard output: {error}")))?;
+    demo.conclude()
 }
 
 fn read_built_in(path: &Path) -> io::Result<Vec<u8>> {
@@ -68,7 +68,7 @@ fn read_built_in(path: &Path) -> io::Result<Vec<u8>> {
 }
 
 /// An alarm that was raised, as it was at that moment.
-struct Raised {
+struct RaisedAlarm {
     rule: Rule,
     cycle: u32,
     true_capacity_ah: f64,
@@ -89,7 +89,7 @@ struct Demo {
     true_capacity_ah: f64,
     out: Outputs,
     table: Table,
-    raised: Vec<Raised>,
+    raised: Vec<RaisedAlarm>,
     frames_in: u64,
     frames_out: u64,
 }
@@ -120,8 +120,8 @@ impl Demo {
         })
     }
 
-    /// The whole demo on standard output, but for its last line.
-    fn tell(&mut self) -> io::Result<()> {
+    /// Runs the demo on standard output, without its last line.
+    fn run(&mut self) -> io::Result<()> {
         let chain = "cell -> frames -> monitor -> frames -> consumer";
         writeln!(io::stdout(), "one 2.6 Ah cell loses {LOSS_AH_PER_CYCLE} Ah per cycle; {chain}")?;
         self.live()?;
@@ -165,7 +165,7 @@ impl Demo {
         self.collect();
     }
 
-    /// Takes what the core sent: every frame goes to the consumer, frames of newly raised alarms are kept.
+    /// Passes every sent frame to the consumer, and keeps the frames of newly raised alarms.
     fn collect(&mut self) {
         let (cycle, true_capacity_ah) = (self.sim.pack().cycles() + 1, self.true_capacity_ah);
         for sent in &self.out.frames {
@@ -177,13 +177,13 @@ impl Demo {
             let frame = self.out.frames.iter().find(|sent| self.consumer.is_alarm(&sent.frame, rule));
             if let Some(sent) = frame {
                 let (time, bus, frame) = (sent.time, sent.bus, sent.frame);
-                self.raised.push(Raised { rule, cycle, true_capacity_ah, time, bus, frame });
+                self.raised.push(RaisedAlarm { rule, cycle, true_capacity_ah, time, bus, frame });
             }
         }
         self.out.clear();
     }
 
-    fn first(&self, rule: Rule) -> Option<&Raised> {
+    fn first(&self, rule: Rule) -> Option<&RaisedAlarm> {
         self.raised.iter().find(|raised| raised.rule == rule)
     }
 
@@ -192,13 +192,13 @@ impl Demo {
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + CYCLES_AFTER)
     }
 
-    fn row(&self, moment: &Moment, cycles: u32) -> Row {
+    fn row(&self, moment: &Moment, cycles: u32) -> TableRow {
         let truth = self.sim.pack().cells()[0];
         let estimate = self.monitor.latest().next().flatten();
         let capacity = self.monitor.capacity(CellIndex(0));
         let mut alarms: Vec<Rule> = self.raised.iter().map(|raised| raised.rule).collect();
         alarms.dedup();
-        Row {
+        TableRow {
             cycle: cycles + 1,
             hours: moment.time.secs() / 3600.0,
             mode: self.monitor.mode(),
@@ -226,8 +226,8 @@ impl Demo {
         Ok(())
     }
 
-    /// What happened, in one line; an error when an alarm did not come or came in frames nobody can read.
-    fn verdict(&self) -> Result<(), Failure> {
+    /// Prints the result in one line; an error when an alarm is missing or a frame is not in the DBC.
+    fn conclude(&self) -> Result<(), Failure> {
         let unknown = self.consumer.unknown_frames();
         match (self.first(Rule::CapacityLow), self.first(Rule::RechargePeriodLow)) {
             (Some(capacity), Some(recharge)) if unknown == 0 => {
@@ -238,7 +238,7 @@ impl Demo {
                 writeln!(io::stdout(), "\n{line}").map_err(|error| Failure::new(format!("standard output: {error}")))
             }
             (capacity, recharge) => {
-                let word = |found: Option<&Raised>| if found.is_some() { "raised" } else { "missing" };
+                let word = |found: Option<&RaisedAlarm>| if found.is_some() { "raised" } else { "missing" };
                 let (capacity, recharge) = (word(capacity), word(recharge));
                 Err(Failure::new(format!(
                     "capacity alarm {capacity}, recharge-period alarm {recharge}, {unknown} frames unknown to their DBC"

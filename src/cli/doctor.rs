@@ -13,11 +13,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::control_args::print;
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
-use crate::config::{self, Survey};
-use crate::diagnosis::{self, Interrupt};
+use crate::diagnosis::{self, Interrupt, Survey};
 use crate::doctor::{Finding, Report, Severity, Topic};
 use crate::io::csv_log::CsvOptions;
-use crate::replay::Progress;
+use crate::replay::ReplayProgress;
 
 /// Longest time to listen, s: a day.
 const MAX_SECONDS: f64 = 86_400.0;
@@ -63,7 +62,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    let mut survey = config::survey(&args.config)?;
+    let mut survey = diagnosis::survey(&args.config)?;
     rename_interfaces(args, &mut survey)?;
     survey.plan.is_csv = args.logs.iter().any(|log| is_csv(log));
     let interrupt = Interrupt::watch().map_err(|error| Failure::new(format!("signals cannot be watched: {error}")))?;
@@ -121,7 +120,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
     let bar = Bar::new(&args.logs);
     let result = diagnosis::replay(survey, &args.logs, csv, args.seconds, interrupt, &mut |progress| {
         let times_real_time = progress.seconds / bar.seconds();
-        bar.show(Progress { bytes: progress.bytes, frames: progress.frames, times_real_time });
+        bar.show(ReplayProgress { bytes: progress.bytes, frames: progress.frames, times_real_time });
     });
     bar.clear();
     let (mut report, counts) = result.map_err(|error| Failure::new(error.to_string()))?;

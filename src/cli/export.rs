@@ -7,10 +7,11 @@ use serde_json::json;
 
 use super::Failure;
 use super::fleet::LogArgs;
-use super::score::write_table;
+use super::numbers::within;
+use super::output::{failure, print_json, unless_closed, write_table};
 use crate::config::{self, Config};
-use crate::lab::fleet::Reading;
-use crate::lab::fleet::export::{self, Exported, Format, Settings};
+use crate::lab::fleet::LogAccess;
+use crate::lab::fleet::export::{self, ExportResult, ExportSettings, TableFormat};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
@@ -29,8 +30,8 @@ enum FormatName {
 #[command(
     after_help = "Writes DIR/NAME/estimates, half_cycles and alarms (.parquet or .csv) and about.json per log. All logs of a fleet in one \
                   query: select log, cell, min(capacity_ah) from 'DIR/*/half_cycles.parquet' group by log, cell. Tables that are there already are \
-                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others go on; the exit code is then 1. The \
-                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv beside it."
+                  replaced once the new ones are complete. A log that fails leaves no new file under its name and the others continue; the exit code is then 1. The \
+                  sections of a CSV are dated by --start-times, else by NAME_cycles.csv next to it."
 )]
 pub(crate) struct Args {
     /// Print the columns with their types and units as Markdown, and do nothing else
@@ -42,10 +43,10 @@ pub(crate) struct Args {
     /// Form of the tables
     #[arg(long, value_enum, default_value = "parquet")]
     format: FormatName,
-    /// Folder for the logs' folders; made when it is not there
+    /// Folder for the logs' folders; created when it does not exist
     #[arg(short, long, value_name = "DIR", required_unless_present = "columns_page")]
     out: Option<PathBuf>,
-    /// At most one estimate per cell in so many seconds, the first; 0 = every one
+    /// Period in which at most one estimate per cell is exported, the first; 0 = every estimate
     #[arg(long, value_name = "S", default_value_t = 1.0, value_parser = period)]
     period: f64,
     /// Print one JSON document
@@ -58,7 +59,7 @@ pub(crate) struct Args {
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.columns_page {
-        return quiet(io::stdout().write_all(export::reference().as_bytes()));
+        return unless_closed(io::stdout().write_all(export::reference().as_bytes()));
     }
     args.logs.check()?;
     let (Some(config), Some(out)) = (&args.config, &args.out) else {
@@ -66,45 +67,34 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let config = config::load(config)?;
     let open = |config: &Config, log: &Path| args.logs.open(config, log);
-    let settings = Settings {
-        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
+    let settings = ExportSettings {
+        access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         format: match args.format {
-            FormatName::Parquet => Format::Parquet,
-            FormatName::Csv => Format::Csv,
+            FormatName::Parquet => TableFormat::Parquet,
+            FormatName::Csv => TableFormat::Csv,
         },
         out: out.clone(),
         period_s: args.period,
         jobs: args.logs.threads(),
     };
     let bar = args.logs.bar(1);
-    let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.advance(bytes));
-    bar.clear();
-    let (good, failed): (Vec<_>, Vec<_>) = results.map_err(Failure::new)?.into_iter().partition(Result::is_ok);
-    let good: Vec<Exported> = good.into_iter().flatten().collect();
-    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).collect();
-    quiet(if args.json { json(&good, &failed) } else { table(&good) })?;
+    let results = export::run(&config, &args.logs.logs, &settings, &|bytes| bar.inc(bytes));
+    bar.finish_and_clear();
+    let (good, failed): (Vec<_>, Vec<_>) = results.map_err(failure)?.into_iter().partition(Result::is_ok);
+    let good: Vec<ExportResult> = good.into_iter().flatten().collect();
+    let failed: Vec<String> = failed.into_iter().filter_map(Result::err).map(|error| error.0).collect();
+    unless_closed(match args.json {
+        true => print_json(&json!({ "version": VERSION, "logs": good, "failed": failed })),
+        false => table(&good),
+    })?;
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }
 
-/// The reader of our output may have seen enough: no failure.
-fn quiet(written: io::Result<()>) -> Result<(), Failure> {
-    match written {
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(error.to_string())),
-    }
-}
-
-fn json(good: &[Exported], failed: &[String]) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, &json!({ "version": VERSION, "logs": good, "failed": failed }))?;
-    writeln!(out)
-}
-
-fn table(good: &[Exported]) -> io::Result<()> {
+fn table(good: &[ExportResult]) -> io::Result<()> {
     if good.is_empty() {
         return Ok(());
     }
-    let row = |exported: &Exported| {
+    let row = |exported: &ExportResult| {
         let rows = |table: &str| exported.rows.get(table).copied().unwrap_or(0).to_string();
         vec![
             exported.log.display().to_string(),
@@ -117,9 +107,7 @@ fn table(good: &[Exported]) -> io::Result<()> {
     };
     let mut text = Vec::new();
     let heads = ["log", "folder", "days", "estimates", "half-cycles", "alarms"];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    rows.extend(good.iter().map(row));
-    write_table(&mut text, &rows, 2)?;
+    write_table(&mut text, &heads, good.iter().map(row), 2)?;
     for exported in good {
         exported.notes.iter().try_for_each(|note| writeln!(text, "note: {}: {note}", exported.log.display()))?;
     }
@@ -127,6 +115,5 @@ fn table(good: &[Exported]) -> io::Result<()> {
 }
 
 fn period(text: &str) -> Result<f64, String> {
-    let good = |value: &f64| (0.0..=1e6).contains(value);
-    text.parse().ok().filter(good).ok_or_else(|| "must be 0 to 1e6 s".to_owned())
+    within(text, |value| (0.0..=1e6).contains(&value), "0 to 1e6 s")
 }

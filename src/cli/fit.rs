@@ -1,17 +1,18 @@
 //! `packwatch fit`: measured data to a cell model.
 //!
-//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is whole.
+//! Prints a table of files with their residuals, warnings, and how the fit went; writes the model when it is complete.
 
 mod report;
 
-use std::io::Write as _;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use super::Failure;
+use super::numbers::{above_0, finite, share};
+use super::output::{failure, unless_closed};
 use crate::cell::MAX_BRANCHES;
-use crate::io::result_file::ResultFile;
-use crate::lab::fit::{self, Request};
+use crate::lab;
+use crate::lab::fit::{self, FitRequest};
 
 /// Arguments of `fit`.
 #[derive(Debug, clap::Args)]
@@ -23,24 +24,24 @@ pub(crate) struct Args {
     /// Cell model to write
     #[arg(short, long, value_name = "MODEL.toml")]
     out: PathBuf,
-    /// What people call the cell
+    /// Name of the cell for display
     #[arg(long)]
     name: String,
-    /// Capacity SOC divides by, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
-    #[arg(long, value_name = "AH", value_parser = positive)]
+    /// Capacity that defines SOC, Ah [default: that of the slow test nearest 25 degrees C, else the deepest discharge]
+    #[arg(long, value_name = "AH", value_parser = above_0)]
     capacity: Option<f64>,
     /// Capacity on the label, Ah [default: the capacity]
-    #[arg(long, value_name = "AH", value_parser = positive)]
+    #[arg(long, value_name = "AH", value_parser = above_0)]
     rated: Option<f64>,
     /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
-    /// of a new cell tells it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
+    /// of a new cell determines it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: from the data]
-    #[arg(long, value_name = "V", value_parser = positive)]
+    #[arg(long, value_name = "V", value_parser = above_0)]
     voltage_min: Option<f64>,
     /// Highest voltage under charge [default: from the data]
-    #[arg(long, value_name = "V", value_parser = positive)]
+    #[arg(long, value_name = "V", value_parser = above_0)]
     voltage_max: Option<f64>,
     /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
     #[arg(long, value_name = "FILE")]
@@ -49,7 +50,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=MAX_BRANCHES as i64))]
     branches: Option<u8>,
     /// Starting time constants, s, rising
-    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = positive)]
+    #[arg(long, value_name = "S,..", value_delimiter = ',', value_parser = above_0)]
     tau: Option<Vec<f64>>,
     /// Temperature nodes, degrees C, rising [default: from the data]
     #[arg(long, value_name = "C,..", value_delimiter = ',', value_parser = finite, allow_negative_numbers = true)]
@@ -71,18 +72,6 @@ pub(crate) struct Args {
 /// SOC breakpoints as checked on the command line.
 #[derive(Debug, Clone)]
 struct SocNodes(Vec<f64>);
-
-fn finite(text: &str) -> Result<f64, String> {
-    text.parse::<f64>().ok().filter(|x| x.is_finite()).ok_or_else(|| "must be a finite number".to_owned())
-}
-
-fn positive(text: &str) -> Result<f64, String> {
-    finite(text).ok().filter(|&x| x > 0.0).ok_or_else(|| "must be a finite number above 0".to_owned())
-}
-
-fn share(text: &str) -> Result<f64, String> {
-    finite(text).ok().filter(|x| (0.0..=1.0).contains(x)).ok_or_else(|| "must be 0 to 1".to_owned())
-}
 
 fn soc_nodes(text: &str) -> Result<SocNodes, String> {
     if let Ok(count) = text.parse::<u16>() {
@@ -107,21 +96,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let begin = Instant::now();
     let request = request(args);
-    let bar = report::Bar::new();
-    let result = fit::run(&request, |progress| bar.show(progress));
-    bar.clear();
-    let outcome = result.map_err(|error| Failure::new(error.to_string()))?;
-    write_model(args, &fit::text(&request, &outcome)).map_err(|error| Failure::new(error.to_string()))?;
+    let bar = report::spinner();
+    let result = fit::run(&request, |progress| report::show(&bar, progress));
+    bar.finish_and_clear();
+    let outcome = result.map_err(failure)?;
+    lab::write_file(&args.out, fit::text(&request, &outcome).as_bytes()).map_err(failure)?;
     if let Some(path) = &args.plot {
-        fit::write_plot(path, &outcome).map_err(|error| Failure::new(error.to_string()))?;
+        fit::write_plot(path, &outcome).map_err(failure)?;
     }
     let seconds = begin.elapsed().as_secs_f64();
     let shown = if args.json { report::json(&outcome, seconds) } else { report::table(&outcome, seconds, &args.out) };
-    shown.map_err(|error| Failure::new(format!("standard output: {error}")))
+    unless_closed(shown)
 }
 
-fn request(args: &Args) -> Request {
-    Request {
+fn request(args: &Args) -> FitRequest {
+    FitRequest {
         name: args.name.clone(),
         capacity_ah: args.capacity,
         rated_ah: args.rated,
@@ -136,10 +125,4 @@ fn request(args: &Args) -> Request {
         first_cycles: args.first_cycles,
         files: args.files.clone(),
     }
-}
-
-fn write_model(args: &Args, text: &str) -> std::io::Result<()> {
-    let mut file = ResultFile::create(&args.out)?;
-    file.write_all(text.as_bytes())?;
-    file.finish()
 }

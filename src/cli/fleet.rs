@@ -1,14 +1,15 @@
-//! What the commands over many logs have in common: the logs, how they are read, progress.
+//! Arguments shared by the commands over many logs: the logs, how to read them, progress.
 
 use std::path::{Path, PathBuf};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 
 use super::Failure;
+use super::output::{check_distinct, progress_bar};
 use super::replay::{InputArgs, log_options};
 use crate::config::Config;
 use crate::io::log::LogSource;
-use crate::lab::fleet::{Opened, truth};
+use crate::lab::fleet::{OpenedLog, truth};
 
 /// The logs and how they are read.
 #[derive(Debug, clap::Args)]
@@ -25,17 +26,13 @@ pub(crate) struct LogArgs {
 }
 
 impl LogArgs {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     pub(crate) fn check(&self) -> Result<(), Failure> {
-        for (index, log) in self.logs.iter().enumerate() {
-            if self.logs[..index].contains(log) {
-                return Err(Failure::new(format!("{}: named twice", log.display())));
-            }
-        }
+        check_distinct(&self.logs)?;
         if self.input.start_times.is_some() && self.logs.len() > 1 {
             let found = self.logs.len();
             return Err(Failure::new(format!(
-                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv beside each serves as well"
+                "--start-times given for {found} logs, must be for 1; NAME_cycles.csv next to each log works as well"
             )));
         }
         if self.logs.len() > 1 && self.is_stdin() {
@@ -45,15 +42,15 @@ impl LogArgs {
     }
 
     /// Opens a log as it is read with a configuration.
-    pub(crate) fn open(&self, config: &Config, log: &Path) -> Opened {
+    pub(crate) fn open(&self, config: &Config, log: &Path) -> OpenedLog {
         let mut options = log_options(&self.input, config);
-        let beside = if options.csv.start_times.is_none() { truth::cycles_beside(log) } else { None };
-        let note = beside.as_ref().map(|table| format!("dated by {}", table.display()));
-        options.csv.start_times = options.csv.start_times.or(beside);
+        let found = if options.csv.start_times.is_none() { truth::cycles_next_to(log) } else { None };
+        let note = found.as_ref().map(|table| format!("dated by {}", table.display()));
+        options.csv.start_times = options.csv.start_times.or(found);
         (LogSource::new([log.to_owned()], options), note)
     }
 
-    /// A hole longer than this means that the recorder was asleep, s.
+    /// A gap longer than this means that the recorder was asleep, s.
     pub(crate) fn sleep_gap_s(&self) -> f64 {
         self.input.sleep_gap
     }
@@ -63,40 +60,15 @@ impl LogArgs {
         self.logs.iter().any(|log| log == Path::new("-"))
     }
 
-    /// Threads asked for.
+    /// Number of threads; `None` = one per core.
     pub(crate) fn threads(&self) -> Option<usize> {
         self.jobs.map(usize::from)
     }
 
     /// Progress in bytes, each log read `times`.
-    pub(crate) fn bar(&self, times: usize) -> Bar {
+    pub(crate) fn bar(&self, times: usize) -> ProgressBar {
         let size = |path: &PathBuf| std::fs::metadata(path).map_or(0, |meta| meta.len());
         let total = self.logs.iter().map(size).sum::<u64>() * times as u64;
-        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
-        let template = "{bar:32} {bytes}/{total_bytes} eta {eta}";
-        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Bar(bar)
+        progress_bar(total, "{bar:32} {bytes}/{total_bytes} eta {eta}")
     }
-}
-
-/// Progress on standard error, when that is a terminal.
-#[derive(Debug)]
-pub(crate) struct Bar(ProgressBar);
-
-impl Bar {
-    /// More bytes were read.
-    pub(crate) fn advance(&self, bytes: u64) {
-        self.0.inc(bytes);
-    }
-
-    /// Takes the bar away.
-    pub(crate) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
-}
-
-/// A number above 0.
-pub(crate) fn positive(text: &str) -> Result<f64, String> {
-    let value: f64 = text.trim().parse().map_err(|_| "must be a number".to_owned())?;
-    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be above 0".to_owned()) }
 }

@@ -4,12 +4,12 @@ mod args;
 mod forecast;
 mod report;
 
-use std::io;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
-use crate::lab::gpr::{self, PartColumn, Table, Trained, Wanted};
+use super::output::{create_folder, failure, unless_closed};
+use crate::lab::gpr::{self, ColumnSelection, ColumnTable, PartColumn, TrainedModel};
 use crate::regress::{Kernel, score};
 use args::{FileArgs, ModelArgs, whole};
 
@@ -17,18 +17,18 @@ use args::{FileArgs, ModelArgs, whole};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(subcommand)]
-    what: What,
+    what: GprCommand,
 }
 
 #[derive(Debug, clap::Subcommand)]
-enum What {
-    /// Predict every row from a model that has not seen it, and tell how good that is
+enum GprCommand {
+    /// Predict every row from a model fitted without it, and report the errors
     Cv(Box<CvArgs>),
     /// Fit a model to all rows and save it
     Train(Box<TrainArgs>),
     /// Predict rows with a saved model
     Predict(PredictArgs),
-    /// Predict rows to come from rows that were, without inputs of the future
+    /// Forecast future rows from past rows, without inputs of the future
     Forecast(Box<forecast::ForecastArgs>),
 }
 
@@ -94,7 +94,7 @@ struct PredictArgs {
     #[command(flatten)]
     files: FileArgs,
     /// Where to: CSV with file, line, inputs, the output where it is known, its mean, standard deviation and the ends of its
-    /// 95 % interval; - is standard output (what is told then goes to standard error)
+    /// 95 % interval; - is standard output (the summary then goes to standard error)
     #[arg(short, long, value_name = "FILE.csv", default_value = "-")]
     out: PathBuf,
     /// Threads [default: one per core]
@@ -105,7 +105,7 @@ struct PredictArgs {
     json: bool,
 }
 
-/// What is predicted, and from what.
+/// The predicted column and its inputs.
 #[derive(Debug, clap::Args)]
 struct ColumnArgs {
     /// Column that is predicted, by its name, or without its unit: voltage finds voltage_v
@@ -118,65 +118,46 @@ struct ColumnArgs {
 
 impl ColumnArgs {
     /// Inputs, then the output.
-    fn table(&self, files: &FileArgs) -> Result<Table, Failure> {
+    fn table(&self, files: &FileArgs) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.inputs.iter().chain([&self.output]).cloned().collect();
-        let wanted = Wanted { columns: &columns, optional: &[], missing: files.missing() };
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing: files.missing() };
         read(&files.files, &wanted, &PartColumn::None)
     }
 }
 
-/// Reads files; a column named twice would be known exactly, so it is refused.
-fn read(files: &[PathBuf], wanted: &Wanted<'_>, part: &PartColumn) -> Result<Table, Failure> {
-    let table = Table::read(files, wanted, part).map_err(failure)?;
+/// Reads files; rejects a column named twice, which would predict itself.
+fn read(files: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<ColumnTable, Failure> {
+    let table = ColumnTable::read(files, wanted, part).map_err(failure)?;
     let names = &table.names[..wanted.columns.len()];
     if let Some((_, twice)) = names.iter().enumerate().find(|(at, name)| names[..*at].contains(name)) {
-        return Err(Failure::new(format!("column {twice} is asked for twice, must be an input or an output, once")));
+        return Err(Failure::new(format!("column {twice} is named twice, must be an input or an output, once")));
     }
     Ok(table)
-}
-
-fn failure(error: impl std::fmt::Display) -> Failure {
-    Failure::new(error.to_string())
 }
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     match &args.what {
-        What::Cv(args) => cv(args),
-        What::Train(args) => train(args),
-        What::Predict(args) => predict(args),
-        What::Forecast(args) => forecast::run(args),
-    }
-}
-
-fn make_folder(folder: Option<&Path>) -> Result<(), Failure> {
-    let made = folder.map_or(Ok(()), std::fs::create_dir_all);
-    made.map_err(|error| {
-        Failure::new(format!("{}: cannot be made: {error}", folder.unwrap_or(Path::new("")).display()))
-    })
-}
-
-/// The reader of our output may have seen enough: no failure.
-fn quiet(written: io::Result<()>) -> Result<(), Failure> {
-    match written {
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
+        GprCommand::Cv(args) => cv(args),
+        GprCommand::Train(args) => train(args),
+        GprCommand::Predict(args) => predict(args),
+        GprCommand::Forecast(args) => forecast::run(args),
     }
 }
 
 fn cv(args: &CvArgs) -> Result<(), Failure> {
     let begin = Instant::now();
-    make_folder(args.plots.as_deref())?;
+    args.plots.iter().try_for_each(|folder| create_folder(folder))?;
     args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.columns.table(&args.files)?;
-    let bar = report::Bar::new(args.kernel.len() * args.folds);
+    let bar = report::fit_bar(args.kernel.len() * args.folds);
     let mut all = Vec::new();
     for (k, kernel) in args.kernel.iter().enumerate() {
         let settings = args.model.settings(kernel, table.len());
-        let mut watcher = |progress| bar.show(&kernel.to_string(), k * args.folds, progress);
+        let mut watcher = |progress| report::show_step(&bar, &kernel.to_string(), k * args.folds, progress);
         all.push(gpr::cross_validate(&table, &settings, args.folds, &mut watcher).map_err(failure)?);
     }
-    bar.clear();
+    bar.finish_and_clear();
     if let Some(path) = &args.predictions {
         gpr::write_validated(path, &table, &all).map_err(failure)?;
     }
@@ -184,7 +165,7 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
         gpr::write_cross_validation(folder, &table, &all).map_err(failure)?;
     }
     let settings = args.model.settings(&args.kernel[0], table.len());
-    let shown = report::Cv {
+    let shown = report::CvReport {
         table: &table,
         settings: &settings,
         folds: args.folds,
@@ -192,7 +173,7 @@ fn cv(args: &CvArgs) -> Result<(), Failure> {
         default_form: args.model.by_rows(),
     };
     let seconds = begin.elapsed().as_secs_f64();
-    quiet(if args.json { shown.json(seconds) } else { shown.table(seconds) })
+    unless_closed(if args.json { shown.json(seconds) } else { shown.table(seconds) })
 }
 
 fn train(args: &TrainArgs) -> Result<(), Failure> {
@@ -200,14 +181,14 @@ fn train(args: &TrainArgs) -> Result<(), Failure> {
     args.files.check_result(&args.out)?;
     let table = args.columns.table(&args.files)?;
     let settings = args.model.settings(&args.kernel, table.len());
-    let bar = report::Bar::new(1);
-    let mut watcher = |progress| bar.show(&args.kernel.to_string(), 0, progress);
-    let trained = Trained::fit(&table, &settings, &mut watcher).map_err(failure)?;
-    bar.clear();
+    let bar = report::fit_bar(1);
+    let mut watcher = |progress| report::show_step(&bar, &args.kernel.to_string(), 0, progress);
+    let trained = TrainedModel::fit(&table, &settings, &mut watcher).map_err(failure)?;
+    bar.finish_and_clear();
     let seconds = begin.elapsed().as_secs_f64();
     trained.save(&args.out).map_err(failure)?;
-    let shown = report::Train { trained: &trained, table: &table, seconds, default_form: args.model.by_rows() };
-    quiet(if args.json { shown.json() } else { shown.table(&args.out) })
+    let shown = report::TrainReport { trained: &trained, table: &table, seconds, default_form: args.model.by_rows() };
+    unless_closed(if args.json { shown.json() } else { shown.table(&args.out) })
 }
 
 fn predict(args: &PredictArgs) -> Result<(), Failure> {
@@ -216,13 +197,13 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
         return Err(Failure::new("--json: needs --out FILE.csv, for both would be written to standard output"));
     }
     args.files.check_result(&args.out)?;
-    let trained = Trained::load(&args.model, args::threads(args.threads)).map_err(failure)?;
+    let trained = TrainedModel::load(&args.model, args::threads(args.threads)).map_err(failure)?;
     let output = [trained.output.clone()];
-    let wanted = Wanted { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
-    let table = Table::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
+    let wanted = ColumnSelection { columns: &trained.inputs, optional: &output, missing: args.files.missing() };
+    let table = ColumnTable::read(&args.files.files, &wanted, &PartColumn::None).map_err(failure)?;
     let predictions = trained.predict(&table).map_err(failure)?;
     match gpr::write_predictions(&args.out, &trained, &table, &predictions) {
-        // The reader of our output has seen enough: no failure.
+        // The reader of the output has closed it: no failure.
         Err(error) if to_stdout && error.0.contains("Broken pipe") => return Ok(()),
         written => written.map_err(failure)?,
     }
@@ -231,9 +212,9 @@ fn predict(args: &PredictArgs) -> Result<(), Failure> {
     let truth: Vec<f64> = rows.iter().map(|row| table.row(*row)[trained.inputs.len()]).collect();
     let judged: Vec<_> = rows.iter().map(|row| predictions[*row]).collect();
     let score = (!rows.is_empty()).then(|| score(&judged, &truth));
-    let shown = report::Predict { trained: &trained, table: &table, known: rows.len(), score };
+    let shown = report::PredictReport { trained: &trained, table: &table, known: rows.len(), score };
     if args.json {
-        return quiet(shown.json());
+        return unless_closed(shown.json());
     }
-    quiet(shown.text(to_stdout))
+    unless_closed(shown.text(to_stdout))
 }

@@ -6,10 +6,10 @@ use serde_json::{Map, Value, json};
 
 use super::Failure;
 use super::control_args::print;
-use crate::store::{self, Entry, Filter, Kind, Reader};
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
+use crate::store::{self, Entry, Filter, Kind, Reader};
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;

@@ -19,6 +19,10 @@ mod generate;
 #[cfg(feature = "lab")]
 mod gpr;
 mod history;
+#[cfg(feature = "lab")]
+mod numbers;
+#[cfg(feature = "lab")]
+mod output;
 mod replay;
 #[cfg(feature = "lab")]
 mod report;

@@ -7,21 +7,22 @@ mod report;
 use std::io;
 use std::path::Path;
 
-pub(crate) use args::{Args, CsvSign, InputArgs, column};
-pub(crate) use report::Bar;
-
 use super::Failure;
+
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::replay::{self, ReplayError, Settings, Sinks, Summary};
-use crate::io::snapshot_file;
-use crate::store::Recorder;
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::io::result_file::ResultFile;
+use crate::io::snapshot_file;
 use crate::io::socket::CanSender;
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplayError, ReplaySettings, ReplaySummary, Sinks};
 use crate::sample::VoltageSource;
+use crate::store::Recorder;
+
+pub(crate) use args::{Args, CsvSign, InputArgs, column};
+pub(crate) use report::Bar;
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
@@ -37,13 +38,18 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         None => replay_all(args, &mut source, config, settings),
     };
     match result {
-        // The reader of our output has seen enough: no failure.
+        // The reader of our output has closed it: no failure.
         Err(ReplayError::Write(error)) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
         result => result.map_err(|error| Failure::new(error.to_string())),
     }
 }
 
-fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: Settings) -> Result<(), ReplayError> {
+fn replay_all(
+    args: &Args,
+    source: &mut LogSource,
+    config: Config,
+    settings: ReplaySettings,
+) -> Result<(), ReplayError> {
     let sinks = Sinks {
         estimates: create(args.estimates.as_deref())?,
         events: create(args.events.as_deref())?,
@@ -62,7 +68,7 @@ fn replay_all(args: &Args, source: &mut LogSource, config: Config, settings: Set
     Ok(())
 }
 
-fn play(args: &Args, source: &mut LogSource, settings: &Settings, interface: &str) -> Result<(), ReplayError> {
+fn play(args: &Args, source: &mut LogSource, settings: &ReplaySettings, interface: &str) -> Result<(), ReplayError> {
     let sender = CanSender::open(interface, true)?;
     let bar = Bar::new(&args.logs);
     let result = replay::play(source, settings, &mut |_, frame| sender.send(frame), &mut |p| bar.show(p));
@@ -86,7 +92,7 @@ pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
             cells: sample.cells,
             pack_total: matches!(sample.voltage_source, VoltageSource::PackTotal { .. }),
         },
-        // A row has no frames: they are made as their senders would have made them, protection and all.
+        // A row has no frames: they are encoded as their senders encode them, with protection.
         encode_row: Box::new(move |values, frames| {
             let uncarried = encoder.encode(values, frames);
             protector.protect(frames);
@@ -95,10 +101,10 @@ pub(crate) fn log_options(args: &InputArgs, config: &Config) -> LogOptions {
     }
 }
 
-fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
-    // Onto an interface the frames' own time is what is wanted; through the core, the result.
+fn settings(args: &Args, config: &Config) -> Result<ReplaySettings, Failure> {
+    // Onto an interface the frames keep their own time; through the core only the result matters.
     let speed = args.speed.or(args.to.is_some().then_some(1.0));
-    Ok(Settings {
+    Ok(ReplaySettings {
         speed: speed.filter(|speed| speed.is_finite()),
         snapshot: args.snapshot.is_some(),
         snapshot_at: args.snapshot_at,
@@ -114,16 +120,16 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
     })
 }
 
-/// The wanted part, as fast as possible, with nothing kept.
-fn plain_settings(args: &Args, config: &Config) -> Settings {
-    let plain = Settings::plain(args.input.sleep_gap, config.interface_names());
-    Settings { from: args.from, until: args.until, ..plain }
+/// Settings for the wanted part, as fast as possible, with nothing stored.
+fn plain_settings(args: &Args, config: &Config) -> ReplaySettings {
+    let plain = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
+    ReplaySettings { from: args.from, until: args.until, ..plain }
 }
 
 fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
     path.map(ResultFile::create).transpose()
 }
 
-fn print_summary(args: &Args, summary: &Summary) -> io::Result<()> {
+fn print_summary(args: &Args, summary: &ReplaySummary) -> io::Result<()> {
     if args.json { report::json(summary) } else { report::table(summary, args.results_on_stdout()) }
 }

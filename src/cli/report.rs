@@ -1,20 +1,22 @@
-//! `packwatch report`: a page that shows how a battery is and was, from a store's history or from a replay.
+//! `packwatch report`: a page on the condition and history of a battery, from a store's history or from a replay.
 
 use std::cell::RefCell;
 use std::fs;
-use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use super::Failure;
+use super::output::{create_folder, failure, unless_closed};
 use super::replay::{Bar, InputArgs, log_options};
+
 use crate::config::{self, Config};
-use crate::replay::{self, Settings, Sinks, Summary, Watch};
-use crate::store::Reader;
 use crate::io::log::LogSource;
-use crate::io::result_file::{ResultFile, check_place};
-use crate::lab::report::{self, Data, Origin, Setting};
+use crate::io::result_file::check_place;
+use crate::lab;
+use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
+use crate::replay::{self, OutputWatch, ReplaySettings, ReplaySummary, Sinks};
+use crate::store::Reader;
 
 /// Arguments of `report`.
 #[derive(Debug, clap::Args)]
@@ -34,7 +36,7 @@ pub(crate) struct Args {
     /// Write every picture as SVG and PNG into this folder as well
     #[arg(long, value_name = "DIR")]
     plots: Option<PathBuf>,
-    /// Truth to show beside the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
+    /// Truth to show next to the estimates: CSV (.gz, .zst) with capacity_ah or capacity_ah_source (Ah) or soc (fraction)
     /// or both, and time_s (s), start or date (like 2008-04-02T13:08:17, UTC), on the clock of the data; with a column
     /// cell (the truth of simulate) the capacity is that between full and empty, else what was measured under load
     #[arg(long, value_name = "TABLE.csv")]
@@ -51,7 +53,8 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     args.check()?;
     let config = args.config.as_deref().map(config::load).transpose()?;
     let config_text = args.config.as_deref().map(fs::read_to_string).transpose();
-    let reference = args.reference.as_deref().map(report::read_reference).transpose().map_err(Failure::new)?;
+    let reference = args.reference.as_deref().map(report::read_reference).transpose();
+    let reference = reference.map_err(failure)?;
     let (data, provenance) = match (&args.state, &config) {
         (Some(folder), _) => of_store(folder)?,
         (None, Some(config)) => of_replay(args, config)?,
@@ -60,26 +63,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let mut provenance = provenance;
     provenance.extend(args.config.iter().map(|path| ("Configuration".to_owned(), path.display().to_string())));
     provenance.extend(args.reference.iter().map(|path| ("Reference".to_owned(), path.display().to_string())));
-    let setting = Setting {
+    let context = PageContext {
         title: args.title(),
         config: config.as_ref(),
-        config_text: config_text.map_err(|error| Failure::new(error.to_string()))?,
+        config_text: config_text.map_err(failure)?,
         reference: reference.unwrap_or_default(),
         provenance,
     };
-    match write(&args.out, &report::page(&data, &setting)) {
-        // The reader of our output has seen enough: no failure.
-        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
-        written => written.map_err(|error| Failure::new(error.to_string()))?,
-    }
+    unless_closed(lab::write_file(&args.out, report::page(&data, &context).as_bytes()))?;
     let Some(folder) = &args.plots else { return Ok(()) };
-    fs::create_dir_all(folder)
-        .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
-    report::write_plots(folder, &data, &setting).map(drop).map_err(|error| Failure::new(error.to_string()))
+    create_folder(folder)?;
+    report::write_plots(folder, &data, &context).map(drop).map_err(failure)
 }
 
 impl Args {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     fn check(&self) -> Result<(), Failure> {
         let inputs = self.logs.iter().chain(&self.config).chain(&self.reference);
         check_place(&self.out, inputs).map_err(Failure::new)
@@ -93,13 +91,7 @@ impl Args {
     }
 }
 
-fn write(path: &Path, page: &str) -> io::Result<()> {
-    let mut file = ResultFile::create(path)?;
-    file.write_all(page.as_bytes())?;
-    file.finish()
-}
-
-/// Lines of the provenance: what, and which.
+/// Lines of the provenance: name and value.
 type Provenance = Vec<(String, String)>;
 
 fn of_store(folder: &Path) -> Result<(Data, Provenance), Failure> {
@@ -129,19 +121,19 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
         out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
         out.events.iter().for_each(|event| data.take_event(event));
     });
-    let sinks = Sinks { watch: Some(Watch(watch)), ..Sinks::default() };
+    let sinks = Sinks { watch: Some(OutputWatch(watch)), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
-    let settings = Settings::plain(args.input.sleep_gap, config.interface_names());
+    let settings = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());
     let result = replay::run(&mut source, monitor, sinks, settings, &mut |progress| bar.show(progress));
     bar.clear();
-    let (summary, _) = result.map_err(|error| Failure::new(error.to_string()))?;
+    let (summary, _) = result.map_err(failure)?;
     // The replay has ended and with it the closure that shared the data.
     let data = Rc::try_unwrap(data).map_err(|_| Failure::new("the replay still holds its data"))?.into_inner();
     Ok((data, provenance(args, &summary)))
 }
 
-fn provenance(args: &Args, summary: &Summary) -> Provenance {
+fn provenance(args: &Args, summary: &ReplaySummary) -> Provenance {
     let mut lines: Provenance =
         args.logs.iter().map(|log| ("Replayed log".to_owned(), log.display().to_string())).collect();
     lines.push(("Frames used".to_owned(), summary.log.frames.to_string()));

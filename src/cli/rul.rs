@@ -5,10 +5,11 @@ mod report;
 use std::path::PathBuf;
 
 use super::Failure;
-use super::score::names;
-use crate::lab::rul::{self, Now, Scored, Threshold};
+use super::numbers::{above_0, finite, fraction};
+use super::output::{check_distinct, failure, short_names, unless_closed};
+use crate::lab::rul::{self, CurrentForecast, HistoryScore, Threshold};
 
-/// Parts of the life asked for at most: one per per cent.
+/// Most parts of the life: one per per cent.
 const MAX_PARTS: usize = 99;
 
 /// Arguments of `rul`.
@@ -16,8 +17,8 @@ const MAX_PARTS: usize = 99;
 #[command(
     after_help = "A file with a type column counts its discharges as full cycles; without one its days count, and any of \
                   them may have been rest. The end of life is where the non-increasing line of least squares through all \
-                  capacities passes the threshold: capacity that comes back after a rest and goes again neither delays nor \
-                  hastens it. Forecasts at parts of the life see nothing of what comes after."
+                  capacities passes the threshold: a passing recovery after a rest neither delays nor hastens it. Forecasts at \
+                  parts of the life use no later reading."
 )]
 pub(crate) struct Args {
     /// Capacity histories: CSV (.gz, .zst) with date or start (ISO 8601 or seconds, rising), capacity_ah or
@@ -43,36 +44,26 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     if args.at.len() > MAX_PARTS {
         return Err(Failure::new(format!("--at: {} parts, must be at most {MAX_PARTS}", args.at.len())));
     }
-    if let Some((index, file)) = args.files.iter().enumerate().find(|(i, file)| args.files[..*i].contains(file)) {
-        return Err(Failure::new(format!("{}: named twice, again as number {}", file.display(), index + 1)));
-    }
+    check_distinct(&args.files)?;
     let shown = if args.at.is_empty() {
-        let forecasts: Vec<Now> = each(args, rul::now)?;
+        let forecasts: Vec<CurrentForecast> = each(args, rul::now)?;
         if args.json { report::now_json(&forecasts) } else { report::now_table(&forecasts) }
     } else {
         let score = |history: &rul::History, name: &str, t| rul::score(history, name, t, &args.at, args.alpha);
-        let scored: Vec<Scored> = each(args, score)?;
+        let scored: Vec<HistoryScore> = each(args, score)?;
         if args.json { report::scored_json(&scored, args.alpha) } else { report::scored_table(&scored, args.alpha) }
     };
-    match shown {
-        // The reader of our output has seen enough: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(format!("standard output: {error}"))),
-    }
+    unless_closed(shown)
 }
 
-/// Every file with every threshold, in the order given.
+/// Runs `work` for every file with every threshold, in the order given.
 fn each<T>(args: &Args, work: impl Fn(&rul::History, &str, Threshold) -> T) -> Result<Vec<T>, Failure> {
     let mut all = Vec::with_capacity(args.files.len() * args.end_of_life.len());
-    for (path, name) in args.files.iter().zip(names(&args.files)) {
-        let history = rul::read(path).map_err(|error| Failure::new(error.to_string()))?;
+    for (path, name) in args.files.iter().zip(short_names(&args.files)) {
+        let history = rul::History::read(path).map_err(failure)?;
         all.extend(args.end_of_life.iter().map(|&threshold| work(&history, &name, threshold)));
     }
     Ok(all)
-}
-
-fn number(text: &str) -> Option<f64> {
-    text.trim().parse::<f64>().ok().filter(|value| value.is_finite())
 }
 
 /// `1.4`, `1.4 Ah`, `70 %`.
@@ -80,22 +71,20 @@ fn threshold(text: &str) -> Result<Threshold, String> {
     const EXPECTED: &str =
         "must be Ah above 0 like 1.4, or per cent of the first capacity, above 0 and below 100, like 70%";
     let found = match text.trim().strip_suffix('%') {
-        Some(percent) => {
-            number(percent).filter(|p| *p > 0.0 && *p < 100.0).map(|percent| Threshold::OfFirst(percent / 100.0))
-        }
-        None => number(text.trim().trim_end_matches("Ah")).filter(|ah| *ah > 0.0).map(Threshold::AmpereHours),
+        Some(percent) => below_100(percent).map(Threshold::OfFirst),
+        None => above_0(text.trim().trim_end_matches("Ah")).ok().map(Threshold::AmpereHours),
     };
     found.ok_or_else(|| EXPECTED.to_owned())
 }
 
-/// Per cent to a part.
-fn part(text: &str) -> Result<f64, String> {
-    let percent = number(text.trim().trim_end_matches('%')).filter(|p| *p > 0.0 && *p < 100.0);
-    percent.map(|percent| percent / 100.0).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
+/// Per cent above 0 and below 100, as a fraction.
+fn below_100(percent: &str) -> Option<f64> {
+    finite(percent).ok().filter(|percent| *percent > 0.0 && *percent < 100.0).map(|percent| percent / 100.0)
 }
 
-fn fraction(text: &str) -> Result<f64, String> {
-    number(text).filter(|f| *f > 0.0 && *f < 1.0).ok_or_else(|| "must be above 0 and below 1".to_owned())
+/// Per cent to a part.
+fn part(text: &str) -> Result<f64, String> {
+    below_100(text.trim().trim_end_matches('%')).ok_or_else(|| "must be per cent above 0 and below 100".to_owned())
 }
 
 #[cfg(test)]

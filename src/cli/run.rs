@@ -6,13 +6,13 @@ use std::time::Duration;
 use super::Failure;
 use crate::config;
 use crate::control::ControlSetting;
-use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::io::snapshot_file;
+use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
+use crate::monitor::Downtime;
+use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::status::document::ConfigFile;
 use crate::store::StateSetting;
 use crate::{logging, service::Service};
-use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
-use crate::monitor::Downtime;
 
 /// Arguments of `run`.
 #[derive(Debug, clap::Args)]

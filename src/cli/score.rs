@@ -5,13 +5,13 @@ mod report;
 
 use std::path::{Path, PathBuf};
 
-pub(crate) use args::{Args, names};
-pub(crate) use report::write_table;
+pub(crate) use args::Args;
 
 use super::Failure;
+use super::output::{create_folder, failure, short_names, unless_closed};
 use crate::config::{self, Config, ConfigFaults};
 use crate::health::UsableConfig;
-use crate::lab::score::{self, Case, CycleTable, Job, Settings};
+use crate::lab::score::{self, Case, CycleTable, ScoreJob, ScoreSettings};
 
 /// The configuration used when none is given, and what it names; the cell model comes from the command line.
 const BUILT_IN: [(&str, &[u8]); 2] = [
@@ -26,28 +26,21 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let settings = settings(args, &config)?;
     let jobs = jobs(args)?;
     let cases = args.cases();
-    if let Some(folder) = &settings.plots {
-        std::fs::create_dir_all(folder)
-            .map_err(|e| Failure::new(format!("{}: cannot be made: {e}", folder.display())))?;
-    }
+    settings.plots.iter().try_for_each(|folder| create_folder(folder))?;
     let bar = report::Bar::new(&jobs);
     let scores = score::run(&jobs, &cases, &settings, &|index, part| bar.advance(index, part));
     bar.clear();
-    let scores = scores.map_err(|error| Failure::new(error.to_string()))?;
-    let shown = report::Shown { config: &config, settings: &settings, cases: &cases, scores: &scores };
-    match if args.json { shown.json() } else { shown.table() } {
-        // The reader of our output has seen enough: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        written => written.map_err(|error| Failure::new(error.to_string())),
-    }
+    let scores = scores.map_err(failure)?;
+    let report = report::ScoreReport { config: &config, settings: &settings, cases: &cases, scores: &scores };
+    unless_closed(if args.json { report.json() } else { report.table() })
 }
 
-/// The configuration asked for, with the cell model of --cell in place of its own.
+/// Loads the configuration, with the cell model of --cell in place of its own.
 fn configuration(args: &Args) -> Result<Config, Failure> {
     let built_in = args.config.is_none();
     let path = args.config.clone().unwrap_or_else(|| PathBuf::from("score.toml"));
     let Some(cell) = &args.cell else { return Ok(config::load(&path)?) };
-    // Faults of the model are told with its own name.
+    // Faults of the model are reported with its own file name.
     config::cell_model::load(cell)?;
     let read = |file: &Path| {
         let known = BUILT_IN.iter().find(|(name, _)| built_in && Path::new(name) == file);
@@ -66,11 +59,11 @@ fn named_cell(path: &Path, read: config::ReadFile<'_>) -> Result<PathBuf, Config
         let model = table.get("pack")?.get("cell_model")?.as_str()?.to_owned();
         Some(path.parent().unwrap_or(Path::new("")).join(model))
     });
-    // Without one, reading the configuration says what is wrong with it.
+    // Without one, reading the configuration reports the fault.
     Ok(named.unwrap_or_default())
 }
 
-fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
+fn settings(args: &Args, config: &Config) -> Result<ScoreSettings, Failure> {
     let mut monitor = config.monitor.clone();
     if monitor.sample.cells != 1 {
         let found = monitor.sample.cells;
@@ -90,7 +83,7 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
             "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
         ));
     }
-    Ok(Settings {
+    Ok(ScoreSettings {
         truth_capacity_ah: args.truth_capacity.unwrap_or(monitor.model.capacity_ah),
         monitor,
         remove: args.remove,
@@ -105,14 +98,14 @@ fn settings(args: &Args, config: &Config) -> Result<Settings, Failure> {
     })
 }
 
-fn jobs(args: &Args) -> Result<Vec<Job>, Failure> {
-    let names = names(&args.files);
+fn jobs(args: &Args) -> Result<Vec<ScoreJob>, Failure> {
+    let names = short_names(&args.files);
     let tables = args.cycles.iter().map(|path| CycleTable::read(path).map(Some));
     let tables: Result<Vec<_>, _> = tables.collect();
-    let mut tables = tables.map_err(|error| Failure::new(error.to_string()))?;
+    let mut tables = tables.map_err(failure)?;
     tables.resize(args.files.len(), None);
     let jobs = args.files.iter().zip(names).zip(tables);
-    Ok(jobs.map(|((path, name), cycles)| Job { path: path.clone(), cycles, name }).collect())
+    Ok(jobs.map(|((path, name), cycles)| ScoreJob { path: path.clone(), cycles, name }).collect())
 }
 
 impl Args {
@@ -121,12 +114,12 @@ impl Args {
         let seeds = if self.window.is_some() { self.seed.iter().map(|&seed| Some(seed)).collect() } else { vec![None] };
         let mut cases = Vec::new();
         for start in &self.start {
-            for told in &self.told {
+            for error in &self.told {
                 for &capacity_error_percent in &self.capacity_error {
                     for &current_offset_a in &self.current_offset {
                         cases.extend(seeds.iter().map(|&seed| Case {
                             start: (*start).into(),
-                            told_points: told.0,
+                            soc_error_points: error.0,
                             capacity_error_percent,
                             current_offset_a,
                             seed,

@@ -10,7 +10,7 @@ use std::time::Duration;
 use super::Failure;
 use super::alarms::state_name;
 use super::control_args::{ControlArgs, print, rule_parser};
-use crate::alarm::{Rule, State};
+use crate::alarm::{AlarmState, Rule};
 use crate::config;
 use crate::control::test_alarm::{self, ChannelReport, Real};
 use crate::io::stamp;
@@ -95,8 +95,15 @@ fn protection(report: &ChannelReport) -> String {
 }
 
 /// States with a code of their own on the wire.
-const ON_THE_WIRE: [State; 7] =
-    [State::Inactive, State::Active, State::Cleared, State::Pending, State::Latched, State::Suppressed, State::Unknown];
+const ON_THE_WIRE: [AlarmState; 7] = [
+    AlarmState::Inactive,
+    AlarmState::Active,
+    AlarmState::Cleared,
+    AlarmState::Pending,
+    AlarmState::Latched,
+    AlarmState::Suppressed,
+    AlarmState::Unknown,
+];
 
 /// What else was on the channel.
 fn push_notes(text: &mut String, report: &ChannelReport) {
@@ -124,7 +131,7 @@ fn push_notes(text: &mut String, report: &ChannelReport) {
 fn alarm_words(rule: u8, state: u8) -> String {
     let name = Rule::from_number(rule).map_or("unknown rule", Rule::name);
     let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == state);
-    let kind = if found.is_some_and(State::is_raised) { "REAL, " } else { "" };
+    let kind = if found.is_some_and(AlarmState::is_raised) { "REAL, " } else { "" };
     format!("{kind}without the marker: {name} {}", found.map_or("in an unknown state", state_name))
 }
 

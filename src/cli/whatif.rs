@@ -1,4 +1,4 @@
-//! `packwatch whatif`: when the alarms would have come with other settings.
+//! `packwatch whatif`: evaluates the alarms of logs under other settings.
 
 mod document;
 mod report;
@@ -6,19 +6,21 @@ mod report;
 use std::path::{Path, PathBuf};
 
 use super::Failure;
-use super::fleet::{LogArgs, positive};
+use super::fleet::LogArgs;
+use super::numbers::{above_0, percent};
+use super::output::{failure, unless_closed};
 use crate::alarm::Rule;
 use crate::config::Config;
 use crate::io::result_file::check_place;
-use crate::lab::fleet::Reading;
+use crate::lab::fleet::LogAccess;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::truth;
 use crate::lab::fleet::variants::{self, Choice};
-use crate::lab::fleet::whatif::{self, Job, LogResult, Settings};
+use crate::lab::fleet::whatif::{self, LogResult, WhatifJob, WhatifSettings};
 
 /// Capacity at the end of life.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum EndOfLife {
+enum EndOfLifeArg {
     Ah(f64),
     /// Part of the rated capacity.
     Part(f64),
@@ -33,9 +35,9 @@ enum EndOfLife {
                   with which the end did not come within --horizon; without --horizon, a raise in a log that has no end of life. open: \
                   such a raise, but the log ends before the horizon does. false raise: capacity_low raised while the true capacity of the \
                   cell was above the threshold. flickers: clears before the end. Leads are medians over the logs (5 to 95 %).\n\n\
-                  The end of life is judged by a truth beside the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv as \
-                  score --cycles takes it, or --truth), else by the learned capacity; the table says which. The sections of a CSV are dated by \
-                  --start-times, else by NAME_cycles.csv beside it."
+                  The end of life is judged by a truth next to the log (NAME.truth.csv of simulate --truth, NAME_cycles.csv as \
+                  score --cycles takes it, or --truth), else by the learned capacity; the table shows which. The sections of a CSV are dated by \
+                  --start-times, else by NAME_cycles.csv next to it."
 )]
 pub(crate) struct Args {
     /// Configuration
@@ -48,18 +50,18 @@ pub(crate) struct Args {
     /// Capacity of the weakest cell at which its life is over: Ah, or a part of the rated capacity as "70 %" (default:
     /// capacity.end_of_life of the configuration). A number given here is one of the usable capacity where [usable] is configured
     #[arg(long, value_name = "AH|PERCENT", value_parser = end_of_life)]
-    end_of_life: Option<EndOfLife>,
+    end_of_life: Option<EndOfLifeArg>,
     /// A raise is false when the end of life does not come this soon after it: equivalent full cycles, or days as 90d (default: the
     /// rest of the log)
     #[arg(long, value_name = "CYCLES|DAYSd", value_parser = horizon)]
     horizon: Option<Horizon>,
-    /// CSV of the true capacities, one per log in the logs' order (default: what is beside the log)
+    /// CSV of the true capacities, one per log in the logs' order (default: the CSV next to the log)
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Vec<PathBuf>,
     /// Rules in the table (default: those of --set; all when --set names another key, or is not given)
     #[arg(long, value_name = "RULE", value_delimiter = ',', value_parser = rule)]
     rule: Vec<Rule>,
-    /// Show every log besides the summary (as for a single log)
+    /// Show every log in addition to the summary (as for a single log)
     #[arg(long)]
     each: bool,
     /// Print one JSON document
@@ -83,33 +85,28 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         return Err(Failure::new(format!("-: is read once, must be a file to be replayed {} times", grid.replays)));
     }
     let open = |config: &Config, log: &Path| args.logs.open(config, log);
-    let settings = Settings {
-        reading: Reading { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
+    let settings = WhatifSettings {
+        access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
         end_of_life_ah: match args.end_of_life {
-            Some(EndOfLife::Ah(ah)) => ah,
-            Some(EndOfLife::Part(part)) => part * rated_ah,
+            Some(EndOfLifeArg::Ah(ah)) => ah,
+            Some(EndOfLifeArg::Part(part)) => part * rated_ah,
             None => plain.health.end_of_life_ah,
         },
-        // The configured end of life is one of the capacity; which one a number given here means, `[usable]` says.
+        // The configured end of life is one of the capacity; for a number given here `[usable]` decides which capacity is meant.
         judges_usable: args.end_of_life.is_some(),
         horizon: args.horizon,
         jobs: args.logs.threads(),
     };
     let jobs = args.jobs();
     let bar = args.logs.bar(grid.replays);
-    let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.advance(bytes));
-    bar.clear();
-    let results = results.map_err(Failure::new)?;
-    let failed = results.iter().filter_map(|result| result.as_ref().err().cloned()).collect();
+    let results = whatif::run(&grid, &jobs, &settings, &|bytes| bar.inc(bytes));
+    bar.finish_and_clear();
+    let results = results.map_err(failure)?;
+    let failed = results.iter().filter_map(|result| Some(result.as_ref().err()?.0.clone())).collect();
     let rules = args.rules(&grid);
     let good: Vec<&LogResult> = results.iter().filter_map(|result| result.as_ref().ok()).collect();
-    let shown = report::Shown { grid: &grid, settings: &settings, rated_ah, rules: &rules, logs: &good, failed };
-    let written = args.write(&shown);
-    match written {
-        // The reader of our output has seen enough: no failure.
-        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => {}
-        written => written.map_err(|error| Failure::new(error.to_string()))?,
-    }
+    let shown = report::WhatifReport { grid: &grid, settings: &settings, rated_ah, rules: &rules, logs: &good, failed };
+    unless_closed(args.write(&shown))?;
     if shown.failed.is_empty() { Ok(()) } else { Err(Failure::new(shown.failed.join("\n"))) }
 }
 
@@ -130,21 +127,24 @@ impl Args {
         Ok(())
     }
 
-    fn jobs(&self) -> Vec<Job> {
-        let beside = truth::beside(&self.logs.logs);
-        let logs = self.logs.logs.iter().zip(beside).enumerate();
-        logs.map(|(index, (log, beside))| Job { log: log.clone(), truth: self.truth.get(index).cloned().or(beside) })
-            .collect()
+    fn jobs(&self) -> Vec<WhatifJob> {
+        let found = truth::find_next_to(&self.logs.logs);
+        let logs = self.logs.logs.iter().zip(found).enumerate();
+        logs.map(|(index, (log, found))| WhatifJob {
+            log: log.clone(),
+            truth: self.truth.get(index).cloned().or(found),
+        })
+        .collect()
     }
 
     /// Rules in the table.
-    fn rules(&self, grid: &variants::Grid) -> Vec<Rule> {
+    fn rules(&self, grid: &variants::VariantGrid) -> Vec<Rule> {
         let named = if self.rule.is_empty() { &grid.rules } else { &self.rule };
         let all = self.rule.is_empty() && (grid.other_keys || grid.rules.is_empty());
         Rule::ALL.into_iter().filter(|rule| all || named.contains(rule)).collect()
     }
 
-    fn write(&self, shown: &report::Shown<'_>) -> std::io::Result<()> {
+    fn write(&self, shown: &report::WhatifReport<'_>) -> std::io::Result<()> {
         if let Some(path) = &self.csv {
             shown.csv(path)?;
             if path == Path::new("-") {
@@ -155,21 +155,20 @@ impl Args {
     }
 }
 
-fn end_of_life(text: &str) -> Result<EndOfLife, String> {
+fn end_of_life(text: &str) -> Result<EndOfLifeArg, String> {
     match text.trim().strip_suffix('%') {
-        Some(percent) => positive(percent).and_then(|percent| match percent {
-            percent if percent <= 100.0 => Ok(EndOfLife::Part(percent / 100.0)),
-            _ => Err("must be above 0 and at most 100 %".to_owned()),
-        }),
-        None => positive(text).map(EndOfLife::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned()),
+        Some(digits) => percent(digits).map(|percent| EndOfLifeArg::Part(percent / 100.0)),
+        None => {
+            above_0(text).map(EndOfLifeArg::Ah).map_err(|_| "must be Ah above 0, or a text like \"70 %\"".to_owned())
+        }
     }
 }
 
 fn horizon(text: &str) -> Result<Horizon, String> {
-    let told = |_| "must be equivalent full cycles above 0, or days like 90d".to_owned();
+    let fault = |_| "must be equivalent full cycles above 0, or days like 90d".to_owned();
     match text.trim().strip_suffix('d') {
-        Some(days) => positive(days).map(Horizon::Days).map_err(told),
-        None => positive(text).map(Horizon::Cycles).map_err(told),
+        Some(days) => above_0(days).map(Horizon::Days).map_err(fault),
+        None => above_0(text).map(Horizon::Cycles).map_err(fault),
     }
 }
 
@@ -185,7 +184,7 @@ mod tests {
 
     #[test]
     fn end_of_life_and_horizon_have_units() {
-        assert_eq!((end_of_life("1.4"), end_of_life("70 %")), (Ok(EndOfLife::Ah(1.4)), Ok(EndOfLife::Part(0.7))));
+        assert_eq!((end_of_life("1.4"), end_of_life("70 %")), (Ok(EndOfLifeArg::Ah(1.4)), Ok(EndOfLifeArg::Part(0.7))));
         assert!(["0", "-1", "x", "120 %", "NaN"].iter().all(|text| end_of_life(text).is_err()));
         assert_eq!((horizon("30"), horizon("90d")), (Ok(Horizon::Cycles(30.0)), Ok(Horizon::Days(90.0))));
         assert!(["0", "d", "-3d", "inf"].iter().all(|text| horizon(text).is_err()));

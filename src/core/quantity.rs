@@ -61,39 +61,39 @@ impl Timestamp {
     }
 }
 
-/// A number of a stored state that cannot be: what, found, allowed.
+/// An impossible number in a stored state.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InvalidState {
-    /// Which number.
+    /// Name of the number.
     pub what: &'static str,
-    /// What it is.
+    /// Its value.
     pub found: f64,
-    /// What it may be.
+    /// Allowed range, with unit.
     pub allowed: &'static str,
 }
 
 impl InvalidState {
-    /// The number, unless `is_sound`.
+    /// Rejects the number unless `is_sound`.
     pub fn unless(is_sound: bool, what: &'static str, found: f64, allowed: &'static str) -> Result<(), Self> {
         if is_sound { Ok(()) } else { Err(Self { what, found, allowed }) }
     }
 
-    /// Finite, and so small that its square and its cube are. Nothing measured comes near the bound.
+    /// Rejects a number that is not finite, or whose square or cube may overflow. Measured values stay far below the bound.
     pub fn unless_number(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless(found.abs() <= 1e20, what, found, "at most 1e20 in size")
     }
 
-    /// The same, and not below 0.
+    /// Rejects a number as [`Self::unless_number`] does, and negative ones.
     pub fn unless_natural(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
     }
 
-    /// The same, and so much above 0 that one can divide by its square.
+    /// Rejects numbers at or near 0 as well, so that the caller can divide by the square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((1e-40..=1e20).contains(&found), what, found, "1e-40 to 1e20")
     }
 
-    /// A capacity a cell can have, Ah.
+    /// Rejects a capacity that no cell can have, Ah.
     pub fn unless_capacity(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((1e-6..=1e9).contains(&found), what, found, "1e-6 to 1e9 Ah")
     }
@@ -103,7 +103,7 @@ impl InvalidState {
 /// "the pack as a whole" fit the 11-bit field of the alarm frame.
 pub const MAX_CELLS: usize = 1024;
 
-/// Which cell of the pack, counted from 0 inside; people and DBC patterns may count from 1.
+/// Index of a cell in the pack, from 0. Displays and DBC patterns may count from 1.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct CellIndex(pub u16);
@@ -115,7 +115,7 @@ impl CellIndex {
     }
 }
 
-/// Which CAN interface, in the order of the configuration's `interfaces`.
+/// Index of a CAN interface, in the order of the configuration's `interfaces`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct BusIndex(pub u8);
@@ -127,7 +127,7 @@ impl BusIndex {
     }
 }
 
-/// Which temperature sensor, in the order of the configuration.
+/// Index of a temperature sensor, in the order of the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(transparent)]
 pub struct SensorIndex(pub u16);
@@ -139,8 +139,10 @@ impl SensorIndex {
     }
 }
 
-/// What a configured signal feeds. The order is the order in which the readings of one frame are
-/// handed on: a voltage triggers the estimator, so current and temperature of the same frame come first.
+/// Input that a configured signal feeds.
+///
+/// Readings of one frame are processed in this order: a voltage triggers the estimator, so current and temperature of
+/// the same frame come first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Channel {
@@ -152,15 +154,15 @@ pub enum Channel {
     PackVoltage,
     /// One cell's voltage, V.
     CellVoltage(CellIndex),
-    /// SOC as the pack itself reports it, fraction. Compared with ours, never believed.
+    /// SOC as the pack itself reports it, fraction. Compared with the estimate, never used by it.
     ReportedSoc,
-    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with ours, never believed.
+    /// SOH (capacity over rated capacity) as the pack itself reports it, fraction. Compared with the estimate, never used by it.
     ReportedSoh,
-    /// A number that is another one for another pack (serial number).
+    /// Serial number of the pack, or another number that identifies it.
     PackIdentity,
 }
 
-/// Why a reading cannot be used. A bad reading is data, not an error.
+/// Reason why a reading cannot be used. A bad reading is data, not an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Fault {
@@ -168,7 +170,7 @@ pub enum Fault {
     ShortFrame,
     /// Its frame failed the end-to-end check: damaged, repeated, out of sequence, or the first of its sequence.
     EndToEnd,
-    /// The sender said "signal not available".
+    /// The sender marks the signal as not available.
     NotAvailable,
     /// NaN or infinite on the wire (IEEE float signals).
     NotFinite,
@@ -176,22 +178,22 @@ pub enum Fault {
     OutOfRange,
     /// Moved faster than the configured rate allows.
     RateTooHigh,
-    /// Did not move for longer than the configured time although it should have.
+    /// Unchanged for longer than the configured time while current flows.
     Stuck,
     /// No value for longer than the configured age.
     Stale,
 }
 
-/// One value taken from a frame, in the program's units and sign, or why there is none.
+/// One value decoded from a frame, in the program's units and sign, or the fault that prevents it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// What it feeds.
+    /// Input that it feeds.
     pub channel: Channel,
     /// The value, or the fault that makes it unusable.
     pub value: Result<f64, Fault>,
 }
 
-/// What the cells do, by the sign of the current after dead band, hysteresis and minimum duration.
+/// Operating mode: sign of the current after dead band, hysteresis and minimum duration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {

@@ -17,8 +17,8 @@
 pub mod answer;
 pub mod client;
 pub mod protocol;
-pub mod test_alarm;
 mod server;
+pub mod test_alarm;
 
 use std::path::PathBuf;
 use std::time::Duration;

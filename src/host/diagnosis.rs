@@ -1,7 +1,9 @@
 //! The doctor's loops: logs replayed, or interfaces listened to, into the core's [`Doctor`] and, where the configuration
-//! is good, a [`Monitor`] beside it.
+//! is good, a [`Monitor`] in addition.
 //!
-//! Listening is passive: nothing is sent. Both loops end early when told to, with what was seen so far.
+//! Listening is passive: nothing is sent. An [`Interrupt`] ends both loops early, with a report of what was seen so far.
+
+mod survey;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,14 +13,15 @@ use std::time::{Duration, Instant};
 use nix::errno::Errno;
 
 use crate::can::encode::{InputEncoder, InputProtector};
-use crate::config::Survey;
 use crate::doctor::{Doctor, Report};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
-use crate::io::socket::{Tap, Tapped};
+use crate::io::socket::{Tap, TapEvent};
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::{BusIndex, Timestamp};
+
+pub use survey::{Survey, survey};
 
 /// How often the interfaces are read: a full bus brings 80 frames in that time, the kernel keeps thousands.
 const READ_PERIOD: Duration = Duration::from_millis(10);
@@ -27,9 +30,9 @@ const LOOK_PERIOD: Duration = Duration::from_millis(500);
 /// Records between two looks at the clock.
 const REPORT_EVERY: u64 = 4096;
 
-/// How far it is.
+/// Progress of a diagnosis.
 #[derive(Debug, Clone, Copy)]
-pub struct Progress {
+pub struct DiagnosisProgress {
     /// Bytes of the logs read.
     pub bytes: u64,
     /// Frames taken.
@@ -38,7 +41,7 @@ pub struct Progress {
     pub seconds: f64,
 }
 
-/// Tells loops to end: set by SIGINT and SIGTERM.
+/// Ends the loops: set by SIGINT and SIGTERM.
 #[derive(Debug, Clone, Default)]
 pub struct Interrupt(Arc<AtomicBool>);
 
@@ -64,7 +67,7 @@ impl Interrupt {
     }
 }
 
-/// The doctor and the monitor beside it.
+/// The doctor and the monitor.
 struct Session {
     doctor: Doctor,
     monitor: Option<Monitor>,
@@ -103,20 +106,20 @@ impl Session {
         }
         if let Some(monitor) = &mut self.monitor {
             monitor.handle(*input, &mut self.out);
-            self.hand_on_estimates();
+            self.forward_estimates();
         }
     }
 
-    fn hand_on_estimates(&mut self) {
+    fn forward_estimates(&mut self) {
         self.out.estimates.iter().for_each(|estimate| self.doctor.handle_estimate(estimate));
         self.out.clear();
     }
 
-    /// Nothing more comes.
+    /// Ends the input and returns the report.
     fn finish(mut self) -> Report {
         if let Some(monitor) = &mut self.monitor {
             monitor.settle(&mut self.out);
-            self.hand_on_estimates();
+            self.forward_estimates();
         }
         self.doctor.finish()
     }
@@ -132,7 +135,7 @@ pub fn replay(
     csv: CsvOptions,
     limit_s: Option<f64>,
     interrupt: &Interrupt,
-    each: &mut dyn FnMut(Progress),
+    each: &mut dyn FnMut(DiagnosisProgress),
 ) -> Result<(Report, LogCounts), LogError> {
     let encoder = InputEncoder::new(&survey.input);
     let mut protector = InputProtector::new(&survey.plan.guards);
@@ -169,13 +172,13 @@ pub fn replay(
         }
         if records.is_multiple_of(REPORT_EVERY) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
-            each(Progress { bytes, frames: session.doctor.frames(), seconds: session.doctor.seconds() });
+            each(DiagnosisProgress { bytes, frames: session.doctor.frames(), seconds: session.doctor.seconds() });
         }
     }
     Ok((session.finish(), source.counts().clone()))
 }
 
-/// One interface listened to.
+/// A listener on one interface.
 struct BusListener {
     bus: BusIndex,
     name: String,
@@ -191,7 +194,7 @@ pub fn listen(
     survey: &Survey,
     duration: Duration,
     interrupt: &Interrupt,
-    each: &mut dyn FnMut(Progress),
+    each: &mut dyn FnMut(DiagnosisProgress),
 ) -> std::io::Result<Report> {
     let clock = MappedClock::new(Reading::now());
     let mut session = Session::new(survey);
@@ -203,24 +206,24 @@ pub fn listen(
         }
     }
     let began = Instant::now();
-    let ear = |(bus, name)| BusListener { bus: BusIndex(bus), name, tap: None, look_at: began };
-    let mut ears: Vec<BusListener> = (0_u8..).zip(names).map(ear).collect();
+    let listener = |(bus, name)| BusListener { bus: BusIndex(bus), name, tap: None, look_at: began };
+    let mut listeners: Vec<BusListener> = (0_u8..).zip(names).map(listener).collect();
     let mut received = Vec::new();
     while began.elapsed() < duration && !interrupt.is_set() {
-        for ear in &mut ears {
-            ear.look(clock, &mut session)?;
-            ear.read(&mut received, &mut session);
+        for listener in &mut listeners {
+            listener.look(clock, &mut session)?;
+            listener.read(&mut received, &mut session);
         }
         received.sort_by_key(|(time, ..)| *time);
         for (time, bus, what) in received.drain(..) {
             let input = match &what {
-                Tapped::Frame(frame) => Input::Frame { time, bus, frame },
-                Tapped::Error(class) => Input::Bus { time, bus, event: BusEvent::ErrorFrame { class: *class } },
-                Tapped::Dropped(frames) => Input::Bus { time, bus, event: BusEvent::Dropped { frames: *frames } },
+                TapEvent::Frame(frame) => Input::Frame { time, bus, frame },
+                TapEvent::Error(class) => Input::Bus { time, bus, event: BusEvent::ErrorFrame { class: *class } },
+                TapEvent::Dropped(frames) => Input::Bus { time, bus, event: BusEvent::Dropped { frames: *frames } },
             };
             session.feed(&input);
         }
-        each(Progress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
+        each(DiagnosisProgress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
         std::thread::sleep(READ_PERIOD);
     }
     session.doctor.handle_listened(began.elapsed().as_secs_f64());
@@ -246,11 +249,11 @@ impl BusListener {
         Ok(())
     }
 
-    fn read(&mut self, received: &mut Vec<(Timestamp, BusIndex, Tapped)>, session: &mut Session) {
+    fn read(&mut self, received: &mut Vec<(Timestamp, BusIndex, TapEvent)>, session: &mut Session) {
         let Some(tap) = &mut self.tap else { return };
-        let mut came = Vec::new();
+        let mut events = Vec::new();
         loop {
-            match tap.next(&mut came) {
+            match tap.next(&mut events) {
                 Ok(true) => {}
                 Ok(false) => break,
                 Err(error) if error.raw_os_error() == Some(Errno::ENETDOWN as i32) => {
@@ -263,10 +266,10 @@ impl BusListener {
                 }
             }
         }
-        if !came.is_empty() {
+        if !events.is_empty() {
             session.doctor.handle_bus(self.bus, BusEvent::Up);
         }
-        received.extend(came.into_iter().map(|(time, what)| (time, self.bus, what)));
+        received.extend(events.into_iter().map(|(time, what)| (time, self.bus, what)));
     }
 }
 

@@ -15,9 +15,9 @@ mod intake;
 mod rows;
 mod summary;
 
-use crate::io::event_log;
 use super::store::Recorder;
 use crate::can::Frame;
+use crate::io::event_log;
 use crate::io::log::{Batch, LogCounts, LogError, LogSource, Record};
 use crate::io::result_file::ResultFile;
 use crate::io::ticks::Ticks;
@@ -25,32 +25,32 @@ use crate::monitor::{Downtime, Input, Monitor, Outputs, RestoreError, Snapshot, 
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
 pub use cells::CellSummary;
-pub use clock::When;
-use clock::{Pace, Place, Span, Window};
+pub use clock::LogTime;
+use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};
 pub use in_order::in_order;
 pub use intake::{DroppedSummary, ProtectedSummary};
 use rows::{write_estimate, write_estimates_header, write_frame};
-pub use summary::Summary;
+pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};
 
 /// Records between two looks at the clock for the progress report.
 const REPORT_EVERY: usize = 4096;
 
-/// How to replay.
+/// Settings of a replay.
 #[derive(Debug)]
-pub struct Settings {
+pub struct ReplaySettings {
     /// Times real time; `None` = as fast as possible.
     pub speed: Option<f64>,
     /// Records before this are left out.
-    pub from: Option<When>,
+    pub from: Option<LogTime>,
     /// Records after this are left out.
-    pub until: Option<When>,
+    pub until: Option<LogTime>,
     /// A hole longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
     /// Whether a snapshot is wanted.
     pub snapshot: bool,
     /// When it is taken; `None` = at the end.
-    pub snapshot_at: Option<When>,
+    pub snapshot_at: Option<LogTime>,
     /// State to start from.
     pub restore: Option<Snapshot>,
     /// How old it is; `None` = as the journal says, or else its stamp.
@@ -61,8 +61,8 @@ pub struct Settings {
     pub interfaces: Vec<String>,
 }
 
-impl Settings {
-    /// From the start to the end, as fast as possible, with nothing kept.
+impl ReplaySettings {
+    /// Settings from start to end, as fast as possible, with nothing stored.
     pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
         Self {
             speed: None,
@@ -78,7 +78,7 @@ impl Settings {
         }
     }
 
-    /// Every record is taken, as fast as possible, and neither it nor the state after it is kept.
+    /// Whether every record is replayed as fast as possible and no state is stored.
     fn is_simple(&self) -> bool {
         // Every field, so that a new one is not overlooked.
         let Self {
@@ -97,32 +97,32 @@ impl Settings {
     }
 }
 
-/// Files that results go to.
+/// Files of the results.
 #[derive(Debug, Default)]
 pub struct Sinks {
     /// CSV, a row per estimate.
     pub estimates: Option<ResultFile>,
     /// A JSON document per line and event.
     pub events: Option<ResultFile>,
-    /// candump lines of what would be sent.
+    /// candump lines of the frames that would be sent.
     pub frames: Option<ResultFile>,
-    /// Somebody who looks at everything that comes out.
-    pub watch: Option<Watch>,
+    /// Observer of all outputs.
+    pub watch: Option<OutputWatch>,
 }
 
-/// Is shown what came out of each input.
-pub struct Watch(pub Box<dyn FnMut(&Outputs)>);
+/// Called with the outputs of each input.
+pub struct OutputWatch(pub Box<dyn FnMut(&Outputs)>);
 
-impl std::fmt::Debug for Watch {
+impl std::fmt::Debug for OutputWatch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Watch")
+        f.write_str("OutputWatch")
     }
 }
 
-/// Why a replay ended early.
+/// Reason why a replay ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// A log cannot be read on.
+    /// A log cannot be read further.
     #[error(transparent)]
     Log(#[from] LogError),
     /// A result cannot be written.
@@ -134,8 +134,8 @@ pub enum ReplayError {
     /// State or history cannot be written.
     #[error("{0}")]
     Store(String),
-    /// The moment of the snapshot lies beyond the log.
-    #[error("no snapshot taken: the log ends at {end_s} s, before the moment asked for")]
+    /// The time of the snapshot lies beyond the log.
+    #[error("no snapshot taken: the log ends at {end_s} s, before the requested time")]
     SnapshotNotReached {
         /// The log's last stamp.
         end_s: f64,
@@ -144,7 +144,7 @@ pub enum ReplayError {
 
 /// For the progress bar.
 #[derive(Debug, Clone, Copy)]
-pub struct Progress {
+pub struct ReplayProgress {
     /// Bytes of the logs read.
     pub bytes: u64,
     /// Frames handed to the core.
@@ -161,11 +161,11 @@ pub fn run(
     source: &mut LogSource,
     monitor: Monitor,
     sinks: Sinks,
-    settings: Settings,
-    report: &mut dyn FnMut(Progress),
-) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+    settings: ReplaySettings,
+    report: &mut dyn FnMut(ReplayProgress),
+) -> Result<(ReplaySummary, Option<Snapshot>), ReplayError> {
     let mut replay = Replay::new(monitor, sinks, settings)?;
-    // Where the log is not read to its end, or may be waited for, nothing is read beyond the record in hand.
+    // Where the replay stops before the end of the log, or is paced, nothing is read beyond the current record.
     let one_by_one = replay.pace.speed.is_some() || replay.window.until.is_some();
     let mut batch = Batch::new(if one_by_one { 1 } else { Batch::MAX });
     let mut unreported: usize = 0;
@@ -182,9 +182,9 @@ pub fn run(
     replay.finish(source.counts())
 }
 
-fn progress(source: &LogSource, frames: u64, span: &Span) -> Progress {
+fn progress(source: &LogSource, frames: u64, span: &RecordSpan) -> ReplayProgress {
     let bytes = source.read_bytes().load(Ordering::Relaxed);
-    Progress { bytes, frames, times_real_time: span.times_real_time() }
+    ReplayProgress { bytes, frames, times_real_time: span.times_real_time() }
 }
 
 /// Plays the frames of `source` in their own time; gives how many. `send` blocks or fails.
@@ -193,18 +193,18 @@ fn progress(source: &LogSource, frames: u64, span: &Span) -> Progress {
 /// When a log cannot be read or `send` fails.
 pub fn play(
     source: &mut LogSource,
-    settings: &Settings,
+    settings: &ReplaySettings,
     send: &mut dyn FnMut(BusIndex, &Frame) -> io::Result<()>,
-    report: &mut dyn FnMut(Progress),
+    report: &mut dyn FnMut(ReplayProgress),
 ) -> Result<u64, ReplayError> {
     let (mut span, mut pace, mut window) =
-        (Span::new(settings.sleep_gap_s), Pace::new(settings.speed), Window::new(settings));
+        (RecordSpan::new(settings.sleep_gap_s), Pace::new(settings.speed), TimeWindow::new(settings));
     let mut sent = 0;
     while let Some(record) = source.next_record()? {
         match window.judge(record.time()) {
-            Place::Before => continue,
-            Place::After => break,
-            Place::Inside => {}
+            WindowPosition::Before => continue,
+            WindowPosition::After => break,
+            WindowPosition::Inside => {}
         }
         if span.advance(record.time()) || matches!(record, Record::UnknownGap { .. }) {
             pace.rebase();
@@ -225,25 +225,25 @@ struct Replay {
     out: Outputs,
     ticks: Ticks,
     pace: Pace,
-    span: Span,
-    window: Window,
+    span: RecordSpan,
+    window: TimeWindow,
     sinks: Sinks,
-    settings: Settings,
-    /// Every record is wanted, at once, and nobody looks at more than what comes of it.
+    settings: ReplaySettings,
+    /// Whether every record is replayed at full speed and only its outputs are written: then the fast path serves.
     is_simple: bool,
     /// When the snapshot is due, once the first stamp is known.
     snapshot_at: Option<Timestamp>,
     snapshot: Option<Snapshot>,
-    summary: Summary,
-    /// A reload of the recorded run was noted.
+    summary: ReplaySummary,
+    /// Whether a reload of the recorded run was noted.
     reloaded: bool,
     usable: BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
-    /// Cell-steps of a stored state that was taken up; `None` until the first input has taken it up.
+    /// Cell-steps of a restored state; `None` until the first input.
     steps_before: Option<u64>,
 }
 
 impl Replay {
-    fn new(monitor: Monitor, mut sinks: Sinks, settings: Settings) -> io::Result<Self> {
+    fn new(monitor: Monitor, mut sinks: Sinks, settings: ReplaySettings) -> io::Result<Self> {
         if let Some(file) = &mut sinks.estimates {
             write_estimates_header(file)?;
         }
@@ -254,14 +254,14 @@ impl Replay {
             out,
             ticks: Ticks::new(TICK_PERIOD_MS, settings.sleep_gap_s),
             pace: Pace::new(settings.speed),
-            span: Span::new(settings.sleep_gap_s),
-            window: Window::new(&settings),
+            span: RecordSpan::new(settings.sleep_gap_s),
+            window: TimeWindow::new(&settings),
             is_simple: settings.is_simple() && sinks.watch.is_none(),
             sinks,
             settings,
             snapshot_at: None,
             snapshot: None,
-            summary: Summary::default(),
+            summary: ReplaySummary::default(),
             reloaded: false,
             usable: BTreeMap::new(),
             steps_before: Some(0),
@@ -292,12 +292,12 @@ impl Replay {
     fn take(&mut self, record: &Record, carries_ticks: bool) -> Result<bool, ReplayError> {
         let time = record.time();
         match self.window.judge(time) {
-            Place::Before => {
+            WindowPosition::Before => {
                 self.summary.skipped_records += 1;
                 return Ok(true);
             }
-            Place::After => return Ok(false),
-            Place::Inside => {}
+            WindowPosition::After => return Ok(false),
+            WindowPosition::Inside => {}
         }
         if self.span.first.is_none() {
             self.begin(record)?;
@@ -321,12 +321,12 @@ impl Replay {
         Ok(true)
     }
 
-    /// The first of the recorded run's reloads is noted: from there this replay may differ from it.
+    /// Notes the first reload of the recorded run: from there this replay may differ from it.
     fn note_reload(&mut self, time: Timestamp) {
         if !std::mem::replace(&mut self.reloaded, true) {
             let at_s = time.secs();
             self.summary.notes.push(format!(
-                "the recorded run took another configuration over at {at_s:.3} s: from there its results may differ"
+                "the recorded run changed to another configuration at {at_s:.3} s: from there its results may differ"
             ));
         }
     }
@@ -383,7 +383,7 @@ impl Replay {
         if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
             return Ok(());
         }
-        if let Some(Watch(watch)) = &mut self.sinks.watch {
+        if let Some(OutputWatch(watch)) = &mut self.sinks.watch {
             watch(out);
         }
         if let Some(file) = &mut self.sinks.estimates {
@@ -408,7 +408,7 @@ impl Replay {
         Ok(())
     }
 
-    fn finish(mut self, counts: &LogCounts) -> Result<(Summary, Option<Snapshot>), ReplayError> {
+    fn finish(mut self, counts: &LogCounts) -> Result<(ReplaySummary, Option<Snapshot>), ReplayError> {
         self.ticks.sleep();
         self.make_ticks()?;
         self.monitor.settle(&mut self.out);
@@ -453,14 +453,14 @@ impl Replay {
     }
 }
 
-/// Voltage readings that came to an estimator, since the monitor's first start.
+/// Voltage readings that reached an estimator, since the monitor's first start.
 fn cell_steps(monitor: &Monitor) -> u64 {
     let counts = monitor.statistics();
     counts.voltages_used + counts.voltages_gated + counts.voltages_without_current
 }
 
 impl Sinks {
-    /// At a pace somebody may be watching: nothing stays in a buffer.
+    /// Flushes all files: a paced replay may be watched.
     fn flush(&mut self) -> io::Result<()> {
         [&mut self.estimates, &mut self.events, &mut self.frames].into_iter().flatten().try_for_each(Write::flush)
     }

@@ -16,28 +16,28 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use engine::Engine;
+use live::Loop;
+use reload::Reload;
 use sd_notify::NotifyState;
+use status_publisher::StatusPublisher;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
 use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
-
 use super::status::StatusServer;
 use super::status::collect::Identity;
 use super::status::document::ConfigFile;
 use super::store::StateSetting;
-use crate::io::unix_socket::SocketSetting;
+
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::socket::{Link, LinkConfig, LinkOutput, Received};
+use crate::io::socket::{Link, LinkConfig, LinkMessage, LinkOutput};
+use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
-use engine::Engine;
-use live::Loop;
-use reload::Reload;
-use status_publisher::StatusPublisher;
 pub(super) use stop::Stop;
 
 /// Things received and not yet handed to the core: half a second of a full 1 Mbit/s bus.
@@ -160,7 +160,7 @@ impl Service {
         Identity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
-    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Received>) -> (JoinSet<()>, Vec<LinkOutput>) {
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
         let mut links = JoinSet::new();
         let mut outputs = Vec::new();
         for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {

@@ -8,14 +8,14 @@
 //! * The loop never touches the disk: a thread of its own does ([`writer`]).
 //! * Whatever is wrong with disk, folder or file, the daemon runs on; the core is told (`store_failed`).
 
-mod token_bucket;
 mod backlog;
 mod chain;
+pub mod commit_barrier;
 mod database;
+mod delta_encoder;
 mod document;
 mod folder;
 mod history_filter;
-pub mod commit_barrier;
 mod packed;
 mod parts;
 mod reader;
@@ -26,8 +26,8 @@ mod rows;
 mod runtime;
 mod salvage;
 mod schema;
-mod delta_encoder;
 mod stamp;
+mod token_bucket;
 mod verify;
 mod wal;
 mod writer;
@@ -38,19 +38,19 @@ use std::thread::JoinHandle;
 
 use tokio::sync::watch;
 
-use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::config::StoreConfig;
+use crate::io::background_file::{MAX_FINISH, ends_in_time};
 use crate::monitor::{Downtime, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::Document;
 use folder::{Folder, Opening, SET_ASIDE};
-use history_filter::{HistoryFilter, CommitDecision};
+use history_filter::{CommitDecision, HistoryFilter};
 use reader::MAX_DAEMON_COPY_BYTES;
 use rows::{Batch, Row};
 use runtime::RuntimeState;
 use stamp::{Age, BootId, Stamp, WallClock};
-use writer::{WriteQueue, Retry, Writer};
+use writer::{Retry, WriteQueue, Writer};
 
 pub use folder::with_suffix;
 pub use reader::{Entry, Filter, Kind, Reader};

@@ -1,15 +1,15 @@
-//! Pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; lanes of spans; heat maps.
+//! Pictures as SVG: lines, bands, points and thresholds over an axis of numbers or dates; bands of states; heat maps.
 //!
-//! One look for everything the program draws. In: values in the units that the labels name; what is not finite
-//! interrupts a line. Out: SVG whose colours are classes, so that a page or a file sets them, for light and dark
+//! One style for all pictures. Input: values in the units that the labels name; a value that is not finite
+//! interrupts a line. Output: SVG whose colours are classes, so that a page or a file sets them, for light and dark
 //! ([`style`]). A long series is cut down to its extremes per pixel column, so that peaks survive and files stay small.
-//! Words stand above the drawing area, never on the data; `<title>` elements are tool tips without a script.
+//! Labels stand above the drawing area, never on the data; `<title>` elements are tool tips without a script.
 
 mod axis;
 mod files;
 mod heat;
-mod state_bands;
 mod plot;
+mod state_bands;
 mod style;
 mod svg;
 mod thin;
@@ -17,8 +17,8 @@ mod thin;
 pub use axis::{Axis, Scale};
 pub use files::{Format, PlotError, write, write_stack};
 pub use heat::Heat;
-pub use state_bands::{Lane, Lanes, Span};
 pub use plot::{Chart, Layer, Point, Shape};
+pub use state_bands::{Span, StateBand, StateBands};
 pub use style::{Ink, variables};
 pub use svg::escape;
 
@@ -36,11 +36,11 @@ impl Size {
     pub const NARROW: Self = Self { width: 350.0, height: 270.0 };
 }
 
-/// Anything that can be drawn.
+/// A picture of any kind.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Picture {
     Chart(Chart),
-    Lanes(Lanes),
+    StateBands(StateBands),
     Heat(Heat),
 }
 
@@ -49,30 +49,30 @@ impl Picture {
     pub fn draw(&self, size: Size) -> (String, f64) {
         match self {
             Self::Chart(chart) => chart.draw(size),
-            Self::Lanes(lanes) => lanes.draw(size),
+            Self::StateBands(bands) => bands.draw(size),
             Self::Heat(heat) => heat.draw(size),
         }
     }
 
-    /// What it shows, in a few words.
+    /// Returns the title.
     pub fn title(&self) -> &str {
         match self {
             Self::Chart(chart) => &chart.title,
-            Self::Lanes(lanes) => &lanes.title,
+            Self::StateBands(bands) => &bands.title,
             Self::Heat(heat) => &heat.title,
         }
     }
 
-    /// The same for those who cannot see it.
+    /// Returns the description for readers who cannot see the picture.
     fn description(&self) -> &str {
         match self {
             Self::Chart(chart) => &chart.description,
-            Self::Lanes(lanes) => &lanes.description,
+            Self::StateBands(bands) => &bands.description,
             Self::Heat(heat) => &heat.description,
         }
     }
 
-    /// An `<svg>` element to stand in a page; its colours come from the page.
+    /// Returns an `<svg>` element for a page; its colours come from the page.
     pub fn inline(&self, size: Size, class: &str) -> String {
         let (body, height) = self.draw(size);
         let (width, title) = (size.width, escape(self.title()));

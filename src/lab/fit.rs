@@ -1,8 +1,8 @@
-//! Measured files to a fitted cell model: what `packwatch fit` does, without the terminal.
+//! Fits a cell model to measured files: the work of `packwatch fit` without the terminal.
 //!
-//! In: measured CSVs ([`super::measured`]), slow tests, and what the command line says of the cell. Out: a
-//! [`Outcome`] with the model's tables, residuals per file and everything the written TOML says ([`toml`]).
-//! Files whose SOC cannot be known are refused, all at once, with the reason.
+//! Input: measured CSVs ([`super::measured`]), slow tests, and the cell's data from the command line. Output: an
+//! [`FitOutcome`] with the model's tables, residuals per file and all values of the written TOML ([`toml`]).
+//! One error names all files whose SOC cannot be determined, with the reasons.
 
 mod picture;
 mod prepare;
@@ -10,28 +10,31 @@ mod toml;
 
 use std::path::PathBuf;
 
+use rayon::prelude::*;
+
 pub use picture::write as write_plot;
 pub use toml::text;
 
-use super::measured::{MeasuredError, MeasuredFile};
+use super::measured::MeasuredFile;
 use crate::cell::Thermal;
-use crate::ident::error_table::Judged;
-use crate::ident::fit::{Fit, Residual, Settings};
+use crate::error::LabError;
+use crate::ident::error_table::WeightedRecord;
+use crate::ident::fit::{FitSettings, FittedTables, Residual};
 use crate::ident::grid::Grid;
-use crate::ident::prior::Beliefs;
+use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{error_table, fit, thermal};
 
-/// Least part of the SOC range the data must cover.
+/// Least share of the SOC range that the data must cover.
 const MIN_SOC_RANGE: f64 = 0.5;
 /// SOC breakpoints when none are given: closer where the OCV bends.
 const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// The same where slow tests give the OCV's shape.
+/// SOC breakpoints where slow tests give the OCV's shape.
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
-/// The same for an ageing cell's full discharges, whose knee is sharp.
+/// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.93, 0.96, 0.98, 1.0,
@@ -40,16 +43,16 @@ const AGEING_SOC_NODES: [f64; 25] = [
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 
 /// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given. A prior, not a result: no
-/// fit of a new cell tells it. 0 = the curve shrinks evenly, 1 = pure loss of lithium; between them, and chosen on the two
-/// whole lives at hand.
+/// fit of a new cell determines it. 0 = the curve shrinks evenly, 1 = pure loss of lithium. The value was
+/// chosen on two measured whole lives.
 pub const AGEING_SHIFT: f64 = 0.5;
 
-/// What is asked.
+/// What to fit.
 #[derive(Debug, Clone, Default)]
-pub struct Request {
-    /// For people.
+pub struct FitRequest {
+    /// Display name of the cell.
     pub name: String,
-    /// Capacity that SOC divides by, Ah; `None` = from the slow test or the deepest discharge.
+    /// Capacity that defines SOC, Ah; `None` = from the slow test or the deepest discharge.
     pub capacity_ah: Option<f64>,
     /// Label capacity, Ah; `None` = the capacity.
     pub rated_ah: Option<f64>,
@@ -67,18 +70,18 @@ pub struct Request {
     pub tau_s: Option<Vec<f64>>,
     /// Temperature breakpoints; `None` = from the data.
     pub temperature_c: Option<Vec<f64>>,
-    /// SOC breakpoints; `None` = a usual set.
+    /// SOC breakpoints; `None` = a default set.
     pub soc: Option<Vec<f64>>,
-    /// Only the first so many half-cycles of an ageing cell.
+    /// Number of first half-cycles of an ageing cell to use; `None` = not an ageing cell.
     pub first_cycles: Option<usize>,
     /// Files to fit.
     pub files: Vec<PathBuf>,
 }
 
-/// How far the work is, for a progress bar.
+/// Progress of the fit, for a progress bar.
 #[derive(Debug, Clone, Copy)]
-pub enum Progress {
-    /// So many files read, of so many.
+pub enum FitProgress {
+    /// Number of files read, and of all files.
     Read(usize, usize),
     /// Pass number and cost.
     Pass(usize, f64),
@@ -87,7 +90,7 @@ pub enum Progress {
 /// Residuals of one file.
 #[derive(Debug, Clone)]
 pub struct FileResidual {
-    /// As given.
+    /// Path as given.
     pub path: PathBuf,
     /// Rows as measured.
     pub rows: usize,
@@ -95,20 +98,20 @@ pub struct FileResidual {
     pub seconds: f64,
     /// Rows left out as impossible.
     pub outliers: usize,
-    /// What the model leaves.
+    /// Residual of the model.
     pub residual: Residual,
 }
 
-/// A fitted model and all that is said of it.
+/// A fitted model with its provenance and quality.
 #[derive(Debug, Clone)]
-pub struct Outcome {
+pub struct FitOutcome {
     /// Tables and residuals per record.
-    pub fit: Fit,
+    pub fit: FittedTables,
     /// Capacity, Ah.
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
-    /// Thermal parameters where the data tell them.
+    /// Thermal parameters where the data determine them.
     pub thermal: Option<Thermal>,
     /// Standard deviation of the model's error averaged over 100 s, V, in node order.
     pub voltage_error_v: Vec<f64>,
@@ -120,33 +123,22 @@ pub struct Outcome {
     pub records: Vec<Record>,
     /// The file of each record, as an index into `files`.
     pub file_of_record: Vec<usize>,
-    /// Notes and warnings for people.
+    /// Notes and warnings to print.
     pub notes: Vec<String>,
 }
 
-/// Why there is no model.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("{0}")]
-pub struct FitFailure(pub String);
-
-impl From<MeasuredError> for FitFailure {
-    fn from(error: MeasuredError) -> Self {
-        Self(error.0)
-    }
-}
-
-/// Reads, prepares, fits.
+/// Reads and prepares the files, and fits the model.
 ///
 /// # Errors
-/// Files that cannot be read or used, and data that do not carry a fit: one line each.
-pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outcome, FitFailure> {
+/// Files that cannot be read or used, and data that do not support a fit: one line each.
+pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Result<FitOutcome, LabError> {
     let (files, slow) = read_all(request, &mut progress)?;
     let prepared = prepare::prepare(request, &files, &slow)?;
     let settings = settings(request, &prepared)?;
     let (records, scale) = prepared.records(&settings.grid);
     check_range(&records)?;
-    let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(Progress::Pass(pass, cost)));
-    let fitted = fitted.map_err(|error| FitFailure(error.to_string()))?;
+    let fitted = fit::fit(&settings, &records, &scale, |pass, cost| progress(FitProgress::Pass(pass, cost)));
+    let fitted = fitted?;
     let energy_wh = prepared.capacity_ah * fitted.mean_ocv_v();
     let thermal = thermal::fit(&records, &fitted.tables, energy_wh);
     let file_of_record: Vec<usize> = prepared.sources.iter().map(|source| source.file).collect();
@@ -154,7 +146,7 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
-    let mut outcome = Outcome {
+    let mut outcome = FitOutcome {
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
         thermal: thermal.ok(),
@@ -166,70 +158,65 @@ pub fn run(request: &Request, mut progress: impl FnMut(Progress)) -> Result<Outc
         notes: prepared.notes,
         fit: fitted,
     };
-    outcome.notes.extend(thermal.err().map(|untold| untold.to_string()));
+    outcome.notes.extend(thermal.err().map(|error| error.to_string()));
     add_notes(&mut outcome);
     Ok(outcome)
 }
 
-fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<Judged<'a>> {
+fn judged<'a>(records: &'a [Record], file_of_record: &[usize]) -> Vec<WeightedRecord<'a>> {
     let each = records.iter().zip(file_of_record);
-    each.map(|(record, &file)| Judged { record, file, share: record::share(record) }).collect()
+    each.map(|(record, &file)| WeightedRecord { record, file, share: record::share(record) }).collect()
 }
 
-/// The files and the slow tests, read by as many threads as there are cores.
+/// Reads the files and the slow tests with one thread per core.
 fn read_all(
-    request: &Request,
-    progress: &mut impl FnMut(Progress),
-) -> Result<(Vec<MeasuredFile>, Vec<MeasuredFile>), FitFailure> {
+    request: &FitRequest,
+    progress: &mut impl FnMut(FitProgress),
+) -> Result<(Vec<MeasuredFile>, Vec<MeasuredFile>), LabError> {
     let paths: Vec<&PathBuf> = request.files.iter().chain(&request.ocv).collect();
     let workers = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let mut read = Vec::with_capacity(paths.len());
     for some in paths.chunks(workers) {
-        let results: Vec<_> = std::thread::scope(|scope| {
-            let jobs: Vec<_> = some.iter().map(|path| scope.spawn(|| MeasuredFile::read(path))).collect();
-            jobs.into_iter().map(|job| job.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))).collect()
-        });
-        for result in results {
-            read.push(result?);
-        }
-        progress(Progress::Read(read.len(), paths.len()));
+        let files: Result<Vec<_>, _> = some.par_iter().map(|path| MeasuredFile::read(path)).collect();
+        read.extend(files?);
+        progress(FitProgress::Read(read.len(), paths.len()));
     }
     let slow = read.split_off(request.files.len());
     Ok((read, slow))
 }
 
-fn settings(request: &Request, prepared: &prepare::Prepared<'_>) -> Result<Settings, FitFailure> {
+fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSettings, LabError> {
     let ageing = request.first_cycles.is_some();
     let tau_s = match (&request.tau_s, request.branches) {
         (Some(tau_s), Some(branches)) if tau_s.len() != branches => {
             let found = tau_s.len();
-            return Err(FitFailure(format!("--tau has {found} values, --branches is {branches}: must agree")));
+            return Err(LabError(format!("--tau has {found} values, --branches is {branches}: must agree")));
         }
         (Some(tau_s), _) => tau_s.clone(),
         (None, branches) => TAU_S[branches.unwrap_or(if ageing { 1 } else { 2 }) - 1].to_vec(),
     };
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let slow_test = !prepared.ocv.is_empty();
-    let (usual, beliefs): (&[f64], _) = match (ageing, slow_test) {
-        (true, _) => (&AGEING_SOC_NODES, Beliefs::AGEING),
-        (false, true) => (&SLOW_TEST_SOC_NODES, Beliefs::SLOW_TEST),
-        (false, false) => (&SOC_NODES, Beliefs::FREE_OCV),
+    let (default_soc, deviations): (&[f64], _) = match (ageing, slow_test) {
+        (true, _) => (&AGEING_SOC_NODES, PriorDeviations::AGEING),
+        (false, true) => (&SLOW_TEST_SOC_NODES, PriorDeviations::SLOW_TEST),
+        (false, false) => (&SOC_NODES, PriorDeviations::FREE_OCV),
     };
-    Ok(Settings {
-        grid: Grid { soc: request.soc.clone().unwrap_or_else(|| usual.to_vec()), temperature_c },
+    Ok(FitSettings {
+        grid: Grid { soc: request.soc.clone().unwrap_or_else(|| default_soc.to_vec()), temperature_c },
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
         min_slope_v: if ageing { AGEING_SLOPE_V.to_vec() } else { vec![] },
         empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
-        beliefs,
+        deviations,
     })
 }
 
 /// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
 const AGEING_SLOPE_V: [(f64, f64); 2] = [(0.0, 0.2), (0.9, 1.0)];
 
-fn check_range(records: &[Record]) -> Result<(), FitFailure> {
+fn check_range(records: &[Record]) -> Result<(), LabError> {
     let judged = records.iter().flat_map(|record| &record.rows).filter(|row| row.weight_s > 0.0);
     let (low, high) =
         judged.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), row| (low.min(row.soc), high.max(row.soc)));
@@ -237,14 +224,14 @@ fn check_range(records: &[Record]) -> Result<(), FitFailure> {
         return Ok(());
     }
     let found = if high > low { format!("SOC {:.2} to {:.2}", low, high) } else { "no usable row".to_owned() };
-    Err(FitFailure(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
+    Err(LabError(format!("the data cover {found}, at least {MIN_SOC_RANGE:.1} of the range is needed")))
 }
 
 fn by_file(
     files: &[&MeasuredFile],
-    prepared: &prepare::Prepared<'_>,
+    prepared: &prepare::FitInputs,
     records: &[Record],
-    fitted: &Fit,
+    fitted: &FittedTables,
 ) -> Vec<FileResidual> {
     let of_file = |(number, file): (usize, &&MeasuredFile)| {
         let own = || prepared.sources.iter().enumerate().filter(move |(_, source)| source.file == number);
@@ -260,7 +247,7 @@ fn by_file(
     files.iter().enumerate().map(of_file).collect()
 }
 
-fn add_notes(outcome: &mut Outcome) {
+fn add_notes(outcome: &mut FitOutcome) {
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {
         outcome.notes.push(format!("{outliers} rows left out: no voltage this cell can have"));

@@ -6,6 +6,8 @@ pub use packwatch_host::{config, io, replay, status, store};
 pub use packwatch_regress as regress;
 
 pub mod chart;
+pub mod error;
+mod fields;
 pub mod fit;
 pub mod fleet;
 pub mod gpr;
@@ -14,3 +16,16 @@ pub mod measured;
 pub mod report;
 pub mod rul;
 pub mod score;
+
+use std::io::Write as _;
+use std::path::Path;
+
+/// Writes a file completely or not at all; `-` is standard output.
+///
+/// # Errors
+/// It cannot be written; the error names it.
+pub fn write_file(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let mut file = io::result_file::ResultFile::create(path)?;
+    file.write_all(bytes)?;
+    file.finish()
+}

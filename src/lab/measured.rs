@@ -1,23 +1,19 @@
-//! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours, as cyclers write them.
+//! Measured files: CSV (plain, gzip or zstd) of time, current, voltage, temperature and ampere-hours from a cycler.
 //!
 //! Columns by name: `time_s`, `current_a` (positive = discharge), `voltage_v`, and where they exist `temperature_c`,
 //! `discharged_ah` (positive = taken out), `type` or `status`, and a part column (`cycle`, `segment` or `ref`) at each
 //! of whose values the time starts again. An empty field is NaN. A field that is no number is an error with its line.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use crate::io::lines;
-
-/// Columns at whose values time starts again.
-const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
+use crate::io::table::{Header, PART_COLUMNS, Row, Table, TableError};
 
 /// A stretch of rows over which time runs on.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Part {
+pub struct MeasuredPart {
     /// Its key in the part column; empty where there is none.
     pub key: String,
-    /// What the `type` column says in its first row: `charge`, `discharge`; empty where there is none.
+    /// Value of the `type` column in its first row: `charge`, `discharge`; empty where there is none.
     pub kind: String,
     /// Seconds since the part's own beginning.
     pub time_s: Vec<f64>,
@@ -31,10 +27,19 @@ pub struct Part {
     pub discharged_ah: Vec<f64>,
 }
 
-impl Part {
+impl MeasuredPart {
     /// Rows.
     pub fn len(&self) -> usize {
         self.time_s.len()
+    }
+
+    /// Adds a row.
+    pub(crate) fn push(&mut self, time_s: f64, current_a: f64, voltage_v: f64, temperature_c: f64, discharged_ah: f64) {
+        self.time_s.push(time_s);
+        self.current_a.push(current_a);
+        self.voltage_v.push(voltage_v);
+        self.temperature_c.push(temperature_c);
+        self.discharged_ah.push(discharged_ah);
     }
 
     /// Whether it has no rows.
@@ -49,15 +54,10 @@ pub struct MeasuredFile {
     /// Where it was read from.
     pub path: PathBuf,
     /// Its parts in the file's order; one where there is no part column.
-    pub parts: Vec<Part>,
+    pub parts: Vec<MeasuredPart>,
 }
 
-/// Why a measured file cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct MeasuredError(pub String);
-
-/// Where the columns are.
+/// Numbers of the columns.
 struct Columns {
     time: usize,
     current: usize,
@@ -73,22 +73,15 @@ impl MeasuredFile {
     ///
     /// # Errors
     /// The file cannot be read, a column is missing, a field is no number, or there are no rows: with place and what was found.
-    pub fn read(path: &Path) -> Result<Self, MeasuredError> {
-        let name = path.display();
-        let source = lines::open(path, &Arc::default()).map_err(|e| MeasuredError(format!("{name}: {e}")))?;
-        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
-        let fail = |e: csv::Error| MeasuredError(format!("{name}: {e}"));
-        let headers = reader.headers().map_err(fail)?.clone();
-        let columns = Columns::find(&headers).map_err(|what| MeasuredError(format!("{name}:1: {what}")))?;
-        let mut parts: Vec<Part> = Vec::new();
-        let mut record = csv::ByteRecord::new();
-        while reader.read_byte_record(&mut record).map_err(fail)? {
-            let line = record.position().map_or(0, csv::Position::line);
-            take_row(&columns, &headers, &record, &mut parts)
-                .map_err(|what| MeasuredError(format!("{name}:{line}: {what}")))?;
+    pub fn read(path: &Path) -> Result<Self, TableError> {
+        let mut table = Table::open(path)?;
+        let columns = Columns::find(table.header())?;
+        let mut parts: Vec<MeasuredPart> = Vec::new();
+        while let Some(row) = table.next_row()? {
+            columns.add_row(&row, &mut parts)?;
         }
         if parts.is_empty() {
-            return Err(MeasuredError(format!("{name}: no rows after the header")));
+            return Err(table.header().file_fault("no rows after the header"));
         }
         Ok(Self { path: path.to_owned(), parts })
     }
@@ -101,65 +94,40 @@ impl MeasuredFile {
 
     /// Rows of all parts.
     pub fn rows(&self) -> usize {
-        self.parts.iter().map(Part::len).sum()
+        self.parts.iter().map(MeasuredPart::len).sum()
     }
 }
 
 impl Columns {
-    fn find(headers: &csv::StringRecord) -> Result<Self, String> {
-        let find = |name: &str| headers.iter().position(|h| h.trim_start_matches('\u{feff}') == name);
-        let needed = |name: &str| {
-            let found = headers.iter().collect::<Vec<_>>().join(",");
-            find(name).ok_or_else(|| format!("no column {name}, found {found}"))
-        };
+    fn find(header: &Header) -> Result<Self, TableError> {
         Ok(Self {
-            time: needed("time_s")?,
-            current: needed("current_a")?,
-            voltage: needed("voltage_v")?,
-            temperature: find("temperature_c"),
-            discharged: find("discharged_ah"),
-            part: PART_COLUMNS.iter().find_map(|name| find(name)),
-            kind: find("type"),
+            time: header.required(&["time_s"])?,
+            current: header.required(&["current_a"])?,
+            voltage: header.required(&["voltage_v"])?,
+            temperature: header.find("temperature_c"),
+            discharged: header.find("discharged_ah"),
+            part: header.find_any(&PART_COLUMNS),
+            kind: header.find("type"),
         })
     }
-}
 
-fn take_row(
-    columns: &Columns,
-    headers: &csv::StringRecord,
-    record: &csv::ByteRecord,
-    parts: &mut Vec<Part>,
-) -> Result<(), String> {
-    let text = |column: usize| record.get(column).map_or_else(Default::default, String::from_utf8_lossy);
-    let number = |column: usize| match record.get(column) {
-        Some(b"") | None => Ok(f64::NAN),
-        Some(field) => std::str::from_utf8(field)
-            .ok()
-            .and_then(|field| field.parse::<f64>().ok())
-            .filter(|value| value.is_finite())
-            .ok_or_else(|| {
-                format!("column {}: found {:?}, expected a finite number or nothing", &headers[column], text(column))
-            }),
-    };
-    let optional = |column: Option<usize>| column.map_or(Ok(f64::NAN), number);
-    let key = columns.part.map_or_else(Default::default, text);
-    let time_s = number(columns.time)?;
-    if time_s.is_nan() {
-        return Err(format!("column {}: empty, expected seconds", &headers[columns.time]));
+    /// Adds a row to the last part, or to a new one where the key differs.
+    fn add_row(&self, row: &Row<'_>, parts: &mut Vec<MeasuredPart>) -> Result<(), TableError> {
+        let text = |column: Option<usize>| column.map_or_else(Default::default, |column| row.text(column));
+        let number = |column: usize| Ok(row.number(column)?.unwrap_or(f64::NAN));
+        let optional = |column: Option<usize>| column.map_or(Ok(f64::NAN), number);
+        let time_s = row.number(self.time)?.ok_or_else(|| row.fault(self.time, "seconds"))?;
+        let (current_a, voltage_v) = (number(self.current)?, number(self.voltage)?);
+        let (temperature_c, discharged_ah) = (optional(self.temperature)?, optional(self.discharged)?);
+        let key = text(self.part);
+        if parts.last().is_none_or(|part| part.key != key) {
+            let kind = text(self.kind).into_owned();
+            parts.push(MeasuredPart { key: key.into_owned(), kind, ..MeasuredPart::default() });
+        }
+        let Some(part) = parts.last_mut() else { return Ok(()) };
+        part.push(time_s, current_a, voltage_v, temperature_c, discharged_ah);
+        Ok(())
     }
-    if parts.last().is_none_or(|part| part.key != key) {
-        let kind = columns.kind.map_or_else(Default::default, text).into_owned();
-        parts.push(Part { key: key.into_owned(), kind, ..Part::default() });
-    }
-    let Some(part) = parts.last_mut() else { return Ok(()) };
-    let values = (number(columns.current)?, number(columns.voltage)?);
-    let more = (optional(columns.temperature)?, optional(columns.discharged)?);
-    part.time_s.push(time_s);
-    part.current_a.push(values.0);
-    part.voltage_v.push(values.1);
-    part.temperature_c.push(more.0);
-    part.discharged_ah.push(more.1);
-    Ok(())
 }
 
 #[cfg(test)]
@@ -187,7 +155,10 @@ mod tests {
     #[test]
     fn a_fault_names_its_line_and_what_was_found() {
         let found = read("time_s,current_a,voltage_v\n0,1,3.5\n1,x,3.5\n");
-        assert_eq!(found, Err("cell.csv:3: column current_a: found \"x\", expected a finite number or nothing".into()));
+        assert_eq!(
+            found,
+            Err("cell.csv:3: column current_a: found \"x\", must be a finite number or an empty field".into())
+        );
         let found = read("time_s,voltage_v\n0,3.5\n");
         assert_eq!(found, Err("cell.csv:1: no column current_a, found time_s,voltage_v".into()));
         assert_eq!(read("time_s,current_a,voltage_v\n"), Err("cell.csv: no rows after the header".into()));

@@ -1,7 +1,7 @@
-//! The report: one HTML file that stands alone, from the history of a store or from a replay.
+//! The report: one self-contained HTML file, from the history of a store or from a replay.
 //!
-//! [`Data`] is gathered from either; [`page`] makes the page of it, [`write_plots`] its pictures as files. The same data
-//! give the same bytes: nothing here looks at a clock. What is not known is said to be unknown, with the reason.
+//! [`Data`] is collected from either; [`page`] renders the page, [`write_plots`] writes its pictures as files. The same data
+//! give the same bytes: nothing here reads a clock. A value that is not known is shown as unknown, with the reason.
 
 mod bins;
 mod data;
@@ -15,25 +15,25 @@ mod trace;
 
 use std::path::Path;
 
-pub use data::{Data, Origin, Source};
+pub use data::{Data, DataSource, Origin};
 pub use html::page;
 pub use reference::{Reference, read as read_reference};
 
 use super::chart::{self, Format, PlotError};
 use crate::config::Config;
 
-/// What a page is made of besides the data.
+/// Content of a page in addition to the data.
 #[derive(Debug, Default)]
-pub struct Setting<'a> {
-    /// Above everything.
+pub struct PageContext<'a> {
+    /// Title of the page.
     pub title: String,
     /// Thresholds, rated capacity; `None` = not known.
     pub config: Option<&'a Config>,
     /// The configuration file's text, for the page's end.
     pub config_text: Option<String>,
-    /// What was measured, or is known to be true.
+    /// Measured or true values.
     pub reference: Reference,
-    /// Lines of the provenance: what, and which.
+    /// Lines of the provenance: name and value.
     pub provenance: Vec<(String, String)>,
 }
 
@@ -41,8 +41,8 @@ pub struct Setting<'a> {
 ///
 /// # Errors
 /// A file cannot be written, or there is no font for the words of a PNG.
-pub fn write_plots(folder: &Path, data: &Data, setting: &Setting<'_>) -> Result<usize, PlotError> {
-    let pictures = pictures::all(data, setting);
+pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Result<usize, PlotError> {
+    let pictures = pictures::all(data, context);
     for (name, picture) in &pictures {
         chart::write(&folder.join(format!("{name}.svg")), picture, Format::Svg)?;
         chart::write(&folder.join(format!("{name}.png")), picture, Format::Png)?;

@@ -1,28 +1,26 @@
-//! Remaining useful life of measured capacity histories: the forecast now, and forecasts made at parts of the life
-//! against what came of it.
+//! Remaining useful life of measured capacity histories: the forecast at the end, and forecasts made at parts of the life,
+//! scored against the truth.
 //!
-//! The forecast is the one on board ([`crate::health::forecast`]), fed reading by reading; nothing of what comes after
-//! the moment of a forecast is looked at.
+//! The forecast is the one on board ([`crate::health::forecast`]), fed reading by reading; a forecast uses no
+//! reading after its moment.
 //!
-//! Words: *use* is what the axis counts from the first reading on (discharges where the file tells them, else days). The
+//! Terms: *use* is what the axis counts from the first reading on (discharges where the file lists them, else days). The
 //! *end of life* is where the non-increasing line of least squares through all capacities passes the threshold for good,
-//! between the readings on both sides in proportion: capacity that comes back after a rest and goes again neither delays
+//! between the readings on both sides in proportion: a passing recovery after a rest neither delays
 //! nor hastens it.
 
 mod baseline;
 mod history;
 mod truth;
 
-use std::path::Path;
-
 use serde::Serialize;
 
-pub use history::{History, HistoryError, Row};
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, RemainingLife, Usage};
+
+pub use history::{History, MeasuredCapacity};
 pub use truth::end_of_life;
 
-use crate::health::{Axis, Forecast, Usage, Reading, RemainingLife, InsufficientData};
-
-/// An error larger than this part of the life counts as this: one baseline that never ends must not decide a mean.
+/// An error larger than this part of the life counts as this: one baseline that never ends must not dominate a mean.
 pub const WORST_ERROR: f64 = 1.0;
 
 /// The capacity at which a cell is at its end.
@@ -34,18 +32,18 @@ pub enum Threshold {
     OfFirst(f64),
 }
 
-/// What was said at a part of the life, and what came of it.
+/// A forecast made at a part of the life, and its errors.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Judged {
+pub struct ForecastScore {
     /// Part of the life gone.
     pub at: f64,
     /// Readings until then.
     pub readings: usize,
-    /// What remained, units of use.
+    /// True remaining life, units of use.
     pub truth: f64,
-    /// 5, 50 and 95 % of what was forecast, units of use; `None` = refused.
+    /// 5, 50 and 95 % of what was forecast, units of use; `None` = no forecast.
     pub forecast: Option<[f64; 3]>,
-    /// Why it was refused.
+    /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
     /// Whether the median is within alpha of the truth.
@@ -54,11 +52,11 @@ pub struct Judged {
     pub covered: bool,
     /// |median - truth| as a part of the life, [`WORST_ERROR`] at most; that when refused.
     pub error: f64,
-    /// What a straight line through the last points says; `None` = it never gets there.
+    /// Forecast of a straight line through the last points; `None` = it never reaches the threshold.
     pub straight: Option<f64>,
     /// Its error, as `error`.
     pub straight_error: f64,
-    /// What a double exponential by least squares says; `None` = it never gets there.
+    /// Forecast of a double exponential by least squares; `None` = it never reaches the threshold.
     pub double_exponential: Option<f64>,
     /// Its error, as `error`.
     pub double_exponential_error: f64,
@@ -66,8 +64,8 @@ pub struct Judged {
 
 /// A file's forecasts.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Scored {
-    /// Of the file.
+pub struct HistoryScore {
+    /// Name of the file.
     pub name: String,
     /// What counts as use.
     pub axis: Axis,
@@ -77,14 +75,14 @@ pub struct Scored {
     pub end_of_life: Option<f64>,
     /// Least capacity of the file, Ah.
     pub least_capacity_ah: f64,
-    /// In order of the parts asked for.
-    pub judged: Vec<Judged>,
+    /// In the order of the parts requested.
+    pub judged: Vec<ForecastScore>,
 }
 
 /// Over all forecasts of all files.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Total {
-    /// Forecasts asked for.
+pub struct ScoreTotal {
+    /// Forecasts requested.
     pub forecasts: usize,
     /// Of these, refused.
     pub refused: usize,
@@ -102,8 +100,8 @@ pub struct Total {
 
 /// The forecast at a history's end.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Now {
-    /// Of the file.
+pub struct CurrentForecast {
+    /// Name of the file.
     pub name: String,
     /// What counts as use.
     pub axis: Axis,
@@ -113,13 +111,13 @@ pub struct Now {
     pub readings: usize,
     /// Use at the last one.
     pub used: f64,
-    /// Capacity without what rest has brought back, mean and standard deviation, Ah.
+    /// Capacity without recovery by rest, mean and standard deviation, Ah.
     pub level_ah: (f64, f64),
     /// Loss per unit of use, mean and standard deviation, Ah.
     pub rate_ah: (f64, f64),
-    /// What remains; `None` = refused.
+    /// Remaining life; `None` = no forecast.
     pub remaining: Option<RemainingLife>,
-    /// Why it was refused.
+    /// Why there is no forecast.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refused: Option<String>,
 }
@@ -134,20 +132,12 @@ impl Threshold {
     }
 }
 
-/// Reads a history.
-///
-/// # Errors
-/// It cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
-pub fn read(path: &Path) -> Result<History, HistoryError> {
-    History::read(path)
-}
-
-/// The forecast at the end of the history.
-pub fn now(history: &History, name: &str, threshold: Threshold) -> Now {
+/// Makes the forecast at the end of the history.
+pub fn now(history: &History, name: &str, threshold: Threshold) -> CurrentForecast {
     let forecast = fed(history, f64::INFINITY);
     let threshold_ah = threshold.ampere_hours(history);
     let remaining = forecast.remaining(threshold_ah);
-    Now {
+    CurrentForecast {
         name: name.to_owned(),
         axis: history.axis,
         threshold_ah,
@@ -161,11 +151,11 @@ pub fn now(history: &History, name: &str, threshold: Threshold) -> Now {
 }
 
 /// Forecasts at these parts of the life, judged.
-pub fn score(history: &History, name: &str, threshold: Threshold, at: &[f64], alpha: f64) -> Scored {
+pub fn score(history: &History, name: &str, threshold: Threshold, at: &[f64], alpha: f64) -> HistoryScore {
     let threshold_ah = threshold.ampere_hours(history);
     let end_of_life = end_of_life(history, threshold_ah);
     let judge = |end: f64| at.iter().map(|&at| judge(history, threshold_ah, end, at, alpha)).collect();
-    Scored {
+    HistoryScore {
         name: name.to_owned(),
         axis: history.axis,
         threshold_ah,
@@ -175,12 +165,12 @@ pub fn score(history: &History, name: &str, threshold: Threshold, at: &[f64], al
     }
 }
 
-/// Over all of them; `None` = nothing was judged.
-pub fn total(scored: &[Scored]) -> Option<Total> {
-    let judged: Vec<&Judged> = scored.iter().flat_map(|file| &file.judged).collect();
-    let mean = |of: &dyn Fn(&Judged) -> f64| judged.iter().map(|one| of(one)).sum::<f64>() / judged.len() as f64;
+/// Returns the totals; `None` = nothing was judged.
+pub fn total(scored: &[HistoryScore]) -> Option<ScoreTotal> {
+    let judged: Vec<&ForecastScore> = scored.iter().flat_map(|file| &file.judged).collect();
+    let mean = |of: &dyn Fn(&ForecastScore) -> f64| judged.iter().map(|one| of(one)).sum::<f64>() / judged.len() as f64;
     let part = |is: bool| if is { 1.0 } else { 0.0 };
-    (!judged.is_empty()).then(|| Total {
+    (!judged.is_empty()).then(|| ScoreTotal {
         forecasts: judged.len(),
         refused: judged.iter().filter(|one| one.forecast.is_none()).count(),
         coverage: mean(&|one| part(one.covered)),
@@ -192,22 +182,24 @@ pub fn total(scored: &[Scored]) -> Option<Total> {
 }
 
 /// One forecast, made after `at` of the life.
-fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) -> Judged {
+fn judge(history: &History, threshold_ah: f64, end: f64, at: f64, alpha: f64) -> ForecastScore {
     let moment = at * end;
     let truth = end - moment;
     let known: Vec<[f64; 2]> =
         history.rows.iter().take_while(|row| row.used <= moment).map(|row| [row.used, row.capacity_ah]).collect();
-    let told = fed(history, moment).remaining(threshold_ah).map(|life| quantiles(history.axis, &life));
-    let (forecast, refused) = match told {
+    let result = fed(history, moment).remaining(threshold_ah).map(|life| quantiles(history.axis, &life));
+    let (forecast, refused) = match result {
         Ok(forecast) => (forecast, None),
         Err(why) => (None, Some(why.to_string())),
     };
-    // From the moment on, like the forecast; a line that has passed already says 0.
+    // Counted from the moment, like the forecast; 0 for a line that is already below.
     let ahead = |crossing: Option<f64>| crossing.map(|used| (used - moment).max(0.0));
     let straight = ahead(baseline::straight(&known, threshold_ah));
     let double_exponential = ahead(baseline::double_exponential(&known, threshold_ah));
-    let error = |said: Option<f64>| said.map_or(WORST_ERROR, |said| ((said - truth).abs() / end).min(WORST_ERROR));
-    Judged {
+    let error = |forecast: Option<f64>| {
+        forecast.map_or(WORST_ERROR, |forecast| ((forecast - truth).abs() / end).min(WORST_ERROR))
+    };
+    ForecastScore {
         at,
         readings: known.len(),
         truth,
@@ -228,20 +220,20 @@ fn quantiles(axis: Axis, life: &RemainingLife) -> Option<[f64; 3]> {
     remaining.map(|remaining| [remaining.low, remaining.median, remaining.high])
 }
 
-/// The filter after everything until `moment`, units of use.
+/// Returns the filter after all readings until `moment`, units of use.
 fn fed(history: &History, moment: f64) -> Forecast {
     let mut forecast = Forecast::new(history.axis, history.first_capacity_ah());
-    let mut before = Row::default();
+    let mut before = MeasuredCapacity::default();
     for row in &history.rows {
         let passed = row.since(&before);
         if row.used > moment {
-            // Part of the way to the next reading has gone, without a reading.
+            // A part of the use until the next reading, without a reading.
             let part = (moment - before.used) / (row.used - before.used);
             let (cycles, days, rest_days) = (part * passed.cycles, part * passed.days, part * passed.rest_days);
             forecast.update(Usage { cycles, days, rest_days }, None);
             break;
         }
-        let reading = Reading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        let reading = CapacityReading { capacity_ah: row.capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 };
         forecast.update(passed, Some(reading));
         before = *row;
     }

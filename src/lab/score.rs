@@ -1,8 +1,8 @@
-//! Estimates against truth: measured files through the real core, and what the estimates were worth.
+//! Scores estimates against truth: measured files through the real monitor, and the errors of its estimates.
 //!
-//! In: files as cyclers write them ([`MeasuredFile`]), a core's configuration, and the cases to be tried: where in the
-//! file the estimator starts, what SOC and capacity it is told. Each row becomes the frame that would have carried it
-//! ([`feed`]), so every stage of the core takes part. Out: per file and case the SOC's errors in points (percent of full),
+//! Input: files as cyclers write them ([`MeasuredFile`]), a monitor's configuration, and the cases to try: where in the
+//! file the estimator starts, and its initial SOC and capacity. Each row becomes the frame that would have carried it
+//! ([`feed`]), so every stage of the monitor takes part. Output: per file and case the SOC's errors in points (percent of full),
 //! the share of samples whose 95 % interval holds the truth, and for whole lives the same of the usable capacity.
 //!
 //! The truth of the SOC is 1 - `discharged_ah` / C with one C for all files; that of the usable capacity is a table of
@@ -18,25 +18,25 @@ mod soc;
 mod window;
 
 use std::path::PathBuf;
-use std::sync::OnceLock;
-use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
 
 pub use case::{Case, CaseScore, Start};
 pub use cycles::CycleTable;
 pub use life::{DischargeScore, LifeScore};
 pub use soc::{CONVERGED_HOLD_S, CONVERGED_POINTS, SocScore};
 
-use super::chart::PlotError;
-use super::measured::{MeasuredError, MeasuredFile};
+use super::measured::MeasuredFile;
+use crate::error::LabError;
 use crate::monitor::MonitorConfig;
 
 /// Half-width of a Gaussian's 95 % interval in standard deviations.
 const STD_OF_95: f64 = 1.96;
 
-/// What all files and cases have in common.
+/// Settings of all files and cases.
 #[derive(Debug, Clone)]
-pub struct Settings {
-    /// The core.
+pub struct ScoreSettings {
+    /// Configuration of the monitor.
     pub monitor: MonitorConfig,
     /// Charge from full to empty that the truth of the SOC is stated in, Ah.
     pub truth_capacity_ah: f64,
@@ -44,11 +44,11 @@ pub struct Settings {
     pub remove: f64,
     /// Samples earlier than this after the start are left out of the statistics, s.
     pub settle_s: f64,
-    /// Standard deviation of the SOC told, fraction; `None` = as [`Settings::told_std`] says.
+    /// Standard deviation of the initial SOC, fraction; `None` = as in [`ScoreSettings::initial_soc_std`].
     pub soc_std: Option<f64>,
     /// Standard deviation of the capacity started with, as a fraction of the model's; `None` = the configuration's.
     pub capacity_std: Option<f64>,
-    /// A hole longer than this means that nobody measured, s.
+    /// A gap longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
     /// First fall of the capacity below this is looked for, Ah.
     pub threshold_ah: f64,
@@ -60,19 +60,20 @@ pub struct Settings {
     pub plots: Option<PathBuf>,
 }
 
-impl Settings {
-    /// Least standard deviation of a told SOC that nobody states, fraction: nobody knows it better.
-    const LEAST_TOLD_STD: f64 = 0.05;
+impl ScoreSettings {
+    /// Least standard deviation of an initial SOC where none is given, fraction.
+    const MIN_INITIAL_SOC_STD: f64 = 0.05;
 
-    /// Standard deviation that goes with a told SOC: as stated, or as large as the error told, 5 points at least.
-    pub fn told_std(&self, told_points: f64) -> f64 {
-        self.soc_std.unwrap_or((told_points.abs() / 100.0).max(Self::LEAST_TOLD_STD))
+    /// Returns the standard deviation of the initial SOC, fraction: the given one, else the size of its error, at least 5
+    /// points.
+    pub fn initial_soc_std(&self, error_points: f64) -> f64 {
+        self.soc_std.unwrap_or((error_points.abs() / 100.0).max(Self::MIN_INITIAL_SOC_STD))
     }
 }
 
 /// One file to score.
 #[derive(Debug, Clone)]
-pub struct Job {
+pub struct ScoreJob {
     /// The measured file.
     pub path: PathBuf,
     /// Its table of published capacities.
@@ -81,55 +82,30 @@ pub struct Job {
     pub name: String,
 }
 
-/// Why there is no score.
-#[derive(Debug, thiserror::Error)]
-pub enum ScoreError {
-    /// A file cannot be read.
-    #[error(transparent)]
-    Measured(#[from] MeasuredError),
-    /// A plot cannot be written.
-    #[error(transparent)]
-    Plot(#[from] PlotError),
-    /// A file, a table or what was asked for does not fit: place, found, allowed.
-    #[error("{0}")]
-    Unfit(String),
-}
-
 /// Scores every file in every case, files in parallel; in the order of `jobs`, and within a file of `cases`.
-/// `progress` is told the file's index and the part of its work just done (fraction).
+/// `progress` receives the file's index and the share of its work just done (fraction).
 ///
 /// # Errors
-/// The first file's (in order) that cannot be scored.
+/// Error of the first file (in order) that cannot be scored.
 pub fn run(
-    jobs: &[Job],
+    jobs: &[ScoreJob],
     cases: &[Case],
-    settings: &Settings,
+    settings: &ScoreSettings,
     progress: &(dyn Fn(usize, f64) + Sync),
-) -> Result<Vec<CaseScore>, ScoreError> {
-    let next = AtomicUsize::new(0);
-    let results: Vec<OnceLock<Outcome>> = jobs.iter().map(|_| OnceLock::new()).collect();
-    let work = || {
-        while let Some((index, job)) = Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|i| Some((i, jobs.get(i)?)))
-        {
-            let outcome = score_file(job, cases, settings, &|part| progress(index, part));
-            // Each index is handed out once: nobody has set it before.
-            let _ = results[index].set(outcome);
-        }
-    };
-    let workers = std::thread::available_parallelism().map_or(1, usize::from).min(jobs.len());
-    std::thread::scope(|scope| (0..workers).for_each(|_| drop(scope.spawn(work))));
-    let lists: Result<Vec<_>, _> = results.into_iter().filter_map(OnceLock::into_inner).collect();
+) -> Result<Vec<CaseScore>, LabError> {
+    let score = |(index, job)| score_file(job, cases, settings, &|part| progress(index, part));
+    // One by one: files differ much in length.
+    let lists: Vec<_> = jobs.par_iter().enumerate().with_max_len(1).map(score).collect();
+    let lists: Result<Vec<_>, _> = lists.into_iter().collect();
     Ok(lists?.into_iter().flatten().collect())
 }
 
-type Outcome = Result<Vec<CaseScore>, ScoreError>;
-
 fn score_file(
-    job: &Job,
+    job: &ScoreJob,
     cases: &[Case],
-    settings: &Settings,
+    settings: &ScoreSettings,
     progress: &dyn Fn(f64),
-) -> Result<Vec<CaseScore>, ScoreError> {
+) -> Result<Vec<CaseScore>, LabError> {
     let file = MeasuredFile::read(&job.path)?;
     let share = 1.0 / cases.len().max(1) as f64;
     cases.iter().map(|case| case::run(job, &file, case, settings, &|part| progress(part * share))).collect()

@@ -1,18 +1,20 @@
 //! The mean function and its generalised least squares.
 //!
+//! In: `G` (below). Out: coefficients with covariance. Functions that the rows cannot separate are an error.
+//!
 //! With W a square root of the inverse covariance, the coefficients are those of ordinary least squares of `W y` on `W H`.
-//! Every form of the process gives `G = [y H]' K^-1 [y H]`; from it come the coefficients, their covariance and the
+//! Every form of the process gives `G = [y H]' K^-1 [y H]`; it determines the coefficients, their covariance and the
 //! squared norm of the residual.
 
 use serde::{Deserialize, Serialize};
 
-use super::Fault;
+use super::RegressionError;
 
 /// Mean function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Basis {
-    /// 0 everywhere.
+    /// Zero.
     Zero,
     /// One constant.
     Constant,
@@ -48,11 +50,11 @@ pub(super) struct Coefficients {
 
 impl Coefficients {
     /// From `G`, symmetric, row after row, of size (1 + coefficients)^2, target first.
-    pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, Fault> {
+    pub(super) fn solve(g: &[f64], size: usize) -> Result<Self, RegressionError> {
         let width = size + 1;
         let fault =
-            || Fault::range("basis", format!("{size} functions"), "such that the rows tell its functions apart");
-        // Cholesky of the part that belongs to the basis, scaled by its diagonal.
+            || RegressionError::range("basis", format!("{size} functions"), "functions that the rows can separate");
+        // Cholesky factor of the basis' part, scaled by its diagonal.
         let scale: Vec<f64> = (1..width).map(|k| g[k * width + k].sqrt()).collect();
         if scale.iter().any(|s| !(*s > 0.0 && s.is_finite())) {
             return Err(fault());
@@ -84,7 +86,7 @@ impl Coefficients {
         (0..self.beta.len()).map(|k| self.beta[k] * basis.value(row, k)).sum()
     }
 
-    /// Variance that comes from not knowing the coefficients; `rest` = h(x) - H' K^-1 k(x).
+    /// Variance by the uncertainty of the coefficients; `rest` = h(x) - H' K^-1 k(x).
     pub(super) fn variance(&self, rest: &[f64]) -> f64 {
         let size = self.beta.len();
         (0..size * size).map(|at| rest[at / size] * self.covariance[at] * rest[at % size]).sum::<f64>().max(0.0)
@@ -115,7 +117,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn coefficients_are_those_of_least_squares() {
+    fn coefficients_agree_with_least_squares() {
         // y = 2 + 3 x at x = 0, 1, 2, 3 with unit covariance, last one off by 1.
         let rows = [(2.0, 0.0), (5.0, 1.0), (8.0, 2.0), (12.0, 3.0)];
         let mut g = vec![0.0; 9];
@@ -133,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn functions_that_the_rows_cannot_tell_apart_are_refused() {
+    fn functions_that_the_rows_cannot_separate_are_rejected() {
         let g = [3.0, 1.0, 2.0, 1.0, 1.0, 2.0, 2.0, 2.0, 4.0];
         assert!(Coefficients::solve(&g, 2).is_err());
     }

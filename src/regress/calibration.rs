@@ -1,26 +1,27 @@
-//! How wide an interval has to be to hold a stated part of the measurements.
+//! Width of the interval that contains a given part of the measurements.
 //!
-//! A Gaussian interval holds what it says only if the residuals are Gaussian and as wide as the model says, everywhere.
-//! Measured residuals seldom are: those of a cell's voltage are twice as wide at rest as while it is charged. So training
-//! rows speak: each of a seeded choice is predicted without itself, which gives a ratio |residual| / standard deviation.
-//! *Spread* at a row is the mean ratio of the nearest of them, shrunk towards and relative to that of all; the factor is
-//! the quantile of ratio / spread (with the correction of split conformal prediction for few rows). Half the interval is
-//! factor x spread x standard deviation. No held-out row is looked at.
+//! A Gaussian interval has its nominal coverage only if the residuals are Gaussian and as wide as the model predicts,
+//! everywhere. Measured residuals seldom are: those of a cell's voltage are twice as wide at rest as during a charge. So
+//! training rows calibrate it: each of a seeded choice is predicted without itself, which gives a ratio |residual| /
+//! standard deviation. *Spread* at a row is the mean ratio of its nearest rows, shrunk towards and relative to that of
+//! all; the factor is the quantile of ratio / spread (with the correction of split conformal prediction for few rows).
+//! Half the interval is factor x spread x standard deviation. Held-out rows are not used. Too few rows give the Gaussian
+//! interval.
 
-use super::nearest::Data;
-use super::tree::Tree;
+use super::kd_tree::Tree;
+use super::nearest::StandardisedRows;
 
-/// Part of the measurements that an interval is to hold.
+/// Nominal coverage of the interval.
 pub(super) const LEVEL: f64 = 0.95;
 /// Half width of the Gaussian interval of that level, in standard deviations.
 pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
 /// Rows that are left out, one at a time; the factor's own standard error is then below 1 %.
 pub(super) const ROWS: usize = 8000;
-/// Rows that speak for the spread at a place: a twentieth of them, not more than so many.
+/// Most rows of the spread at a row; otherwise a twentieth of them.
 const MOST_NEAR: usize = 200;
-/// Fewer do not say anything: the spread is then 1 everywhere.
+/// Fewest rows of the spread at a row; with fewer it is 1 everywhere.
 const FEWEST_NEAR: usize = 20;
-/// Weight of the mean of all in the spread at a place, in rows.
+/// Weight of the mean of all rows in the spread at a row, in rows.
 const SHRINKAGE: f64 = 20.0;
 
 /// The factor and the spread.
@@ -42,7 +43,7 @@ impl Calibration {
     }
 
     /// From rows and their ratios when predicted without themselves. Without rows: Gaussian.
-    pub(super) fn new(data: &Data, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
+    pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, ratios: Vec<f64>) -> Self {
         let near = (ratios.len() / 20).min(MOST_NEAR);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
@@ -53,17 +54,17 @@ impl Calibration {
         let mut relative: Vec<f64> = calibration.ratios.iter().enumerate().map(relative).collect();
         relative.sort_by(f64::total_cmp);
         let rank = ((relative.len() + 1) as f64 * LEVEL).ceil() as usize;
-        // Too few rows to say: the Gaussian one.
+        // Too few rows: the Gaussian factor stays.
         if rank > 0 && rank <= relative.len() {
             calibration.factor = relative[rank - 1];
         }
         calibration
     }
 
-    /// How wide residuals are at a standardised row, relative to what the model says on the whole.
-    fn spread(&self, row: &[f64], but: Option<usize>) -> f64 {
+    /// Width of the residuals at a standardised row, relative to the model's over all rows.
+    fn spread(&self, row: &[f64], excluded: Option<usize>) -> f64 {
         let Some(tree) = &self.tree else { return 1.0 };
-        let near = tree.nearest(row, self.near, self.ratios.len(), but);
+        let near = tree.nearest(row, self.near, self.ratios.len(), excluded);
         let sum: f64 = near.iter().map(|k| self.ratios[*k as usize]).sum();
         (sum + SHRINKAGE * self.mean) / (near.len() as f64 + SHRINKAGE) / self.mean
     }
@@ -74,8 +75,8 @@ impl Calibration {
     }
 }
 
-/// Weights that make all inputs count alike.
-fn inverse_deviations(inputs: &[f64], data: &Data) -> Vec<f64> {
+/// Weights that give all inputs the same standard deviation.
+fn inverse_deviations(inputs: &[f64], data: &StandardisedRows) -> Vec<f64> {
     let (d, n) = (data.dimensions, inputs.len() as f64 / data.dimensions as f64);
     let of = |column: usize| {
         let values = || inputs.iter().skip(column).step_by(d);
@@ -91,9 +92,9 @@ mod tests {
     use super::*;
     use crate::Basis;
 
-    fn data(rows: usize) -> Data {
+    fn data(rows: usize) -> StandardisedRows {
         let inputs = (0..rows).map(|k| k as f64).collect();
-        Data { dimensions: 1, inputs, targets: vec![0.0; rows], basis: Basis::Zero }
+        StandardisedRows { dimensions: 1, inputs, targets: vec![0.0; rows], basis: Basis::Zero }
     }
 
     #[test]

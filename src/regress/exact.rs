@@ -1,5 +1,8 @@
 //! Gaussian process over all pairs of rows: no approximation, n^3 time, n^2 memory.
 //!
+//! In: standardised rows and hyperparameters. Out: likelihood, gradient, predictions. A matrix that is not positive
+//! definite with the largest jitter is an error.
+//!
 //! With `K = k(X, X) + noise` and `a = K^-1 (y - H beta)`:
 //!
 //! `-log p = 1/2 (y - H beta)' a + 1/2 ln |K| + n/2 ln 2 pi`, `-d log p = 1/2 tr((K^-1 - a a') dK)`.
@@ -12,23 +15,23 @@ use faer::linalg::triangular_solve::{solve_lower_triangular_in_place, solve_uppe
 use faer::{MatMut, MatRef, Par};
 use rayon::prelude::*;
 
-use super::Fault;
+use super::RegressionError;
 use super::basis::Coefficients;
 use super::jitter::{Jitter, until_positive};
-use super::nearest::Data;
+use super::nearest::StandardisedRows;
 use super::plan::{Plan, Values, Work};
 
-/// Pairs evaluated at a time: what they need stays in the near cache.
+/// Pairs evaluated at a time: their memory fits the near cache.
 const BLOCK_PAIRS: usize = 1024;
 /// Queries of one block of a prediction.
 const BLOCK_QUERIES: usize = 256;
 /// Columns one thread takes at a time.
 const COLUMNS: usize = 8;
 
-/// Everything a prediction needs.
+/// State for predictions.
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
-    pub data: Data,
+    pub data: StandardisedRows,
     pub plan: Plan,
     pub values: Values,
     pub coefficients: Coefficients,
@@ -43,11 +46,11 @@ pub(super) struct Posterior {
     /// Minus the log likelihood.
     pub value: f64,
     pub jitter: Jitter,
-    /// What was added to the diagonal this time, as part of the prior variance.
+    /// Jitter on the diagonal, as part of the prior variance.
     used_jitter: f64,
 }
 
-/// The threads of this pool for faer.
+/// Parallelism of the present thread pool, for faer.
 pub(super) fn parallelism() -> Par {
     match rayon::current_num_threads() {
         0 | 1 => Par::Seq,
@@ -98,7 +101,7 @@ pub(super) fn cholesky(matrix: &mut [f64], n: usize) -> bool {
 }
 
 impl Posterior {
-    pub(super) fn new(data: Data, plan: Plan, theta: &[f64]) -> Result<Self, Fault> {
+    pub(super) fn new(data: StandardisedRows, plan: Plan, theta: &[f64]) -> Result<Self, RegressionError> {
         let (n, values) = (data.len(), plan.values(theta));
         let columns = by_column(&data.inputs, data.dimensions);
         let mut factor = vec![0.0; n * n];
@@ -126,7 +129,7 @@ impl Posterior {
     }
 
     /// Coefficients, weights and likelihood from the factor.
-    fn solve(&mut self) -> Result<(), Fault> {
+    fn solve(&mut self) -> Result<(), RegressionError> {
         let (n, data) = (self.data.len(), &self.data);
         let size = data.basis.size(data.dimensions);
         let mut right = data.targets.clone();
@@ -220,7 +223,7 @@ impl Posterior {
         all
     }
 
-    /// Mean at a row, and what of its basis the rows do not explain.
+    /// Mean at a row, and the part of its basis that the rows do not explain.
     fn mean(&self, row: &[f64], cross: &[f64]) -> (f64, Vec<f64>) {
         let n = self.data.len();
         let dot = |a: &[f64]| a.iter().zip(cross).map(|(x, y)| x * y).sum::<f64>();
@@ -229,7 +232,7 @@ impl Posterior {
         (self.coefficients.mean(self.data.basis, row) + dot(&self.alpha), rest)
     }
 
-    /// For some rows: residual and variance of the measurement, predicted from all other rows (coefficients as they are).
+    /// For some rows: residual and variance of the measurement, predicted from all other rows (with the present coefficients).
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let n = self.data.len();
         let mut all = Vec::with_capacity(rows.len());
@@ -249,7 +252,7 @@ impl Posterior {
 }
 
 /// The covariance of all measurements, lower triangle.
-fn fill(plan: &Plan, values: &Values, data: &Data, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
+fn fill(plan: &Plan, values: &Values, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
     let diagonal = values.prior_variance * (1.0 + jitter) + values.noise_variance;
     matrix.par_chunks_mut(n).enumerate().with_max_len(COLUMNS).for_each_init(

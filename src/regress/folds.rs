@@ -1,4 +1,7 @@
-//! k-fold cross-validation: every row is predicted by a model that has not seen it.
+//! k-fold cross-validation: every row is predicted by a model fitted without it.
+//!
+//! In: rows, settings, number of folds. Out: predictions of all rows, and their errors in units of the target. A number
+//! of folds out of range is an error, as are the errors of a fit.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -7,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use super::jitter::Jitter;
 use super::model::{Hyperparameter, Prediction, fit};
 use super::scale::check;
-use super::{Fault, Rows, Settings, Watcher};
+use super::{GprSettings, ProgressCallback, RegressionError, TrainingRows};
 
 /// Most folds.
 const MAX_FOLDS: usize = 1000;
@@ -21,13 +24,13 @@ pub struct Fold {
     pub fit_s: f64,
     /// Time of the predictions, s.
     pub predict_s: f64,
-    /// What was found.
+    /// Fitted hyperparameters.
     pub hyperparameters: Vec<Hyperparameter>,
-    /// Of the rows it learned from.
+    /// Log marginal likelihood of its training rows.
     pub log_marginal_likelihood: f64,
     /// Half width of the 95 % interval in standard deviations.
     pub interval_factor: f64,
-    /// What had to be added to diagonals.
+    /// Jitter on diagonals.
     pub jitter: Jitter,
 }
 
@@ -44,7 +47,7 @@ pub struct Folds {
 
 /// Errors of predictions, in units of the target.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Score {
+pub struct PredictionScore {
     /// Root of the mean squared error.
     pub rmse: f64,
     /// Mean absolute error.
@@ -58,12 +61,12 @@ pub struct Score {
 }
 
 /// Errors of predictions of known targets, of the same length.
-pub fn score(predictions: &[Prediction], targets: &[f64]) -> Score {
+pub fn score(predictions: &[Prediction], targets: &[f64]) -> PredictionScore {
     let count = predictions.len() as f64;
     let mean = |of: &dyn Fn(&Prediction, f64) -> f64| {
         predictions.iter().zip(targets).map(|(p, y)| of(p, *y)).sum::<f64>() / count
     };
-    Score {
+    PredictionScore {
         rmse: mean(&|p, y| (y - p.mean).powi(2)).sqrt(),
         mean_absolute_error: mean(&|p, y| (y - p.mean).abs()),
         coverage_95: mean(&|p, y| if (p.low_95..=p.high_95).contains(&y) { 1.0 } else { 0.0 }),
@@ -75,7 +78,7 @@ pub fn score(predictions: &[Prediction], targets: &[f64]) -> Score {
     }
 }
 
-/// Which fold holds out each row: a seeded shuffle cut into parts of equal size, give or take a row.
+/// Fold that holds out each row: a seeded shuffle in parts of equal size, to within a row.
 pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
     let mut order: Vec<usize> = (0..rows).collect();
     order.shuffle(&mut ChaCha8Rng::seed_from_u64(seed));
@@ -86,23 +89,23 @@ pub fn assign(rows: usize, folds: usize, seed: u64) -> Vec<usize> {
 
 /// Cross-validates; `clock` gives seconds from any origin, for the times of the folds.
 pub fn cross_validate(
-    rows: &Rows,
-    settings: &Settings,
+    rows: &TrainingRows,
+    settings: &GprSettings,
     folds: usize,
     clock: &dyn Fn() -> f64,
-    watcher: &mut Watcher,
-) -> Result<Folds, Fault> {
+    watcher: &mut ProgressCallback,
+) -> Result<Folds, RegressionError> {
     check(rows)?;
     let n = rows.targets.len();
     let most = MAX_FOLDS.min(n / 2);
     if !(2..=most).contains(&folds) {
-        return Err(Fault::range("folds", folds, format!("2 to {most}")));
+        return Err(RegressionError::range("folds", folds, format!("2 to {most}")));
     }
     let fold_of_row = assign(n, folds, settings.seed);
     let mut predictions = vec![None; n];
     let mut done = Vec::with_capacity(folds);
     for fold in 0..folds {
-        let mut watch = |mut progress: super::Progress| {
+        let mut watch = |mut progress: super::FitProgress| {
             (progress.fold, progress.folds) = (fold + 1, folds);
             watcher(progress)
         };
@@ -112,20 +115,20 @@ pub fn cross_validate(
 }
 
 fn one_fold(
-    rows: &Rows,
-    settings: &Settings,
+    rows: &TrainingRows,
+    settings: &GprSettings,
     (fold, fold_of_row): (usize, &[usize]),
     clock: &dyn Fn() -> f64,
-    watcher: &mut Watcher,
+    watcher: &mut ProgressCallback,
     predictions: &mut [Option<Prediction>],
-) -> Result<Fold, Fault> {
+) -> Result<Fold, RegressionError> {
     let (held, kept): (Vec<usize>, Vec<usize>) = (0..fold_of_row.len()).partition(|row| fold_of_row[*row] == fold);
     let inputs = |some: &[usize]| -> Vec<f64> {
         some.iter().flat_map(|row| rows.inputs[row * rows.dimensions..][..rows.dimensions].to_vec()).collect()
     };
     let targets: Vec<f64> = kept.iter().map(|row| rows.targets[*row]).collect();
     let start_s = clock();
-    let training = Rows { inputs: &inputs(&kept), dimensions: rows.dimensions, targets: &targets, lines: &[] };
+    let training = TrainingRows { inputs: &inputs(&kept), dimensions: rows.dimensions, targets: &targets, lines: &[] };
     let model = fit(&training, settings, watcher)?;
     let fitted_s = clock();
     let found = model.predict(&inputs(&held))?;

@@ -10,8 +10,9 @@
 //! Derivative, with `w_i = 1/2 (1/l_i - v_i' B^-1 v_i / l_i^2 - a_i^2)`, `Y_i = 1/2 B^-1 v_i / l_i - v_i w_i - 1/2 c a_i`:
 //! by `k(Z, X)` it is `2 L^-T Y`, by `k(Z, Z)` `-L^-T Y V' L^-1`, by the variance of row i (and its noise) `w_i`.
 //!
-//! Rows are taken in blocks, twice; memory is m^2 and m times a block, whatever the number of rows. `k(Z, Z)` always
-//! carries a hundred-millionth of its diagonal more, or a smooth kernel could seldom be factorised.
+//! In: standardised rows, inducing points and hyperparameters. Out: likelihood, gradient, predictions. A matrix that is not
+//! positive definite with the largest jitter is an error. Rows are processed in blocks, twice; memory is m^2 and m times a block, for any number of rows. `k(Z, Z)` always
+//! has a hundred-millionth added to its diagonal: a smooth kernel could seldom be factorised without it.
 
 use std::f64::consts::TAU;
 
@@ -24,13 +25,13 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::Fault;
+use super::RegressionError;
 use super::basis::Coefficients;
 use super::exact::{by_column, cholesky, cross, parallelism, squares};
 use super::jitter::{Jitter, until_positive};
-use super::nearest::Data;
+use super::kd_tree::Tree;
+use super::nearest::StandardisedRows;
 use super::plan::{Plan, Values, Work};
-use super::tree::Tree;
 
 /// Rows of a block.
 const BLOCK: usize = 512;
@@ -38,13 +39,13 @@ const BLOCK: usize = 512;
 const NUGGET: f64 = 1e-8;
 /// Passes of k-means.
 const MEANS_PASSES: usize = 10;
-/// Points of which a kernel is evaluated at a time.
+/// Points evaluated at a time.
 const BLOCK_PAIRS: usize = 1024;
 
-/// Everything a prediction needs.
+/// State for predictions.
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
-    pub data: Data,
+    pub data: StandardisedRows,
     plan: Plan,
     values: Values,
     coefficients: Coefficients,
@@ -66,7 +67,7 @@ pub(super) struct Posterior {
 }
 
 /// Points as means of clusters of rows in the metric: seeded k-means.
-pub(super) fn choose(data: &Data, metric: &[f64], count: usize, seed: u64) -> Vec<f64> {
+pub(super) fn choose(data: &StandardisedRows, metric: &[f64], count: usize, seed: u64) -> Vec<f64> {
     let (n, d) = (data.len(), data.dimensions);
     if count >= n {
         return data.inputs.clone();
@@ -86,7 +87,7 @@ pub(super) fn choose(data: &Data, metric: &[f64], count: usize, seed: u64) -> Ve
             members[point] += 1.0;
             sums[point * d..][..d].iter_mut().zip(data.row(row)).for_each(|(sum, x)| *sum += x);
         }
-        // A point without rows (two were equal) stays where it is.
+        // A point without rows (two were equal) keeps its position.
         (0..points.len()).filter(|at| members[at / d] > 0.0).for_each(|at| points[at] = sums[at] / members[at / d]);
     }
     points
@@ -99,7 +100,12 @@ struct Block {
 }
 
 impl Posterior {
-    pub(super) fn new(data: &Data, plan: &Plan, theta: &[f64], points: &[f64]) -> Result<Self, Fault> {
+    pub(super) fn new(
+        data: &StandardisedRows,
+        plan: &Plan,
+        theta: &[f64],
+        points: &[f64],
+    ) -> Result<Self, RegressionError> {
         let values = plan.values(theta);
         let (d, m) = (data.dimensions, points.len() / data.dimensions);
         let columns = by_column(points, d);
@@ -163,7 +169,7 @@ impl Posterior {
         std::iter::once(self.data.targets[row]).chain(basis).collect()
     }
 
-    fn first_pass(&mut self) -> Result<(), Fault> {
+    fn first_pass(&mut self) -> Result<(), RegressionError> {
         let (m, n, d) = (self.count(), self.data.len(), self.data.dimensions);
         let size = self.data.basis.size(d);
         let width = size + 1;
@@ -185,7 +191,7 @@ impl Posterior {
             add_square(&mut b, &block.v, m);
         }
         if !cholesky(&mut b, m) {
-            return Err(Fault::NotPositiveDefinite { jitter: self.added });
+            return Err(RegressionError::NotPositiveDefinite { jitter: self.added });
         }
         self.b = b;
         let factor = MatRef::from_column_major_slice(&self.b, m, m);
@@ -335,7 +341,7 @@ impl Posterior {
         all
     }
 
-    /// For some rows: residual and variance of the measurement, predicted from all other rows (coefficients as they are).
+    /// For some rows: residual and variance of the measurement, predicted from all other rows (with the present coefficients).
     pub(super) fn left_out(&self, rows: &[u32]) -> Vec<(f64, f64)> {
         let m = self.count();
         let mut all = Vec::with_capacity(rows.len());
@@ -370,8 +376,13 @@ fn add_square(b: &mut [f64], v: &[f64], m: usize) {
     );
 }
 
-/// Factor of `k(Z, Z)` with what was added to its diagonal, as part of it.
-fn factor_of_points(plan: &Plan, values: &Values, points: &[f64], columns: &[f64]) -> Result<(Vec<f64>, f64), Fault> {
+/// Factor of `k(Z, Z)`, and the jitter on its diagonal, as part of it.
+fn factor_of_points(
+    plan: &Plan,
+    values: &Values,
+    points: &[f64],
+    columns: &[f64],
+) -> Result<(Vec<f64>, f64), RegressionError> {
     let d = plan.dimensions;
     let m = points.len() / d;
     let mut matrix = vec![0.0; m * m];

@@ -1,20 +1,22 @@
-//! What is added to the diagonal of a covariance matrix that has no Cholesky factor.
+//! Jitter: an addition to the diagonal of a covariance matrix that has no Cholesky factor.
+//!
+//! In: a factorisation to try. Out: the smallest sufficient jitter, as part of the signal variance, or an error.
 
 use serde::{Deserialize, Serialize};
 
-use super::Fault;
+use super::RegressionError;
 
-/// Tried one after the other, as part of the signal variance.
+/// Jitter of successive tries, as part of the signal variance.
 const TRIES: [f64; 5] = [0.0, 1e-10, 1e-8, 1e-6, LAST];
 pub(super) const LAST: f64 = 1e-4;
 
-/// What had to be added to the diagonal of matrices that were not positive definite.
+/// Jitter of matrices that were not positive definite.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Jitter {
-    /// Matrices that needed it in the final model's likelihood; a prediction's own are mended the same way, uncounted.
+    /// Matrices with jitter in the final model's likelihood. Jitter in predictions is not counted.
     pub matrices: usize,
-    /// The most that was added, as part of the signal variance.
+    /// Largest jitter, as part of the signal variance.
     pub largest: f64,
 }
 
@@ -25,9 +27,9 @@ impl Jitter {
     }
 }
 
-/// Calls `factorise` with more and more jitter, 0 first, until it says that it worked; gives the jitter of that call.
-pub(super) fn until_positive(mut factorise: impl FnMut(f64) -> bool) -> Result<f64, Fault> {
-    TRIES.into_iter().find(|added| factorise(*added)).ok_or(Fault::NotPositiveDefinite { jitter: LAST })
+/// Calls `factorise` with increasing jitter, 0 first, until it returns true; returns the jitter of that call.
+pub(super) fn until_positive(mut factorise: impl FnMut(f64) -> bool) -> Result<f64, RegressionError> {
+    TRIES.into_iter().find(|added| factorise(*added)).ok_or(RegressionError::NotPositiveDefinite { jitter: LAST })
 }
 
 #[cfg(test)]
@@ -35,14 +37,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn jitter_grows_to_its_end() {
+    fn jitter_grows_to_its_last_value() {
         let mut tries = Vec::new();
         let fault = until_positive(|added| {
             tries.push(added);
             false
         });
         assert_eq!(tries, TRIES);
-        assert_eq!(fault, Err(Fault::NotPositiveDefinite { jitter: LAST }));
+        assert_eq!(fault, Err(RegressionError::NotPositiveDefinite { jitter: LAST }));
         assert_eq!(until_positive(|added| added > 1e-9), Ok(1e-8));
     }
 }

@@ -1,5 +1,7 @@
 //! Covariance functions as text and as a tree: five shapes, their sums and products.
 //!
+//! In: text. Out: a [`Kernel`], or an error with the column; a kernel is written back as text.
+//!
 //! With r the distance in units of the length scale(s):
 //!
 //! | name | k(r) |
@@ -10,15 +12,16 @@
 //! | `squared_exponential` | exp(-r^2 / 2) |
 //! | `rational_quadratic` | (1 + r^2 / (2 alpha))^-alpha |
 //!
-//! `a + b * (c + d)` reads as usual; in names a dash does for a low line. Every shape has its own length scales; it has its own standard deviation unless that
-//! could not be told from another's (in a product, only the first factor has one).
+//! Operators have their usual precedence in `a + b * (c + d)`; in names a dash stands for an underscore. Every shape has
+//! its own length scales, and its own standard deviation where it can be identified (in a product, only the first factor
+//! has one).
 
 use std::fmt;
 use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use super::Fault;
+use super::RegressionError;
 
 /// Deepest nesting of brackets: text is read by recursion.
 const MAX_DEPTH: usize = 16;
@@ -45,7 +48,7 @@ impl Shape {
     pub const ALL: [Self; 5] =
         [Self::Exponential, Self::SquaredExponential, Self::Matern32, Self::Matern52, Self::RationalQuadratic];
 
-    /// Its name in text.
+    /// Name in text.
     pub fn name(self) -> &'static str {
         match self {
             Self::Exponential => "exponential",
@@ -84,9 +87,9 @@ impl From<Kernel> for String {
 }
 
 impl TryFrom<String> for Kernel {
-    type Error = Fault;
+    type Error = RegressionError;
 
-    fn try_from(text: String) -> Result<Self, Fault> {
+    fn try_from(text: String) -> Result<Self, RegressionError> {
         text.parse()
     }
 }
@@ -113,27 +116,27 @@ fn write_node(f: &mut fmt::Formatter<'_>, node: &Node, in_product: bool) -> fmt:
 }
 
 impl FromStr for Kernel {
-    type Err = Fault;
+    type Err = RegressionError;
 
-    fn from_str(text: &str) -> Result<Self, Fault> {
-        let mut reader = Reader { text, rest: text, depth: 0, shapes: 0 };
-        let root = reader.sum()?;
-        match reader.rest.trim_start() {
+    fn from_str(text: &str) -> Result<Self, RegressionError> {
+        let mut parser = KernelParser { text, rest: text, depth: 0, shapes: 0 };
+        let root = parser.sum()?;
+        match parser.rest.trim_start() {
             "" => Ok(Self { root }),
-            rest => Err(reader.fault(rest, "+, * or the end")),
+            rest => Err(parser.fault(rest, "+, * or the end")),
         }
     }
 }
 
-struct Reader<'a> {
+struct KernelParser<'a> {
     text: &'a str,
     rest: &'a str,
     depth: usize,
     shapes: usize,
 }
 
-impl Reader<'_> {
-    fn sum(&mut self) -> Result<Node, Fault> {
+impl KernelParser<'_> {
+    fn sum(&mut self) -> Result<Node, RegressionError> {
         let mut terms = vec![self.product()?];
         while self.take('+') {
             terms.push(self.product()?);
@@ -141,7 +144,7 @@ impl Reader<'_> {
         Ok(if terms.len() == 1 { terms.remove(0) } else { Node::Sum(flat(terms, true)) })
     }
 
-    fn product(&mut self) -> Result<Node, Fault> {
+    fn product(&mut self) -> Result<Node, RegressionError> {
         let mut factors = vec![self.atom()?];
         while self.take('*') {
             factors.push(self.atom()?);
@@ -149,7 +152,7 @@ impl Reader<'_> {
         Ok(if factors.len() == 1 { factors.remove(0) } else { Node::Product(flat(factors, false)) })
     }
 
-    fn atom(&mut self) -> Result<Node, Fault> {
+    fn atom(&mut self) -> Result<Node, RegressionError> {
         if self.take('(') {
             self.depth += 1;
             if self.depth > MAX_DEPTH {
@@ -164,7 +167,7 @@ impl Reader<'_> {
         }
         let start = self.rest.trim_start();
         let word = start.split(|c: char| !c.is_ascii_alphanumeric() && c != '_' && c != '-').next().unwrap_or("");
-        // There is no minus among kernels: a dash joins words as well.
+        // Kernels have no minus sign: a dash also joins words.
         let name = word.replace('-', "_");
         let Some(shape) = Shape::ALL.into_iter().find(|shape| shape.name() == name) else {
             let names: Vec<&str> = Shape::ALL.iter().map(|shape| shape.name()).collect();
@@ -184,14 +187,14 @@ impl Reader<'_> {
         rest.is_some()
     }
 
-    fn fault(&self, at: &str, allowed: &str) -> Fault {
+    fn fault(&self, at: &str, allowed: &str) -> RegressionError {
         let column = self.text[..self.text.len() - at.trim_start().len()].chars().count() + 1;
         let found = at.split_whitespace().next().unwrap_or("the end").to_owned();
-        Fault::Kernel { text: self.text.to_owned(), column, found, allowed: allowed.to_owned() }
+        RegressionError::Kernel { text: self.text.to_owned(), column, found, allowed: allowed.to_owned() }
     }
 }
 
-/// Sums inside a sum, and products inside a product, are taken into it.
+/// Merges sums inside a sum, and products inside a product.
 fn flat(nodes: Vec<Node>, is_sum: bool) -> Vec<Node> {
     let mut all = Vec::new();
     for node in nodes {
@@ -227,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn text_that_is_no_kernel_is_refused_with_its_place() {
+    fn text_that_is_no_kernel_is_rejected_with_its_column() {
         for (text, column, found) in [
             ("", 1, "the end"),
             ("gaussian", 1, "gaussian"),
@@ -238,7 +241,7 @@ mod tests {
         ] {
             let fault = text.parse::<Kernel>().expect_err(text);
             assert!(
-                matches!(&fault, Fault::Kernel { column: c, found: f, .. } if *c == column && f == found),
+                matches!(&fault, RegressionError::Kernel { column: c, found: f, .. } if *c == column && f == found),
                 "{text:?}: {fault}"
             );
         }

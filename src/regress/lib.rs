@@ -1,14 +1,14 @@
-//! Gaussian process regression: pure numbers, knows no battery.
+//! Gaussian process regression on plain numbers, independent of batteries.
 //!
 //! A target y at inputs x is modelled as `h(x)' beta + f(x) + noise`: a basis `h` (none, a constant, a plane) whose
 //! coefficients come from generalised least squares, a Gaussian process `f` with a covariance function ([`Kernel`]), and
 //! white noise. Hyperparameters maximise the marginal likelihood, whose gradient is exact. (Rasmussen and Williams,
 //! *Gaussian Processes for Machine Learning*, 2006, chapters 2, 5 and 8.)
 //!
-//! The way of the numbers: [`Rows`] are checked and standardised ([`scale`]) -> one of three forms gives the likelihood
-//! with its gradient, the coefficients and predictions ([`exact`]: all rows with all; [`nearest`]: each row with its
-//! nearest; [`inducing`]: through a few points) -> [`search`] maximises -> [`Model`] predicts, is saved and loaded;
-//! [`folds`] holds rows out.
+//! Data flow: [`TrainingRows`] are checked and standardised ([`scale`]) -> one of three forms computes the likelihood with
+//! its gradient, the coefficients and predictions ([`exact`]: all pairs of rows; [`nearest`]: each row with its nearest
+//! ones; [`inducing`]: through a few points) -> [`search`] maximises -> [`Model`] predicts, is saved and loaded; [`folds`]
+//! cross-validates. Bad rows, settings and saved models are a [`RegressionError`].
 //!
 //! | form | memory | time of one likelihood | good for |
 //! | --- | --- | --- | --- |
@@ -17,22 +17,23 @@
 //! | [`Form::Inducing`] | n m | n m^2 | smooth functions, many inputs |
 //!
 //! Deviation 1: the paper used a fully independent conditional (inducing points) for its 30,723 rows. [`Form::Nearest`] is
-//! the default for as many: a rough function over months cannot go through a few hundred points.
-//! Deviation 2: what a prediction does not know of the basis' coefficients is part of its variance.
+//! the default for as many: a few hundred points cannot represent a rough function over months.
+//! Deviation 2: the variance of a prediction includes the uncertainty of the basis' coefficients.
 //!
-//! Deviation 3: the 95 % interval is not 1.96 standard deviations: training rows predicted without themselves say how
-//! wide it must be, and where ([`Settings::calibrate`]).
+//! Deviation 3: the 95 % interval is not 1.96 standard deviations: training rows predicted without themselves set its
+//! width, row by row ([`GprSettings::calibrate`]).
 //!
 //! Results are the same for the same rows, settings and seed on one machine; linear algebra may differ in the last bits
 //! between machines and numbers of threads.
 
 mod basis;
 mod calibration;
+mod error;
 mod exact;
-mod fault;
 mod folds;
 mod inducing;
 mod jitter;
+mod kd_tree;
 mod kernel;
 mod minimise;
 mod model;
@@ -41,15 +42,14 @@ mod plan;
 mod saved;
 mod scale;
 mod search;
-mod tree;
-mod wide;
+mod vector_math;
 
 #[cfg(test)]
 mod tests;
 
 pub use basis::Basis;
-pub use fault::Fault;
-pub use folds::{Fold, Folds, Score, assign, cross_validate, score};
+pub use error::RegressionError;
+pub use folds::{Fold, Folds, PredictionScore, assign, cross_validate, score};
 pub use jitter::Jitter;
 pub use kernel::{Kernel, Shape};
 pub use model::{Hyperparameter, Model, Prediction, fit};
@@ -69,18 +69,18 @@ pub const MAX_INDUCING: usize = 5_000;
 
 /// Rows to learn from.
 #[derive(Debug, Clone, Copy)]
-pub struct Rows<'a> {
+pub struct TrainingRows<'a> {
     /// Inputs, row after row.
     pub inputs: &'a [f64],
     /// Inputs of one row.
     pub dimensions: usize,
-    /// What is to be predicted, one a row.
+    /// Value to predict, one per row.
     pub targets: &'a [f64],
     /// Line of each row in its file, for errors; empty = rows are counted from 1.
     pub lines: &'a [u64],
 }
 
-/// How the covariance of many rows is dealt with.
+/// Approximation of the covariance of many rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Form {
@@ -89,19 +89,19 @@ pub enum Form {
     /// Each row is conditioned on its nearest among the rows before it in a seeded order (Vecchia's approximation), a
     /// prediction on the nearest of all.
     Nearest {
-        /// How many, 1 to 500.
+        /// Number of neighbours, 1 to 500.
         neighbours: usize,
     },
     /// Through inducing points with a row-wise correction of the noise (fully independent training conditional).
     Inducing {
-        /// How many, 1 to 5000.
+        /// Number of inducing points, 1 to 5000.
         points: usize,
     },
 }
 
-/// What to fit and how.
+/// Settings of a fit.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct GprSettings {
     /// Covariance function.
     pub kernel: Kernel,
     /// Mean function.
@@ -112,21 +112,21 @@ pub struct Settings {
     pub standardise: bool,
     /// Exact or sparse.
     pub form: Form,
-    /// Searches from seeded random starts beside the first.
+    /// Searches from seeded random starts in addition to the first.
     pub restarts: usize,
     /// Seed of starts, order, inducing points and folds.
     pub seed: u64,
-    /// Most steps of one search; 0 = the start is taken as it is.
+    /// Most steps of one search; 0 = the start is the result.
     pub max_iterations: usize,
-    /// Hyperparameters to start from, in the order and units of [`Model::hyperparameters`]; empty = guessed from the rows.
+    /// Hyperparameters to start from, in the order and units of [`Model::hyperparameters`]; empty = derived from the rows.
     pub start: Vec<f64>,
-    /// The 95 % interval is made as wide as training rows near by, predicted without themselves, say; else Gaussian.
+    /// Calibrates the 95 % interval by nearby training rows, each predicted without itself; else Gaussian.
     pub calibrate: bool,
     /// Threads, 1 or more.
     pub threads: usize,
 }
 
-impl Settings {
+impl GprSettings {
     /// A constant basis, one length scale, standardised inputs, one search; exact up to 2,000 rows.
     pub fn new(kernel: Kernel, rows: usize) -> Self {
         Self {
@@ -145,18 +145,18 @@ impl Settings {
     }
 }
 
-/// How far the work is.
+/// Progress of a fit.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Progress {
+pub struct FitProgress {
     /// Fold being fitted, from 1; 1 of 1 outside a cross-validation.
     pub fold: usize,
     /// Number of folds.
     pub folds: usize,
-    /// Search under way, from 1.
+    /// Present search, from 1.
     pub search: usize,
     /// Number of searches.
     pub searches: usize,
-    /// Steps of this search that are done.
+    /// Steps of this search so far.
     pub iteration: usize,
     /// Most steps of a search.
     pub max_iterations: usize,
@@ -164,5 +164,5 @@ pub struct Progress {
     pub log_likelihood_per_row: f64,
 }
 
-/// Called now and then; `Break` gives up the work with [`Fault::Cancelled`].
-pub type Watcher<'a> = dyn FnMut(Progress) -> ControlFlow<()> + 'a;
+/// Callback after each step of a search; `Break` ends the fit with [`RegressionError::Cancelled`].
+pub type ProgressCallback<'a> = dyn FnMut(FitProgress) -> ControlFlow<()> + 'a;

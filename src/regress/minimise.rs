@@ -1,64 +1,66 @@
 //! Quasi-Newton minimisation (BFGS) of a smooth function of few variables inside a box.
 //!
-//! A variable at a bound whose gradient points outward stays there for the step; the step is cut back until the function
-//! falls enough (Armijo) and is projected onto the box. A point where the function has no value counts as infinitely high.
+//! In: a start, bounds, a function with its gradient. Out: the lowest point found.
+//!
+//! A variable at a bound whose gradient points outward stays there for the step. The step is shortened until the function
+//! falls enough (Armijo), and is projected onto the box. A point without a value counts as infinitely high.
 
 /// Longest first step of a search, and of any step, in one variable. Variables are logarithms: a factor of 7.
 const LONGEST_STEP: f64 = 2.0;
-/// Part of the linear prediction by which a step has to lower the function.
+/// Smallest decrease of a step, as part of its linear prediction.
 const ARMIJO: f64 = 1e-4;
-/// Most cuts of one step.
+/// Most reductions of one step.
 const MAX_CUTS: usize = 12;
 
-/// What an objective says: value and gradient; `None` = no value here.
-pub(super) type Point = Option<(f64, Vec<f64>)>;
+/// Value and gradient of the objective; `None` = no value at this point.
+pub(super) type Evaluation = Option<(f64, Vec<f64>)>;
 
 /// The lowest point found.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Lowest {
+pub(super) struct Minimum {
     pub x: Vec<f64>,
     pub value: f64,
     pub gradient: Vec<f64>,
     pub iterations: usize,
 }
 
-/// When to stop, and where.
+/// Bounds and stopping rule of a search.
 #[derive(Debug, Clone)]
-pub(super) struct Limits<'a> {
+pub(super) struct SearchLimits<'a> {
     pub low: &'a [f64],
     pub high: &'a [f64],
     pub max_iterations: usize,
-    /// Fall of the value below which the search has converged, twice running.
+    /// The search ends after two successive steps that lower the value by less than this.
     pub tolerance: f64,
 }
 
 /// Minimises from `start`; the objective's own errors end the search. `Ok(None)` = no value at the start.
 pub(super) fn minimise<E>(
     start: &[f64],
-    limits: &Limits,
-    mut objective: impl FnMut(&[f64]) -> Result<Point, E>,
-    mut seen: impl FnMut(&Lowest) -> Result<(), E>,
-) -> Result<Option<Lowest>, E> {
+    limits: &SearchLimits,
+    mut objective: impl FnMut(&[f64]) -> Result<Evaluation, E>,
+    mut report: impl FnMut(&Minimum) -> Result<(), E>,
+) -> Result<Option<Minimum>, E> {
     let x: Vec<f64> =
         (start.iter().zip(limits.low.iter().zip(limits.high))).map(|(x, (l, h))| x.clamp(*l, *h)).collect();
     let Some((value, gradient)) = objective(&x)?.filter(is_finite) else { return Ok(None) };
-    let mut at = Lowest { x, value, gradient, iterations: 0 };
-    let mut inverse = Inverse::new(at.x.len());
+    let mut at = Minimum { x, value, gradient, iterations: 0 };
+    let mut inverse = InverseHessian::new(at.x.len());
     let mut small_falls = 0;
-    seen(&at)?;
+    report(&at)?;
     while at.iterations < limits.max_iterations {
         let direction = inverse.direction(&at, limits);
         let Some(next) = line_search(&at, &direction, limits, &mut objective)? else {
             if inverse.fresh {
                 break;
             }
-            inverse = Inverse::new(at.x.len());
+            inverse = InverseHessian::new(at.x.len());
             continue;
         };
         small_falls = if at.value - next.value < limits.tolerance { small_falls + 1 } else { 0 };
         inverse.update(&at, &next);
         at = next;
-        seen(&at)?;
+        report(&at)?;
         if small_falls == 2 {
             break;
         }
@@ -71,11 +73,11 @@ fn is_finite((value, gradient): &(f64, Vec<f64>)) -> bool {
 }
 
 fn line_search<E>(
-    at: &Lowest,
+    at: &Minimum,
     direction: &[f64],
-    limits: &Limits,
-    objective: &mut impl FnMut(&[f64]) -> Result<Point, E>,
-) -> Result<Option<Lowest>, E> {
+    limits: &SearchLimits,
+    objective: &mut impl FnMut(&[f64]) -> Result<Evaluation, E>,
+) -> Result<Option<Minimum>, E> {
     let longest = direction.iter().fold(0.0_f64, |m, d| m.max(d.abs()));
     if longest == 0.0 {
         return Ok(None);
@@ -88,9 +90,9 @@ fn line_search<E>(
         let found = objective(&x)?;
         if let Some((value, gradient)) = found.filter(is_finite) {
             if slope < 0.0 && value <= at.value + ARMIJO * slope {
-                return Ok(Some(Lowest { x, value, gradient, iterations: at.iterations + 1 }));
+                return Ok(Some(Minimum { x, value, gradient, iterations: at.iterations + 1 }));
             }
-            // The lowest point of the parabola through what is known, within reason.
+            // The minimum of the parabola through both points, within limits.
             let bend = 2.0 * (value - at.value - slope);
             step *= if bend > 0.0 { (-slope / bend).clamp(0.1, 0.5) } else { 0.5 };
         } else {
@@ -101,13 +103,13 @@ fn line_search<E>(
 }
 
 /// Approximation of the inverse of the second derivatives.
-struct Inverse {
+struct InverseHessian {
     matrix: Vec<f64>,
     size: usize,
     fresh: bool,
 }
 
-impl Inverse {
+impl InverseHessian {
     fn new(size: usize) -> Self {
         let mut matrix = vec![0.0; size * size];
         (0..size).for_each(|k| matrix[k * size + k] = 1.0);
@@ -118,7 +120,7 @@ impl Inverse {
         (0..self.size).map(|i| (0..self.size).map(|j| self.matrix[i * self.size + j] * v[j]).sum()).collect()
     }
 
-    fn direction(&self, at: &Lowest, limits: &Limits) -> Vec<f64> {
+    fn direction(&self, at: &Minimum, limits: &SearchLimits) -> Vec<f64> {
         let held = |k: usize| {
             (at.x[k] <= limits.low[k] && at.gradient[k] > 0.0) || (at.x[k] >= limits.high[k] && at.gradient[k] < 0.0)
         };
@@ -129,7 +131,7 @@ impl Inverse {
         if descends { direction } else { free.iter().map(|g| -g).collect() }
     }
 
-    fn update(&mut self, old: &Lowest, new: &Lowest) {
+    fn update(&mut self, old: &Minimum, new: &Minimum) {
         let n = self.size;
         let s: Vec<f64> = (0..n).map(|k| new.x[k] - old.x[k]).collect();
         let y: Vec<f64> = (0..n).map(|k| new.gradient[k] - old.gradient[k]).collect();
@@ -156,32 +158,32 @@ impl Inverse {
 mod tests {
     use super::*;
 
-    fn rosenbrock(x: &[f64]) -> Result<Point, ()> {
+    fn rosenbrock(x: &[f64]) -> Result<Evaluation, ()> {
         let (a, b) = (1.0 - x[0], x[1] - x[0] * x[0]);
         Ok(Some((a * a + 100.0 * b * b, vec![-2.0 * a - 400.0 * x[0] * b, 200.0 * b])))
     }
 
-    fn lowest(start: &[f64], low: &[f64], high: &[f64]) -> Lowest {
-        let limits = Limits { low, high, max_iterations: 200, tolerance: 1e-14 };
+    fn minimum(start: &[f64], low: &[f64], high: &[f64]) -> Minimum {
+        let limits = SearchLimits { low, high, max_iterations: 200, tolerance: 1e-14 };
         minimise(start, &limits, rosenbrock, |_| Ok(())).expect("no error").expect("a value")
     }
 
     #[test]
-    fn the_valley_is_followed_to_its_lowest_point() {
-        let found = lowest(&[-1.2, 1.0], &[-5.0, -5.0], &[5.0, 5.0]);
+    fn the_search_follows_the_valley_to_its_minimum() {
+        let found = minimum(&[-1.2, 1.0], &[-5.0, -5.0], &[5.0, 5.0]);
         assert!((found.x[0] - 1.0).abs() < 1e-5 && (found.x[1] - 1.0).abs() < 1e-5, "{found:?}");
     }
 
     #[test]
-    fn the_box_is_kept() {
-        let found = lowest(&[-1.2, 1.0], &[-5.0, -5.0], &[0.5, 5.0]);
+    fn the_search_stays_in_the_box() {
+        let found = minimum(&[-1.2, 1.0], &[-5.0, -5.0], &[0.5, 5.0]);
         assert!(found.x[0] == 0.5 && (found.x[1] - 0.25).abs() < 1e-6, "{found:?}");
     }
 
     #[test]
-    fn points_without_a_value_are_stepped_back_from() {
-        let limits = Limits { low: &[-5.0], high: &[50.0], max_iterations: 100, tolerance: 1e-14 };
-        let objective = |x: &[f64]| -> Result<Point, ()> {
+    fn a_point_without_a_value_shortens_the_step() {
+        let limits = SearchLimits { low: &[-5.0], high: &[50.0], max_iterations: 100, tolerance: 1e-14 };
+        let objective = |x: &[f64]| -> Result<Evaluation, ()> {
             Ok((x[0] < 3.0).then(|| ((x[0] - 2.9).powi(2), vec![2.0 * (x[0] - 2.9)])))
         };
         let found = minimise(&[-4.0], &limits, objective, |_| Ok(())).expect("no error").expect("a value");

@@ -1,4 +1,7 @@
-//! A fitted process: fit, predict, what was found.
+//! A fitted process: fit, predictions, hyperparameters.
+//!
+//! In: checked rows and settings. Out: a [`Model`] with predictions in units of the target. Rows and settings out of range
+//! are errors.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -10,20 +13,23 @@ use serde::{Deserialize, Serialize};
 use super::calibration::{Calibration, ROWS};
 use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
-use super::minimise::Lowest;
-use super::nearest::{Data, Factors};
-use super::plan::{Plan, Role};
+use super::minimise::Minimum;
+use super::nearest::{ConditionalFactors, StandardisedRows};
+use super::plan::{ParameterRole, Plan};
 use super::scale::{Scale, check};
-use super::search::{Watched, descend, first_start, log_bounds, random_start};
-use super::{Basis, Fault, Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, Progress, Rows, Settings, Watcher};
+use super::search::{SearchMonitor, descend, first_start, log_bounds, random_start};
+use super::{
+    Basis, FitProgress, Form, GprSettings, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback,
+    RegressionError, TrainingRows,
+};
 use super::{exact, inducing, nearest};
 
-/// Rows whose factors the search of [`Form::Nearest`] sums over; the hyperparameters' standard error from this choice is
-/// far below what a prediction can show.
+/// Rows whose factors the search of [`Form::Nearest`] sums over; the effect of this choice on the hyperparameters is far
+/// too small to show in a prediction.
 const SEARCH_ROWS: usize = 6000;
-/// Most times the neighbours or inducing points are chosen anew while the length scales move.
+/// Most choices of neighbours or inducing points while the length scales move.
 const MAX_ROUNDS: usize = 4;
-/// Change of the ratio of two length scales below which the choice stands.
+/// Change of the ratio of two length scales below which the choice is kept.
 const SAME_METRIC: f64 = 1.3;
 /// Most threads.
 const MAX_THREADS: usize = 1024;
@@ -33,22 +39,22 @@ const MAX_RESTARTS: usize = 1000;
 /// One hyperparameter: length scales in (standardised) inputs, standard deviations in units of the target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Hyperparameter {
-    /// Such as `matern32_1.length_scale_2`: the first shape of the kernel, second input.
+    /// Name, such as `matern32_1.length_scale_2`: the first shape of the kernel, second input.
     pub name: String,
     /// Its value.
     pub value: f64,
 }
 
-/// What is to be expected at one row.
+/// Prediction at one row.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prediction {
     /// Mean of function and measurement.
     pub mean: f64,
-    /// Variance of the function's value: what more rows would lower.
+    /// Variance of the function's value, which more rows would lower.
     pub function_variance: f64,
     /// Variance of a new measurement: the function's and the noise.
     pub measurement_variance: f64,
-    /// Lower end of the interval that holds 95 % of new measurements, see [`Model::interval_factor`]: not 1.96 standard
+    /// Lower end of the interval for 95 % of new measurements, see [`Model::interval_factor`]: not 1.96 standard
     /// deviations when residuals are not Gaussian or not as wide everywhere.
     pub low_95: f64,
     /// Its upper end.
@@ -58,30 +64,30 @@ pub struct Prediction {
 /// A fitted process.
 #[derive(Debug)]
 pub struct Model {
-    pub(super) spec: Spec,
+    pub(super) spec: ModelSpec,
     pub(super) scale: Scale,
     /// Logarithms, in standardised units.
     pub(super) theta: Vec<f64>,
     pub(super) posterior: Posterior,
-    pub(super) outcome: Outcome,
+    pub(super) outcome: FitOutcome,
     pub(super) calibration: Calibration,
     pool: ThreadPool,
 }
 
 /// A model without its threads.
-pub(super) struct Parts {
-    pub spec: Spec,
+pub(super) struct ModelContents {
+    pub spec: ModelSpec,
     pub scale: Scale,
     pub theta: Vec<f64>,
     pub posterior: Posterior,
-    pub outcome: Outcome,
+    pub outcome: FitOutcome,
     pub calibration: Calibration,
 }
 
-/// What a model is, apart from its numbers.
+/// Structure of a model, without its numbers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Spec {
+pub(super) struct ModelSpec {
     pub kernel: Kernel,
     pub basis: Basis,
     pub ard: bool,
@@ -89,11 +95,11 @@ pub(super) struct Spec {
     pub dimensions: usize,
 }
 
-/// What came of the fit.
+/// Outcome of the fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Outcome {
-    /// In standardised targets.
+pub(super) struct FitOutcome {
+    /// Log likelihood, in standardised targets.
     pub log_likelihood: f64,
     pub jitter: Jitter,
     pub iterations: usize,
@@ -107,7 +113,7 @@ pub(super) enum Posterior {
 }
 
 impl Posterior {
-    pub(super) fn data(&self) -> &Data {
+    pub(super) fn data(&self) -> &StandardisedRows {
         match self {
             Self::Exact(posterior) => &posterior.data,
             Self::Nearest(posterior) => &posterior.data,
@@ -115,7 +121,7 @@ impl Posterior {
         }
     }
 
-    fn predict(&self, queries: &[f64]) -> Result<Vec<(f64, f64)>, Fault> {
+    fn predict(&self, queries: &[f64]) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.predict(queries)),
             Self::Nearest(posterior) => posterior.predict(queries, None),
@@ -124,7 +130,7 @@ impl Posterior {
     }
 
     /// Residual and variance of the measurement of some rows, each predicted from the others.
-    fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, Fault> {
+    fn left_out(&self, rows: &[u32], noise_variance: f64) -> Result<Vec<(f64, f64)>, RegressionError> {
         match self {
             Self::Exact(posterior) => Ok(posterior.left_out(rows)),
             Self::Inducing(posterior) => Ok(posterior.left_out(rows)),
@@ -139,37 +145,41 @@ impl Posterior {
     }
 }
 
-/// Fits a process to rows. `watcher` hears of every step and can end the work.
-pub fn fit(rows: &Rows, settings: &Settings, watcher: &mut Watcher) -> Result<Model, Fault> {
+/// Fits a process to rows. Calls `watcher` after every step; it can end the fit.
+pub fn fit(
+    rows: &TrainingRows,
+    settings: &GprSettings,
+    watcher: &mut ProgressCallback,
+) -> Result<Model, RegressionError> {
     check(rows)?;
-    let job = Job::new(rows, settings)?;
+    let job = FitJob::new(rows, settings)?;
     let (theta, iterations) = if settings.max_iterations == 0 { (job.first_start()?, 0) } else { job.search(watcher)? };
     job.finish(theta, iterations)
 }
 
-/// Rows and settings made ready.
-struct Job<'a> {
-    settings: &'a Settings,
+/// A fit: settings, standardised rows and plan.
+struct FitJob<'a> {
+    settings: &'a GprSettings,
     scale: Scale,
-    data: Data,
+    data: StandardisedRows,
     plan: Plan,
     pool: ThreadPool,
     /// Typical standard deviation of an (otherwise) standardised input.
     spread: f64,
 }
 
-impl<'a> Job<'a> {
-    fn new(rows: &Rows, settings: &'a Settings) -> Result<Self, Fault> {
+impl<'a> FitJob<'a> {
+    fn new(rows: &TrainingRows, settings: &'a GprSettings) -> Result<Self, RegressionError> {
         let n = rows.targets.len();
         check_settings(settings, n)?;
         let scale = Scale::of(rows, settings.standardise, settings.basis);
         let natural = Scale::of(rows, true, settings.basis);
         if let Some(what) = natural.too_wide() {
-            return Err(Fault::range(&what, "values whose mean or variance overflows", "of a smaller size"));
+            return Err(RegressionError::range(&what, "values whose mean or variance overflows", "of a smaller size"));
         }
         let logs: f64 = natural.deviations.iter().zip(&scale.deviations).map(|(d, unit)| (d / unit).ln()).sum();
         let d = rows.dimensions;
-        let mut data = Data {
+        let mut data = StandardisedRows {
             dimensions: d,
             inputs: scale.inputs(rows.inputs),
             targets: scale.targets(rows.targets),
@@ -185,29 +195,31 @@ impl<'a> Job<'a> {
         Ok(Self { settings, scale, data, plan, pool: threads(settings.threads)?, spread: (logs / d as f64).exp() })
     }
 
-    fn first_start(&self) -> Result<Vec<f64>, Fault> {
+    fn first_start(&self) -> Result<Vec<f64>, RegressionError> {
         let given = &self.settings.start;
         if given.is_empty() {
             return Ok(first_start(&self.plan, self.spread));
         }
         let count = self.plan.parameters.len();
         if given.len() != count || given.iter().any(|value| !(value.is_finite() && *value > 0.0)) {
-            return Err(Fault::range("start", format!("{given:?}"), format!("{count} positive numbers")));
+            return Err(RegressionError::range("start", format!("{given:?}"), format!("{count} positive numbers")));
         }
-        let unit = |role| if matches!(role, Role::Signal | Role::Noise) { self.scale.target_deviation } else { 1.0 };
+        let unit = |role| {
+            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
+        };
         Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / unit(p.role)).ln()).collect())
     }
 
-    /// The best of all searches, and its steps.
-    fn search(&self, watcher: &mut Watcher) -> Result<(Vec<f64>, usize), Fault> {
+    /// Result of the best search, and its steps.
+    fn search(&self, watcher: &mut ProgressCallback) -> Result<(Vec<f64>, usize), RegressionError> {
         let searches = self.settings.restarts + 1;
-        let mut best: Option<Lowest> = None;
+        let mut best: Option<Minimum> = None;
         for k in 0..searches {
             let start = match k {
                 0 => self.first_start()?,
                 _ => random_start(&self.plan, self.spread, self.settings.seed, k),
             };
-            let progress = Progress {
+            let progress = FitProgress {
                 fold: 1,
                 folds: 1,
                 search: k + 1,
@@ -217,31 +229,31 @@ impl<'a> Job<'a> {
                 log_likelihood_per_row: f64::NEG_INFINITY,
             };
             let rows = self.data.len().min(self.search_rows());
-            let found = self.one_search(start, &mut Watched { watcher, progress, rows })?;
+            let found = self.one_search(start, &mut SearchMonitor { watcher, progress, rows })?;
             best = match (best, found) {
                 (Some(old), Some(new)) if new.value < old.value => Some(new),
                 (None, new) => new,
                 (old, _) => old,
             };
         }
-        best.map(|best| (best.x, best.iterations)).ok_or(Fault::NotPositiveDefinite { jitter: jitter::LAST })
+        best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
     }
 
     fn search_rows(&self) -> usize {
         if matches!(self.settings.form, Form::Nearest { .. }) { SEARCH_ROWS } else { usize::MAX }
     }
 
-    /// One search; what depends on the metric (neighbours, inducing points) is chosen anew until the metric rests.
-    fn one_search(&self, mut start: Vec<f64>, watched: &mut Watched) -> Result<Option<Lowest>, Fault> {
+    /// One search; chooses neighbours or inducing points again until the metric is stable.
+    fn one_search(&self, mut start: Vec<f64>, monitor: &mut SearchMonitor) -> Result<Option<Minimum>, RegressionError> {
         let (low, high) = log_bounds(&self.plan, self.spread);
-        let mut found: Option<Lowest> = None;
+        let mut found: Option<Minimum> = None;
         for _ in 0..MAX_ROUNDS {
             let metric = self.metric(&start);
-            let Some(mut lowest) = self.one_round(&start, &metric, (&low, &high), watched)? else { break };
-            lowest.iterations += found.map_or(0, |before| before.iterations);
-            start.clone_from(&lowest.x);
-            found = Some(lowest);
-            if matches!(self.settings.form, Form::Exact) || same(&metric, &self.metric(&start)) {
+            let Some(mut minimum) = self.one_round(&start, &metric, (&low, &high), monitor)? else { break };
+            minimum.iterations += found.map_or(0, |before| before.iterations);
+            start.clone_from(&minimum.x);
+            found = Some(minimum);
+            if matches!(self.settings.form, Form::Exact) || is_same_metric(&metric, &self.metric(&start)) {
                 break;
             }
         }
@@ -257,20 +269,20 @@ impl<'a> Job<'a> {
         start: &[f64],
         metric: &[f64],
         bounds: (&[f64], &[f64]),
-        watched: &mut Watched,
-    ) -> Result<Option<Lowest>, Fault> {
+        monitor: &mut SearchMonitor,
+    ) -> Result<Option<Minimum>, RegressionError> {
         let steps = self.settings.max_iterations;
         match self.settings.form {
-            Form::Exact => descend(start, bounds, steps, watched, |theta| {
+            Form::Exact => descend(start, bounds, steps, monitor, |theta| {
                 self.pool.install(|| {
                     let posterior = exact::Posterior::new(self.data.clone(), self.plan.clone(), theta)?;
                     Ok((posterior.value, posterior.gradient()))
                 })
             }),
             Form::Nearest { neighbours } => {
-                let rows = chosen(self.data.len(), SEARCH_ROWS);
-                let factors = self.pool.install(|| Factors::new(&self.data, rows, metric, neighbours));
-                descend(start, bounds, steps, watched, |theta| {
+                let rows = evenly_spaced(self.data.len(), SEARCH_ROWS);
+                let factors = self.pool.install(|| ConditionalFactors::new(&self.data, rows, metric, neighbours));
+                descend(start, bounds, steps, monitor, |theta| {
                     let sums = self.pool.install(|| factors.sums(&self.data, &self.plan, theta, true))?;
                     Ok((sums.value, sums.gradient))
                 })
@@ -278,7 +290,7 @@ impl<'a> Job<'a> {
             Form::Inducing { points } => {
                 let choose = || inducing::choose(&self.data, metric, points, self.settings.seed);
                 let points = self.pool.install(choose);
-                descend(start, bounds, steps, watched, |theta| {
+                descend(start, bounds, steps, monitor, |theta| {
                     self.pool.install(|| {
                         let posterior = inducing::Posterior::new(&self.data, &self.plan, theta, &points)?;
                         Ok((posterior.value, posterior.gradient()))
@@ -288,7 +300,7 @@ impl<'a> Job<'a> {
         }
     }
 
-    fn finish(self, theta: Vec<f64>, iterations: usize) -> Result<Model, Fault> {
+    fn finish(self, theta: Vec<f64>, iterations: usize) -> Result<Model, RegressionError> {
         let metric = self.metric(&theta);
         let noise_variance = self.plan.values(&theta).noise_variance;
         let (data, plan) = (self.data, self.plan);
@@ -299,7 +311,8 @@ impl<'a> Job<'a> {
                 Ok((Posterior::Exact(Box::new(posterior)), value, jitter))
             }
             Form::Nearest { neighbours } => {
-                let factors = Factors::new(&data, chosen(data.len(), usize::MAX), &metric, neighbours);
+                let factors =
+                    ConditionalFactors::new(&data, evenly_spaced(data.len(), usize::MAX), &metric, neighbours);
                 let sums = factors.sums(&data, &plan, &theta, false)?;
                 let posterior = nearest::Posterior::new(data, plan, &theta, sums.coefficients, neighbours);
                 Ok((Posterior::Nearest(Box::new(posterior)), sums.value, sums.jitter))
@@ -308,19 +321,19 @@ impl<'a> Job<'a> {
                 let points = inducing::choose(&data, &metric, points, self.settings.seed);
                 let posterior = inducing::Posterior::new(&data, &plan, &theta, &points)?;
                 let (value, jitter) = (posterior.value, posterior.jitter);
-                Ok::<_, Fault>((Posterior::Inducing(Box::new(posterior)), value, jitter))
+                Ok::<_, RegressionError>((Posterior::Inducing(Box::new(posterior)), value, jitter))
             }
         })?;
-        let outcome = Outcome { log_likelihood: -value, jitter, iterations };
+        let outcome = FitOutcome { log_likelihood: -value, jitter, iterations };
         let mut calibration = Calibration::none();
         if self.settings.calibrate {
-            let rows = chosen(posterior.data().len(), ROWS);
+            let rows = evenly_spaced(posterior.data().len(), ROWS);
             let left_out = self.pool.install(|| posterior.left_out(&rows, noise_variance))?;
             let ratios = left_out.into_iter().map(|(residual, variance)| residual.abs() / variance.sqrt()).collect();
             calibration = Calibration::new(posterior.data(), rows, ratios);
         }
         let settings = self.settings;
-        let spec = Spec {
+        let spec = ModelSpec {
             kernel: settings.kernel.clone(),
             basis: settings.basis,
             ard: settings.ard,
@@ -332,66 +345,75 @@ impl<'a> Job<'a> {
 }
 
 /// At most `most` row numbers, evenly from `0..n` (rows of [`Form::Nearest`] are in random order).
-fn chosen(n: usize, most: usize) -> Vec<u32> {
+fn evenly_spaced(n: usize, most: usize) -> Vec<u32> {
     let count = n.min(most);
     (0..count).map(|k| u32::try_from(k * n / count).unwrap_or(u32::MAX)).collect()
 }
 
-/// Whether two metrics rank rows much alike: all their ratios are.
-fn same(a: &[f64], b: &[f64]) -> bool {
+/// Whether two metrics are nearly proportional, and so rank rows alike.
+fn is_same_metric(a: &[f64], b: &[f64]) -> bool {
     let ratios = || a.iter().zip(b).map(|(a, b)| (a / b).ln());
     let (low, high) = ratios().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), r| (l.min(r), h.max(r)));
     high - low < SAME_METRIC.ln()
 }
 
-pub(super) fn threads(count: usize) -> Result<ThreadPool, Fault> {
+pub(super) fn threads(count: usize) -> Result<ThreadPool, RegressionError> {
     if count == 0 || count > MAX_THREADS {
-        return Err(Fault::range("threads", count, format!("1 to {MAX_THREADS}")));
+        return Err(RegressionError::range("threads", count, format!("1 to {MAX_THREADS}")));
     }
-    rayon::ThreadPoolBuilder::new().num_threads(count).build().map_err(|error| Fault::Threads(error.to_string()))
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(count)
+        .build()
+        .map_err(|error| RegressionError::Threads(error.to_string()))
 }
 
-fn check_settings(settings: &Settings, rows: usize) -> Result<(), Fault> {
+fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionError> {
     if settings.restarts > MAX_RESTARTS {
-        return Err(Fault::range("restarts", settings.restarts, format!("at most {MAX_RESTARTS}")));
+        return Err(RegressionError::range("restarts", settings.restarts, format!("at most {MAX_RESTARTS}")));
     }
     match settings.form {
-        Form::Exact if rows > MAX_EXACT_ROWS => {
-            Err(Fault::range("rows of an exact fit", rows, format!("at most {MAX_EXACT_ROWS}; take a sparse form")))
-        }
+        Form::Exact if rows > MAX_EXACT_ROWS => Err(RegressionError::range(
+            "rows of an exact fit",
+            rows,
+            format!("at most {MAX_EXACT_ROWS}; take a sparse form"),
+        )),
         Form::Nearest { neighbours } if neighbours == 0 || neighbours > MAX_NEIGHBOURS => {
-            Err(Fault::range("neighbours", neighbours, format!("1 to {MAX_NEIGHBOURS}")))
+            Err(RegressionError::range("neighbours", neighbours, format!("1 to {MAX_NEIGHBOURS}")))
         }
         Form::Inducing { points } if points == 0 || points > MAX_INDUCING => {
-            Err(Fault::range("inducing points", points, format!("1 to {MAX_INDUCING}")))
+            Err(RegressionError::range("inducing points", points, format!("1 to {MAX_INDUCING}")))
         }
         _ => Ok(()),
     }
 }
 
 impl Model {
-    pub(super) fn assemble(parts: Parts, pool: ThreadPool) -> Self {
-        let Parts { spec, scale, theta, posterior, outcome, calibration } = parts;
+    pub(super) fn assemble(contents: ModelContents, pool: ThreadPool) -> Self {
+        let ModelContents { spec, scale, theta, posterior, outcome, calibration } = contents;
         Self { spec, scale, theta, posterior, outcome, calibration, pool }
     }
 
-    /// What is to be expected at rows of inputs, one after the other.
-    pub fn predict(&self, inputs: &[f64]) -> Result<Vec<Prediction>, Fault> {
+    /// Predicts rows of inputs, row after row.
+    pub fn predict(&self, inputs: &[f64]) -> Result<Vec<Prediction>, RegressionError> {
         let d = self.spec.dimensions;
         if !inputs.len().is_multiple_of(d) {
-            return Err(Fault::range("number of inputs", inputs.len(), format!("a multiple of {d}")));
+            return Err(RegressionError::range("number of inputs", inputs.len(), format!("a multiple of {d}")));
         }
         if let Some(at) = inputs.iter().position(|x| !x.is_finite()) {
             let what = format!("input {}", at % d + 1);
-            return Err(Fault::NotFinite { line: (at / d) as u64 + 1, what, found: inputs[at] });
+            return Err(RegressionError::NotFinite { line: (at / d) as u64 + 1, what, found: inputs[at] });
         }
         let queries = self.scale.inputs(inputs);
         self.pool.install(|| {
             let found = self.posterior.predict(&queries)?;
-            // An input so far away that its square overflows.
+            // The square of a very distant input overflows.
             if let Some(row) = found.iter().position(|(mean, variance)| !mean.is_finite() || !variance.is_finite()) {
                 let far = format!("{:?}", &inputs[row * d..(row + 1) * d]);
-                return Err(Fault::range(&format!("inputs of row {}", row + 1), far, "nearer to the model's rows"));
+                return Err(RegressionError::range(
+                    &format!("inputs of row {}", row + 1),
+                    far,
+                    "nearer to the model's rows",
+                ));
             }
             let rows = queries.par_chunks_exact(d).with_min_len(64);
             Ok(found
@@ -417,10 +439,12 @@ impl Model {
         }
     }
 
-    /// Hyperparameters as found; the noise is the last. The same order serves as a start ([`Settings::start`]).
+    /// Fitted hyperparameters; the noise is the last. The same order serves as a start ([`GprSettings::start`]).
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
-        let unit = |role| if matches!(role, Role::Signal | Role::Noise) { self.scale.target_deviation } else { 1.0 };
+        let unit = |role| {
+            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
+        };
         let named = plan.parameters.into_iter().zip(&self.theta);
         named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * unit(p.role) }).collect()
     }
@@ -430,14 +454,14 @@ impl Model {
         self.outcome.log_likelihood - self.rows() as f64 * self.scale.target_deviation.ln()
     }
 
-    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals are as wide as on the
-    /// whole: 1.96 for Gaussian residuals; from training rows predicted without themselves when
-    /// [`Settings::calibrate`] is set, and then wider or narrower where such rows nearby say so.
+    /// Half width of the 95 % interval in standard deviations of a measurement, where residuals have their
+    /// mean width: 1.96 for Gaussian residuals. With [`GprSettings::calibrate`] it comes from training rows predicted
+    /// without themselves, and the interval is wider or narrower by such rows nearby.
     pub fn interval_factor(&self) -> f64 {
         self.calibration.factor
     }
 
-    /// What had to be added to diagonals.
+    /// Jitter on diagonals.
     pub fn jitter(&self) -> Jitter {
         self.outcome.jitter
     }
@@ -447,12 +471,12 @@ impl Model {
         self.outcome.iterations
     }
 
-    /// Rows it was fitted to.
+    /// Number of training rows.
     pub fn rows(&self) -> usize {
         self.posterior.data().len()
     }
 
-    /// Inputs of a row.
+    /// Number of inputs of a row.
     pub fn dimensions(&self) -> usize {
         self.spec.dimensions
     }

@@ -1,8 +1,8 @@
 //! Gaussian process by nearest neighbours (Vecchia's approximation; Vecchia 1988, Datta et al. 2016).
 //!
-//! In a seeded random order, the density of all rows is the product of the densities of each row given those before it.
-//! Here "those before it" are the nearest `m` of them. That is a proper density, exact for `m` = all; each factor needs
-//! one Cholesky factor of size `m`, whatever the number of rows. Measurements, noise included, are conditioned on.
+//! In a seeded random order, the density of all rows is the product of the densities of each row given its predecessors.
+//! This approximation uses the nearest `m` predecessors. That is a proper density, exact for `m` = all; each factor needs
+//! one Cholesky factor of size `m`, for any number of rows. The conditioning is on measurements, including their noise.
 //!
 //! One factor, with K the covariance of neighbours and row (last), `q = K^-1 e_last`, `A = K^-1 [y H]` and
 //! `a = A (1, -beta)'`: the conditional variance is `1/q_n`, the residual `a_n/q_n`, so
@@ -13,31 +13,34 @@
 //! the coefficients beta are those of generalised least squares, where the derivative by them is 0.
 //!
 //! The search for hyperparameters may use a seeded choice of the factors (each with neighbours among all rows), which is
-//! an unbiased estimate of the sum. The neighbours are taken anew when the length scales have moved.
+//! an unbiased estimate of the sum. The neighbours are chosen again when the length scales have moved.
+//!
+//! In: standardised rows and hyperparameters. Out: likelihood, gradient, predictions. A matrix that is not positive
+//! definite with the largest jitter is an error.
 
 use std::f64::consts::TAU;
 
 use rayon::prelude::*;
 
-use super::Fault;
+use super::RegressionError;
 use super::basis::{Basis, Coefficients};
 use super::jitter::{Jitter, until_positive};
+use super::kd_tree::Tree;
 use super::plan::{Plan, Values, Work};
-use super::tree::Tree;
 
-/// Rows that one thread takes at a time; sums are the same for any number of threads.
+/// Rows per task; sums are the same for any number of threads.
 const CHUNK: usize = 64;
 
 /// Standardised rows in the order of conditioning.
 #[derive(Debug, Clone)]
-pub(super) struct Data {
+pub(super) struct StandardisedRows {
     pub dimensions: usize,
     pub inputs: Vec<f64>,
     pub targets: Vec<f64>,
     pub basis: Basis,
 }
 
-impl Data {
+impl StandardisedRows {
     pub(super) fn row(&self, at: usize) -> &[f64] {
         &self.inputs[at * self.dimensions..][..self.dimensions]
     }
@@ -49,13 +52,13 @@ impl Data {
 
 /// Factors: rows and their neighbours.
 #[derive(Debug, Clone)]
-pub(super) struct Factors {
+pub(super) struct ConditionalFactors {
     pub rows: Vec<u32>,
     neighbours: Vec<Vec<u32>>,
 }
 
 /// Sums over factors.
-pub(super) struct Sums {
+pub(super) struct LikelihoodSums {
     /// Minus the log density.
     pub value: f64,
     pub gradient: Vec<f64>,
@@ -63,36 +66,42 @@ pub(super) struct Sums {
     pub jitter: Jitter,
 }
 
-/// Some factors, with what they add to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
-struct Part {
-    factors: Vec<Factor>,
+/// A batch of factors, with their contribution to `[y H]' K^-1 [y H]` and to the logarithms of the variances.
+struct FactorBatch {
+    factors: Vec<ConditionalFactor>,
     g: Vec<f64>,
     log: f64,
 }
 
-/// What the first pass leaves for the second.
-struct Factor {
+/// Result of the first pass for the second.
+struct ConditionalFactor {
     q: Vec<f64>,
     /// `K^-1` on targets and basis, column after column.
     a: Vec<f64>,
     jitter: f64,
 }
 
-impl Factors {
+impl ConditionalFactors {
     /// Neighbours of the given rows among the rows before each.
-    pub(super) fn new(data: &Data, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
+    pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
         let tree = Tree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
         let neighbours = rows.par_iter().with_min_len(CHUNK).map(of).collect();
         Self { rows, neighbours }
     }
 
-    /// Minus the log density of the rows given their neighbours, its gradient (if asked for) and the coefficients.
-    pub(super) fn sums(&self, data: &Data, plan: &Plan, theta: &[f64], with_gradient: bool) -> Result<Sums, Fault> {
+    /// Minus the log density of the rows given their neighbours, its gradient (if requested) and the coefficients.
+    pub(super) fn sums(
+        &self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        theta: &[f64],
+        with_gradient: bool,
+    ) -> Result<LikelihoodSums, RegressionError> {
         let values = plan.values(theta);
         let size = data.basis.size(data.dimensions);
         let width = size + 1;
-        let first: Vec<Result<Part, Fault>> = (self.rows.par_chunks(CHUNK))
+        let first: Vec<Result<FactorBatch, RegressionError>> = (self.rows.par_chunks(CHUNK))
             .zip(self.neighbours.par_chunks(CHUNK))
             .map_init(Scratch::default, |scratch, (rows, near)| scratch.part(data, plan, &values, rows, near))
             .collect();
@@ -109,10 +118,17 @@ impl Factors {
         value += 0.5 * coefficients.squared_norm;
         let gradient =
             if with_gradient { self.gradient(data, plan, &values, &factors, &coefficients.beta) } else { vec![] };
-        Ok(Sums { value, gradient, coefficients, jitter })
+        Ok(LikelihoodSums { value, gradient, coefficients, jitter })
     }
 
-    fn gradient(&self, data: &Data, plan: &Plan, values: &Values, factors: &[Vec<Factor>], beta: &[f64]) -> Vec<f64> {
+    fn gradient(
+        &self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        values: &Values,
+        factors: &[Vec<ConditionalFactor>],
+        beta: &[f64],
+    ) -> Vec<f64> {
         let count = plan.parameters.len();
         let parts: Vec<Vec<f64>> = (self.neighbours.par_chunks(CHUNK))
             .zip(self.rows.par_chunks(CHUNK).zip(factors))
@@ -145,7 +161,7 @@ struct Scratch {
 }
 
 impl Scratch {
-    fn gather(&mut self, data: &Data, row: u32, near: &[u32]) {
+    fn gather(&mut self, data: &StandardisedRows, row: u32, near: &[u32]) {
         self.rows.clear();
         self.rows.extend_from_slice(near);
         self.rows.push(row);
@@ -164,14 +180,14 @@ impl Scratch {
 
     fn part(
         &mut self,
-        data: &Data,
+        data: &StandardisedRows,
         plan: &Plan,
         values: &Values,
         rows: &[u32],
         neighbours: &[Vec<u32>],
-    ) -> Result<Part, Fault> {
+    ) -> Result<FactorBatch, RegressionError> {
         let width = data.basis.size(data.dimensions) + 1;
-        let mut part = Part { factors: Vec::with_capacity(rows.len()), g: vec![0.0; width * width], log: 0.0 };
+        let mut part = FactorBatch { factors: Vec::with_capacity(rows.len()), g: vec![0.0; width * width], log: 0.0 };
         for (row, near) in rows.iter().zip(neighbours) {
             let factor = self.factor(data, plan, values, *row, near)?;
             let (n, q) = (factor.q.len(), factor.q[factor.q.len() - 1]);
@@ -183,7 +199,14 @@ impl Scratch {
         Ok(part)
     }
 
-    fn factor(&mut self, data: &Data, plan: &Plan, values: &Values, row: u32, near: &[u32]) -> Result<Factor, Fault> {
+    fn factor(
+        &mut self,
+        data: &StandardisedRows,
+        plan: &Plan,
+        values: &Values,
+        row: u32,
+        near: &[u32],
+    ) -> Result<ConditionalFactor, RegressionError> {
         self.gather(data, row, near);
         let n = self.rows.len();
         let kernel = plan.evaluate(values, &self.squares, n * (n - 1) / 2 + 1, &mut self.work);
@@ -201,10 +224,17 @@ impl Scratch {
         let mut q = vec![0.0; n];
         q[n - 1] = 1.0 / self.matrix[n * n - 1];
         backward(&self.matrix, &mut q);
-        Ok(Factor { q, a, jitter })
+        Ok(ConditionalFactor { q, a, jitter })
     }
 
-    fn add_gradient(&mut self, plan: &Plan, values: &Values, factor: &Factor, beta: &[f64], gradient: &mut [f64]) {
+    fn add_gradient(
+        &mut self,
+        plan: &Plan,
+        values: &Values,
+        factor: &ConditionalFactor,
+        beta: &[f64],
+        gradient: &mut [f64],
+    ) {
         let (q, n) = (&factor.q, factor.q.len());
         let mut a = factor.a[..n].to_vec();
         for (k, coefficient) in beta.iter().enumerate() {
@@ -225,8 +255,8 @@ impl Scratch {
 }
 
 /// Cholesky factor (lower, column after column) of the kernel's lower triangle with prior and noise on the diagonal;
-/// gives the jitter that was needed, as part of the prior variance.
-fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, values: &Values) -> Result<f64, Fault> {
+/// returns the jitter, as part of the prior variance.
+fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, values: &Values) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
         let mut from = 0;
@@ -245,7 +275,7 @@ fn cholesky(matrix: &mut [f64], n: usize) -> bool {
     for j in 0..n {
         let (before, rest) = matrix.split_at_mut(j * n);
         let column = &mut rest[j..n];
-        // Four columns at a time: the loads and stores of this one are what costs.
+        // Four columns at a time: the loads and stores of this column dominate the cost.
         let mut k = 0;
         while k + 4 <= j {
             let c = |i: usize| &before[(k + i) * n + j..(k + i + 1) * n];
@@ -293,10 +323,10 @@ fn backward(matrix: &[f64], b: &mut [f64]) {
     }
 }
 
-/// Everything a prediction needs.
+/// State for predictions.
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
-    pub data: Data,
+    pub data: StandardisedRows,
     pub plan: Plan,
     pub values: Values,
     pub coefficients: Coefficients,
@@ -305,19 +335,29 @@ pub(super) struct Posterior {
 }
 
 impl Posterior {
-    pub(super) fn new(data: Data, plan: Plan, theta: &[f64], coefficients: Coefficients, neighbours: usize) -> Self {
+    pub(super) fn new(
+        data: StandardisedRows,
+        plan: Plan,
+        theta: &[f64],
+        coefficients: Coefficients,
+        neighbours: usize,
+    ) -> Self {
         let values = plan.values(theta);
         let tree = Tree::new(&data.inputs, &plan.metric(&values));
         Self { data, plan, values, coefficients, neighbours, tree }
     }
 
-    /// Mean and variance of the function at standardised rows; every row of `but` is left out for its own query.
-    pub(super) fn predict(&self, queries: &[f64], but: Option<&[u32]>) -> Result<Vec<(f64, f64)>, Fault> {
+    /// Mean and variance of the function at standardised rows; row `excluded[k]` is left out of query `k`.
+    pub(super) fn predict(
+        &self,
+        queries: &[f64],
+        excluded: Option<&[u32]>,
+    ) -> Result<Vec<(f64, f64)>, RegressionError> {
         let d = self.data.dimensions;
-        let parts: Vec<Result<Vec<(f64, f64)>, Fault>> = (queries.par_chunks(CHUNK * d).enumerate())
+        let parts: Vec<Result<Vec<(f64, f64)>, RegressionError>> = (queries.par_chunks(CHUNK * d).enumerate())
             .map_init(Scratch::default, |scratch, (chunk, rows)| {
                 let one = |(at, row): (usize, &[f64])| {
-                    self.one(scratch, row, but.map(|but| but[chunk * CHUNK + at] as usize))
+                    self.one(scratch, row, excluded.map(|excluded| excluded[chunk * CHUNK + at] as usize))
                 };
                 rows.chunks_exact(d).enumerate().map(one).collect()
             })
@@ -329,8 +369,8 @@ impl Posterior {
         Ok(all)
     }
 
-    fn one(&self, scratch: &mut Scratch, row: &[f64], but: Option<usize>) -> Result<(f64, f64), Fault> {
-        let near = self.tree.nearest(row, self.neighbours, self.data.len(), but);
+    fn one(&self, scratch: &mut Scratch, row: &[f64], excluded: Option<usize>) -> Result<(f64, f64), RegressionError> {
+        let near = self.tree.nearest(row, self.neighbours, self.data.len(), excluded);
         let (Some((last, rest)), n) = (near.split_last(), near.len()) else {
             let h: Vec<f64> = (0..self.coefficients.beta.len()).map(|k| self.data.basis.value(row, k)).collect();
             let variance = self.values.prior_variance + self.coefficients.variance(&h);

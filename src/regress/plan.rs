@@ -1,27 +1,28 @@
-//! A kernel made ready for arithmetic: its parameters laid out in one vector, its values over a block of pairs of rows,
-//! and the derivative of any sum of them by every parameter (reverse mode, exact).
+//! A kernel prepared for evaluation: its parameters in one vector, its values over a block of pairs of rows, and the
+//! derivative of any weighted sum of them by every parameter (reverse mode, exact).
 //!
 //! A block of pairs comes as *squares*: for every input a stripe of `count` squared differences. Parameters are natural
 //! logarithms: of length scales, of `alpha`, of standard deviations (signal, then the noise, which is always the last).
+//! Inputs are not checked: a NaN stays a NaN.
 
 use faer::traits::pulp::Arch;
 
 use super::kernel::{Kernel, Node, Shape};
-use super::wide;
+use super::vector_math;
 
-/// What a parameter is.
+/// Kind of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Role {
+pub(super) enum ParameterRole {
     Length,
     Alpha,
     Signal,
     Noise,
 }
 
-/// One parameter: what it is and how it is called in reports.
+/// One parameter: kind and name in reports.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Parameter {
-    pub role: Role,
+    pub role: ParameterRole,
     pub name: String,
 }
 
@@ -35,7 +36,7 @@ struct Leaf {
 }
 
 #[derive(Debug, Clone)]
-enum Step {
+enum PlanStep {
     Leaf(usize),
     Sum(Vec<usize>),
     Product(Vec<usize>),
@@ -47,11 +48,11 @@ pub(super) struct Plan {
     pub dimensions: usize,
     ard: bool,
     leaves: Vec<Leaf>,
-    steps: Vec<Step>,
+    steps: Vec<PlanStep>,
     pub parameters: Vec<Parameter>,
 }
 
-/// Parameters of the leaves as the loops need them.
+/// Parameters of the leaves in the form that the loops use.
 #[derive(Debug, Clone)]
 pub(super) struct Values {
     leaves: Vec<LeafValues>,
@@ -69,7 +70,7 @@ struct LeafValues {
     variance: f64,
 }
 
-/// Memory of one evaluation, used again from block to block.
+/// Memory of one evaluation, reused from block to block.
 #[derive(Debug, Default)]
 pub(super) struct Work {
     values: Vec<Vec<f64>>,
@@ -83,20 +84,20 @@ impl Plan {
     pub(super) fn new(kernel: &Kernel, dimensions: usize, ard: bool) -> Self {
         let mut plan = Self { dimensions, ard, leaves: vec![], steps: vec![], parameters: vec![] };
         plan.add(&kernel.root, true);
-        plan.parameters.push(Parameter { role: Role::Noise, name: "noise_sd".to_owned() });
+        plan.parameters.push(Parameter { role: ParameterRole::Noise, name: "noise_sd".to_owned() });
         plan
     }
 
     /// Adds a node after its children; `scaled` = it has a standard deviation of its own.
     fn add(&mut self, node: &Node, scaled: bool) -> usize {
         let step = match node {
-            Node::Leaf(shape) => Step::Leaf(self.add_leaf(*shape, scaled)),
+            Node::Leaf(shape) => PlanStep::Leaf(self.add_leaf(*shape, scaled)),
             Node::Sum(children) => {
-                Step::Sum(children.iter().enumerate().map(|(k, child)| self.add(child, scaled || k > 0)).collect())
+                PlanStep::Sum(children.iter().enumerate().map(|(k, child)| self.add(child, scaled || k > 0)).collect())
             }
-            Node::Product(children) => {
-                Step::Product(children.iter().enumerate().map(|(k, child)| self.add(child, scaled && k == 0)).collect())
-            }
+            Node::Product(children) => PlanStep::Product(
+                children.iter().enumerate().map(|(k, child)| self.add(child, scaled && k == 0)).collect(),
+            ),
         };
         self.steps.push(step);
         self.steps.len() - 1
@@ -108,7 +109,7 @@ impl Plan {
         for d in 0..if self.ard { self.dimensions } else { 1 } {
             let name =
                 if self.ard { format!("{label}.length_scale_{}", d + 1) } else { format!("{label}.length_scale") };
-            self.parameters.push(Parameter { role: Role::Length, name });
+            self.parameters.push(Parameter { role: ParameterRole::Length, name });
         }
         let mut optional = |wanted: bool, role, name: &str| {
             wanted.then(|| {
@@ -116,8 +117,8 @@ impl Plan {
                 self.parameters.len() - 1
             })
         };
-        let alpha = optional(shape == Shape::RationalQuadratic, Role::Alpha, "alpha");
-        let signal = optional(scaled, Role::Signal, "signal_sd");
+        let alpha = optional(shape == Shape::RationalQuadratic, ParameterRole::Alpha, "alpha");
+        let signal = optional(scaled, ParameterRole::Signal, "signal_sd");
         self.leaves.push(Leaf { shape, lengths, alpha, signal });
         self.leaves.len() - 1
     }
@@ -140,7 +141,7 @@ impl Plan {
         }
     }
 
-    /// Weights of the inputs in a distance that says which rows are near: of the shortest length scale of each.
+    /// Weights of the inputs in the distance between rows: by the shortest length scale of each.
     pub(super) fn metric(&self, values: &Values) -> Vec<f64> {
         let of = |d: usize| values.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
         (0..self.dimensions).map(of).collect()
@@ -167,14 +168,14 @@ impl Plan {
         self.set_adjoint(self.steps.len() - 1, weights, work);
         for at in (0..self.steps.len()).rev() {
             match &self.steps[at] {
-                Step::Leaf(leaf) => self.leaf_gradient(at, *leaf, values, squares, work, gradient),
-                Step::Sum(children) => {
+                PlanStep::Leaf(leaf) => self.leaf_gradient(at, *leaf, values, squares, work, gradient),
+                PlanStep::Sum(children) => {
                     let (below, here) = work.adjoints.split_at_mut(at);
                     for child in children {
                         below[*child].clone_from(&here[0]);
                     }
                 }
-                Step::Product(children) => product_adjoints(at, children, work),
+                PlanStep::Product(children) => product_adjoints(at, children, work),
             }
         }
     }
@@ -219,15 +220,15 @@ impl Plan {
             let out = &mut here[0];
             out.resize(count, 0.0);
             match &self.steps[at] {
-                Step::Leaf(leaf) => {
+                PlanStep::Leaf(leaf) => {
                     distances(&values.leaves[*leaf].inverse_squares, squares, out);
                     let (slope, alpha) = (&mut work.slopes[*leaf], &mut work.alphas[*leaf]);
                     slope.resize(if slopes { count } else { 0 }, 0.0);
                     alpha.resize(slope.len(), 0.0);
                     shape_values(self.leaves[*leaf].shape, &values.leaves[*leaf], out, slope, alpha);
                 }
-                Step::Sum(children) => combine(below, children, out, |total, value| total + value),
-                Step::Product(children) => combine(below, children, out, |total, value| total * value),
+                PlanStep::Sum(children) => combine(below, children, out, |total, value| total + value),
+                PlanStep::Product(children) => combine(below, children, out, |total, value| total * value),
             }
         }
     }
@@ -235,7 +236,7 @@ impl Plan {
 
 #[inline(always)]
 fn dot_product(a: &[f64], b: &[f64]) -> f64 {
-    // Eight sums, so that the compiler may do them at once.
+    // Eight sums, so that the compiler can vectorise them.
     let mut sums = [0.0; 8];
     let (a_chunks, b_chunks) = (a.chunks_exact(8), b.chunks_exact(8));
     let rest: f64 = a_chunks.remainder().iter().zip(b_chunks.remainder()).map(|(x, y)| x * y).sum();
@@ -288,7 +289,7 @@ fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
     });
 }
 
-/// Turns squared distances into values; slopes and alphas are filled when they have room.
+/// Replaces squared distances by values; fills slopes and alphas if they have elements.
 fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut [f64], alphas: &mut [f64]) {
     /// Keeps the division by a distance finite; the slope is then multiplied by squares that are 0.
     const TINY: f64 = 1e-150;
@@ -296,28 +297,28 @@ fn shape_values(shape: Shape, values: &LeafValues, out: &mut [f64], slopes: &mut
     match shape {
         Shape::Exponential => fill(out, slopes, |r2| {
             let r = r2.sqrt();
-            let k = s * wide::exp(-r);
+            let k = s * vector_math::exp(-r);
             (k, -0.5 * k / r.max(TINY))
         }),
         Shape::Matern32 => fill(out, slopes, |r2| {
             let u = (3.0 * r2).sqrt();
-            let e = s * wide::exp(-u);
+            let e = s * vector_math::exp(-u);
             ((1.0 + u) * e, -1.5 * e)
         }),
         Shape::Matern52 => fill(out, slopes, |r2| {
             let u = (5.0 * r2).sqrt();
-            let e = s * wide::exp(-u);
+            let e = s * vector_math::exp(-u);
             ((1.0 + u + u * u / 3.0) * e, -5.0 / 6.0 * (1.0 + u) * e)
         }),
         Shape::SquaredExponential => fill(out, slopes, |r2| {
-            let k = s * wide::exp(-0.5 * r2);
+            let k = s * vector_math::exp(-0.5 * r2);
             (k, -0.5 * k)
         }),
         Shape::RationalQuadratic => {
             let power = |r2: f64| {
                 let base = 1.0 + 0.5 / a * r2;
-                let log = wide::ln(base);
-                (s * wide::exp(-a * log), base, log)
+                let log = vector_math::ln(base);
+                (s * vector_math::exp(-a * log), base, log)
             };
             if !alphas.is_empty() {
                 Arch::new().dispatch(|| {
@@ -368,10 +369,10 @@ mod tests {
             let plan = Plan::new(&name.parse().expect(name), 1, false);
             let theta: Vec<f64> = (plan.parameters.iter())
                 .map(|p| match p.role {
-                    Role::Length => 2.0_f64.ln(),
-                    Role::Alpha => 0.7_f64.ln(),
-                    Role::Signal => 3.0_f64.ln(),
-                    Role::Noise => 0.1_f64.ln(),
+                    ParameterRole::Length => 2.0_f64.ln(),
+                    ParameterRole::Alpha => 0.7_f64.ln(),
+                    ParameterRole::Signal => 3.0_f64.ln(),
+                    ParameterRole::Noise => 0.1_f64.ln(),
                 })
                 .collect();
             let values = plan.values(&theta);
@@ -415,10 +416,10 @@ mod tests {
     }
 
     #[test]
-    fn every_parameter_can_be_told_from_the_others() {
+    fn every_parameter_can_be_identified() {
         let names = |text: &str| -> Vec<String> {
             let plan = Plan::new(&text.parse().expect(text), 1, false);
-            plan.parameters.into_iter().filter(|p| p.role == Role::Signal).map(|p| p.name).collect()
+            plan.parameters.into_iter().filter(|p| p.role == ParameterRole::Signal).map(|p| p.name).collect()
         };
         assert_eq!(names("exponential * matern32"), ["exponential_1.signal_sd"]);
         assert_eq!(

@@ -1,22 +1,22 @@
-//! Models as text, and back.
+//! Saves models as text and loads them.
 //!
 //! Two lines of JSON: a header with the version and a checksum of the second line, then the model: its rows
-//! (standardised), hyperparameters and outcome. What can be computed from these is computed again when it is loaded, which
-//! takes an exact model n^3 operations.
+//! (standardised), hyperparameters and outcome. Loading recomputes everything else, which takes n^3 operations for an exact
+//! model. A damaged text or one of another version is an error.
 
 use serde::{Deserialize, Serialize};
 
 use super::basis::Coefficients;
 use super::calibration::Calibration;
-use super::model::{Model, Outcome, Parts, Posterior, Spec, threads};
-use super::nearest::Data;
+use super::model::{FitOutcome, Model, ModelContents, ModelSpec, Posterior, threads};
+use super::nearest::StandardisedRows;
 use super::plan::Plan;
 use super::scale::Scale;
-use super::{Fault, Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, exact, inducing, nearest};
+use super::{Form, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, RegressionError, exact, inducing, nearest};
 
-/// What the header says it is.
+/// Format name in the header.
 const FORMAT: &str = "packwatch gaussian process";
-/// Version written; older ones are read as long as they exist, newer ones are refused.
+/// Version of the format; others are rejected.
 const VERSION: u32 = 1;
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -30,18 +30,18 @@ struct Header {
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Body {
-    spec: Spec,
+    spec: ModelSpec,
     scale: Scale,
     theta: Vec<f64>,
-    outcome: Outcome,
+    outcome: FitOutcome,
     inputs: Vec<f64>,
     targets: Vec<f64>,
-    /// Coefficients and their covariance, of the form that does not compute them again.
+    /// Coefficients and their covariance, where loading does not recompute them.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta: Vec<f64>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     beta_covariance: Vec<f64>,
-    /// Rows that were left out for the intervals, and their ratios.
+    /// Rows left out for the intervals, and their ratios.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     left_out: Vec<u32>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -51,7 +51,7 @@ struct Body {
     points: Vec<f64>,
 }
 
-/// FNV-1a, 64 bits: finds damage, proves no origin.
+/// FNV-1a, 64 bits: detects damage, is no signature.
 fn checksum(text: &str) -> String {
     let hash = text
         .bytes()
@@ -59,13 +59,13 @@ fn checksum(text: &str) -> String {
     format!("{hash:016x}")
 }
 
-fn damaged(what: impl std::fmt::Display) -> Fault {
-    Fault::Saved(format!("damaged: {what}"))
+fn damaged(what: impl std::fmt::Display) -> RegressionError {
+    RegressionError::Saved(format!("damaged: {what}"))
 }
 
 impl Model {
     /// The model as text, two lines.
-    pub fn save(&self) -> Result<String, Fault> {
+    pub fn save(&self) -> Result<String, RegressionError> {
         let data = self.posterior.data();
         let mut body = Body {
             spec: self.spec.clone(),
@@ -88,22 +88,25 @@ impl Model {
             }
             Posterior::Inducing(posterior) => body.points = posterior.points().to_vec(),
         }
-        let json = |error: serde_json::Error| Fault::Saved(format!("cannot be written: {error}"));
+        let json = |error: serde_json::Error| RegressionError::Saved(format!("cannot be written: {error}"));
         let body = serde_json::to_string(&body).map_err(json)?;
         let header = Header { format: FORMAT.to_owned(), version: VERSION, checksum: checksum(&body) };
         Ok(format!("{}\n{body}\n", serde_json::to_string(&header).map_err(json)?))
     }
 
-    /// A model from its text, to work with so many threads.
-    pub fn load(text: &str, thread_count: usize) -> Result<Self, Fault> {
+    /// Loads a model from its text, with a pool of `thread_count` threads.
+    pub fn load(text: &str, thread_count: usize) -> Result<Self, RegressionError> {
         let (header, rest) = text.split_once('\n').ok_or_else(|| damaged("one line only, must be two"))?;
         let header: Header = serde_json::from_str(header).map_err(|e| damaged(format!("line 1: {e}")))?;
         if header.format != FORMAT {
-            return Err(Fault::Saved(format!("line 1: format = {:?}, must be {FORMAT:?}", header.format)));
+            return Err(RegressionError::Saved(format!("line 1: format = {:?}, must be {FORMAT:?}", header.format)));
         }
         if header.version != VERSION {
             let newer = if header.version > VERSION { "; a newer packwatch wrote it" } else { "" };
-            return Err(Fault::Saved(format!("line 1: version = {}, must be {VERSION}{newer}", header.version)));
+            return Err(RegressionError::Saved(format!(
+                "line 1: version = {}, must be {VERSION}{newer}",
+                header.version
+            )));
         }
         let body = rest.trim_end_matches(['\n', '\r']);
         let found = checksum(body);
@@ -117,8 +120,8 @@ impl Model {
 }
 
 impl Body {
-    /// Lengths that fit, numbers that are finite: nothing later may index beyond an end.
-    fn check(&self) -> Result<(), Fault> {
+    /// Checks that lengths match and numbers are finite, so that no index is out of bounds later.
+    fn check(&self) -> Result<(), RegressionError> {
         let (d, n) = (self.spec.dimensions, self.targets.len());
         let same = |what: &str, found: usize, expected: usize| {
             if found == expected { Ok(()) } else { Err(damaged(format!("{what} = {found}, must be {expected}"))) }
@@ -163,12 +166,12 @@ impl Body {
         if finite && positive && small && rows { Ok(()) } else { Err(damaged("a number out of its range")) }
     }
 
-    fn model(self, thread_count: usize) -> Result<Model, Fault> {
+    fn model(self, thread_count: usize) -> Result<Model, RegressionError> {
         let pool = threads(thread_count)?;
         let (spec, theta) = (self.spec, self.theta);
         let plan = Plan::new(&spec.kernel, spec.dimensions, spec.ard);
         let (dimensions, basis) = (spec.dimensions, spec.basis);
-        let data = Data { dimensions, inputs: self.inputs, targets: self.targets, basis };
+        let data = StandardisedRows { dimensions, inputs: self.inputs, targets: self.targets, basis };
         let posterior = pool.install(|| match spec.form {
             Form::Exact => Ok(Posterior::Exact(Box::new(exact::Posterior::new(data, plan, &theta)?))),
             Form::Nearest { neighbours } => {
@@ -179,14 +182,14 @@ impl Body {
             }
             Form::Inducing { .. } => {
                 let posterior = inducing::Posterior::new(&data, &plan, &theta, &self.points)?;
-                Ok::<_, Fault>(Posterior::Inducing(Box::new(posterior)))
+                Ok::<_, RegressionError>(Posterior::Inducing(Box::new(posterior)))
             }
         })?;
         let calibration = match self.left_out.len() {
             0 => Calibration::none(),
             _ => Calibration::new(posterior.data(), self.left_out, self.ratios),
         };
-        let parts = Parts { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration };
-        Ok(Model::assemble(parts, pool))
+        let contents = ModelContents { spec, scale: self.scale, theta, posterior, outcome: self.outcome, calibration };
+        Ok(Model::assemble(contents, pool))
     }
 }

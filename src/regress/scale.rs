@@ -1,8 +1,10 @@
-//! Checking of rows; mean and standard deviation of inputs and targets, and the way there and back.
+//! Checks rows; standardises inputs and targets by mean and standard deviation.
+//!
+//! In: rows. Out: standardised rows. Bad lengths and numbers are errors with the row's line.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Basis, Fault, MAX_DIMENSIONS, Rows};
+use super::{Basis, MAX_DIMENSIONS, RegressionError, TrainingRows};
 
 /// Shift and scale of every input and of the target.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -14,20 +16,20 @@ pub(super) struct Scale {
     pub target_deviation: f64,
 }
 
-/// Refuses rows that cannot be learned from.
-pub(super) fn check(rows: &Rows) -> Result<(), Fault> {
+/// Rejects rows of wrong lengths or with numbers that are not finite.
+pub(super) fn check(rows: &TrainingRows) -> Result<(), RegressionError> {
     let (d, n) = (rows.dimensions, rows.targets.len());
     if d == 0 || d > MAX_DIMENSIONS {
-        return Err(Fault::range("inputs of a row", d, format!("1 to {MAX_DIMENSIONS}")));
+        return Err(RegressionError::range("inputs of a row", d, format!("1 to {MAX_DIMENSIONS}")));
     }
     if rows.inputs.len() != d * n {
-        return Err(Fault::range("number of inputs", rows.inputs.len(), format!("{d} x {n} rows")));
+        return Err(RegressionError::range("number of inputs", rows.inputs.len(), format!("{d} x {n} rows")));
     }
     if n < 2 {
-        return Err(Fault::range("rows", n, "2 or more"));
+        return Err(RegressionError::range("rows", n, "2 or more"));
     }
     if !rows.lines.is_empty() && rows.lines.len() != n {
-        return Err(Fault::range("line numbers", rows.lines.len(), format!("none or {n}")));
+        return Err(RegressionError::range("line numbers", rows.lines.len(), format!("none or {n}")));
     }
     let line = |row: usize| rows.lines.get(row).copied().unwrap_or(row as u64 + 1);
     let bad_input = rows.inputs.iter().position(|x| !x.is_finite());
@@ -35,11 +37,11 @@ pub(super) fn check(rows: &Rows) -> Result<(), Fault> {
     let target_first = bad_target.is_some_and(|row| bad_input.is_none_or(|at| row < at / d));
     match (bad_input, bad_target) {
         (_, Some(row)) if target_first => {
-            Err(Fault::NotFinite { line: line(row), what: "target".to_owned(), found: rows.targets[row] })
+            Err(RegressionError::NotFinite { line: line(row), what: "target".to_owned(), found: rows.targets[row] })
         }
         (Some(at), _) => {
             let what = format!("input {}", at % d + 1);
-            Err(Fault::NotFinite { line: line(at / d), what, found: rows.inputs[at] })
+            Err(RegressionError::NotFinite { line: line(at / d), what, found: rows.inputs[at] })
         }
         _ => Ok(()),
     }
@@ -48,7 +50,7 @@ pub(super) fn check(rows: &Rows) -> Result<(), Fault> {
 /// Mean and standard deviation; deviation 1 where the values do not differ.
 fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
     let count = values.clone().count() as f64;
-    // From the first value on: the sum of many equal ones would not be exact.
+    // Relative to the first value: the sum of many equal ones would not be exact.
     let first = values.clone().next().unwrap_or(0.0);
     let mean = first + values.clone().map(|v| v - first).sum::<f64>() / count;
     let deviation = (values.map(|v| (v - mean) * (v - mean)).sum::<f64>() / count).sqrt();
@@ -57,8 +59,8 @@ fn moments(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
 }
 
 impl Scale {
-    /// The scale of checked rows. With the zero basis the target is not shifted: 0 is then what is meant.
-    pub(super) fn of(rows: &Rows, standardise: bool, basis: Basis) -> Self {
+    /// The scale of checked rows. With the zero basis the target is not shifted.
+    pub(super) fn of(rows: &TrainingRows, standardise: bool, basis: Basis) -> Self {
         let column = |d: usize| rows.inputs.iter().skip(d).step_by(rows.dimensions).copied();
         let inputs: Vec<(f64, f64)> =
             (0..rows.dimensions).map(|d| if standardise { moments(column(d)) } else { (0.0, 1.0) }).collect();
@@ -71,7 +73,7 @@ impl Scale {
         }
     }
 
-    /// The first column whose spread is beyond what can be computed with: `input 2` or `target`.
+    /// The first column whose mean or deviation overflows: `input 2` or `target`.
     pub(super) fn too_wide(&self) -> Option<String> {
         let target = (!self.target_deviation.is_finite() || !self.target_mean.is_finite()).then(|| "target".to_owned());
         let is_wide = |(mean, deviation): (&f64, &f64)| !mean.is_finite() || !deviation.is_finite();
@@ -99,19 +101,19 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_not_finite_is_refused_with_its_line() {
+    fn a_number_that_is_not_finite_is_rejected_with_its_line() {
         let (inputs, targets) = ([1.0, 2.0, 3.0, f64::NAN], [1.0, 2.0]);
-        let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[12, 19] };
+        let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[12, 19] };
         assert_eq!(check(&rows).expect_err("NaN").to_string(), "line 19: input 2 = NaN, must be a finite number");
-        let rows = Rows { inputs: &inputs[..2], dimensions: 1, targets: &[1.0, f64::INFINITY], lines: &[] };
+        let rows = TrainingRows { inputs: &inputs[..2], dimensions: 1, targets: &[1.0, f64::INFINITY], lines: &[] };
         assert_eq!(check(&rows).expect_err("inf").to_string(), "line 2: target = inf, must be a finite number");
-        let rows = Rows { inputs: &inputs[..3], dimensions: 2, targets: &targets, lines: &[] };
+        let rows = TrainingRows { inputs: &inputs[..3], dimensions: 2, targets: &targets, lines: &[] };
         assert_eq!(check(&rows).expect_err("short").to_string(), "number of inputs = 3, must be 2 x 2 rows");
     }
 
     #[test]
     fn constant_columns_keep_their_scale() {
-        let rows = Rows { inputs: &[5.0, 5.0, 5.0], dimensions: 1, targets: &[1.0, 2.0, 6.0], lines: &[] };
+        let rows = TrainingRows { inputs: &[5.0, 5.0, 5.0], dimensions: 1, targets: &[1.0, 2.0, 6.0], lines: &[] };
         let scale = Scale::of(&rows, true, Basis::Constant);
         assert_eq!((scale.means[0], scale.deviations[0], scale.target_mean), (5.0, 1.0, 3.0));
         assert_eq!(Scale::of(&rows, true, Basis::Zero).target_mean, 0.0);

@@ -2,7 +2,7 @@
 
 use std::ops::ControlFlow;
 
-use super::nearest::{Data, Factors};
+use super::nearest::{ConditionalFactors, StandardisedRows};
 use super::plan::Plan;
 use super::*;
 
@@ -16,7 +16,7 @@ fn noise(seed: u64) -> impl FnMut() -> f64 {
 }
 
 /// A wavy plane of two inputs with noise.
-fn made(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
+fn wavy_plane(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     let mut draw = noise(seed);
     let inputs: Vec<f64> = (0..2 * rows).map(|_| 2.0 * draw()).collect();
     let value = |row: &[f64]| (2.0 * row[0]).sin() + 0.5 * row[0] * row[1];
@@ -24,9 +24,9 @@ fn made(rows: usize, seed: u64) -> (Vec<f64>, Vec<f64>) {
     (inputs, targets)
 }
 
-fn data(rows: usize, basis: Basis) -> Data {
-    let (inputs, targets) = made(rows, 5);
-    Data { dimensions: 2, inputs, targets, basis }
+fn data(rows: usize, basis: Basis) -> StandardisedRows {
+    let (inputs, targets) = wavy_plane(rows, 5);
+    StandardisedRows { dimensions: 2, inputs, targets, basis }
 }
 
 const KERNELS: [&str; 3] =
@@ -60,7 +60,7 @@ fn gradients_of_all_forms_agree_with_finite_differences() {
             let posterior = exact::Posterior::new(data.clone(), plan.clone(), theta).expect("positive definite");
             (posterior.value, posterior.gradient())
         });
-        let factors = Factors::new(&data, (0..60).step_by(3).collect(), &[1.0, 1.0], 7);
+        let factors = ConditionalFactors::new(&data, (0..60).step_by(3).collect(), &[1.0, 1.0], 7);
         check_gradient(&plan, "nearest", |theta| {
             let sums = factors.sums(&data, &plan, theta, true).expect("positive definite");
             (sums.value, sums.gradient)
@@ -73,12 +73,12 @@ fn gradients_of_all_forms_agree_with_finite_differences() {
     }
 }
 
-fn fitted(form: Form, change: impl Fn(&mut Settings)) -> Model {
-    let (inputs, targets) = made(120, 5);
-    let mut settings = Settings::new("matern52".parse().expect("a kernel"), 120);
+fn fitted(form: Form, change: impl Fn(&mut GprSettings)) -> Model {
+    let (inputs, targets) = wavy_plane(120, 5);
+    let mut settings = GprSettings::new("matern52".parse().expect("a kernel"), 120);
     settings.form = form;
     change(&mut settings);
-    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
     fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect("a model")
 }
 
@@ -91,20 +91,20 @@ fn assert_close(found: &[Prediction], expected: &[Prediction], within: f64) {
 }
 
 #[test]
-fn the_sparse_forms_with_everything_are_the_exact_one() {
+fn the_sparse_forms_with_all_rows_agree_with_the_exact_form() {
     for basis in [Basis::Zero, Basis::Constant, Basis::Linear] {
-        let fixed = |settings: &mut Settings| {
+        let fixed = |settings: &mut GprSettings| {
             (settings.basis, settings.max_iterations, settings.calibrate) = (basis, 0, false);
         };
         let exact = fitted(Form::Exact, fixed);
-        let queries: Vec<f64> = made(40, 77).0;
+        let queries: Vec<f64> = wavy_plane(40, 77).0;
         let expected = exact.predict(&queries).expect("finite");
         for (form, within) in [(Form::Nearest { neighbours: 119 }, 1e-8), (Form::Inducing { points: 120 }, 1e-5)] {
             let sparse = fitted(form, fixed);
             let likelihoods = (sparse.log_marginal_likelihood(), exact.log_marginal_likelihood());
             assert!((likelihoods.0 - likelihoods.1).abs() < 1e3 * within, "{form:?}: {likelihoods:?}");
             if form == (Form::Nearest { neighbours: 119 }) {
-                // A prediction has one row more to look at than a factor: all but one of the exact one's.
+                // A prediction conditions on one row more than a factor.
                 continue;
             }
             assert_close(&sparse.predict(&queries).expect("finite"), &expected, within);
@@ -115,7 +115,7 @@ fn the_sparse_forms_with_everything_are_the_exact_one() {
 }
 
 #[test]
-fn rows_left_out_are_predicted_as_by_a_model_without_them() {
+fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
     let data = data(50, Basis::Zero);
     let plan = Plan::new(&"matern32".parse().expect("a kernel"), 2, false);
     let at = theta(&plan);
@@ -135,16 +135,16 @@ fn rows_left_out_are_predicted_as_by_a_model_without_them() {
 }
 
 #[test]
-fn the_search_finds_noise_and_function_again() {
+fn the_search_recovers_noise_and_function() {
     for form in [Form::Exact, Form::Nearest { neighbours: 25 }, Form::Inducing { points: 40 }] {
         let model = fitted(form, |settings| settings.restarts = 1);
         let hyperparameters = model.hyperparameters();
         let noise_sd = hyperparameters.last().expect("the noise is there").value;
-        // The noise of these 120 rows came out at 0.086. Inducing points are known to find too little: what they cannot
-        // follow counts as each row's own noise.
-        let lowest = if matches!(form, Form::Inducing { .. }) { 0.06 } else { 0.075 };
-        assert!((lowest..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
-        let (queries, targets) = made(400, 99);
+        // The exact noise of these 120 rows is 0.086. Inducing points underestimate it: deviations that they cannot represent
+        // count as noise of the single rows.
+        let minimum = if matches!(form, Form::Inducing { .. }) { 0.06 } else { 0.075 };
+        assert!((minimum..0.1).contains(&noise_sd), "{form:?}: {hyperparameters:?}");
+        let (queries, targets) = wavy_plane(400, 99);
         let predictions = model.predict(&queries).expect("finite");
         let score = score(&predictions, &targets);
         assert!(score.rmse < 0.15 && (0.90..0.99).contains(&score.coverage_95), "{form:?}: {score:?}");
@@ -153,7 +153,7 @@ fn the_search_finds_noise_and_function_again() {
 }
 
 #[test]
-fn a_given_start_is_the_model_when_nothing_is_searched() {
+fn without_a_search_the_given_start_is_the_model() {
     let start = [0.7, 1.4, 0.9, 0.2];
     let model = fitted(Form::Exact, |settings| {
         (settings.ard, settings.max_iterations) = (true, 0);
@@ -180,9 +180,9 @@ fn results_do_not_depend_on_the_number_of_threads() {
 fn equal_rows_with_hardly_any_noise_need_jitter_and_it_is_counted() {
     let inputs: Vec<f64> = (0..40).map(|k| f64::from(k / 4) * 1e-3).collect();
     let targets: Vec<f64> = inputs.iter().map(|x| x.sin()).collect();
-    let rows = Rows { inputs: &inputs, dimensions: 1, targets: &targets, lines: &[] };
+    let rows = TrainingRows { inputs: &inputs, dimensions: 1, targets: &targets, lines: &[] };
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
-        let mut settings = Settings::new("squared_exponential".parse().expect("a kernel"), 40);
+        let mut settings = GprSettings::new("squared_exponential".parse().expect("a kernel"), 40);
         (settings.form, settings.max_iterations) = (form, 0);
         settings.start = vec![3.0, 1.0, 1e-12];
         let model = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect("jitter helps");
@@ -208,7 +208,7 @@ fn a_model_survives_saving_and_loading() {
 }
 
 #[test]
-fn damaged_and_newer_models_are_refused() {
+fn damaged_and_newer_models_are_rejected() {
     let text = fitted(Form::Nearest { neighbours: 20 }, |settings| settings.max_iterations = 0).save().expect("text");
     let refused = |text: &str| Model::load(text, 1).expect_err("not sound").to_string();
     assert!(refused("").contains("one line only"));
@@ -221,24 +221,24 @@ fn damaged_and_newer_models_are_refused() {
 }
 
 #[test]
-fn the_watcher_can_end_the_work() {
-    let (inputs, targets) = made(100, 5);
-    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
-    let settings = Settings::new("exponential".parse().expect("a kernel"), 100);
+fn the_callback_can_cancel_the_fit() {
+    let (inputs, targets) = wavy_plane(100, 5);
+    let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let settings = GprSettings::new("exponential".parse().expect("a kernel"), 100);
     let mut calls = 0;
-    let mut watcher = |progress: Progress| {
+    let mut watcher = |progress: FitProgress| {
         calls += 1;
         if progress.iteration == 2 { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     };
-    assert_eq!(fit(&rows, &settings, &mut watcher).expect_err("cancelled"), Fault::Cancelled);
+    assert_eq!(fit(&rows, &settings, &mut watcher).expect_err("cancelled"), RegressionError::Cancelled);
     assert_eq!(calls, 3);
 }
 
 #[test]
 fn cross_validation_holds_every_row_out_once() {
-    let (inputs, targets) = made(203, 5);
-    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
-    let mut settings = Settings::new("matern52".parse().expect("a kernel"), 203);
+    let (inputs, targets) = wavy_plane(203, 5);
+    let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let mut settings = GprSettings::new("matern52".parse().expect("a kernel"), 203);
     settings.ard = true;
     let ticks = std::cell::Cell::new(0.0);
     let clock = || {
@@ -246,7 +246,7 @@ fn cross_validation_holds_every_row_out_once() {
         ticks.get()
     };
     let mut folds_seen = std::collections::BTreeSet::new();
-    let mut watcher = |progress: Progress| {
+    let mut watcher = |progress: FitProgress| {
         folds_seen.insert((progress.fold, progress.folds));
         ControlFlow::Continue(())
     };
@@ -262,11 +262,11 @@ fn cross_validation_holds_every_row_out_once() {
 }
 
 #[test]
-fn settings_out_of_range_are_refused() {
-    let (inputs, targets) = made(30, 5);
-    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
-    let refused = |change: &dyn Fn(&mut Settings)| {
-        let mut settings = Settings::new("exponential".parse().expect("a kernel"), 30);
+fn settings_out_of_range_are_rejected() {
+    let (inputs, targets) = wavy_plane(30, 5);
+    let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let refused = |change: &dyn Fn(&mut GprSettings)| {
+        let mut settings = GprSettings::new("exponential".parse().expect("a kernel"), 30);
         change(&mut settings);
         fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect_err("out of range").to_string()
     };
@@ -280,20 +280,20 @@ fn settings_out_of_range_are_refused() {
 }
 
 #[test]
-fn numbers_too_large_to_square_are_refused_and_not_told_as_certain() {
+fn numbers_too_large_to_square_are_rejected() {
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
         let model = fitted(form, |_| ());
         let told = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
-        // Either so far that nothing is known, or refused by its row.
+        // Either so distant that the prior applies, or rejected by row.
         match told {
             Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
             Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),
         }
     }
-    let (mut inputs, targets) = made(30, 5);
+    let (mut inputs, targets) = wavy_plane(30, 5);
     inputs.iter_mut().step_by(2).for_each(|x| *x *= 1e200);
-    let rows = Rows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
-    let settings = Settings::new("exponential".parse().expect("a kernel"), 30);
+    let rows = TrainingRows { inputs: &inputs, dimensions: 2, targets: &targets, lines: &[] };
+    let settings = GprSettings::new("exponential".parse().expect("a kernel"), 30);
     let fault = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect_err("too large").to_string();
     assert_eq!(fault, "input 1 = values whose mean or variance overflows, must be of a smaller size");
 }

@@ -23,8 +23,8 @@ def install():
 
 
 def python(*modules):
-    """An interpreter that has the modules: that of `--install`, or the one that runs us; None when neither does."""
-    for interpreter in (VENV / "bin/python3", sys.executable):
+    """An interpreter that has the modules: that of `--install`, or PACKWATCH_PYTHON or the one that runs this; None when neither does."""
+    for interpreter in (VENV / "bin/python3", os.environ.get("PACKWATCH_PYTHON", sys.executable)):
         command = [str(interpreter), "-c", "import " + ", ".join(modules)]
         try:
             if subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL).returncode == 0:

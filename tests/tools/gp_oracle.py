@@ -1,4 +1,4 @@
-"""scikit-learn's Gaussian process regression, exponential kernel, fixed hyperparameters: the second opinion of tests/gp_peer.rs.
+"""scikit-learn's Gaussian process regression, exponential kernel, fixed hyperparameters: the second opinion of tests/integration/gp_peer.rs.
 
 Standard input, a line each; every answer is one line on standard output:
   make N DIR   draws N rows of 3 inputs and 2000 queries, writes DIR/rows.f64 (inputs, targets, queries; little endian)

@@ -70,7 +70,7 @@ class Life:
         self.mode = "unknown"
         self.bad, self.untrusted = set(), set()
         self.alarms = {}  # (rule, cell, severity) of those raised: the last event about it
-        self.recharge = None  # the last told
+        self.recharge = None  # the last reported
         self.normalised = None
         self.life = dict.fromkeys(("RemainingCycles", "RemainingCyclesLow", "RemainingDays"))
 
@@ -276,7 +276,7 @@ def compare_alarm(result, life, time, values, told):
         result.value(time, "Alarm", "Acknowledged", values["Acknowledged"], event["acknowledged"])
         result.value(time, "Alarm", threshold, values[threshold], factor * event["threshold"])
     elif values["State"] == STATES["unknown"]:
-        # Not raised, and nobody can say whether it should be.
+        # Not raised, and it is unknown whether it should be.
         result.value(time, "Alarm", name, values[name], None)
         result.frames["Alarm unknown"] += 1
     else:

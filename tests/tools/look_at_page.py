@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Opens a page in a headless Chromium and tells what it asked for and what its console said.
+"""Opens a page in a headless Chromium and prints its requests and its console messages.
 
 usage: look_at_page.py CHROMIUM PAGE.html WIDTH HEIGHT light|dark [SHOT.png] [PRINT.pdf]
 

@@ -38,7 +38,7 @@ frames_of() { awk -v on="$2" '$1 ~ /^\(/ && $2 == on { print $3 }' "$1"; }
 # Sum of the last words of the lines with the expression: frames dropped, frames not sent.
 sum_of() { awk -v wanted="$2" '$0 ~ wanted { n += $NF } END { print n + 0 }' "$1"; }
 
-# replayed NAME CONFIG ARGS...: the journal of NAME replayed must give what NAME sent and told, byte for byte.
+# replayed NAME CONFIG ARGS...: the journal of NAME, replayed, must give the frames and events of NAME, byte for byte.
 replayed() {
     local name=$1 file=$2 base=$tmp/$1 what
     shift 2
@@ -49,10 +49,10 @@ replayed() {
     done
 }
 
-# restart_bar LOG...: how far a restarted daemon may be from one that went on, in points. 0.2, and on a machine on which a restart
+# restart_bar LOG...: how far a restarted daemon may be from one that kept running, in points. 0.2, and on a machine on which a restart
 # takes more than 2.5 s (the logs say how long it was away) what the drive's largest current moves meanwhile unseen: 6.2 A of
 # 2.6 Ah are 0.066 points a second. A tenth on top, for the time between the last sample seen and the state's stamp.
 restart_bar() {
-    cat -- "$@" | sed -nE 's/.*state taken up.* away=([0-9.]+).*/\1/p' |
+    cat -- "$@" | sed -nE 's/.*state (taken up|restored).* away=([0-9.]+).*/\2/p' |
         awk '$1 > away { away = $1 } END { print (away > 2.5 ? 0.073 * away + 0.02 : 0.2) }'
 }

@@ -2,10 +2,10 @@
 """What tests of faults share: a player that nothing stops, floods, and comparisons of what was announced, stored and true.
 
     fault_tools.py play LOG INTERFACE [--from SAMPLE]      a candump log in real time. While the interface is down or gone, frames are
-                                                           dropped and time goes on, as a pack does. SIGTERM parks it
-    fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers nobody configured
+                                                           dropped and time passes, as for a pack. SIGTERM parks it
+    fault_tools.py flood INTERFACE --seconds S [--rate N] [--ids N]   frames of identifiers that are not configured
     fault_tools.py clients SOCKET [--count N] [--seconds S]  clients of the status socket that never read; are others answered?
-    fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is nothing that was told missing?
+    fault_tools.py learned STATE [EVENTS...] [--exactly]   the store's capacities, half-cycles and alarms; is no reported event missing?
     fault_tools.py alarm DUMP RULE                         state of the rule's last alarm frame
     fault_tools.py same BEFORE AFTER                       two snapshots: is what was learned the same?
     fault_tools.py apart DUMP ID OTHER POINTS INTERFACE    status frames of two daemons: are they within so many points of SOC?
@@ -46,7 +46,7 @@ MOVING = (1, 3)  # charge, discharge
 # Of fast_pack.
 PERIOD_S, MAX_RATE_PER_S = 0.01, 0.32
 MEMORY = 300  # samples
-LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/restart.rs
+LOST = 0.75  # of the estimates within two deviations: below, a fault has put them wrong. How honest they are is judged in tests/integration/restart.rs
 TOO_LATE_S, STEP_S = 0.1, 600.0
 
 
@@ -87,7 +87,7 @@ class Truth:
 
     def errors(self, lines, after: int = -1) -> list[tuple[float, float]]:
         """Error and stated deviation of the estimates on the bus, once the sample `after` was on it. What the pack moved while the
-        player itself was late (a busy machine) is nobody's error."""
+        player itself was late (a busy machine) is no error."""
         sample, found = -1, []
         self.latest_s = 0.0
         late_s = collections.deque(maxlen=MEMORY)  # of each sample against its own time, of the last seconds
@@ -165,7 +165,7 @@ class Store:
         return all(now[: len(before)] == before for now, before in pairs)
 
 
-def told_of(files: list[Path]) -> tuple[int, int, int]:
+def reported_by(files: list[Path]) -> tuple[int, int, int]:
     """Capacities something was learned about, half-cycles and changes of alarms in files of events."""
     counts = [0, 0, 0]
     for line in (line for file in files for line in open(file)):
@@ -180,13 +180,13 @@ def told_of(files: list[Path]) -> tuple[int, int, int]:
 
 
 def learned(args) -> None:
-    """Told first: what is told while the store is read may be stored already."""
-    told, stored = told_of(args.events), Store(args.state).counts()
+    """Reads the reports first: what is reported while the store is read may be stored already."""
+    reported, stored = reported_by(args.events), Store(args.state).counts()
     print(" ".join(map(str, stored)))
-    if any(of_store < of_events for of_store, of_events in zip(stored, told)):
-        sys.exit(f"told {told}, stored only {stored} (capacities, half-cycles, alarms)")
-    if args.exactly and told != stored:
-        sys.exit(f"told {told}, stored {stored} (capacities, half-cycles, alarms)")
+    if any(of_store < of_events for of_store, of_events in zip(stored, reported)):
+        sys.exit(f"reported {reported}, stored only {stored} (capacities, half-cycles, alarms)")
+    if args.exactly and reported != stored:
+        sys.exit(f"reported {reported}, stored {stored} (capacities, half-cycles, alarms)")
 
 
 # ---- snapshots -----------------------------------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ def learned_of(snapshot: dict) -> tuple[list, list]:
 
 
 def comes_back(before: dict, after: dict) -> bool:
-    """Has a later state all of it? Other alarms may have been raised since (nobody fed it)."""
+    """Has a later state all of it? Other alarms may have been raised since (it had no input)."""
     (capacities, alarms), (later_capacities, later_alarms) = learned_of(before), learned_of(after)
     near = all(abs(now - then) < 1e-6 for then, now in zip(capacities, later_capacities, strict=True))
     return near and all(alarm in later_alarms for alarm in alarms)
@@ -311,7 +311,7 @@ def flood(args) -> None:
 
 
 def clients(args) -> None:
-    """Many at once, of whom none reads; a few come and go meanwhile and are answered, which shows that the others are in nobody's way."""
+    """Many at once, of whom none reads; a few come and go meanwhile and are answered, which shows that the others block no client."""
     def connected(path):
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         client.settimeout(10)
@@ -335,7 +335,7 @@ def clients(args) -> None:
         time.sleep(0.2)
     print(f"{len(idle)} clients that do not read, {answered} answers to others meanwhile, {refused} turned away")
     if not answered:
-        sys.exit("nobody was answered beside the clients that do not read")
+        sys.exit("no other client was answered next to those that do not read")
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 # shellcheck shell=bash
 # Helpers for tests of faults:   . "$(dirname "$0")/lib.sh"; . "$(dirname "$0")/daemon.sh"; . "$(dirname "$0")/faults.sh"
-# A daemon with its state on disk learns from fast_pack's pack while something happens to it. Each test tells, a line per fault,
-# what happened and what was learned, and in the end holds the store against what was told.
+# A daemon with its state on disk learns from fast_pack's pack while something happens to it. Each test prints a line per fault:
+# what happened and what was learned. In the end it compares the store with the reports.
 
 # Where `main` keeps its state; a test on a disk of its own says another.
 state=$tmp/state
@@ -29,7 +29,7 @@ sample() {
     echo $((16#${last:-0}))
 }
 
-# again WHAT...: the daemon `main` once more, after `stop main` or the like; what it told before counts on.
+# again WHAT...: the daemon `main` once more, after `stop main` or the like; its earlier reports still count.
 runs=0
 again() {
     local file
@@ -40,34 +40,34 @@ again() {
 
 # ---- what was learned ----------------------------------------------------------------------------------------------------------------
 
-# told EVENT: how many the daemon `main` has told, in all its runs.
-told() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
-# Capacities, half-cycles, alarms raised or cleared: told.
-told_all() { echo "$(told capacity) $(told half_cycle) $(told alarm)"; }
-# told_more EVENT COUNT: COUNT or more?
-told_more() { (($(told "$1") >= $2)); }
-learned_more() { told_more half_cycle "$1"; }
+# reported EVENT: how many the daemon `main` has reported, in all its runs.
+reported() { cat "$tmp"/main*.events | grep -E "\"event\":\"$1\"" | grep -cvE '"measured_ah":null|"change":"(suppressed|resumed)"' || true; }
+# Capacities, half-cycles, alarms raised or cleared, as reported.
+reported_all() { echo "$(reported capacity) $(reported half_cycle) $(reported alarm)"; }
+# reported_more EVENT COUNT: COUNT or more?
+reported_more() { (($(reported "$1") >= $2)); }
+learned_more() { reported_more half_cycle "$1"; }
 
 # fault NAME: from here on it happens.
 fault() {
-    fault_name=$1 fault_before=$(told_all)
+    fault_name=$1 fault_before=$(reported_all)
     running main || fail "$fault_name: the daemon is not running before"
 }
 
-# survived WHAT...: it is over; the daemon must be the same one, learn on, and have stored all it told.
+# survived WHAT...: it is over; the daemon must be the same one, keep learning, and have stored all its reports.
 survived() {
     local stored after
     running main || fail "$fault_name: the daemon ended"
-    wait_for 15 "learning after $fault_name" learned_more $(($(told half_cycle) + 4))
-    after=$(told_all)
+    wait_for 15 "learning after $fault_name" learned_more $(($(reported half_cycle) + 4))
+    after=$(reported_all)
     stored=$(tools learned "$state" "$tmp"/main*.events 2>"$tmp/learned.err") || fail "$fault_name: $(cat "$tmp/learned.err")"
     echo "$fault_name: $*; learned (capacities, half-cycles, alarms): before $fault_before, after $after, stored $stored"
 }
 
-# all_stored: at the end, with the daemon stopped: the store has what was told, no more and no less, and its chain holds.
+# all_stored: at the end, with the daemon stopped: the store has exactly what was reported, and its chain holds.
 all_stored() {
     local stored
     stored=$(tools learned "$state" "$tmp"/main*.events --exactly 2>"$tmp/learned.err") || fail "in the end: $(cat "$tmp/learned.err")"
     "$packwatch" history verify --state "$state" >"$tmp/verify.log" 2>&1 || fail "history verify: $(cat "$tmp/verify.log")"
-    echo "in the end: told (capacities, half-cycles, alarms) $(told_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
+    echo "in the end: reported (capacities, half-cycles, alarms) $(reported_all) = stored $stored; history verify: $(tail -n 1 "$tmp/verify.log")"
 }

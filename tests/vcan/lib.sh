@@ -86,7 +86,7 @@ stop() {
 
 # Has the log of NAME a line with the (extended) regular expression?   wait_for 5 "start" logged daemon 'ready'
 logged() { grep -qE -- "$2" "$tmp/$1.log"; }
-# caught_up NAME: has the candump NAME of vcan0 all that was sent before? By a frame that nobody else sends.
+# caught_up NAME: has the candump NAME of vcan0 all that was sent before? By a frame that no other node sends.
 caught_up() { cansend vcan0 7FF#0123 && logged "$1" '7FF#0123'; }
 
 iface_add() { ip link add dev "$1" mtu 72 type vcan && ip link set dev "$1" up; }

@@ -14,7 +14,7 @@
 grep -q 'User Mode Linux' /proc/cpuinfo || skip "only in the user-mode kernel (PACKWATCH_VCAN=uml): it changes /etc and /usr"
 
 repository=$(cd "$(dirname "${BASH_SOURCE[0]}")/../.." && pwd)
-units=$tmp/units # becomes /run/systemd/system: /run itself is made anew by the boot
+units=$tmp/units # becomes /run/systemd/system: the boot mounts a new /run
 mkdir -p "$units"
 
 # systemd_prepare CONFIG: config/CONFIG becomes packwatch.toml. The units get no dependencies on a whole system.
@@ -84,7 +84,7 @@ in_system() { nsenter --target "$(system_process)" --mount --pid "$@"; }
 property() { in_system systemctl show "${2-packwatch.service}" --property "$1" --value 2>/dev/null; }
 # has NAME VALUE [UNIT]
 has() { [[ $(property "$1" "${3-packwatch.service}") == "$2" ]]; }
-# status_has REGEX: the status line the daemon told systemd.
+# status_has REGEX: the status line that the daemon sent to systemd.
 status_has() { [[ $(property StatusText) =~ $1 ]]; }
 # journal [ARGS...]: what the journal has of packwatch, the message alone.
 journal() { in_system journalctl --quiet --no-pager --unit packwatch.service --output cat "$@"; }

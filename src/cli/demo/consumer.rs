@@ -1,4 +1,4 @@
-//! Another ECU: knows the frames it receives by nothing but their DBC.
+//! Another ECU: decodes received frames by their DBC alone.
 
 use crate::alarm::Rule;
 use crate::can::Frame;
@@ -17,12 +17,12 @@ impl Consumer {
         Ok(Self { database, unknown_frames: 0 })
     }
 
-    /// Takes a frame; one that the DBC does not know is counted.
+    /// Takes a frame; counts it if the DBC does not have it.
     pub(super) fn receive(&mut self, frame: &Frame) {
         self.unknown_frames += u64::from(self.message(frame).is_none());
     }
 
-    /// Frames that the DBC does not know.
+    /// Number of frames that the DBC does not have.
     pub(super) fn unknown_frames(&self) -> u64 {
         self.unknown_frames
     }

@@ -6,14 +6,14 @@ use std::time::Duration;
 use crate::alarm::Rule;
 use crate::quantity::Mode;
 
-/// Pause after each redraw, so that an eye can follow what takes a machine a fraction of a second.
+/// Pause after each redraw, so that a reader can follow.
 const FRAME_TIME: Duration = Duration::from_millis(20);
 
-/// Back to the line's start and nothing behind it.
+/// Erases the line.
 const ERASE_LINE: &str = "\r\x1b[K";
 
-/// What a row shows.
-pub(super) struct Row {
+/// Values of a row.
+pub(super) struct TableRow {
     pub(super) cycle: u32,
     pub(super) hours: f64,
     pub(super) mode: Mode,
@@ -45,14 +45,14 @@ impl Table {
     }
 
     /// A row that stays.
-    pub(super) fn keep(&mut self, row: &Row) -> io::Result<()> {
+    pub(super) fn keep(&mut self, row: &TableRow) -> io::Result<()> {
         self.head()?;
         let start = if self.live { ERASE_LINE } else { "" };
         writeln!(io::stdout(), "{start}{}", text(row))
     }
 
     /// The live row; nothing without a terminal.
-    pub(super) fn redraw(&mut self, row: &Row) -> io::Result<()> {
+    pub(super) fn redraw(&mut self, row: &TableRow) -> io::Result<()> {
         if !self.live {
             return Ok(());
         }
@@ -76,7 +76,7 @@ impl Table {
     }
 }
 
-fn text(row: &Row) -> String {
+fn text(row: &TableRow) -> String {
     let soc = match row.soc {
         Some((soc, std)) => format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std),
         None => format!("{:>6}{:8}", "-", ""),

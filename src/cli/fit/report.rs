@@ -1,4 +1,4 @@
-//! What `fit` shows: progress on the terminal, the table of residuals, JSON.
+//! Output of `fit`: progress on the terminal, the table of residuals, JSON.
 
 use std::io::{self, Write as _};
 use std::path::Path;
@@ -6,35 +6,28 @@ use std::path::Path;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::ident::fit::Residual;
-use crate::lab::fit::{Outcome, Progress};
+use crate::lab::fit::{FitOutcome, FitProgress};
 
-/// Live line on the terminal; nothing where standard error is none.
-pub(super) struct Bar(ProgressBar);
-
-impl Bar {
-    pub(super) fn new() -> Self {
-        let bar = ProgressBar::new_spinner();
-        if let Ok(style) = ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
-            bar.set_style(style);
-        }
-        Self(bar)
-    }
-
-    pub(super) fn show(&self, progress: Progress) {
-        self.0.set_message(match progress {
-            Progress::Read(done, all) => format!("read {done} of {all} files"),
-            Progress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
-        });
-        self.0.tick();
-    }
-
-    pub(super) fn clear(&self) {
-        self.0.finish_and_clear();
+/// Live line on the terminal; nothing where standard error is no terminal.
+pub(super) fn spinner() -> ProgressBar {
+    let bar = ProgressBar::new_spinner();
+    match ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
+        Ok(style) => bar.with_style(style),
+        Err(_) => bar,
     }
 }
 
-/// Residuals per file, notes, and how the fit went.
-pub(super) fn table(outcome: &Outcome, seconds: f64, path: &Path) -> io::Result<()> {
+/// Shows the progress of the fit.
+pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {
+    bar.set_message(match progress {
+        FitProgress::Read(done, all) => format!("read {done} of {all} files"),
+        FitProgress::Pass(pass, cost) => format!("pass {pass}, cost {cost:.6e}"),
+    });
+    bar.tick();
+}
+
+/// Prints residuals per file, notes, and the end of the fit.
+pub(super) fn table(outcome: &FitOutcome, seconds: f64, path: &Path) -> io::Result<()> {
     let names: Vec<String> = outcome.files.iter().map(|file| file.path.display().to_string()).collect();
     let width = names.iter().map(String::len).max().unwrap_or(0).max(5);
     let mut out = io::stdout().lock();
@@ -57,8 +50,8 @@ pub(super) fn table(outcome: &Outcome, seconds: f64, path: &Path) -> io::Result<
     writeln!(out, "{ended} after {} passes, {seconds:.1} s; written to {}", fit.passes, path.display())
 }
 
-/// The same for programs.
-pub(super) fn json(outcome: &Outcome, seconds: f64) -> io::Result<()> {
+/// Prints the outcome as JSON.
+pub(super) fn json(outcome: &FitOutcome, seconds: f64) -> io::Result<()> {
     let of_file = |file: &crate::lab::fit::FileResidual| {
         let r = &file.residual;
         serde_json::json!({

@@ -1,11 +1,11 @@
-//! What the subcommands of `gpr` have in common: files, kernel grammar, form of the model.
+//! Arguments shared by the subcommands of `gpr`: files, kernel grammar, form of the model.
 
 use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
 use crate::io::result_file::check_place;
-use crate::lab::gpr::Missing;
-use crate::regress::{Basis, Form, Kernel, MAX_INDUCING, MAX_NEIGHBOURS, Settings};
+use crate::lab::gpr::MissingPolicy;
+use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
 
 /// Below the options.
 pub(super) const GRAMMAR: &str = "\
@@ -13,7 +13,7 @@ KERNEL is one of exponential, squared_exponential, matern32, matern52, rational_
 products of them with brackets: \"exponential + matern52 * (squared_exponential + rational_quadratic)\". A straight line in the \
 inputs is no kernel but a basis: --basis linear.\n\n\
 Columns are found by their name, or by their name without its unit. Length scales are in standard deviations of the inputs. The \
-95 % interval is as wide as training rows say that were predicted without themselves.";
+95 % interval is calibrated on training rows, each predicted without itself.";
 
 /// Files with rows.
 #[derive(Debug, clap::Args)]
@@ -21,19 +21,19 @@ pub(super) struct FileArgs {
     /// CSV files (.gz, .zst) with a heading; their rows follow one another
     #[arg(required = true, value_name = "FILE.csv")]
     pub(super) files: Vec<PathBuf>,
-    /// Leave rows out that lack a value (empty or NaN), and tell how many [default: refuse, with file and line]
+    /// Leave rows out that lack a value (empty or NaN), and report how many [default: fail with file and line]
     #[arg(long)]
     skip_missing: bool,
 }
 
 impl FileArgs {
-    /// A result has a place, and is none of these files.
+    /// Checks that a result can be written and is none of these files.
     pub(super) fn check_result(&self, result: &Path) -> Result<(), Failure> {
         check_place(result, self.files.iter()).map_err(Failure::new)
     }
 
-    pub(super) fn missing(&self) -> Missing {
-        if self.skip_missing { Missing::Skipped } else { Missing::Refused }
+    pub(super) fn missing(&self) -> MissingPolicy {
+        if self.skip_missing { MissingPolicy::Skipped } else { MissingPolicy::Rejected }
     }
 }
 
@@ -69,7 +69,7 @@ impl From<BasisName> for Basis {
     }
 }
 
-/// How a model is made.
+/// Settings of a model.
 #[derive(Debug, clap::Args)]
 pub(super) struct ModelArgs {
     /// Mean function
@@ -78,7 +78,7 @@ pub(super) struct ModelArgs {
     /// A length scale for every input instead of one for all
     #[arg(long)]
     ard: bool,
-    /// How the covariance of many rows is dealt with [default: exact up to 2000 rows, else nearest]
+    /// Approximation of the covariance of many rows [default: exact up to 2000 rows, else nearest]
     #[arg(long, value_enum)]
     form: Option<FormName>,
     /// Neighbours of a row in the form nearest
@@ -102,9 +102,9 @@ pub(super) struct ModelArgs {
 }
 
 impl ModelArgs {
-    /// For so many rows.
-    pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> Settings {
-        let mut settings = Settings::new(kernel.clone(), rows);
+    /// Returns the settings for a number of rows.
+    pub(super) fn settings(&self, kernel: &Kernel, rows: usize) -> GprSettings {
+        let mut settings = GprSettings::new(kernel.clone(), rows);
         settings.form = match self.form {
             Some(FormName::Exact) => Form::Exact,
             Some(FormName::Nearest) => Form::Nearest { neighbours: self.neighbours },
@@ -125,9 +125,9 @@ impl ModelArgs {
     }
 }
 
-/// Threads asked for, or one per core.
-pub(super) fn threads(asked: Option<usize>) -> usize {
-    asked.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
+/// Returns the given number of threads, or one per core.
+pub(super) fn threads(given: Option<usize>) -> usize {
+    given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 
 /// A whole number in a range.

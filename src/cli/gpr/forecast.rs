@@ -1,4 +1,4 @@
-//! `packwatch gpr forecast`: rows to come from rows that were.
+//! `packwatch gpr forecast`: forecasts future rows from past rows.
 
 use std::io::{self, Write};
 use std::ops::ControlFlow;
@@ -7,12 +7,15 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use super::super::Failure;
-use super::super::score::write_table;
 use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
-use super::report::{Bar, VERSION, form, jitter_json, mebibytes, short, skipped, write_json};
-use super::{PartColumn, Table, Wanted, failure, make_folder, quiet, read};
-use crate::lab::gpr::forecast::{self, Forecast, Horizon, MAX_LAGS, MAX_STEPS, OutputForecast, Plan, Steps, horizons};
+use super::report::{VERSION, fit_bar, form, jitter_json, mebibytes, score_json, short, show_fits, skipped};
+use super::{ColumnSelection, ColumnTable, PartColumn, read};
+use crate::cli::Failure;
+use crate::cli::numbers::percent;
+use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
+use crate::lab::gpr::forecast::{
+    self, ForecastPlan, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, RowSpacing, TableForecast, horizons,
+};
 use crate::lab::gpr::{self, peak_kib};
 use crate::regress::Kernel;
 
@@ -25,22 +28,22 @@ pub(super) struct ForecastArgs {
     /// Columns that are forecast
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',', required = true)]
     outputs: Vec<String>,
-    /// Further columns whose past is looked at; their future is not needed
+    /// Further columns whose past is used; their future is not needed
     #[arg(long, value_name = "COLUMN,..", value_delimiter = ',')]
     inputs: Vec<String>,
-    /// Values of each column that a forecast looks at: the one at the origin and those before it
+    /// Values of each column that a forecast uses: the one at the origin and those before it
     #[arg(long, value_name = "N", default_value_t = 5, value_parser = whole::<1, MAX_LAGS>)]
     lags: usize,
     /// Rows ahead: forecasts of 1 to N rows, of more than 10 for 10 of them, spread evenly in ratio
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = whole::<1, MAX_STEPS>)]
     steps: usize,
-    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast what nobody knows
+    /// Part of the rows that is known, per cent; forecasts are judged on the rows after it. 100 = forecast the unknown future
     #[arg(long, value_name = "PERCENT", default_value_t = 70.0, value_parser = percent)]
     origin: f64,
     /// Take every N-th row only (of each part)
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = whole::<1, 1_000_000>)]
     every: usize,
-    /// Column at whose values rows do not belong together any more; none = there is no such column [default: cycle, segment
+    /// Column whose value separates parts that do not belong together; none = there is no such column [default: cycle, segment
     /// or ref where there is one]
     #[arg(long, value_name = "COLUMN")]
     part: Option<String>,
@@ -63,33 +66,28 @@ pub(super) struct ForecastArgs {
     json: bool,
 }
 
-fn percent(text: &str) -> Result<f64, String> {
-    let number = text.trim().trim_end_matches('%').trim().parse::<f64>().ok().filter(|p| *p > 0.0 && *p <= 100.0);
-    number.ok_or_else(|| "must be per cent above 0, at most 100".to_owned())
-}
-
-/// What was asked and what came of it.
-struct Shown<'a> {
-    table: &'a Table,
-    plan: &'a Plan,
-    forecast: &'a Forecast,
-    steps: Option<Steps>,
+/// A forecast with its plan.
+struct ForecastReport<'a> {
+    table: &'a ColumnTable,
+    plan: &'a ForecastPlan,
+    forecast: &'a TableForecast,
+    steps: Option<RowSpacing>,
     seconds: f64,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     let begin = Instant::now();
-    make_folder(args.plots.as_deref())?;
+    args.plots.iter().try_for_each(|folder| create_folder(folder))?;
     args.predictions.iter().try_for_each(|path| args.files.check_result(path))?;
     let table = args.table()?;
     let settings = args.model.settings(&args.kernel, args.rows.min(table.len()));
     let (outputs, origin) = (args.outputs.len(), args.origin / 100.0);
-    let plan = Plan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
-    let bar = Bar::new(outputs * horizons(args.steps).len());
-    let mut done = |fits, _| bar.done(fits, "forecasts");
+    let plan = ForecastPlan { outputs, lags: args.lags, steps: args.steps, origin, rows: args.rows, settings };
+    let bar = fit_bar(outputs * horizons(args.steps).len());
+    let mut done = |fits, _| show_fits(&bar, fits, "forecasts");
     let made = forecast::run(&table, &plan, &mut |_| ControlFlow::Continue(()), &mut done);
-    bar.clear();
+    bar.finish_and_clear();
     let made = made.map_err(failure)?;
     if let Some(path) = &args.predictions {
         forecast::write(path, &table, &made).map_err(failure)?;
@@ -97,20 +95,20 @@ pub(super) fn run(args: &ForecastArgs) -> Result<(), Failure> {
     if let Some(folder) = &args.plots {
         gpr::write_forecast(folder, &table, &made).map_err(failure)?;
     }
-    let steps = if table.has[0] { Steps::of(&table, table.width() - 1) } else { None };
+    let steps = if table.has[0] { RowSpacing::of(&table, table.width() - 1) } else { None };
     let seconds = begin.elapsed().as_secs_f64();
-    let shown = Shown { table: &table, plan: &plan, forecast: &made, steps, seconds };
-    quiet(if args.json { shown.json() } else { shown.table() })
+    let shown = ForecastReport { table: &table, plan: &plan, forecast: &made, steps, seconds };
+    unless_closed(if args.json { shown.json() } else { shown.table() })
 }
 
 impl ForecastArgs {
     /// Outputs, inputs, and the time where there is one.
-    fn table(&self) -> Result<Table, Failure> {
+    fn table(&self) -> Result<ColumnTable, Failure> {
         let columns: Vec<String> = self.outputs.iter().chain(&self.inputs).cloned().collect();
         let time = ["time".to_owned()];
-        let wanted = Wanted { columns: &columns, optional: &time, missing: self.files.missing() };
+        let wanted = ColumnSelection { columns: &columns, optional: &time, missing: self.files.missing() };
         let part = match self.part.as_deref() {
-            None => PartColumn::Usual,
+            None => PartColumn::Default,
             Some("none") => PartColumn::None,
             Some(name) => PartColumn::Named(name.to_owned()),
         };
@@ -118,7 +116,7 @@ impl ForecastArgs {
     }
 }
 
-impl Shown<'_> {
+impl ForecastReport<'_> {
     fn table(&self) -> io::Result<()> {
         let mut out = io::stdout().lock();
         self.head(&mut out)?;
@@ -169,7 +167,7 @@ impl Shown<'_> {
         let output = |output: &OutputForecast| json!({ "name": output.name, "horizons": output.horizons.iter().map(horizon_json).collect::<Vec<_>>() });
         let steps =
             self.steps.map(|s| json!({ "median": s.median, "p5": s.range.0, "p95": s.range.1, "even": s.even() }));
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "rows": table.len(), "parts": table.parts.len(), "skipped": table.skipped,
             "columns": table.names[..table.width() - table.has.len()], "lags": plan.lags, "steps": plan.steps,
             "kernel": plan.settings.kernel.to_string(), "form": form(plan.settings.form), "seed": plan.settings.seed,
@@ -180,11 +178,11 @@ impl Shown<'_> {
     }
 }
 
-/// Errors of forecasts made after the origin.
+/// Prints the errors of forecasts made after the origin.
 fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
     let heads =
-        ["ahead", "forecasts", "RMSE", "stays as it is", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];
-    let line = |horizon: &Horizon| {
+        ["ahead", "forecasts", "RMSE", "persistence", "ratio", "mean abs.", "inside 95 %", "width", "trained on"];
+    let line = |horizon: &HorizonForecast| {
         let cells = horizon.score.zip(horizon.persistence_rmse).map(|(s, persistence)| {
             [
                 short(s.rmse),
@@ -201,32 +199,27 @@ fn judged_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()>
             .chain([horizon.trained.to_string()])
             .collect()
     };
-    let rows: Vec<Vec<String>> =
-        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
-    write_table(out, &rows, 0)
+    write_table(out, &heads, output.horizons.iter().map(line), 0)
 }
 
-/// Forecasts of what nobody knows.
+/// Prints forecasts without measured values.
 fn future_table(out: &mut impl Write, output: &OutputForecast) -> io::Result<()> {
     let heads = ["ahead", "mean", "std", "low 95 %", "high 95 %", "trained on"];
-    let line = |horizon: &Horizon| {
+    let line = |horizon: &HorizonForecast| {
         let p = &horizon.at_origin;
         let numbers = [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95].map(short);
         let own = [horizon.steps.to_string()];
         own.into_iter().chain(numbers).chain([horizon.trained.to_string()]).collect()
     };
-    let rows: Vec<Vec<String>> =
-        std::iter::once(heads.map(str::to_owned).to_vec()).chain(output.horizons.iter().map(line)).collect();
-    write_table(out, &rows, 0)
+    write_table(out, &heads, output.horizons.iter().map(line), 0)
 }
 
-fn horizon_json(horizon: &Horizon) -> Value {
+fn horizon_json(horizon: &HorizonForecast) -> Value {
     let p = &horizon.at_origin;
-    let score = horizon.score.map(|s| {
-        json!({
-            "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
-            "mean_width_95": s.mean_width_95, "persistence_rmse": horizon.persistence_rmse,
-        })
+    let score = horizon.score.as_ref().map(|score| {
+        let mut score = score_json(score);
+        score.insert("persistence_rmse".to_owned(), json!(horizon.persistence_rmse));
+        score
     });
     json!({
         "steps": horizon.steps, "trained": horizon.trained, "calibrated": horizon.calibrated,

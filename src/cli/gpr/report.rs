@@ -1,53 +1,40 @@
-//! What `gpr` shows: progress, tables, JSON.
+//! Output of `gpr`: progress, tables, JSON.
 
 use std::io::{self, Write};
 use std::ops::ControlFlow;
 use std::path::Path;
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 use serde_json::{Map, Value, json};
 
-use super::super::score::write_table;
-use crate::lab::gpr::{Table, Trained, Validated, peak_kib};
-use crate::regress::{Fold, Form, Hyperparameter, Jitter, Progress, Score, Settings};
+use crate::cli::output::{print_json, progress_bar, write_table};
+use crate::lab::gpr::{ColumnTable, CrossValidation, TrainedModel, peak_kib};
+use crate::regress::{FitProgress, Fold, Form, GprSettings, Hyperparameter, Jitter, PredictionScore};
 
 /// Version of the JSON documents.
 pub(super) const VERSION: u32 = 1;
 /// Parts of a fold in the progress bar.
 const TICKS: usize = 100;
 
-/// Progress on standard error, when that is a terminal.
-pub(super) struct Bar(ProgressBar);
+/// A progress bar over a number of fits.
+pub(super) fn fit_bar(fits: usize) -> ProgressBar {
+    progress_bar((fits * TICKS) as u64, "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}")
+}
 
-impl Bar {
-    /// Of so many fits.
-    pub(super) fn new(fits: usize) -> Self {
-        let bar = ProgressBar::with_draw_target(Some((fits * TICKS) as u64), ProgressDrawTarget::stderr_with_hz(5));
-        let template = "{bar:32} {percent} % {msg}, {elapsed}, eta {eta}";
-        bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-        Self(bar)
-    }
+/// Shows a step of a search; `before` fits were done before this cross-validation.
+pub(super) fn show_step(bar: &ProgressBar, what: &str, before: usize, p: FitProgress) -> ControlFlow<()> {
+    let part = (p.search - 1) * p.max_iterations + p.iteration;
+    let whole = (p.searches * p.max_iterations).max(1);
+    let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
+    bar.set_position(done as u64);
+    bar.set_message(format!("{what}, fold {} of {}, step {}", p.fold, p.folds, p.iteration));
+    ControlFlow::Continue(())
+}
 
-    /// A step of a search; `before` fits are done beside those of this cross-validation.
-    pub(super) fn show(&self, what: &str, before: usize, p: Progress) -> ControlFlow<()> {
-        let part = (p.search - 1) * p.max_iterations + p.iteration;
-        let whole = (p.searches * p.max_iterations).max(1);
-        let done = (before + p.fold - 1) * TICKS + (part * TICKS / whole).min(TICKS - 1);
-        self.0.set_position(done as u64);
-        self.0.set_message(format!("{what}, fold {} of {}, step {}", p.fold, p.folds, p.iteration));
-        ControlFlow::Continue(())
-    }
-
-    /// So many fits are done.
-    pub(super) fn done(&self, fits: usize, what: &str) {
-        self.0.set_position((fits * TICKS) as u64);
-        self.0.set_message(what.to_owned());
-    }
-
-    /// Takes the bar away.
-    pub(super) fn clear(&self) {
-        self.0.finish_and_clear();
-    }
+/// Sets the number of finished fits.
+pub(super) fn show_fits(bar: &ProgressBar, fits: usize, what: &str) {
+    bar.set_position((fits * TICKS) as u64);
+    bar.set_message(what.to_owned());
 }
 
 /// A form in words.
@@ -60,11 +47,11 @@ pub(super) fn form(form: Form) -> String {
 }
 
 fn form_note(of: Form, default_form: bool) -> String {
-    let why = if default_form { " (chosen by the number of rows; --form says otherwise)" } else { "" };
+    let why = if default_form { " (chosen by the number of rows; --form overrides it)" } else { "" };
     format!("form {}{why}", form(of))
 }
 
-fn basis(settings: &Settings) -> String {
+fn basis(settings: &GprSettings) -> String {
     format!("{:?}", settings.basis).to_lowercase()
 }
 
@@ -76,7 +63,7 @@ pub(super) fn jitter_json(jitter: Jitter) -> Value {
     json!({ "matrices": jitter.matrices, "largest": jitter.largest })
 }
 
-pub(super) fn skipped(out: &mut impl Write, table: &Table) -> io::Result<()> {
+pub(super) fn skipped(out: &mut impl Write, table: &ColumnTable) -> io::Result<()> {
     if table.skipped > 0 {
         writeln!(out, "{} rows left out: a value is missing", table.skipped)?;
     }
@@ -87,11 +74,15 @@ fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
     all.iter().map(|h| (h.name.clone(), json!(h.value))).collect()
 }
 
-/// Writes one JSON document.
-pub(super) fn write_json(document: &Value) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, document)?;
-    writeln!(out)
+/// Errors of predictions.
+pub(super) fn score_json(s: &PredictionScore) -> Map<String, Value> {
+    let values = [
+        ("rmse", s.rmse),
+        ("mean_absolute_error", s.mean_absolute_error),
+        ("coverage_95", s.coverage_95),
+        ("mean_width_95", s.mean_width_95),
+    ];
+    values.map(|(name, value)| (name.to_owned(), json!(value))).into_iter().collect()
 }
 
 /// A number with four digits that matter.
@@ -101,28 +92,28 @@ pub(super) fn short(value: f64) -> String {
 }
 
 /// A cross-validation.
-pub(super) struct Cv<'a> {
-    pub(super) table: &'a Table,
-    pub(super) settings: &'a Settings,
+pub(super) struct CvReport<'a> {
+    pub(super) table: &'a ColumnTable,
+    pub(super) settings: &'a GprSettings,
     pub(super) folds: usize,
-    pub(super) all: &'a [Validated],
+    pub(super) all: &'a [CrossValidation],
     pub(super) default_form: bool,
 }
 
 /// Sum over the folds.
-fn total(validated: &Validated, of: impl Fn(&Fold) -> f64) -> f64 {
+fn total(validated: &CrossValidation, of: impl Fn(&Fold) -> f64) -> f64 {
     validated.folds.folds.iter().map(of).sum()
 }
 
 /// Matrices with jitter, and the most of it, over the folds.
-fn jitter(validated: &Validated) -> Jitter {
+fn jitter(validated: &CrossValidation) -> Jitter {
     validated.folds.folds.iter().fold(Jitter::default(), |all, fold| Jitter {
         matrices: all.matrices + fold.jitter.matrices,
         largest: all.largest.max(fold.jitter.largest),
     })
 }
 
-impl Cv<'_> {
+impl CvReport<'_> {
     fn inputs(&self) -> &[String] {
         &self.table.names[..self.table.width() - 1]
     }
@@ -131,7 +122,7 @@ impl Cv<'_> {
         &self.table.names[self.table.width() - 1]
     }
 
-    /// For people.
+    /// Prints tables.
     pub(super) fn table(&self, seconds: f64) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (rows, inputs, output) = (self.table.len(), self.inputs().join(", "), self.output());
@@ -146,7 +137,7 @@ impl Cv<'_> {
         )?;
         let heads =
             ["kernel", "RMSE", "mean abs.", "inside", "width", "training s", "predicting s", "peak MiB", "rows"];
-        let line = |validated: &Validated| {
+        let line = |validated: &CrossValidation| {
             let s = &validated.score;
             vec![
                 validated.kernel.clone(),
@@ -160,9 +151,7 @@ impl Cv<'_> {
                 validated.folds.predictions.len().to_string(),
             ]
         };
-        let rows: Vec<Vec<String>> =
-            std::iter::once(heads.map(str::to_owned).to_vec()).chain(self.all.iter().map(line)).collect();
-        write_table(&mut out, &rows, 1)?;
+        write_table(&mut out, &heads, self.all.iter().map(line), 1)?;
         for validated in self.all {
             let jitter = jitter(validated);
             if jitter.matrices > 0 {
@@ -173,7 +162,7 @@ impl Cv<'_> {
         writeln!(out, "\n{seconds:.1} s in all")
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self, seconds: f64) -> io::Result<()> {
         let fold = |fold: &Fold| {
             json!({
@@ -182,7 +171,7 @@ impl Cv<'_> {
                 "interval_factor": fold.interval_factor, "hyperparameters": hyperparameters(&fold.hyperparameters),
             })
         };
-        let kernel = |validated: &Validated| {
+        let kernel = |validated: &CrossValidation| {
             let s = &validated.score;
             json!({
                 "kernel": validated.kernel, "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error,
@@ -193,7 +182,7 @@ impl Cv<'_> {
                 "folds": validated.folds.folds.iter().map(fold).collect::<Vec<_>>(),
             })
         };
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": self.output(), "inputs": self.inputs(), "rows": self.table.len(),
             "skipped": self.table.skipped, "folds": self.folds, "seed": self.settings.seed,
             "form": form(self.settings.form), "basis": basis(self.settings), "threads": self.settings.threads,
@@ -203,15 +192,15 @@ impl Cv<'_> {
 }
 
 /// A model that was trained.
-pub(super) struct Train<'a> {
-    pub(super) trained: &'a Trained,
-    pub(super) table: &'a Table,
+pub(super) struct TrainReport<'a> {
+    pub(super) trained: &'a TrainedModel,
+    pub(super) table: &'a ColumnTable,
     pub(super) seconds: f64,
     pub(super) default_form: bool,
 }
 
-impl Train<'_> {
-    /// For people.
+impl TrainReport<'_> {
+    /// Prints tables.
     pub(super) fn table(&self, path: &Path) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let (trained, model) = (self.trained, &self.trained.model);
@@ -239,10 +228,10 @@ impl Train<'_> {
         writeln!(out, "written to {}", path.display())
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let (trained, model) = (self.trained, &self.trained.model);
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": trained.output, "inputs": trained.inputs, "rows": model.rows(),
             "skipped": self.table.skipped, "kernel": model.kernel().to_string(), "form": form(model.form()),
             "basis": format!("{:?}", model.basis()).to_lowercase(),
@@ -255,15 +244,15 @@ impl Train<'_> {
 }
 
 /// Predictions of a saved model.
-pub(super) struct Predict<'a> {
-    pub(super) trained: &'a Trained,
-    pub(super) table: &'a Table,
+pub(super) struct PredictReport<'a> {
+    pub(super) trained: &'a TrainedModel,
+    pub(super) table: &'a ColumnTable,
     pub(super) known: usize,
-    pub(super) score: Option<Score>,
+    pub(super) score: Option<PredictionScore>,
 }
 
-impl Predict<'_> {
-    /// For people, beside the rows or instead of them.
+impl PredictReport<'_> {
+    /// Prints a summary, on standard error when the rows go to standard output.
     pub(super) fn text(&self, to_stderr: bool) -> io::Result<()> {
         let mut text = Vec::new();
         let (rows, output) = (self.table.len(), &self.trained.output);
@@ -280,17 +269,11 @@ impl Predict<'_> {
         if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
     }
 
-    /// For programs.
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
-        let score = self.score.map(|s| {
-            json!({
-                "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
-                "mean_width_95": s.mean_width_95,
-            })
-        });
-        write_json(&json!({
+        print_json(&json!({
             "version": VERSION, "output": self.trained.output, "rows": self.table.len(), "known": self.known,
-            "skipped": self.table.skipped, "score": score,
+            "skipped": self.table.skipped, "score": self.score.as_ref().map(score_json),
         }))
     }
 }

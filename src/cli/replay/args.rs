@@ -1,12 +1,12 @@
-//! What `replay` can be told.
+//! Arguments of `replay`.
 
 use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
 use crate::cli::run::away;
-use crate::replay::When;
 use crate::io::stamp;
 use crate::monitor::Downtime;
+use crate::replay::LogTime;
 
 /// Which way a CSV's positive current flows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -29,7 +29,7 @@ pub(crate) struct Args {
     #[command(flatten)]
     pub(crate) input: InputArgs,
     /// Replay every log by itself and from the start, several at a time; summaries come in the logs' order, as JSON one per line. A
-    /// log that fails is told, and the others go on
+    /// log that fails is reported, and the others continue
     #[arg(long, conflicts_with_all = ["to", "speed", "snapshot", "snapshot_at", "restore", "away", "state"])]
     pub(crate) each: bool,
     /// Logs at a time (default: one per core)
@@ -59,7 +59,7 @@ pub(crate) struct Args {
     /// When the state is written: a stamp of the log in seconds, +SECONDS after its start, or like
     /// 2008-04-02T13:08:17 (UTC); the end when not given
     #[arg(long, value_name = "WHEN", requires = "snapshot", value_parser = when, allow_hyphen_values = true)]
-    pub(crate) snapshot_at: Option<When>,
+    pub(crate) snapshot_at: Option<LogTime>,
     /// Keep state and history in this new folder, as `packwatch run` does, with the log's clock as wall clock
     #[arg(long, value_name = "DIR")]
     pub(crate) state: Option<PathBuf>,
@@ -71,10 +71,10 @@ pub(crate) struct Args {
     pub(crate) away: Option<Downtime>,
     /// Leave out what is before; as --snapshot-at
     #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
-    pub(crate) from: Option<When>,
+    pub(crate) from: Option<LogTime>,
     /// Leave out what is after; as --snapshot-at
     #[arg(long, value_name = "WHEN", value_parser = when, allow_hyphen_values = true)]
-    pub(crate) until: Option<When>,
+    pub(crate) until: Option<LogTime>,
 }
 
 /// How logs are read.
@@ -108,7 +108,7 @@ impl Args {
         self.results().any(|path| path == Path::new("-"))
     }
 
-    /// What one argument alone cannot tell.
+    /// Checks that concern several arguments.
     pub(crate) fn check(&self) -> Result<(), Failure> {
         if self.each {
             // Results are folders, which have rules of their own.
@@ -136,10 +136,10 @@ fn positive(text: &str) -> Result<f64, String> {
     if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) }
 }
 
-fn when(text: &str) -> Result<When, String> {
-    let after = text.strip_prefix('+').map(|s| stamp::parse_seconds(s.as_bytes()).map(|t| When::After(t.nanos())));
+fn when(text: &str) -> Result<LogTime, String> {
+    let after = text.strip_prefix('+').map(|s| stamp::parse_seconds(s.as_bytes()).map(|t| LogTime::After(t.nanos())));
     after
-        .unwrap_or_else(|| stamp::parse_stamp(text).map(When::At))
+        .unwrap_or_else(|| stamp::parse_stamp(text).map(LogTime::At))
         .ok_or_else(|| "must be seconds, +seconds or like 2008-04-02T13:08:17.921".to_owned())
 }
 

@@ -11,11 +11,12 @@ use std::time::Instant;
 use indicatif::{ProgressBar, ProgressDrawTarget};
 
 use super::{Args, Failure, report};
+
 use crate::config::Config;
-use crate::replay::{self, Progress, ReplayError, Sinks, Summary, in_order};
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
 use crate::monitor::Monitor;
+use crate::replay::{self, ReplayError, ReplayProgress, ReplaySummary, Sinks, in_order};
 
 /// Runs the command.
 pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
@@ -46,14 +47,14 @@ pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     );
     bar.bar.finish_and_clear();
     match written {
-        // The reader of our output has seen enough: no failure.
+        // The reader of our output has closed it: no failure.
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => {}
         written => written.map_err(|error| Failure::new(error.to_string()))?,
     }
     if failed.is_empty() { Ok(()) } else { Err(Failure::new(failed.join("\n"))) }
 }
 
-/// What the arguments alone cannot tell.
+/// Checks that concern several arguments.
 fn check(args: &Args) -> Result<(), Failure> {
     if args.logs.iter().any(|log| log == Path::new("-")) {
         return Err(Failure::new("-: standard input cannot be replayed with --each, must be files"));
@@ -69,13 +70,13 @@ fn check(args: &Args) -> Result<(), Failure> {
         let has_results = folders(args).into_iter().flatten().next().is_some();
         if let Some(other) = names.insert(name(log), log).filter(|_| has_results) {
             let (log, other) = (log.display(), other.display());
-            return Err(Failure::new(format!("{log}: its results would take the place of those of {other}")));
+            return Err(Failure::new(format!("{log}: its results would replace those of {other}")));
         }
     }
     Ok(())
 }
 
-/// Where the results go: estimates, events, frames.
+/// Folders of the results: estimates, events, frames.
 fn folders(args: &Args) -> [Option<&Path>; 3] {
     [args.estimates.as_deref(), args.events.as_deref(), args.frames.as_deref()]
 }
@@ -94,19 +95,19 @@ fn name(log: &Path) -> String {
     stem.file_stem().map(OsStr::to_string_lossy).unwrap_or_default().into_owned()
 }
 
-fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result<Summary, ReplayError> {
+fn replay_one(args: &Args, config: &Config, log: &Path, bar: &EachBar) -> Result<ReplaySummary, ReplayError> {
     let create = |path: &Option<PathBuf>| path.as_deref().map(ResultFile::create).transpose();
     let [estimates, events, frames] = results(args, log);
     let sinks =
         Sinks { estimates: create(&estimates)?, events: create(&events)?, frames: create(&frames)?, watch: None };
     let mut source = LogSource::new([log.to_owned()], super::log_options(&args.input, config));
     let settings = super::plain_settings(args, config);
-    let mut part = Part { bar, began: Instant::now(), bytes: 0, frames: 0, awake_s: 0.0 };
+    let mut progress_of_log = LogProgress { bar, began: Instant::now(), bytes: 0, frames: 0, awake_s: 0.0 };
     let result = replay::run(&mut source, Monitor::new(config.monitor.clone()), sinks, settings, &mut |progress| {
-        part.show(progress)
+        progress_of_log.show(progress)
     });
     let bytes = source.read_bytes().load(Ordering::Relaxed);
-    part.show(Progress { bytes, frames: source.counts().frames, times_real_time: 0.0 });
+    progress_of_log.show(ReplayProgress { bytes, frames: source.counts().frames, times_real_time: 0.0 });
     result.map(|(summary, _)| summary)
 }
 
@@ -116,7 +117,7 @@ fn named(log: &Path, error: &ReplayError) -> String {
     if text.starts_with(&name) { text } else { format!("{name}: {text}") }
 }
 
-fn print(args: &Args, log: &Path, result: &Result<Summary, ReplayError>) -> io::Result<()> {
+fn print(args: &Args, log: &Path, result: &Result<ReplaySummary, ReplayError>) -> io::Result<()> {
     let mut out = io::stdout().lock();
     match result {
         Ok(summary) if args.json => report::json_line(&mut out, log, summary),
@@ -174,7 +175,7 @@ impl EachBar {
 }
 
 /// One log's part of the progress.
-struct Part<'a> {
+struct LogProgress<'a> {
     bar: &'a EachBar,
     began: Instant,
     bytes: u64,
@@ -182,9 +183,9 @@ struct Part<'a> {
     awake_s: f64,
 }
 
-impl Part<'_> {
-    /// Adds what is new.
-    fn show(&mut self, now: Progress) {
+impl LogProgress<'_> {
+    /// Adds the difference to the last call.
+    fn show(&mut self, now: ReplayProgress) {
         let awake_s = (now.times_real_time * self.began.elapsed().as_secs_f64()).max(self.awake_s);
         self.bar.frames.fetch_add(now.frames.saturating_sub(self.frames), Ordering::Relaxed);
         // Saturates; far from it in any record.

@@ -1,4 +1,4 @@
-//! What `replay` tells on the terminal: a progress bar, a summary.
+//! Output of `replay` on the terminal: a progress bar, a summary.
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::replay::{Progress, ProtectedSummary, Summary};
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
+use crate::replay::{ProtectedSummary, ReplayProgress, ReplaySummary};
 
 /// Alarms listed for people; JSON has more.
 const MAX_SHOWN_ALARMS: usize = 20;
@@ -25,8 +25,8 @@ impl Bar {
         Self(bar(logs, ProgressDrawTarget::stderr_with_hz(5)))
     }
 
-    /// The present state.
-    pub(crate) fn show(&self, progress: Progress) {
+    /// Shows the current state.
+    pub(crate) fn show(&self, progress: ReplayProgress) {
         let seconds = self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64();
         if self.0.is_hidden() {
             return;
@@ -41,7 +41,7 @@ impl Bar {
         self.0.elapsed().max(Duration::from_millis(1)).as_secs_f64()
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub(crate) fn clear(&self) {
         self.0.finish_and_clear();
     }
@@ -60,32 +60,32 @@ pub(super) fn bar(logs: &[PathBuf], target: ProgressDrawTarget) -> ProgressBar {
 }
 
 /// The summary as one line of JSON that begins with the log's name.
-pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &Summary) -> io::Result<()> {
+pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummary) -> io::Result<()> {
     #[derive(serde::Serialize)]
     struct Named<'a> {
         name: String,
         #[serde(flatten)]
-        summary: &'a Summary,
+        summary: &'a ReplaySummary,
     }
     serde_json::to_writer(&mut *out, &Named { name: log.display().to_string(), summary })?;
     writeln!(out)
 }
 
 /// The summary as one JSON document on standard output.
-pub(super) fn json(summary: &Summary) -> io::Result<()> {
+pub(super) fn json(summary: &ReplaySummary) -> io::Result<()> {
     let mut out = io::stdout().lock();
     serde_json::to_writer_pretty(&mut out, summary)?;
     writeln!(out)
 }
 
 /// The summary for people.
-pub(super) fn table(summary: &Summary, to_stderr: bool) -> io::Result<()> {
+pub(super) fn table(summary: &ReplaySummary, to_stderr: bool) -> io::Result<()> {
     let mut text = Vec::new();
     write_table(&mut text, summary)?;
     if to_stderr { io::stderr().write_all(&text) } else { io::stdout().write_all(&text) }
 }
 
-/// What was played onto an interface.
+/// The counts of frames played onto an interface.
 pub(super) fn played(sent: u64, interface: &str, counts: &LogCounts, as_json: bool) -> io::Result<()> {
     let mut out = io::stdout().lock();
     if as_json {
@@ -118,7 +118,7 @@ fn log_rows(log: &LogCounts) -> Vec<(&'static str, String)> {
     rows
 }
 
-pub(super) fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
+pub(super) fn write_table(out: &mut impl Write, summary: &ReplaySummary) -> io::Result<()> {
     let s = summary;
     let mut rows = log_rows(&s.log);
     rows.push(("record", format!("{:.1} s awake", s.awake_s)));
@@ -150,7 +150,7 @@ pub(super) fn write_table(out: &mut impl Write, summary: &Summary) -> io::Result
 fn statuses(of: &ProtectedSummary) -> String {
     let given = of.counts.iter().filter(|(_, count)| **count > 0);
     let given: Vec<_> = given.map(|(status, count)| format!("{status} {count}")).collect();
-    let given = if given.is_empty() { "never came".to_owned() } else { given.join(", ") };
+    let given = if given.is_empty() { "never received".to_owned() } else { given.join(", ") };
     format!("{} {}: {given}", of.interface, of.id)
 }
 
@@ -159,7 +159,7 @@ fn write_rows(out: &mut impl Write, rows: &[(&str, String)]) -> io::Result<()> {
     rows.iter().try_for_each(|(name, value)| writeln!(out, "{name:width$}  {value}"))
 }
 
-fn write_cells(out: &mut impl Write, summary: &Summary) -> io::Result<()> {
+fn write_cells(out: &mut impl Write, summary: &ReplaySummary) -> io::Result<()> {
     if summary.cells.is_empty() {
         return writeln!(out, "no estimate was made");
     }

@@ -1,12 +1,12 @@
-//! What `rul` tells: tables and JSON.
+//! Output of `rul`: tables and JSON.
 
 use std::io::{self, Write};
 
 use serde::Serialize;
 
-use super::super::score::write_table;
+use crate::cli::output::{print_json, write_table};
 use crate::health::{Axis, Remaining};
-use crate::lab::rul::{self, Judged, Now, Scored, Total, WORST_ERROR};
+use crate::lab::rul::{self, CurrentForecast, ForecastScore, HistoryScore, ScoreTotal, WORST_ERROR};
 
 /// Version of the JSON documents.
 const VERSION: u32 = 1;
@@ -15,7 +15,7 @@ const VERSION: u32 = 1;
 struct NowDocument<'a> {
     version: u32,
     interval: [f64; 2],
-    forecasts: &'a [Now],
+    forecasts: &'a [CurrentForecast],
 }
 
 #[derive(Serialize)]
@@ -23,36 +23,29 @@ struct ScoredDocument<'a> {
     version: u32,
     interval: [f64; 2],
     alpha: f64,
-    files: &'a [Scored],
-    total: Option<Total>,
+    files: &'a [HistoryScore],
+    total: Option<ScoreTotal>,
 }
 
-/// Quantiles of the interval told.
+/// Quantiles of the interval.
 const INTERVAL: [f64; 2] = [0.05, 0.95];
 
-/// Forecasts now, for programs.
-pub(super) fn now_json(forecasts: &[Now]) -> io::Result<()> {
-    json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
+/// Prints forecasts at the end of the histories as JSON.
+pub(super) fn now_json(forecasts: &[CurrentForecast]) -> io::Result<()> {
+    print_json(&NowDocument { version: VERSION, interval: INTERVAL, forecasts })
 }
 
-/// Judged forecasts, for programs.
-pub(super) fn scored_json(files: &[Scored], alpha: f64) -> io::Result<()> {
-    json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
+/// Prints scored forecasts as JSON.
+pub(super) fn scored_json(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
+    print_json(&ScoredDocument { version: VERSION, interval: INTERVAL, alpha, files, total: rul::total(files) })
 }
 
-fn json(document: &impl Serialize) -> io::Result<()> {
+/// Prints forecasts at the end of the histories as a table.
+pub(super) fn now_table(forecasts: &[CurrentForecast]) -> io::Result<()> {
     let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, document)?;
-    writeln!(out)
-}
-
-/// Forecasts now, for people.
-pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the rate of use of late\n")?;
+    writeln!(out, "remaining: median (5 to 95 %), counted from the last reading; days at the recent rate of use\n")?;
     let heads = ["file", "end of life", "readings", "capacity", "loss per unit", "cycles", "days"];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    rows.extend(forecasts.iter().map(|now| {
+    let rows = forecasts.iter().map(|now| {
         let life = now.remaining;
         vec![
             now.name.clone(),
@@ -63,8 +56,8 @@ pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
             amount(life.and_then(|life| life.cycles)),
             amount(life.and_then(|life| life.days)),
         ]
-    }));
-    write_table(&mut out, &rows, 2)?;
+    });
+    write_table(&mut out, &heads, rows, 2)?;
     for now in forecasts {
         if let Some(why) = &now.refused {
             writeln!(out, "{}, {:.3} Ah: no forecast: {why}", now.name, now.threshold_ah)?;
@@ -73,34 +66,20 @@ pub(super) fn now_table(forecasts: &[Now]) -> io::Result<()> {
     Ok(())
 }
 
-/// Judged forecasts, for people.
-pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
+/// Prints scored forecasts as a table.
+pub(super) fn scored_table(files: &[HistoryScore], alpha: f64) -> io::Result<()> {
     let mut out = io::stdout().lock();
     let percent = 100.0 * alpha;
     writeln!(out, "remaining: median (5 to 95 %); passes when the median is within {percent:.0} % of the truth")?;
     writeln!(out, "errors are |median - truth| as a part of the life, at most {:.0} %\n", 100.0 * WORST_ERROR)?;
+    #[rustfmt::skip]
     let heads = [
-        "file",
-        "end of life",
-        "at",
-        "readings",
-        "unit",
-        "truth",
-        "forecast",
-        "alpha",
-        "interval",
-        "error",
-        "line",
-        "error",
-        "double exp.",
-        "error",
+        "file", "end of life", "at", "readings", "unit", "truth", "forecast", "alpha", "interval", "error", "line", "error",
+        "double exp.", "error",
     ];
-    let mut rows = vec![heads.map(str::to_owned).to_vec()];
-    for file in files {
-        rows.extend(file.judged.iter().map(|judged| judged_row(file, judged)));
-    }
-    if rows.len() > 1 {
-        write_table(&mut out, &rows, 2)?;
+    let rows: Vec<_> = files.iter().flat_map(|file| file.judged.iter().map(|score| judged_row(file, score))).collect();
+    if !rows.is_empty() {
+        write_table(&mut out, &heads, rows, 2)?;
         writeln!(out)?;
     }
     notes(&mut out, files)?;
@@ -110,9 +89,9 @@ pub(super) fn scored_table(files: &[Scored], alpha: f64) -> io::Result<()> {
     }
 }
 
-fn judged_row(file: &Scored, judged: &Judged) -> Vec<String> {
+fn judged_row(file: &HistoryScore, judged: &ForecastScore) -> Vec<String> {
     let forecast = judged.forecast.map(|[low, median, high]| Remaining { low, median, high });
-    let baseline = |said: Option<f64>| said.map_or("never".to_owned(), |said| format!("{said:.1}"));
+    let baseline = |end: Option<f64>| end.map_or("never".to_owned(), |end| format!("{end:.1}"));
     vec![
         file.name.clone(),
         format!("{:.3} Ah", file.threshold_ah),
@@ -131,8 +110,8 @@ fn judged_row(file: &Scored, judged: &Judged) -> Vec<String> {
     ]
 }
 
-/// What was not judged, and what was refused.
-fn notes(out: &mut impl Write, files: &[Scored]) -> io::Result<()> {
+/// Prints which files were not scored, and which forecasts are missing.
+fn notes(out: &mut impl Write, files: &[HistoryScore]) -> io::Result<()> {
     for file in files {
         let (name, threshold_ah) = (&file.name, file.threshold_ah);
         match file.end_of_life {
@@ -154,7 +133,7 @@ fn notes(out: &mut impl Write, files: &[Scored]) -> io::Result<()> {
     Ok(())
 }
 
-fn totals(out: &mut impl Write, total: &Total) -> io::Result<()> {
+fn totals(out: &mut impl Write, total: &ScoreTotal) -> io::Result<()> {
     writeln!(out, "\n{} forecasts, {} refused", total.forecasts, total.refused)?;
     writeln!(out, "interval holds the truth  {}", part(total.coverage))?;
     writeln!(out, "median passes alpha       {}", part(total.within_alpha))?;

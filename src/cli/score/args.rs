@@ -1,8 +1,10 @@
-//! What `score` can be told.
+//! Arguments of `score`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::cli::Failure;
+use crate::cli::numbers::{above_0, finite, fraction, within};
+use crate::cli::output::check_distinct;
 use crate::lab::score;
 
 /// Where in a file the estimator starts.
@@ -23,7 +25,7 @@ impl From<Start> for score::Start {
     }
 }
 
-/// Error of the SOC told, points; `None` = nothing told.
+/// Error of the initial SOC, points; `None` = no initial SOC is given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct InitialSocError(pub(crate) Option<f64>);
 
@@ -57,14 +59,14 @@ pub(crate) struct Args {
     #[arg(long, value_enum, value_delimiter = ',', default_value = "full", help_heading = "Starts")]
     pub(crate) start: Vec<Start>,
     /// Part of the full charge already taken out where a start in the middle begins
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = part, help_heading = "Starts")]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction, help_heading = "Starts")]
     pub(crate) remove: f64,
-    /// Error of the SOC the estimator is told, points (-20: told 20 points less than true); "none": it is told nothing
-    /// and starts from its first voltage
-    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = told,
+    /// Error of the initial SOC given to the estimator, points (-20: 20 points below the truth); "none": no SOC is given and
+    /// it starts from its first voltage
+    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
           allow_hyphen_values = true, help_heading = "Starts")]
     pub(crate) told: Vec<InitialSocError>,
-    /// Standard deviation told with the SOC, points; as large as --told says when not given, and 5 at least
+    /// Standard deviation of the initial SOC, points; when not given, as large as --told and 5 at least
     #[arg(long, value_name = "POINTS", value_parser = percent_above_0, help_heading = "Starts")]
     pub(crate) soc_std: Option<f64>,
     /// Error of the capacity the estimator starts with, percent of the model's
@@ -75,17 +77,17 @@ pub(crate) struct Args {
     #[arg(long, value_name = "PERCENT", value_parser = percent_above_0, help_heading = "Starts")]
     pub(crate) capacity_std: Option<f64>,
     /// Offset of the current sensor, A: added to every measured current before the estimator sees it
-    #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = number,
+    #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = finite,
           allow_hyphen_values = true, help_heading = "Starts")]
     pub(crate) current_offset: Vec<f64>,
 
-    /// Time after the start that no statistic counts: 600, 600s, 10min or 1h
+    /// Time after the start without statistics: 600, 600s, 10min or 1h
     #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration, help_heading = "Truth and statistics")]
     pub(crate) settle: f64,
     /// Charge from full to empty that the truth is stated in, Ah; the cell model's capacity_ah when not given
     #[arg(long, value_name = "AH", value_parser = above_0, help_heading = "Truth and statistics")]
     pub(crate) truth_capacity: Option<f64>,
-    /// A hole in a file longer than this means that nobody measured, s
+    /// A gap in a file longer than this means that the recorder was asleep, s
     #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0, help_heading = "Truth and statistics")]
     pub(crate) sleep_gap: f64,
 
@@ -117,7 +119,7 @@ pub(crate) struct Args {
 }
 
 impl Args {
-    /// What one argument alone cannot tell.
+    /// Checks the arguments that depend on each other.
     pub(super) fn check(&self) -> Result<(), Failure> {
         let (files, tables) = (self.files.len(), self.cycles.len());
         if tables != 0 && tables != files {
@@ -125,60 +127,24 @@ impl Args {
                 "--cycles given {tables} times for {files} files, must be once per file"
             )));
         }
-        for (index, file) in self.files.iter().enumerate() {
-            if self.files[..index].contains(file) {
-                return Err(Failure::new(format!("{}: named twice", file.display())));
-            }
-        }
-        Ok(())
+        check_distinct(&self.files)
     }
-}
-
-/// Short names that tell the files apart: folder and name without endings, the whole path where two are the same.
-pub(crate) fn names(files: &[PathBuf]) -> Vec<String> {
-    let short = |path: &PathBuf| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let name = name.split('.').next().unwrap_or_default().to_owned();
-        let folder = path.parent().and_then(Path::file_name).map(|folder| folder.to_string_lossy().into_owned());
-        folder.map_or(name.clone(), |folder| format!("{folder}/{name}"))
-    };
-    let all: Vec<String> = files.iter().map(short).collect();
-    let twice = |name: &String| all.iter().filter(|other| *other == name).count() > 1;
-    let full = |(name, path): (&String, &PathBuf)| if twice(name) { path.display().to_string() } else { name.clone() };
-    all.iter().zip(files).map(full).collect()
-}
-
-fn number(text: &str) -> Result<f64, String> {
-    let value: f64 = text.trim().parse().map_err(|_| "must be a number".to_owned())?;
-    if value.is_finite() { Ok(value) } else { Err("must be finite".to_owned()) }
-}
-
-fn above_0(text: &str) -> Result<f64, String> {
-    number(text).and_then(|value| if value > 0.0 { Ok(value) } else { Err("must be above 0".to_owned()) })
-}
-
-/// Strictly between 0 and 1.
-fn part(text: &str) -> Result<f64, String> {
-    let within = |value: &f64| *value > 0.0 && *value < 1.0;
-    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and below 1".to_owned()))
 }
 
 fn percent_above_0(text: &str) -> Result<f64, String> {
-    let within = |value: &f64| *value > 0.0 && *value <= 100.0;
-    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above 0 and at most 100".to_owned()))
+    within(text, |value| value > 0.0 && value <= 100.0, "above 0 and at most 100")
 }
 
-fn told(text: &str) -> Result<InitialSocError, String> {
+fn initial_soc_error(text: &str) -> Result<InitialSocError, String> {
     if text == "none" {
         return Ok(InitialSocError(None));
     }
-    let value = number(text).map_err(|_| "must be a number of points or none".to_owned())?;
-    if value.abs() <= 100.0 { Ok(InitialSocError(Some(value))) } else { Err("must be -100 to 100".to_owned()) }
+    let points = within(text, |points| points.abs() <= 100.0, "a number of points, -100 to 100, or none")?;
+    Ok(InitialSocError(Some(points)))
 }
 
 fn capacity_error(text: &str) -> Result<f64, String> {
-    let within = |value: &f64| *value > -100.0 && *value <= 100.0;
-    number(text).and_then(|v| Some(v).filter(within).ok_or_else(|| "must be above -100 and at most 100".to_owned()))
+    within(text, |value| value > -100.0 && value <= 100.0, "above -100 and at most 100")
 }
 
 /// Seconds of `600`, `600s`, `10min`, `1h`.
@@ -187,20 +153,20 @@ fn duration(text: &str) -> Result<f64, String> {
     let text = text.trim();
     let (digits, unit) =
         UNITS.iter().find_map(|(unit, seconds)| Some((text.strip_suffix(unit)?, *seconds))).unwrap_or((text, 1.0));
-    let value = number(digits).map_err(|_| "must be like 600, 600s, 10min or 1h".to_owned())?;
-    if value >= 0.0 { Ok(value * unit) } else { Err("must be at least 0".to_owned()) }
+    let value = within(digits, |value| value >= 0.0, "0 or more, like 600, 600s, 10min or 1h")?;
+    Ok(value * unit)
 }
 
 fn window(text: &str) -> Result<(f64, f64), String> {
     const EXPECTED: &str = "must be two parts above 0 and at most 1, the smaller first, like 0.4,0.7";
     let (least, most) = text.split_once(',').ok_or(EXPECTED)?;
-    let (least, most) = (number(least).map_err(|_| EXPECTED)?, number(most).map_err(|_| EXPECTED)?);
+    let (least, most) = (finite(least).map_err(|_| EXPECTED)?, finite(most).map_err(|_| EXPECTED)?);
     if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(EXPECTED.to_owned()) }
 }
 
 fn load(text: &str) -> Result<Load, String> {
     const EXPECTED: &str = "must be amperes above 0, degrees C and volts above 0, like 2,24,2.7";
-    let values: Result<Vec<f64>, String> = text.split(',').map(number).collect();
+    let values: Result<Vec<f64>, String> = text.split(',').map(finite).collect();
     match values.as_deref() {
         Ok(&[current_a, temperature_c, cutoff_v]) if current_a > 0.0 && cutoff_v > 0.0 => {
             Ok(Load { current_a, temperature_c, cutoff_v })
@@ -226,13 +192,9 @@ mod tests {
         assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
         assert_eq!(load("2,-10,2.7"), Ok(Load { current_a: 2.0, temperature_c: -10.0, cutoff_v: 2.7 }));
         assert!(["2,24", "0,24,2.7", "2,24,2.7,1", "a,b,c"].iter().all(|text| load(text).is_err()));
-        assert_eq!((told("none"), told("-20")), (Ok(InitialSocError(None)), Ok(InitialSocError(Some(-20.0)))));
-        assert!(told("-101").is_err() && told("NaN").is_err() && part("1").is_err() && capacity_error("-100").is_err());
-    }
-
-    #[test]
-    fn names_tell_files_apart() {
-        let files = ["a/25C/x.csv.gz", "a/10C/x.csv.gz", "b/10C/x.csv", "y.csv"].map(PathBuf::from);
-        assert_eq!(names(&files), ["25C/x", "a/10C/x.csv.gz", "b/10C/x.csv", "y"]);
+        assert_eq!(initial_soc_error("none"), Ok(InitialSocError(None)));
+        assert_eq!(initial_soc_error("-20"), Ok(InitialSocError(Some(-20.0))));
+        assert!(initial_soc_error("-101").is_err() && initial_soc_error("NaN").is_err());
+        assert!(fraction("1").is_err() && capacity_error("-100").is_err());
     }
 }

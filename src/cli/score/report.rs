@@ -1,13 +1,14 @@
-//! What `score` tells: a progress bar, tables, JSON.
+//! Output of `score`: a progress bar, tables, JSON.
 
 use std::io::{self, Write};
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 use serde::Serialize;
 
+use crate::cli::output::{print_json, progress_bar, write_table};
 use crate::config::Config;
 use crate::lab::score::{
-    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, Job, LifeScore, Settings, SocScore, Start,
+    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore, Start,
 };
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.
@@ -17,18 +18,15 @@ pub(super) struct Bar {
 }
 
 impl Bar {
-    pub(super) fn new(jobs: &[Job]) -> Self {
+    pub(super) fn new(jobs: &[ScoreJob]) -> Self {
         let bytes: Vec<f64> =
             jobs.iter().map(|job| std::fs::metadata(&job.path).map_or(0.0, |found| found.len() as f64)).collect();
-        let total = bytes.iter().sum::<f64>() as u64;
-        let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
-        let style = ProgressStyle::with_template("{bar:32} {percent} % of {msg}, eta {eta}");
-        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        let bar = progress_bar(bytes.iter().sum::<f64>() as u64, "{bar:32} {percent} % of {msg}, eta {eta}");
         bar.set_message(if jobs.len() == 1 { "1 file".to_owned() } else { format!("{} files", jobs.len()) });
         Self { bar, bytes }
     }
 
-    /// `part` of the work on file `index` is done.
+    /// Adds a share of the work on file `index`.
     pub(super) fn advance(&self, index: usize, part: f64) {
         self.bar.inc((part * self.bytes.get(index).copied().unwrap_or(0.0)).round() as u64);
     }
@@ -38,12 +36,22 @@ impl Bar {
     }
 }
 
-/// Everything there is to show.
-pub(super) struct Shown<'a> {
+/// Scores with their settings.
+pub(super) struct ScoreReport<'a> {
     pub(super) config: &'a Config,
-    pub(super) settings: &'a Settings,
+    pub(super) settings: &'a ScoreSettings,
     pub(super) cases: &'a [Case],
     pub(super) scores: &'a [CaseScore],
+}
+
+/// Columns of the table of SOC errors.
+const SOC_HEADS: [&str; 11] =
+    ["file", "case", "RMSE", "mean", "max", "converged", "in 95 %", "+/-", "NIS", "resets", "samples"];
+
+/// Columns of the table of capacity errors.
+#[rustfmt::skip]
+fn life_heads(below: &str) -> [&str; 12] {
+    ["file", "case", "mean |error|", "mean", "max", "in 95 %", "+/-", below, "truth", "capacity", "resistance", "resets"]
 }
 
 /// The JSON document.
@@ -89,10 +97,10 @@ struct LifeTotal<'a> {
     least_coverage: f64,
 }
 
-impl Shown<'_> {
-    /// One JSON document on standard output.
+impl ScoreReport<'_> {
+    /// Prints one JSON document on standard output.
     pub(super) fn json(&self) -> io::Result<()> {
-        let document = Document {
+        print_json(&Document {
             config: self.config.path.display().to_string(),
             cell_model: &self.settings.monitor.model.name,
             truth_capacity_ah: self.settings.truth_capacity_ah,
@@ -101,13 +109,10 @@ impl Shown<'_> {
             converged_hold_s: CONVERGED_HOLD_S,
             scores: self.scores,
             totals: self.totals(),
-        };
-        let mut out = io::stdout().lock();
-        serde_json::to_writer_pretty(&mut out, &document)?;
-        writeln!(out)
+        })
     }
 
-    /// Tables for people on standard output.
+    /// Prints tables on standard output.
     pub(super) fn table(&self) -> io::Result<()> {
         let mut out = io::stdout().lock();
         let settings = self.settings;
@@ -119,11 +124,12 @@ impl Shown<'_> {
                 out,
                 "\nSOC in points of {truth_ah} Ah, after {settle_s:.0} s; converged = within {CONVERGED_POINTS} points for {hold_min:.0} min"
             )?;
-            write_table(&mut out, &self.soc_rows(), 2)?;
+            write_table(&mut out, &SOC_HEADS, self.soc_rows(), 2)?;
         }
         if self.scores.iter().any(|score| score.life.is_some()) {
             writeln!(out, "\nusable capacity after {} discharges", settings.skip_cycles)?;
-            write_table(&mut out, &self.life_rows(), 2)?;
+            let below = format!("below {} Ah", settings.threshold_ah);
+            write_table(&mut out, &life_heads(&below), self.life_rows(), 2)?;
         }
         self.notes(&mut out)
     }
@@ -136,59 +142,29 @@ impl Shown<'_> {
     }
 
     fn soc_rows(&self) -> Vec<Vec<String>> {
-        let heads = ["file", "case", "RMSE", "mean", "max", "converged", "in 95 %", "+/-", "NIS", "resets", "samples"];
-        let mut rows = vec![heads.map(str::to_owned).to_vec()];
         let scored = self.scores.iter().filter_map(|score| Some((score, score.soc.as_ref()?)));
-        rows.extend(scored.map(|(score, soc)| soc_row(score, soc)));
+        let mut rows: Vec<_> = scored.map(|(score, soc)| soc_row(score, soc)).collect();
         for total in self.totals().iter().filter(|total| total.files > 1) {
             let Some(soc) = &total.soc else { continue };
             let case = describe(&total.case);
-            rows.push(vec![
-                "mean of files".into(),
-                case.clone(),
-                two(soc.mean_rmse_points),
-                String::new(),
-                String::new(),
-                String::new(),
-                percent(soc.mean_coverage),
-                two(soc.mean_half_width_points),
-            ]);
-            rows.push(vec![
-                format!("worst: {}", soc.worst_file),
-                case,
-                two(soc.worst_rmse_points),
-                String::new(),
-                String::new(),
-                String::new(),
-                percent(soc.least_coverage),
-            ]);
+            let row = |file: String, rmse: f64, coverage: f64| {
+                let blank = [const { String::new() }; 3];
+                [file, case.clone(), two(rmse)].into_iter().chain(blank).chain([percent(coverage)]).collect::<Vec<_>>()
+            };
+            let mut mean = row("mean of files".into(), soc.mean_rmse_points, soc.mean_coverage);
+            mean.push(two(soc.mean_half_width_points));
+            rows.push(mean);
+            rows.push(row(format!("worst: {}", soc.worst_file), soc.worst_rmse_points, soc.least_coverage));
         }
         rows
     }
 
     fn life_rows(&self) -> Vec<Vec<String>> {
-        let below = format!("below {} Ah", self.settings.threshold_ah);
-        let heads = [
-            "file",
-            "case",
-            "mean |error|",
-            "mean",
-            "max",
-            "in 95 %",
-            "+/-",
-            &below,
-            "truth",
-            "capacity",
-            "resistance",
-            "resets",
-        ];
-        let mut rows = vec![heads.map(str::to_owned).to_vec()];
         let scored = self.scores.iter().filter_map(|score| Some((score, score.life.as_ref()?)));
-        rows.extend(scored.map(|(score, life)| life_row(score, life)));
-        rows
+        scored.map(|(score, life)| life_row(score, life)).collect()
     }
 
-    /// What was not handed on or not judged.
+    /// Prints which values were not fed or not scored.
     fn notes(&self, out: &mut impl Write) -> io::Result<()> {
         for score in self.scores {
             let (name, case) = (&score.name, describe(&score.case));
@@ -197,7 +173,7 @@ impl Shown<'_> {
                 writeln!(out, "{name}, {case}: {left_out} of {} rows left out (no truth or no estimate)", score.rows)?;
             }
             if score.uncarried_values > 0 {
-                writeln!(out, "{name}, {case}: {} values that no frame could carry", score.uncarried_values)?;
+                writeln!(out, "{name}, {case}: {} values that no frame can carry", score.uncarried_values)?;
             }
             if let Some(life) = score.life.as_ref().filter(|life| life.left_out > 0) {
                 let (left_out, all) = (life.left_out, life.discharges);
@@ -224,18 +200,14 @@ impl<'a> Total<'a> {
 
 impl<'a> SocTotal<'a> {
     fn new(scores: &[&'a CaseScore]) -> Option<Self> {
-        let all: Vec<(&str, &SocScore)> = scores
-            .iter()
-            .filter_map(|score| Some((score.name.as_str(), score.soc.as_ref()?)))
-            .filter(|(_, soc)| soc.samples > 0)
-            .collect();
-        let (worst_file, worst) = all.iter().max_by(|a, b| a.1.rmse_points.total_cmp(&b.1.rmse_points))?;
+        let all: Vec<(&str, &SocScore)> = scored(scores, |score| score.soc.as_ref().filter(|soc| soc.samples > 0));
+        let (worst_file, worst_rmse_points) = worst(&all, |soc| soc.rmse_points)?;
         Some(Self {
             mean_rmse_points: mean(&all, |soc| soc.rmse_points),
-            worst_rmse_points: worst.rmse_points,
+            worst_rmse_points,
             worst_file,
             mean_coverage: mean(&all, |soc| soc.coverage),
-            least_coverage: all.iter().map(|(_, soc)| soc.coverage).fold(f64::INFINITY, f64::min),
+            least_coverage: least(&all, |soc| soc.coverage),
             mean_half_width_points: mean(&all, |soc| soc.mean_half_width_points),
         })
     }
@@ -243,23 +215,33 @@ impl<'a> SocTotal<'a> {
 
 impl<'a> LifeTotal<'a> {
     fn new(scores: &[&'a CaseScore]) -> Option<Self> {
-        let all: Vec<(&str, &LifeScore)> = scores
-            .iter()
-            .filter_map(|score| Some((score.name.as_str(), score.life.as_ref()?)))
-            .filter(|(_, life)| life.scored > 0)
-            .collect();
-        let (worst_file, worst) = all.iter().max_by(|a, b| a.1.mean_abs_error_ah.total_cmp(&b.1.mean_abs_error_ah))?;
+        let all: Vec<(&str, &LifeScore)> = scored(scores, |score| score.life.as_ref().filter(|life| life.scored > 0));
+        let (worst_file, worst_mean_abs_error_ah) = worst(&all, |life| life.mean_abs_error_ah)?;
         Some(Self {
             mean_abs_error_ah: mean(&all, |life| life.mean_abs_error_ah),
-            worst_mean_abs_error_ah: worst.mean_abs_error_ah,
+            worst_mean_abs_error_ah,
             worst_file,
-            least_coverage: all.iter().map(|(_, life)| life.coverage).fold(f64::INFINITY, f64::min),
+            least_coverage: least(&all, |life| life.coverage),
         })
     }
 }
 
+/// The files with a score, by name.
+fn scored<'a, T>(scores: &[&'a CaseScore], of: impl Fn(&'a CaseScore) -> Option<&'a T>) -> Vec<(&'a str, &'a T)> {
+    scores.iter().filter_map(|score| Some((score.name.as_str(), of(score)?))).collect()
+}
+
 fn mean<T>(all: &[(&str, &T)], value: impl Fn(&T) -> f64) -> f64 {
     all.iter().map(|(_, score)| value(score)).sum::<f64>() / all.len() as f64
+}
+
+fn least<T>(all: &[(&str, &T)], value: impl Fn(&T) -> f64) -> f64 {
+    all.iter().map(|(_, score)| value(score)).fold(f64::INFINITY, f64::min)
+}
+
+/// The file with the largest value, and that value.
+fn worst<'a, T>(all: &[(&'a str, &T)], value: impl Fn(&T) -> f64) -> Option<(&'a str, f64)> {
+    all.iter().map(|(name, score)| (*name, value(score))).max_by(|a, b| a.1.total_cmp(&b.1))
 }
 
 fn describe(case: &Case) -> String {
@@ -267,7 +249,7 @@ fn describe(case: &Case) -> String {
         Start::Full => "full".to_owned(),
         Start::Middle => "middle".to_owned(),
     }];
-    words.extend(case.told_points.map(|points| format!("told {points:+}")));
+    words.extend(case.soc_error_points.map(|points| format!("told {points:+}")));
     words.extend((case.capacity_error_percent != 0.0).then(|| format!("C {:+} %", case.capacity_error_percent)));
     words.extend((case.current_offset_a != 0.0).then(|| format!("I {:+} A", case.current_offset_a)));
     words.extend(case.seed.map(|seed| format!("windows {seed}")));
@@ -291,7 +273,7 @@ fn soc_row(score: &CaseScore, soc: &SocScore) -> Vec<String> {
 }
 
 fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
-    let milli = |ah: f64| if ah.is_finite() { format!("{:.1} mAh", 1000.0 * ah) } else { "-".to_owned() };
+    let milli = |ah: f64| known(ah, |ah| format!("{:.1} mAh", 1000.0 * ah));
     let number = |found: Option<usize>| found.map_or_else(|| "never".to_owned(), |number| number.to_string());
     let with_std = |value: Option<f64>, std: Option<f64>, digits: usize| {
         let text = value.zip(std).map(|(value, std)| format!("{value:.digits$} +/- {std:.digits$}"));
@@ -313,34 +295,23 @@ fn life_row(score: &CaseScore, life: &LifeScore) -> Vec<String> {
     ]
 }
 
+/// Formats a finite value, else a dash.
+fn known(value: f64, format: impl Fn(f64) -> String) -> String {
+    if value.is_finite() { format(value) } else { "-".to_owned() }
+}
+
 fn two(value: f64) -> String {
-    if value.is_finite() { format!("{value:.2}") } else { "-".to_owned() }
+    known(value, |value| format!("{value:.2}"))
 }
 
 fn four(value: f64) -> String {
-    if value.is_finite() { format!("{value:.4}") } else { "-".to_owned() }
+    known(value, |value| format!("{value:.4}"))
 }
 
 fn signed(value: f64) -> String {
-    if value.is_finite() { format!("{value:+.2}") } else { "-".to_owned() }
+    known(value, |value| format!("{value:+.2}"))
 }
 
 fn percent(value: f64) -> String {
-    if value.is_finite() { format!("{:.1} %", 100.0 * value) } else { "-".to_owned() }
-}
-
-/// Columns as wide as their widest entry: the first `left` to the left, numbers to the right.
-pub(crate) fn write_table(out: &mut impl Write, rows: &[Vec<String>], left: usize) -> io::Result<()> {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
-    let widths: Vec<usize> =
-        (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
-    for row in rows {
-        let cells = widths.iter().enumerate().map(|(column, &width)| {
-            let text = entry(row, column);
-            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
-        });
-        writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-    }
-    Ok(())
+    known(value, |value| format!("{:.1} %", 100.0 * value))
 }

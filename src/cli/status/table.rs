@@ -5,9 +5,9 @@ use std::fmt::Write as _;
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
 use crate::cli::alarms::{cell as cell_name, severity, state_name, with_unit};
+use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{Cell, Document, Pack};
-use crate::io::stamp;
 
 /// Up to so many cells all are listed: more do not fit a screen beside the rest.
 const MAX_LISTED: usize = 16;

@@ -1,49 +1,58 @@
-//! What `whatif` tells programs: one JSON document, or CSV.
+//! Output of `whatif` for programs: one JSON document, or CSV.
 
-use std::io::{self, Write};
+use std::io;
 use std::path::Path;
 
 use serde_json::json;
 
-use super::report::Shown;
+use super::report::WhatifReport;
+use crate::cli::output::print_json;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::Variant;
-use crate::lab::fleet::whatif::{AlarmRow, LogResult};
+use crate::lab::fleet::whatif::{LogResult, ThresholdScore};
 use crate::quantity::Timestamp;
 
 /// Version of the JSON document.
 const VERSION: u32 = 1;
-/// Columns of the CSV besides the values set.
-const HEADS: [&str; 23] = [
-    "log",
-    "judged_by",
-    "days",
-    "cycles",
-    "end_of_life_day",
-    "end_of_life_cycle",
-    "setting",
-    "rule",
-    "severity",
-    "threshold",
-    "raises",
-    "raised_utc",
-    "raised_day",
-    "raised_cycle",
-    "cell",
-    "value",
-    "lead_days",
-    "lead_cycles",
-    "missed",
-    "false_alarms",
-    "open",
-    "false_raises",
-    "flickers",
+/// A column of the CSV: name and value.
+type Column = (&'static str, fn(&LogResult, &ThresholdScore) -> String);
+
+/// Columns of the CSV in addition to the values set.
+#[rustfmt::skip]
+const COLUMNS: [Column; 23] = [
+    ("log", |log, _| log.log.display().to_string()),
+    ("judged_by", |log, _| log.judged_by.words().to_owned()),
+    ("days", |log, _| log.days.to_string()),
+    ("cycles", |log, _| log.cycles.to_string()),
+    ("end_of_life_day", |log, _| text(log.end_of_life.map(|end| end.days))),
+    ("end_of_life_cycle", |log, _| text(log.end_of_life.map(|end| end.cycles))),
+    ("setting", |_, row| row.setting.to_string()),
+    ("rule", |_, row| row.rule.name().to_owned()),
+    ("severity", |_, row| row.severity.name().to_owned()),
+    ("threshold", |_, row| row.threshold.to_string()),
+    ("raises", |_, row| row.judged.raises.to_string()),
+    ("raised_utc", |_, row| text(row.judged.first.map(|first| stamp::format_utc(Timestamp::from_secs(first.time_s))))),
+    ("raised_day", |_, row| text(row.judged.first.map(|first| first.days))),
+    ("raised_cycle", |_, row| text(row.judged.first.map(|first| first.cycles))),
+    ("cell", |_, row| text(row.judged.first.and_then(|first| first.cell))),
+    ("value", |_, row| text(row.judged.first.and_then(|first| first.value))),
+    ("lead_days", |_, row| text(row.judged.lead_days)),
+    ("lead_cycles", |_, row| text(row.judged.lead_cycles)),
+    ("missed", |_, row| text(row.judged.missed)),
+    ("false_alarms", |_, row| text(row.judged.false_alarms)),
+    ("open", |_, row| text(row.judged.open)),
+    ("false_raises", |_, row| text(row.judged.false_raises)),
+    ("flickers", |_, row| row.judged.flickers.to_string()),
 ];
 
-impl Shown<'_> {
-    /// One JSON document.
+fn text(value: Option<impl ToString>) -> String {
+    value.map(|value| value.to_string()).unwrap_or_default()
+}
+
+impl WhatifReport<'_> {
+    /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
         let horizon = match self.settings.horizon {
             None => json!(null),
@@ -62,7 +71,7 @@ impl Shown<'_> {
                 LogResult { alarms, ..(*log).clone() }
             })
             .collect();
-        let document = json!({
+        print_json(&json!({
             "version": VERSION,
             "end_of_life_ah": self.settings.end_of_life_ah,
             "rated_capacity_ah": self.rated_ah,
@@ -73,56 +82,22 @@ impl Shown<'_> {
             "logs": logs,
             "failed": self.failed,
             "notes": self.grid.notes,
-        });
-        let mut out = io::stdout().lock();
-        serde_json::to_writer_pretty(&mut out, &document)?;
-        writeln!(out)
+        }))
     }
 
-    /// A row per log, setting and alarm.
+    /// Writes a row per log, setting and alarm.
     pub(super) fn csv(&self, path: &Path) -> io::Result<()> {
         let mut out = csv::Writer::from_writer(ResultFile::create(path)?);
-        out.write_record(HEADS.into_iter().chain(self.grid.keys.iter().map(String::as_str)))?;
+        let keys = self.grid.keys.iter().map(String::as_str);
+        out.write_record(COLUMNS.iter().map(|(name, _)| *name).chain(keys))?;
         for log in self.logs {
             for row in self.rows(log) {
                 let values =
                     self.grid.variants.get(row.setting).map(|variant| variant.values.as_slice()).unwrap_or_default();
                 let set = (0..self.grid.keys.len()).map(|key| values.get(key).cloned().unwrap_or_default());
-                out.write_record(csv_row(log, row).into_iter().chain(set))?;
+                out.write_record(COLUMNS.iter().map(|(_, value)| value(log, row)).chain(set))?;
             }
         }
         out.into_inner().map_err(|error| io::Error::other(error.to_string()))?.finish()
     }
-}
-
-fn csv_row(log: &LogResult, row: &AlarmRow) -> [String; HEADS.len()] {
-    fn text(value: Option<impl ToString>) -> String {
-        value.map(|value| value.to_string()).unwrap_or_default()
-    }
-    let (judged, first, end) = (&row.judged, row.judged.first.as_ref(), log.end_of_life.as_ref());
-    [
-        log.log.display().to_string(),
-        log.judged_by.words().to_owned(),
-        log.days.to_string(),
-        log.cycles.to_string(),
-        text(end.map(|end| end.days)),
-        text(end.map(|end| end.cycles)),
-        row.setting.to_string(),
-        row.rule.name().to_owned(),
-        row.severity.name().to_owned(),
-        row.threshold.to_string(),
-        judged.raises.to_string(),
-        text(first.map(|first| stamp::format_utc(Timestamp::from_secs(first.time_s)))),
-        text(first.map(|first| first.days)),
-        text(first.map(|first| first.cycles)),
-        text(first.and_then(|first| first.cell)),
-        text(first.and_then(|first| first.value)),
-        text(judged.lead_days),
-        text(judged.lead_cycles),
-        text(judged.missed),
-        text(judged.false_alarms),
-        text(judged.open),
-        text(judged.false_raises),
-        judged.flickers.to_string(),
-    ]
 }

@@ -1,26 +1,26 @@
-//! What `whatif` tells people: the summary over the logs, each log.
+//! Tables of `whatif`: the summary over the logs, each log.
 
 use std::io::{self, Write};
 
 use serde::Serialize;
 
 use crate::alarm::{Rule, Severity};
-use crate::cli::score::write_table;
+use crate::cli::output::write_table;
 use crate::lab::fleet::judge::Horizon;
-use crate::lab::fleet::variants::Grid;
-use crate::lab::fleet::whatif::{AlarmRow, EndOfLife, LogResult, Settings};
+use crate::lab::fleet::variants::VariantGrid;
+use crate::lab::fleet::whatif::{EndOfLife, LogResult, ThresholdScore, WhatifSettings};
 
-/// Columns of a table besides the alarm and the values set.
+/// Columns of a table in addition to the alarm and the values set.
 const OWN_COLUMNS: usize = 9;
 const SUMMARY_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "lead, days", "lead, cycles", "missed", "false", "open", "false raises", "flickers"];
 const LOG_HEADS: [&str; OWN_COLUMNS] =
     ["threshold", "raised", "at day", "cycle", "cell", "value", "lead, days", "lead, cycles", "judged"];
 
-/// Everything that is shown.
-pub(super) struct Shown<'a> {
-    pub(super) grid: &'a Grid,
-    pub(super) settings: &'a Settings<'a>,
+/// Results with their settings.
+pub(super) struct WhatifReport<'a> {
+    pub(super) grid: &'a VariantGrid,
+    pub(super) settings: &'a WhatifSettings<'a>,
     pub(super) rated_ah: f64,
     /// Rules in the tables.
     pub(super) rules: &'a [Rule],
@@ -48,8 +48,8 @@ pub(super) struct Summary {
     flickers: usize,
 }
 
-impl Shown<'_> {
-    /// Tables for people.
+impl WhatifReport<'_> {
+    /// Prints the tables.
     pub(super) fn table(&self, each: bool) -> io::Result<()> {
         if self.logs.is_empty() {
             return Ok(());
@@ -105,9 +105,7 @@ impl Shown<'_> {
             self.row((summary.rule, summary.severity), summary.setting, own)
         };
         writeln!(out)?;
-        let mut rows = vec![self.heads(SUMMARY_HEADS)];
-        rows.extend(self.summaries().iter().map(row));
-        write_table(out, &rows, 2)
+        write_table(out, &self.heads(SUMMARY_HEADS), self.summaries().iter().map(row), 2)
     }
 
     fn write_log(&self, out: &mut impl Write, log: &LogResult) -> io::Result<()> {
@@ -119,12 +117,10 @@ impl Shown<'_> {
         };
         let (name, by) = (log.log.display(), log.judged_by.words());
         writeln!(out, "\n{name}: {:.2} days, {:.1} cycles, {learned}; {end} ({by})", log.days, log.cycles)?;
-        let mut rows = vec![self.heads(LOG_HEADS)];
-        rows.extend(self.rows(log).map(|row| self.log_row(log, row)));
-        write_table(out, &rows, 2)
+        write_table(out, &self.heads(LOG_HEADS), self.rows(log).map(|row| self.log_row(log, row)), 2)
     }
 
-    fn log_row(&self, log: &LogResult, row: &AlarmRow) -> Vec<String> {
+    fn log_row(&self, log: &LogResult, row: &ThresholdScore) -> Vec<String> {
         let judged = &row.judged;
         let first = judged.first.as_ref();
         let number = |value: Option<f64>, digits: usize| value.map_or_else(dash, |value| format!("{value:.digits$}"));
@@ -155,7 +151,7 @@ impl Shown<'_> {
         std::iter::once(alarm).chain(self.setting_cells(setting)).chain(own).collect()
     }
 
-    /// Columns of the values set; those of the configuration as it is are said so.
+    /// Returns the columns of the values set; "as it is" for the plain configuration.
     fn setting_cells(&self, setting: usize) -> impl Iterator<Item = String> {
         let values = self.grid.variants.get(setting).map(|variant| variant.values.clone()).unwrap_or_default();
         let plain = values.is_empty();
@@ -167,7 +163,7 @@ impl Shown<'_> {
     }
 
     /// The rows of a log that are shown.
-    pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l AlarmRow> {
+    pub(super) fn rows<'l>(&'l self, log: &'l LogResult) -> impl Iterator<Item = &'l ThresholdScore> {
         log.alarms.iter().filter(|row| self.rules.contains(&row.rule))
     }
 
@@ -182,14 +178,14 @@ impl Shown<'_> {
     }
 }
 
-fn summary(rows: &[&AlarmRow]) -> Summary {
+fn summary(rows: &[&ThresholdScore]) -> Summary {
     let first = rows[0];
-    let sum = |of: fn(&AlarmRow) -> Option<usize>| {
+    let sum = |of: fn(&ThresholdScore) -> Option<usize>| {
         rows.iter()
             .map(|row| of(row))
             .fold(None, |so_far: Option<usize>, next| next.map(|next| so_far.unwrap_or(0) + next).or(so_far))
     };
-    let leads = |of: fn(&AlarmRow) -> Option<f64>| quantiles(rows.iter().filter_map(|row| of(row)).collect());
+    let leads = |of: fn(&ThresholdScore) -> Option<f64>| quantiles(rows.iter().filter_map(|row| of(row)).collect());
     Summary {
         setting: first.setting,
         rule: first.rule,
@@ -214,7 +210,7 @@ fn quantiles(mut values: Vec<f64>) -> Option<[f64; 3]> {
     Some([at(0.5), at(0.05), at(0.95)])
 }
 
-fn verdict(row: &AlarmRow, end: Option<&EndOfLife>) -> String {
+fn verdict(row: &ThresholdScore, end: Option<&EndOfLife>) -> String {
     let judged = &row.judged;
     let late_days = judged.first.zip(end).map(|(first, end)| first.days - end.days).filter(|days| *days >= 0.0);
     let missed = || late_days.map_or_else(|| "missed".to_owned(), |days| format!("missed, came {days:.2} days late"));

@@ -1,20 +1,20 @@
-//! One alarm machine per rule, severity and cell, fed by rule; tells what became of them.
+//! One alarm machine per rule, severity and cell; reports their changes.
 //!
 //! In: values in each rule's unit with the time of the look, and commands. Out: [`AlarmChange`]s and the list of raised
 //! alarms in the order rule, severity, cell (the pack first). One rule may have a threshold per severity; each has
 //! alarms of its own. A value for a rule that is not configured, or for a cell a rule does not watch, concerns no alarm
-//! and is passed over.
+//! and is ignored.
 
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::judge::Verdict;
-use super::machine::{Change, Machine, Refusal, Standing, State};
-use super::{Observation, Outcome, Rule, RuleConfig, Scope, Selector, Severity};
+use super::limit::LimitCheck;
+use super::machine::{AlarmState, Change, IndexEntry, Machine, Refusal};
+use super::{CommandOutcome, Observation, Rule, RuleConfig, Scope, Selector, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// An alarm as it stands.
+/// An alarm as it is now.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {
     /// Which rule.
@@ -23,8 +23,8 @@ pub struct Alarm {
     pub severity: Severity,
     /// Which cell; `None` = the pack.
     pub cell: Option<CellIndex>,
-    /// Where it is in its life.
-    pub state: State,
+    /// Its state.
+    pub state: AlarmState,
     /// The latest value, in the rule's unit; `None` = not known (any more).
     pub value: Option<f64>,
     /// Probability that the truth is beyond the threshold; `None` = the value has no standard deviation.
@@ -33,26 +33,26 @@ pub struct Alarm {
     pub threshold: f64,
     /// Times it was raised.
     pub occurrences: u32,
-    /// When it was raised for the first of these times; `None` = never.
+    /// Comparison it was raised for the first of these times; `None` = never.
     pub first_raised: Option<Timestamp>,
-    /// When it was raised last.
+    /// Comparison it was raised last.
     pub last_raised: Option<Timestamp>,
     /// The value that raised it last; `None` = never raised.
     pub raised_value: Option<f64>,
-    /// Whether somebody has seen it since it was raised last.
+    /// Whether it has been acknowledged since it was raised last.
     pub is_acknowledged: bool,
 }
 
-/// What became of an alarm, and how it stands now.
+/// A change of an alarm, and the alarm after it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AlarmChange {
-    /// What.
+    /// The change.
     pub change: Change,
     /// The alarm after it.
     pub alarm: Alarm,
 }
 
-/// What became of all alarms of one threshold.
+/// Summary of all alarms of one threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ThresholdState {
     /// Which rule.
@@ -61,7 +61,7 @@ pub struct ThresholdState {
     pub severity: Severity,
     /// Whether one of its alarms is raised.
     pub is_raised: bool,
-    /// Times the one of them that was raised most often was.
+    /// Times the most often raised of them was raised.
     pub occurrences: u32,
 }
 
@@ -89,13 +89,13 @@ impl StoredAlarm {
     }
 }
 
-/// What an engine remembers: every alarm that was raised or is about to be.
+/// Stored part of an engine: every alarm that was raised or is about to be.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-pub struct AlarmState {
+pub struct AlarmSnapshot {
     alarms: Vec<StoredAlarm>,
 }
 
-impl AlarmState {
+impl AlarmSnapshot {
     /// Moves every stamp by `by_nanos`, onto another clock.
     pub fn rebase(&mut self, by_nanos: i64) {
         for alarm in &mut self.alarms {
@@ -119,7 +119,7 @@ struct RuleSlots {
 
 impl RuleSlots {
     fn new(config: RuleConfig, first: usize, cells: usize) -> Self {
-        let (pack_slots, cell_slots) = match config.rule.row().scope {
+        let (pack_slots, cell_slots) = match config.rule.spec().scope {
             Scope::Pack => (1, 0),
             Scope::Cell => (0, cells),
             Scope::Both => (1, cells),
@@ -182,16 +182,16 @@ impl AlarmEngine {
         }
     }
 
-    /// Takes the value of `rule` for `cell` (`None` = the pack) as it stands at `now`.
+    /// Takes the value of `rule` for `cell` (`None` = the pack) at `now`.
     pub fn observe(
         &mut self,
         now: Timestamp,
         rule: Rule,
         cell: Option<CellIndex>,
-        seen: &Observation,
+        observation: &Observation,
         changes: &mut Vec<AlarmChange>,
     ) {
-        self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, seen));
+        self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
     /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
@@ -204,7 +204,7 @@ impl AlarmEngine {
         valid: bool,
         changes: &mut Vec<AlarmChange>,
     ) {
-        if rule.row().is_learned {
+        if rule.spec().is_learned {
             self.each_threshold(rule, cell, changes, |machine, config| match valid {
                 true => machine.resume(now, config),
                 false => machine.suspend(now, config),
@@ -216,7 +216,7 @@ impl AlarmEngine {
     /// alarm is at rest, and that is not beyond a threshold. Also when nothing watches the rule.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
         self.rules[self.by_rule[usize::from(rule as u8)].clone()].iter().all(|slots| {
-            let is_beyond = || Verdict::of(&slots.config, &Observation::new(Some(worst))).0 != Verdict::Healthy;
+            let is_beyond = || LimitCheck::of(&slots.config, &Observation::new(Some(worst))).0 != LimitCheck::Healthy;
             slots.restless == 0 && !is_beyond()
         })
     }
@@ -231,17 +231,17 @@ impl AlarmEngine {
         }
     }
 
-    /// Lets time pass for the values that hold until the next one ([`Row::is_learned`](super::rule::Row::is_learned)).
+    /// Lets time pass for the values that hold until the next one ([`RuleSpec::is_learned`](super::rule::RuleSpec::is_learned)).
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<AlarmChange>) {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
             let config = &self.rules[index].config;
-            let before = self.machines[slot].standing();
-            let change = if config.rule.row().is_learned { self.machines[slot].poll(now, config) } else { None };
+            let before = self.machines[slot].index_entry();
+            let change = if config.rule.spec().is_learned { self.machines[slot].poll(now, config) } else { None };
             if let Some(change) = change {
                 // The slot leaves `counting`, so the next one moves into its place.
-                self.file(index, slot, before);
+                self.update_index(index, slot, before);
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             } else {
                 next += 1;
@@ -249,38 +249,38 @@ impl AlarmEngine {
         }
     }
 
-    /// Nobody looked until the next value (asleep, restarted, log with a hole): for values that do not hold
-    /// between looks the time up to then does not count.
+    /// No value comes until the next one (asleep, restarted, log with a hole): for values that do not hold
+    /// between readings the time up to then does not count.
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
-            let before = self.machines[slot].standing();
+            let before = self.machines[slot].index_entry();
             self.machines[slot].handle_gap();
-            self.file(self.rule_of(slot), slot, before);
+            self.update_index(self.rule_of(slot), slot, before);
         }
     }
 
-    /// Somebody has seen the alarms.
-    pub fn acknowledge(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> Outcome {
+    /// Acknowledges alarms.
+    pub fn acknowledge(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         self.command(which, changes, Machine::acknowledge)
     }
 
-    /// Somebody clears the alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten;
+    /// Clears alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten;
     /// those that are active, or whose value has not been healthy since, stay and count as refused. No learned value is
     /// touched.
-    pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> Outcome {
+    pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         self.command(which, changes, Machine::clear)
     }
 
-    /// Another pack is connected: alarms about what was learned of the old one are over, and their past with them.
+    /// Forgets alarms on learned values, and their past: another pack is connected.
     pub fn forget_learned(&mut self, changes: &mut Vec<AlarmChange>) {
         for index in 0..self.rules.len() {
-            if !self.rules[index].config.rule.row().is_learned {
+            if !self.rules[index].config.rule.spec().is_learned {
                 continue;
             }
             for slot in self.rules[index].slots() {
                 let old = std::mem::take(&mut self.machines[slot]);
-                self.file(index, slot, old.standing());
+                self.update_index(index, slot, old.index_entry());
                 if old.state.is_raised() {
                     changes.push(AlarmChange { change: Change::Forgotten, alarm: self.alarm(index, slot) });
                 }
@@ -345,15 +345,15 @@ impl AlarmEngine {
         rule.slots().find(is_waiting).map(|slot| self.alarm(index, slot))
     }
 
-    /// The alarm of a rule and cell as it stands (the worst severity's, when the rule has several thresholds); `None` =
+    /// The alarm of a rule and cell as it is now (the worst severity's, when the rule has several thresholds); `None` =
     /// nothing watches it.
     pub fn get(&self, rule: Rule, cell: Option<CellIndex>) -> Option<Alarm> {
         let index = self.by_rule[usize::from(rule as u8)].clone().next_back()?;
         self.rules[index].slot(cell).map(|slot| self.alarm(index, slot))
     }
 
-    /// What is to be stored.
-    pub fn snapshot(&self) -> AlarmState {
+    /// The part to be stored.
+    pub fn snapshot(&self) -> AlarmSnapshot {
         let of_rule = |rule: &RuleSlots| {
             let kept = rule.slots().filter(|&slot| self.machines[slot].is_worth_storing());
             let stored = |slot| StoredAlarm {
@@ -364,29 +364,29 @@ impl AlarmEngine {
             };
             kept.map(stored).collect::<Vec<_>>()
         };
-        AlarmState { alarms: self.rules.iter().flat_map(of_rule).collect() }
+        AlarmSnapshot { alarms: self.rules.iter().flat_map(of_rule).collect() }
     }
 
-    /// Takes up a stored state (rebased by the caller); returns those of its alarms that no configured threshold
-    /// watches any more: they are gone, and the caller says so.
-    pub fn restore(&mut self, state: &AlarmState) -> Vec<StoredAlarm> {
+    /// Restores a stored state (rebased by the caller); returns those of its alarms that no configured threshold
+    /// watches any more: they are gone, and the caller reports them.
+    pub fn restore(&mut self, state: &AlarmSnapshot) -> Vec<StoredAlarm> {
         let cells = self.cells();
         *self = Self::new(self.rules.drain(..).map(|rule| rule.config).collect(), cells);
         let mut orphans = Vec::new();
         for alarm in &state.alarms {
-            let Some((index, slot)) = self.place(alarm.rule, alarm.severity, alarm.cell) else {
+            let Some((index, slot)) = self.locate(alarm.rule, alarm.severity, alarm.cell) else {
                 orphans.push(alarm.clone());
                 continue;
             };
-            // Its value comes with the next look.
+            // Its value comes with the next observation.
             self.machines[slot] = alarm.machine.without_value();
-            self.file(index, slot, Machine::default().standing());
+            self.update_index(index, slot, Machine::default().index_entry());
         }
         orphans
     }
 
-    /// Goes on with other rules: an alarm whose rule, severity and cell are still watched is as it was, and judged anew when
-    /// its threshold is another one; any other that is raised or has been is forgotten. Returns how many those are.
+    /// Continues with other rules: an alarm with a rule, severity and cell that are still watched stays, and is judged again
+    /// when its threshold is another one; any other that is raised or has been is forgotten. Returns the number of those.
     pub fn reconfigure(
         &mut self,
         now: Timestamp,
@@ -399,9 +399,9 @@ impl AlarmEngine {
         for before in 0..old.rules.len() {
             for slot in old.rules[before].slots() {
                 let rule = &old.rules[before];
-                if let Some((index, place)) = self.place(rule.config.rule, rule.config.severity, rule.cell(slot)) {
+                if let Some((index, place)) = self.locate(rule.config.rule, rule.config.severity, rule.cell(slot)) {
                     self.machines[place] = old.machines[slot];
-                    self.file(index, place, Machine::default().standing());
+                    self.update_index(index, place, Machine::default().index_entry());
                 } else if std::mem::take(&mut old.machines[slot]).is_worth_storing() {
                     ended += 1;
                     changes.push(AlarmChange { change: Change::Forgotten, alarm: old.alarm(before, slot) });
@@ -418,17 +418,17 @@ impl AlarmEngine {
 
     fn retarget(&mut self, now: Timestamp, index: usize, changes: &mut Vec<AlarmChange>) {
         for slot in self.rules[index].slots() {
-            let before = self.machines[slot].standing();
+            let before = self.machines[slot].index_entry();
             let change = self.machines[slot].retarget(now, &self.rules[index].config);
-            self.file(index, slot, before);
+            self.update_index(index, slot, before);
             if let Some(change) = change {
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             }
         }
     }
 
-    /// Where an alarm is, if it is watched: the index of its threshold, and its slot.
-    fn place(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<(usize, usize)> {
+    /// Index of the threshold and slot of an alarm, if it is watched.
+    fn locate(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<(usize, usize)> {
         let same = |slots: &RuleSlots| (slots.config.rule, slots.config.severity) == (rule, severity);
         let index = self.rules.iter().position(same)?;
         Some((index, self.rules[index].slot(cell)?))
@@ -448,9 +448,9 @@ impl AlarmEngine {
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
             let Some(slot) = self.rules[index].slot(cell) else { continue };
-            let before = self.machines[slot].standing();
+            let before = self.machines[slot].index_entry();
             let change = act(&mut self.machines[slot], &self.rules[index].config);
-            self.file(index, slot, before);
+            self.update_index(index, slot, before);
             if let Some(change) = change {
                 changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
             }
@@ -462,17 +462,17 @@ impl AlarmEngine {
         which: &Selector,
         changes: &mut Vec<AlarmChange>,
         act: impl Fn(&mut Machine) -> Result<Change, Refusal>,
-    ) -> Outcome {
-        let mut outcome = Outcome::default();
+    ) -> CommandOutcome {
+        let mut outcome = CommandOutcome::default();
         for index in 0..self.rules.len() {
             let (rule, severity) = (self.rules[index].config.rule, self.rules[index].config.severity);
             for slot in self.rules[index].slots() {
                 if !which.matches(rule, severity, self.rules[index].cell(slot)) {
                     continue;
                 }
-                let before = self.machines[slot].standing();
+                let before = self.machines[slot].index_entry();
                 let result = act(&mut self.machines[slot]);
-                self.file(index, slot, before);
+                self.update_index(index, slot, before);
                 match result {
                     Ok(change) => {
                         outcome.changed += 1;
@@ -491,7 +491,7 @@ impl AlarmEngine {
     }
 
     fn is_learned(&self, slot: usize) -> bool {
-        self.rules[self.rule_of(slot)].config.rule.row().is_learned
+        self.rules[self.rule_of(slot)].config.rule.spec().is_learned
     }
 
     fn alarm(&self, index: usize, slot: usize) -> Alarm {
@@ -513,9 +513,9 @@ impl AlarmEngine {
         }
     }
 
-    /// Keeps the lists and counts in step with a machine.
-    fn file(&mut self, index: usize, slot: usize, before: Standing) {
-        let now = self.machines[slot].standing();
+    /// Updates the lists and counts after a machine has changed.
+    fn update_index(&mut self, index: usize, slot: usize, before: IndexEntry) {
+        let now = self.machines[slot].index_entry();
         if now == before {
             return;
         }

@@ -1,14 +1,14 @@
-//! Everything an alarm engine is told, as values: what one engine was told can be told to others.
+//! Every input of an alarm engine as a value, so that another engine can take the same inputs.
 //!
-//! In: what the [`Monitor`](crate::monitor::Monitor) has for its rules. Out: the same as the engine's own methods. The
-//! values of the rules do not depend on their thresholds, so engines with other thresholds that are told the same do
-//! what a monitor with those thresholds would have done (`input_missing` aside: how long a silence is, is judged by its
-//! strictest threshold before the engine sees it).
+//! In: values that the [`Monitor`](crate::monitor::Monitor) passes to its rules. Out: the same as the engine's own
+//! methods. The values do not depend on thresholds, so an engine with other thresholds and the same inputs does what a
+//! monitor with those thresholds would have done (except `input_missing`: its strictest threshold decides whether a
+//! silence is passed to the engine at all).
 
-use super::{AlarmChange, AlarmEngine, Observation, Outcome, Rule, Selector};
+use super::{AlarmChange, AlarmEngine, CommandOutcome, Observation, Rule, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// One thing an engine is told.
+/// One input of an engine.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum AlarmInput {
     /// [`AlarmEngine::observe`].
@@ -18,7 +18,7 @@ pub enum AlarmInput {
         /// Of which cell; `None` = of the pack.
         cell: Option<CellIndex>,
         /// The value.
-        seen: Observation,
+        observation: Observation,
     },
     /// [`AlarmEngine::set_inputs_valid`].
     InputsValid {
@@ -42,10 +42,10 @@ pub enum AlarmInput {
 }
 
 impl AlarmEngine {
-    /// Takes one input at `now`; the outcome is that of a command.
-    pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> Outcome {
+    /// Takes one input at `now`; returns the outcome of a command.
+    pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         match *input {
-            AlarmInput::Observe { rule, cell, seen } => self.observe(now, rule, cell, &seen, changes),
+            AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),
             AlarmInput::InputsValid { rule, cell, valid } => self.set_inputs_valid(now, rule, cell, valid, changes),
             AlarmInput::Poll => self.poll(now, changes),
             AlarmInput::Gap => self.handle_gap(),
@@ -53,6 +53,6 @@ impl AlarmEngine {
             AlarmInput::Clear(which) => return self.clear(&which, changes),
             AlarmInput::ForgetLearned => self.forget_learned(changes),
         }
-        Outcome::default()
+        CommandOutcome::default()
     }
 }

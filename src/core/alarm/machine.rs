@@ -1,4 +1,4 @@
-//! The life of one alarm.
+//! State machine of one alarm.
 //!
 //! | state | beyond | between | healthy | unknown | acknowledge | clear |
 //! | --- | --- | --- | --- | --- | --- | --- |
@@ -11,24 +11,24 @@
 //! | latched | count towards active | stay | stay | hold | mark | rest |
 //! | cleared | count towards active | stay | stay | unknown | inactive | inactive, forget |
 //!
-//! Rest is `cleared` when the alarm has been raised and nobody has acknowledged that, else `inactive`. The end is
+//! Rest is `cleared` when the alarm has been raised and not been acknowledged, else `inactive`. The end is
 //! `latched` for a rule that latches, else rest. An alarm is raised while it is active, clearing, suppressed or latched.
 //!
-//! Counting means time and new values; both must be reached. Time counts only between two looks at a known value on the
-//! same side: what lies beside an unknown value counts for nothing, and takes nothing away either, or a flickering
-//! input could keep an alarm from ever being raised.
+//! Counting means time and new values; both must be reached. Time counts only between two observations of a known value on the
+//! same side. Time next to an unknown value does not count, and resets nothing either: otherwise a flickering input could
+//! keep an alarm from ever being raised.
 
 use serde::{Deserialize, Serialize};
 
-use super::judge::Verdict;
+use super::limit::LimitCheck;
 use super::{Observation, RuleConfig};
 use crate::quantity::Timestamp;
 
-/// Where an alarm is in its life.
+/// State of an alarm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum State {
-    /// Its value is not known: nobody can say whether it should be raised.
+pub enum AlarmState {
+    /// Its value is not known, nor whether it should be raised.
     #[default]
     Unknown,
     /// Nothing wrong.
@@ -41,19 +41,19 @@ pub enum State {
     Clearing,
     /// Raised, and its value is not known any more.
     Suppressed,
-    /// Raised earlier, healthy again; stays until it is cleared by somebody.
+    /// Raised earlier, healthy again; stays until a command clears it.
     Latched,
-    /// Raised earlier, healthy again; nobody has acknowledged it.
+    /// Raised earlier, healthy again, not acknowledged.
     Cleared,
 }
 
-impl State {
+impl AlarmState {
     /// Whether the alarm is raised in this state.
     pub const fn is_raised(self) -> bool {
         matches!(self, Self::Active | Self::Clearing | Self::Suppressed | Self::Latched)
     }
 
-    /// The code on the wire (`State` of the alarm frame).
+    /// The code on the wire (`AlarmState` of the alarm frame).
     pub const fn wire_code(self) -> u8 {
         match self {
             Self::Inactive => 0,
@@ -67,15 +67,15 @@ impl State {
     }
 }
 
-/// What an alarm is told.
+/// Input of an alarm machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum MachineInput {
-    Verdict(Verdict),
+    Check(LimitCheck),
     Acknowledge,
     Clear,
 }
 
-/// What became of an alarm that others must hear of.
+/// A change of an alarm that is published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Change {
@@ -85,11 +85,11 @@ pub enum Change {
     Suppressed,
     /// Raised, and its value is known again.
     Resumed,
-    /// Healthy again, kept until somebody clears it.
+    /// Healthy again, kept until a command clears it.
     Latched,
     /// Over.
     Cleared,
-    /// Somebody has seen it.
+    /// Acknowledged by a command.
     Acknowledged,
     /// Its past was forgotten on request.
     Forgotten,
@@ -99,15 +99,15 @@ pub enum Change {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Refusal {
-    /// Cleared by nobody but its value: the alarm is raised, and its value is not healthy (or not known).
+    /// The alarm is raised, and its value is not healthy (or not known): only the value can clear it.
     NotHealthy,
     /// There was nothing to do.
     Nothing,
 }
 
-/// What to do in a state on what it is told.
+/// Action in a state on an input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Step {
+enum Action {
     /// Nothing changes.
     Stay,
     /// Count towards the other side.
@@ -115,14 +115,14 @@ enum Step {
     /// Keep what was counted, count nothing.
     Hold,
     /// Forget what was counted, go there.
-    Go(State),
+    Go(AlarmState),
     /// Forget what was counted, go to rest.
     Rest,
     /// Raised without a value; what was counted towards the end is kept.
     Suppress,
-    /// Somebody has seen the raised alarm.
+    /// Mark the raised alarm as acknowledged.
     Mark,
-    /// Somebody has seen that the alarm was raised.
+    /// Mark the past alarm as acknowledged.
     Settle,
     /// That the alarm was raised is forgotten.
     Forget,
@@ -130,30 +130,30 @@ enum Step {
     Refuse,
 }
 
-const fn step(state: State, told: MachineInput) -> Step {
-    use State::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
-    match told {
-        MachineInput::Verdict(verdict) => match (state, verdict) {
-            (Unknown | Inactive | Pending | Latched | Cleared, Verdict::Beyond) => Step::Count,
-            (Active, Verdict::Beyond | Verdict::Between) => Step::Stay,
-            (Clearing | Suppressed, Verdict::Beyond | Verdict::Between) => Step::Go(Active),
-            (Unknown | Pending, Verdict::Between | Verdict::Healthy) => Step::Rest,
-            (Inactive | Cleared, Verdict::Between | Verdict::Healthy) => Step::Stay,
-            (Latched, Verdict::Between | Verdict::Healthy) => Step::Go(Latched),
-            (Active | Clearing | Suppressed, Verdict::Healthy) => Step::Count,
-            (Unknown, Verdict::Unknown) => Step::Stay,
-            (Inactive | Cleared, Verdict::Unknown) => Step::Go(Unknown),
-            (Pending | Suppressed | Latched, Verdict::Unknown) => Step::Hold,
-            (Active | Clearing, Verdict::Unknown) => Step::Suppress,
+const fn action(state: AlarmState, input: MachineInput) -> Action {
+    use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
+    match input {
+        MachineInput::Check(check) => match (state, check) {
+            (Unknown | Inactive | Pending | Latched | Cleared, LimitCheck::Beyond) => Action::Count,
+            (Active, LimitCheck::Beyond | LimitCheck::Between) => Action::Stay,
+            (Clearing | Suppressed, LimitCheck::Beyond | LimitCheck::Between) => Action::Go(Active),
+            (Unknown | Pending, LimitCheck::Between | LimitCheck::Healthy) => Action::Rest,
+            (Inactive | Cleared, LimitCheck::Between | LimitCheck::Healthy) => Action::Stay,
+            (Latched, LimitCheck::Between | LimitCheck::Healthy) => Action::Go(Latched),
+            (Active | Clearing | Suppressed, LimitCheck::Healthy) => Action::Count,
+            (Unknown, LimitCheck::Unknown) => Action::Stay,
+            (Inactive | Cleared, LimitCheck::Unknown) => Action::Go(Unknown),
+            (Pending | Suppressed | Latched, LimitCheck::Unknown) => Action::Hold,
+            (Active | Clearing, LimitCheck::Unknown) => Action::Suppress,
         },
         MachineInput::Acknowledge => match state {
-            Unknown | Inactive | Pending | Cleared => Step::Settle,
-            Active | Clearing | Suppressed | Latched => Step::Mark,
+            Unknown | Inactive | Pending | Cleared => Action::Settle,
+            Active | Clearing | Suppressed | Latched => Action::Mark,
         },
         MachineInput::Clear => match state {
-            Unknown | Inactive | Pending | Cleared => Step::Forget,
-            Active | Clearing | Suppressed => Step::Refuse,
-            Latched => Step::Rest,
+            Unknown | Inactive | Pending | Cleared => Action::Forget,
+            Active | Clearing | Suppressed => Action::Refuse,
+            Latched => Action::Rest,
         },
     }
 }
@@ -161,22 +161,22 @@ const fn step(state: State, told: MachineInput) -> Step {
 /// One alarm: its state, its past, and what its debounce has counted.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Machine {
-    pub(super) state: State,
-    /// Whether the latest look could be judged.
+    pub(super) state: AlarmState,
+    /// Whether the latest observation could be compared.
     #[serde(skip)]
     pub(super) is_known: bool,
     /// The latest value, standard deviation and probability; the value of a learned rule outlives its input.
     #[serde(skip)]
-    pub(super) seen: Observation,
+    pub(super) observation: Observation,
     #[serde(skip)]
     pub(super) probability: Option<f64>,
     /// Times it was raised since its past was last forgotten.
     pub(super) occurrences: u32,
-    /// When it was raised for the first and the last of these times, and the value that raised it last.
+    /// Comparison it was raised for the first and the last of these times, and the value that raised it last.
     pub(super) first_raised: Timestamp,
     pub(super) last_raised: Timestamp,
     pub(super) raised_value: Option<f64>,
-    /// Whether somebody has seen the last of them.
+    /// Whether the last of them was acknowledged.
     pub(super) is_acknowledged: bool,
     /// Time counted by the running debounce, ns.
     held_nanos: i64,
@@ -188,9 +188,9 @@ pub(super) struct Machine {
     is_suspended: bool,
 }
 
-/// What is counted and listed of an alarm.
+/// The facts about an alarm that the engine counts and lists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Standing {
+pub(super) struct IndexEntry {
     pub(super) is_known: bool,
     pub(super) is_raised: bool,
     /// Whether time is being counted.
@@ -200,10 +200,10 @@ pub(super) struct Standing {
 }
 
 impl Machine {
-    pub(super) fn standing(&self) -> Standing {
+    pub(super) fn index_entry(&self) -> IndexEntry {
         let is_counting = self.counted_to.is_some();
-        let is_rest = matches!(self.state, State::Inactive | State::Cleared);
-        Standing {
+        let is_rest = matches!(self.state, AlarmState::Inactive | AlarmState::Cleared);
+        IndexEntry {
             is_known: self.is_known,
             is_raised: self.state.is_raised(),
             is_counting,
@@ -214,14 +214,14 @@ impl Machine {
     /// Shows a value that changes nothing, without a deviation.
     #[inline]
     pub(super) fn show(&mut self, value: f64) {
-        (self.seen, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
+        (self.observation, self.probability) = (Observation { value: Some(value), ..Observation::default() }, None);
     }
 
-    /// Takes a value. One that is learned while its inputs are lost (their loss ends the half-cycle before) may raise the
-    /// alarm; to one that is raised already it says nothing before they are back: it would clear, or look fresh.
-    pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, seen: &Observation) -> Option<Change> {
-        self.seen = *seen;
-        if self.is_suspended && self.state == State::Suppressed {
+    /// Takes a value. A value learned while its inputs are lost (their loss ends the half-cycle before) may raise the alarm.
+    /// It does not change an alarm that is raised already until the inputs are back: it would clear it, or look fresh.
+    pub(super) fn observe(&mut self, now: Timestamp, rule: &RuleConfig, observation: &Observation) -> Option<Change> {
+        self.observation = *observation;
+        if self.is_suspended && self.state == AlarmState::Suppressed {
             return None;
         }
         self.is_suspended = false;
@@ -233,16 +233,16 @@ impl Machine {
         if self.counted_to.is_some() { self.count(now, rule, false) } else { None }
     }
 
-    /// What the value was learned from is not valid now: the value cannot be renewed.
+    /// The inputs of the learned value are not valid now: the value cannot be renewed.
     pub(super) fn suspend(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if self.is_suspended {
             return None;
         }
         self.is_suspended = true;
-        self.tell(now, rule, Verdict::Unknown, false)
+        self.handle_check(now, rule, LimitCheck::Unknown, false)
     }
 
-    /// It is valid again: the value stands as it was, or as it was learned since.
+    /// The inputs are valid again: the value holds as before, or as learned since.
     pub(super) fn resume(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         if !std::mem::take(&mut self.is_suspended) {
             return None;
@@ -250,80 +250,79 @@ impl Machine {
         self.judge(now, rule)
     }
 
-    /// The time up to the next look is not known or nobody looked: it does not count.
+    /// The time up to the next observation does not count.
     pub(super) fn handle_gap(&mut self) {
         self.counted_to = None;
     }
 
-    /// Its threshold is another one: what was counted towards the old one does not count, and a value that is known is
-    /// new to it.
+    /// Takes another threshold: counts towards the old one are dropped, and a known value is new to it.
     pub(super) fn retarget(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
         (self.held_nanos, self.events, self.counted_to) = (0, 0, None);
         if !self.is_known {
             return None;
         }
-        self.seen.is_new = true;
+        self.observation.is_new = true;
         self.judge(now, rule)
     }
 
-    /// Somebody has seen the alarm.
+    /// Acknowledges the alarm.
     pub(super) fn acknowledge(&mut self) -> Result<Change, Refusal> {
-        match step(self.state, MachineInput::Acknowledge) {
-            Step::Mark | Step::Settle if self.occurrences == 0 || self.is_acknowledged => Err(Refusal::Nothing),
+        match action(self.state, MachineInput::Acknowledge) {
+            Action::Mark | Action::Settle if self.occurrences == 0 || self.is_acknowledged => Err(Refusal::Nothing),
             _ => {
                 self.is_acknowledged = true;
-                if self.state == State::Cleared {
-                    self.enter(State::Inactive);
+                if self.state == AlarmState::Cleared {
+                    self.enter(AlarmState::Inactive);
                 }
                 Ok(Change::Acknowledged)
             }
         }
     }
 
-    /// Somebody clears it: a latched alarm ends, a past one is forgotten, one that is beyond or not known stays.
+    /// Clears it: a latched alarm ends, a past one is forgotten, one that is beyond or not known stays.
     pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
-        match step(self.state, MachineInput::Clear) {
-            Step::Refuse => Err(Refusal::NotHealthy),
+        match action(self.state, MachineInput::Clear) {
+            Action::Refuse => Err(Refusal::NotHealthy),
             // Beyond again, only not for long enough yet.
-            Step::Rest if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
-            Step::Rest => {
+            Action::Rest if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
+            Action::Rest => {
                 self.is_acknowledged = true;
-                self.enter(if self.is_known { State::Inactive } else { State::Unknown });
+                self.enter(if self.is_known { AlarmState::Inactive } else { AlarmState::Unknown });
                 Ok(Change::Cleared)
             }
             _ if self.occurrences == 0 => Err(Refusal::Nothing),
             _ => {
                 (self.occurrences, self.is_acknowledged) = (0, true);
-                if self.state == State::Cleared {
-                    self.enter(State::Inactive);
+                if self.state == AlarmState::Cleared {
+                    self.enter(AlarmState::Inactive);
                 }
                 Ok(Change::Forgotten)
             }
         }
     }
 
-    /// Its state as others see it: what is not known is shown so, also before the first look after a restart.
-    pub(super) fn shown(&self) -> State {
+    /// Its published state: an unknown value is shown as such, also before the first observation after a restart.
+    pub(super) fn shown(&self) -> AlarmState {
         match self.state {
-            State::Inactive | State::Cleared if !self.is_known => State::Unknown,
-            State::Active | State::Clearing if !self.is_known => State::Suppressed,
+            AlarmState::Inactive | AlarmState::Cleared if !self.is_known => AlarmState::Unknown,
+            AlarmState::Active | AlarmState::Clearing if !self.is_known => AlarmState::Suppressed,
             state => state,
         }
     }
 
     /// The latest value, unless it is not known (any more).
     pub(super) fn value(&self) -> Option<f64> {
-        self.seen.value.filter(|value| self.is_known && value.is_finite())
+        self.observation.value.filter(|value| self.is_known && value.is_finite())
     }
 
     /// Whether a restart must not forget it.
     pub(super) fn is_worth_storing(&self) -> bool {
-        self.occurrences > 0 || self.state == State::Pending
+        self.occurrences > 0 || self.state == AlarmState::Pending
     }
 
-    /// As it is stored: its value is not known before the next look.
+    /// As it is restored: its value is not known before the next observation.
     pub(super) fn without_value(self) -> Self {
-        Self { is_known: false, seen: Observation::default(), probability: None, ..self }
+        Self { is_known: false, observation: Observation::default(), probability: None, ..self }
     }
 
     /// Moves the stamps onto another clock.
@@ -334,36 +333,36 @@ impl Machine {
     }
 
     fn judge(&mut self, now: Timestamp, rule: &RuleConfig) -> Option<Change> {
-        let (verdict, probability) = Verdict::of(rule, &self.seen);
+        let (check, probability) = LimitCheck::of(rule, &self.observation);
         self.probability = probability;
         // New only once, however often it is judged.
-        let is_new = std::mem::take(&mut self.seen.is_new);
-        self.tell(now, rule, verdict, is_new)
+        let is_new = std::mem::take(&mut self.observation.is_new);
+        self.handle_check(now, rule, check, is_new)
     }
 
-    fn tell(&mut self, now: Timestamp, rule: &RuleConfig, verdict: Verdict, is_new: bool) -> Option<Change> {
-        self.is_known = verdict != Verdict::Unknown;
-        match step(self.state, MachineInput::Verdict(verdict)) {
-            Step::Count => return self.count(now, rule, is_new),
-            Step::Hold => self.counted_to = None,
-            Step::Suppress => {
-                (self.state, self.counted_to) = (State::Suppressed, None);
+    fn handle_check(&mut self, now: Timestamp, rule: &RuleConfig, check: LimitCheck, is_new: bool) -> Option<Change> {
+        self.is_known = check != LimitCheck::Unknown;
+        match action(self.state, MachineInput::Check(check)) {
+            Action::Count => return self.count(now, rule, is_new),
+            Action::Hold => self.counted_to = None,
+            Action::Suppress => {
+                (self.state, self.counted_to) = (AlarmState::Suppressed, None);
                 return Some(Change::Suppressed);
             }
-            Step::Go(state) => {
-                let was_suppressed = self.state == State::Suppressed;
+            Action::Go(state) => {
+                let was_suppressed = self.state == AlarmState::Suppressed;
                 self.enter(state);
                 return was_suppressed.then_some(Change::Resumed);
             }
-            Step::Rest => self.enter(self.rest()),
-            Step::Stay | Step::Mark | Step::Settle | Step::Forget | Step::Refuse => {}
+            Action::Rest => self.enter(self.rest()),
+            Action::Stay | Action::Mark | Action::Settle | Action::Forget | Action::Refuse => {}
         }
         None
     }
 
-    /// Where an alarm is that is not raised and whose value is known.
-    fn rest(&self) -> State {
-        if self.occurrences > 0 && !self.is_acknowledged { State::Cleared } else { State::Inactive }
+    /// State of an alarm that is not raised and has a known value.
+    fn rest(&self) -> AlarmState {
+        if self.occurrences > 0 && !self.is_acknowledged { AlarmState::Cleared } else { AlarmState::Inactive }
     }
 
     fn count(&mut self, now: Timestamp, rule: &RuleConfig, is_new: bool) -> Option<Change> {
@@ -374,32 +373,39 @@ impl Machine {
         let held_long_enough = self.held_nanos >= Timestamp::from_secs(rule.debounce_s).nanos();
         let is_over = held_long_enough && self.events >= rule.debounce_events;
         match (self.state, is_over) {
-            (State::Unknown | State::Inactive | State::Pending | State::Cleared, false) => {
-                self.state = State::Pending;
+            (AlarmState::Unknown | AlarmState::Inactive | AlarmState::Pending | AlarmState::Cleared, false) => {
+                self.state = AlarmState::Pending;
                 None
             }
-            (State::Latched, false) => None,
-            (State::Active | State::Clearing, false) => {
-                self.state = State::Clearing;
+            (AlarmState::Latched, false) => None,
+            (AlarmState::Active | AlarmState::Clearing, false) => {
+                self.state = AlarmState::Clearing;
                 None
             }
-            (State::Suppressed, false) => {
-                self.state = State::Clearing;
+            (AlarmState::Suppressed, false) => {
+                self.state = AlarmState::Clearing;
                 Some(Change::Resumed)
             }
-            (State::Unknown | State::Inactive | State::Pending | State::Cleared | State::Latched, true) => {
+            (
+                AlarmState::Unknown
+                | AlarmState::Inactive
+                | AlarmState::Pending
+                | AlarmState::Cleared
+                | AlarmState::Latched,
+                true,
+            ) => {
                 self.raise(now);
                 Some(Change::Raised)
             }
-            (State::Active | State::Clearing | State::Suppressed, true) => {
-                self.enter(if rule.is_latching { State::Latched } else { self.rest() });
+            (AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed, true) => {
+                self.enter(if rule.is_latching { AlarmState::Latched } else { self.rest() });
                 Some(if rule.is_latching { Change::Latched } else { Change::Cleared })
             }
         }
     }
 
     fn raise(&mut self, now: Timestamp) {
-        self.enter(State::Active);
+        self.enter(AlarmState::Active);
         if self.occurrences == 0 {
             self.first_raised = now;
         }
@@ -407,7 +413,7 @@ impl Machine {
         (self.last_raised, self.raised_value, self.is_acknowledged) = (now, self.value(), false);
     }
 
-    fn enter(&mut self, state: State) {
+    fn enter(&mut self, state: AlarmState) {
         self.state = state;
         self.held_nanos = 0;
         self.events = 0;

@@ -1,11 +1,11 @@
-//! What an alarm can be about: one row per rule, and how bad it can be.
+//! Subjects of alarms: one specification per rule, and the severities.
 //!
-//! The table in [`Rule::row`] is the one place that says what a rule compares; configuration, reference page, frames
+//! The table in [`Rule::spec`] is the one place that specifies what a rule compares; configuration, reference page, frames
 //! and engine all take it from there.
 
 use serde::{Deserialize, Serialize};
 
-/// What an alarm can be about. The number is the one on the wire (`config/packwatch.dbc`), never reused.
+/// Subject of an alarm. The number is the one on the wire (`config/packwatch.dbc`), never reused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -40,14 +40,14 @@ pub enum Rule {
     BusFault = 14,
 }
 
-/// What a rule is about: the pack as a whole, its cells, or both.
+/// Scope of a rule: the pack as a whole, its cells, or both.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Scope {
     /// One value for the pack.
     Pack,
     /// One value per cell.
     Cell,
-    /// One value per cell, and one for what belongs to no cell (the pack's current, say).
+    /// One value per cell, and one for the inputs of no cell (such as the pack's current).
     Both,
 }
 
@@ -90,9 +90,9 @@ impl Unit {
     }
 }
 
-/// What one rule compares.
+/// Specification of one rule: the compared quantity.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Row {
+pub struct RuleSpec {
     /// Pack, cells or both.
     pub scope: Scope,
     /// Which side of its threshold is bad.
@@ -103,10 +103,10 @@ pub struct Row {
     pub has_deviation: bool,
     /// Whether a value stays true until the next one, so that the time debounce may run out between them.
     ///
-    /// What was learned at a transition does: a capacity is not less low because no cycle has ended since.
-    /// What is measured all the time does not: if no new consistency figure comes, the old one proves nothing.
+    /// A value learned at a transition does: a capacity is not less low because no cycle has ended since.
+    /// A value measured all the time does not: without a new consistency figure the old one proves nothing.
     pub is_learned: bool,
-    /// What is compared, for people.
+    /// The compared quantity, for readers.
     pub about: &'static str,
 }
 
@@ -154,8 +154,8 @@ impl Rule {
         }
     }
 
-    /// What it compares.
-    pub const fn row(self) -> Row {
+    /// Its specification.
+    pub const fn spec(self) -> RuleSpec {
         use Direction::{Above, Below};
         use Scope::{Both, Cell, Pack};
         use Unit::{AmpereHours, Celsius, Cycles, Fraction, Ratio, Seconds};
@@ -181,11 +181,11 @@ impl Rule {
             Self::StoreFailed => (Pack, Above, Seconds, false, false, "the time a file could not be written"),
             Self::BusFault => (Pack, Above, Seconds, false, false, "the time an interface was out of order"),
         };
-        Row { scope, direction, unit, has_deviation, is_learned, about }
+        RuleSpec { scope, direction, unit, has_deviation, is_learned, about }
     }
 }
 
-/// How bad, as on the wire.
+/// Severity, as on the wire.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]

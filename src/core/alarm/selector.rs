@@ -1,11 +1,11 @@
-//! Which alarms a command means, and what became of them.
+//! The alarms that a command selects, and its outcome.
 
 use serde::{Deserialize, Serialize};
 
 use super::{Rule, Severity};
 use crate::quantity::CellIndex;
 
-/// Alarms of a rule, a severity and a cell; what is not given means all.
+/// Alarms of a rule, a severity and a cell; a field without a value selects all.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Selector {
@@ -13,12 +13,12 @@ pub struct Selector {
     pub rule: Option<Rule>,
     /// Which severity.
     pub severity: Option<Severity>,
-    /// Which cell, counted from 0; the pack's own alarms are meant only without it.
+    /// Which cell, counted from 0; the pack's own alarms are selected only without it.
     pub cell: Option<CellIndex>,
 }
 
 impl Selector {
-    /// Whether it means that alarm (`cell`: `None` = the pack's).
+    /// Whether it selects that alarm (`cell`: `None` = the pack's).
     pub fn matches(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> bool {
         self.rule.is_none_or(|wanted| wanted == rule)
             && self.severity.is_none_or(|wanted| wanted == severity)
@@ -26,9 +26,9 @@ impl Selector {
     }
 }
 
-/// What became of a command.
+/// Outcome of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct Outcome {
+pub struct CommandOutcome {
     /// Alarms changed.
     pub changed: u32,
     /// Alarms that were to be cleared, but are raised and not healthy (or their value is not known).

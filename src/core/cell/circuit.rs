@@ -2,17 +2,18 @@
 //!
 //! State: SOC (fraction) and one voltage per RC branch (V). I > 0 is discharge.
 //! dSOC/dt = -I / (3600 C); dU/dt = -U/(R1 C1) + I/C1; V = OCV(SOC, T) - sum U - I R0.
-//! Ageing multiplies R0 and every branch resistance by one ratio and leaves the time constants alone.
+//! Ageing multiplies R0 and every branch resistance by one ratio; the time constants stay. Inputs are not checked: a NaN
+//! stays a NaN.
 
 use super::config::Discretisation;
-use super::model::{CellModel, Place, Row};
+use super::model::{CellModel, GridPosition, TemperaturePosition};
 
-/// SOC after `charge_as` ampere-seconds were taken out of `capacity_ah`.
+/// SOC after a discharge of `charge_as` (A s) from a cell of `capacity_ah`.
 pub fn soc_after(soc: f64, charge_as: f64, capacity_ah: f64) -> f64 {
     soc - charge_as / (3600.0 * capacity_ah)
 }
 
-/// One RC branch of an aged cell at one place of the tables.
+/// One RC branch of an aged cell at one grid position.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BranchAt {
     /// Resistance, ohm.
@@ -22,13 +23,13 @@ pub struct BranchAt {
 }
 
 impl BranchAt {
-    /// Branch `i` of `model` whose resistances have grown by `resistance_ratio`.
-    pub fn new(model: &CellModel, i: usize, place: &Place, resistance_ratio: f64) -> Self {
-        Self { r_ohm: model.branch_r_ohm(i, place) * resistance_ratio, tau_s: model.branch_tau_s(i, place) }
+    /// Branch `i` of a cell whose resistances are `resistance_ratio` times those of `model`.
+    pub fn new(model: &CellModel, i: usize, position: &GridPosition, resistance_ratio: f64) -> Self {
+        Self { r_ohm: model.branch_r_ohm(i, position) * resistance_ratio, tau_s: model.branch_tau_s(i, position) }
     }
 
     /// The branch's voltage after `dt_s` at a constant `current_a`. Euler's rule is unstable in steps longer than the
-    /// time constant (gaps): those are exact whatever the rule.
+    /// time constant (gaps): such a step is always exact.
     pub fn voltage_after(&self, rule: Discretisation, branch_v: f64, current_a: f64, dt_s: f64) -> f64 {
         let settled_v = self.r_ohm * current_a;
         match rule {
@@ -41,19 +42,32 @@ impl BranchAt {
 }
 
 /// Terminal voltage under `current_a` with the branches' voltages summed in `branches_v`.
-pub fn terminal_v(model: &CellModel, place: &Place, resistance_ratio: f64, branches_v: f64, current_a: f64) -> f64 {
-    model.ocv_v(place) - branches_v - model.r0_ohm(place) * resistance_ratio * current_a
+pub fn terminal_v(
+    model: &CellModel,
+    position: &GridPosition,
+    resistance_ratio: f64,
+    branches_v: f64,
+    current_a: f64,
+) -> f64 {
+    model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// The same of a cell that has aged to `capacity_ah`: its open-circuit curve has shifted ([`CellModel::ocv_soc`]).
-pub fn aged_terminal_v(model: &CellModel, state: (f64, f64, f64), row: &Row, branches_v: f64, current_a: f64) -> f64 {
+/// Terminal voltage of a cell at `state` = (SOC, resistance ratio, capacity in Ah) whose open-circuit curve has shifted
+/// with the lost capacity ([`CellModel::ocv_soc`]).
+pub fn aged_terminal_v(
+    model: &CellModel,
+    state: (f64, f64, f64),
+    temperature: &TemperaturePosition,
+    branches_v: f64,
+    current_a: f64,
+) -> f64 {
     let (soc, resistance_ratio, capacity_ah) = state;
-    let place = model.place_in(row, soc);
+    let position = model.grid_position_at(temperature, soc);
     if model.ocv_ageing_shift == 0.0 {
-        return terminal_v(model, &place, resistance_ratio, branches_v, current_a);
+        return terminal_v(model, &position, resistance_ratio, branches_v, current_a);
     }
-    let ocv_v = model.ocv_v(&model.place_in(row, model.ocv_soc(soc, capacity_ah)));
-    ocv_v - branches_v - model.r0_ohm(&place) * resistance_ratio * current_a
+    let ocv_v = model.ocv_v(&model.grid_position_at(temperature, model.ocv_soc(soc, capacity_ah)));
+    ocv_v - branches_v - model.r0_ohm(&position) * resistance_ratio * current_a
 }
 
 /// Temperature after `dt_s` of the lumped thermal model C dT/dt = losses - (T - ambient)/R, exact for
@@ -78,8 +92,8 @@ mod tests {
     #[test]
     fn exact_branch_is_independent_of_the_step_and_euler_converges_to_it() {
         let model = small_model();
-        let place = model.place(0.5, 0.0);
-        let branch = BranchAt::new(&model, 0, &place, 1.5);
+        let position = model.grid_position(0.5, 0.0);
+        let branch = BranchAt::new(&model, 0, &position, 1.5);
         let run = |rule, n: u32| (0..n).fold(0.0, |u, _| branch.voltage_after(rule, u, 2.0, 30.0 / f64::from(n)));
         let closed_form = 2.0 * 0.02 * 1.5 * (1.0 - libm::exp(-30.0 / 20.0));
         assert!((run(Discretisation::Exact, 1) - closed_form).abs() < 1e-15);

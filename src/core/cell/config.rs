@@ -1,11 +1,11 @@
-//! Settings of the per-cell estimator.
+//! Settings of the per-cell estimator. `config` checks their ranges; the estimator uses them as they are.
 
 /// How the circuit's equations are stepped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Discretisation {
     /// exp(-dt/RC): exact for a current constant over the step.
     Exact,
-    /// Forward Euler, as the paper.
+    /// Forward Euler, as in the paper.
     Euler,
 }
 
@@ -14,7 +14,7 @@ pub enum Discretisation {
 pub enum CapacityState {
     /// Estimated with the SOC, so that their correlation is known.
     Joint,
-    /// Held at the last learned value, as the paper.
+    /// Held at the last learned value, as in the paper.
     Held,
 }
 
@@ -51,38 +51,38 @@ pub struct EstimatorConfig {
     pub branch_noise_v_per_sqrt_s: f64,
     /// ln(resistance) process noise, per sqrt(s).
     pub log_resistance_noise_per_sqrt_s: f64,
-    /// SOC process noise while nobody measures the current, fraction per sqrt(s).
+    /// SOC process noise while the current is not measured, fraction per sqrt(s).
     pub gap_noise_per_sqrt_s: f64,
-    /// What the cell may lose by itself, fraction of SOC per s.
+    /// Largest self-discharge, fraction of SOC per s.
     pub self_discharge_per_s: f64,
-    /// What may be taken out or charged while the program does not run, fraction of SOC per s.
+    /// Largest rate at which the cell may be used or charged while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
-    /// A current beyond this beside a gap may have gone on in it; below it the cell was left alone. A per cell.
+    /// A current above this next to a gap may have continued through the gap; below it the cell rested. A per cell.
     pub rest_current_a: f64,
     /// White part of a voltage reading's error, V (sensor noise), per sample.
     pub voltage_noise_v: f64,
-    /// Slow model error expressed as information per second: standard deviation of a 1 s average, V. Holds where the
-    /// cell model has no error of its own.
+    /// Slow model error as information per second: standard deviation of a 1 s average, V. Used where the cell model
+    /// states no error of its own.
     pub model_error_v_sqrt_s: f64,
-    /// The same in proportion to the voltage lost in the cell at the reading: fraction of it, over one second.
+    /// Model error in proportion to the voltage drop in the cell at the reading: fraction of it, over one second.
     pub drop_error_sqrt_s: f64,
-    /// The same in proportion to the voltage the load of the last minutes drops in the cell.
+    /// Model error in proportion to the voltage that the load of the last minutes drops in the cell, over one second.
     pub load_error_sqrt_s: f64,
-    /// How long the model's error outlives the load that made it (slow diffusion), s.
+    /// Time constant of the model error after its load has ended (slow diffusion), s.
     pub load_memory_s: f64,
-    /// Longest time one voltage reading may speak for, s: readings further apart are no better than this.
+    /// Longest time that one voltage reading stands for, s: readings further apart count no more than this.
     pub max_information_s: f64,
-    /// A voltage innovation beyond this many standard deviations moves nothing.
+    /// Gate: a voltage innovation beyond this many standard deviations is rejected.
     pub gate_sigma: f64,
-    /// Model error a single reading may show, V (standard deviation): for the gate and the consistency monitor,
-    /// where the information-per-second variance would let anything through at high sample rates.
+    /// Model error of a single reading, V (standard deviation). Used by the gate and the consistency monitor, where the
+    /// information-per-second variance would accept every reading at high sample rates.
     pub gate_model_error_v: f64,
-    /// The same as an error along the OCV curve, fraction of SOC.
+    /// Model error of a single reading along the OCV curve, fraction of SOC.
     pub gate_soc_error: f64,
-    /// When every reading has been beyond the gate for this long, the filter has lost its cell and starts again, s.
+    /// The filter restarts from the voltage after every reading has been beyond the gate for this time, s.
     pub lost_after_s: f64,
     /// Window of the consistency monitor, s.
     pub consistency_window_s: f64,
-    /// Mean normalised innovation squared above which the estimate is not to be trusted.
+    /// Mean normalised innovation squared above which the estimate is not trusted.
     pub consistency_limit: f64,
 }

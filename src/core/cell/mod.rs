@@ -1,4 +1,8 @@
-//! One cell: its circuit, its thermal model and the filter that estimates its state.
+//! One cell: circuit, thermal model and the filter that estimates its state.
+//!
+//! In: a checked cell model, settings and one [`CellStep`] per voltage reading (V, A with positive = discharge, s, degrees
+//! C). Out: SOC, resistance ratio, capacity (Ah) and branch voltages (V), each with its standard deviation. Readings
+//! beyond the gate change no estimate.
 
 pub mod circuit;
 pub mod config;
@@ -7,4 +11,6 @@ pub mod model;
 
 pub use config::{CapacityState, Discretisation, EstimatorConfig};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
-pub use model::{Branch, CellModel, ERROR_WINDOW_S, MAX_BRANCHES, Place, Row, Table, Thermal, arrhenius};
+pub use model::{
+    Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,
+};

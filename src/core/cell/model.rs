@@ -1,13 +1,13 @@
-//! The equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC x temperature.
+//! Equivalent-circuit model of one cell type: OCV, R0 and 1 to 3 RC branches over SOC x temperature.
 //!
-//! Between two SOC breakpoints every value runs linearly. Between two temperatures the OCV and the time constants run
-//! linearly, resistances as an Arrhenius law of [`ACTIVATION_ENERGY_J_PER_MOL`] that meets both: linear interpolation
-//! would be up to 15 % too high in the middle of a 20 K interval.
-//! Outside the grid the nearest edge value holds (no extrapolation) in temperature; in SOC the OCV goes on
-//! with the slope of its last interval, so that a wrong SOC beyond 0 or 1 is still pulled back, while
+//! Between two SOC breakpoints every value is interpolated linearly. Between two temperatures the OCV and the time
+//! constants are interpolated linearly, resistances by an Arrhenius law of [`ACTIVATION_ENERGY_J_PER_MOL`] through both
+//! values: linear interpolation would be up to 15 % too high in the middle of a 20 K interval.
+//! Outside the grid the nearest edge value holds (no extrapolation) in temperature; in SOC the OCV continues
+//! with the slope of its last interval, so that a wrong SOC beyond 0 or 1 is still corrected, while
 //! resistances hold their edge value.
 //!
-//! Deviation: the paper interpolates R1 and C1; here their product, the time constant, is what is interpolated. Reason:
+//! Deviation: the paper interpolates R1 and C1; this model interpolates their product, the time constant. Reason:
 //! between nodes whose resistances differ the product of two interpolated values is up to twice that of either node.
 //! Effect: none where both are constant.
 
@@ -27,7 +27,7 @@ const ZERO_CELSIUS_K: f64 = 273.15;
 /// Temperature at which [`arrhenius`] is 1, degrees C.
 const REFERENCE_C: f64 = 25.0;
 
-/// Resistance at a temperature relative to that at 25 degrees C.
+/// Resistance at a temperature, relative to that at 25 degrees C.
 pub fn arrhenius(temperature_c: f64) -> f64 {
     let per_kelvin = 1.0 / (temperature_c + ZERO_CELSIUS_K) - 1.0 / (REFERENCE_C + ZERO_CELSIUS_K);
     libm::exp(ACTIVATION_ENERGY_J_PER_MOL / GAS_CONSTANT_J_PER_MOL_K * per_kelvin)
@@ -62,7 +62,7 @@ pub struct Thermal {
 /// capacitances positive and finite, tables without holes. Made by `config::cell_model`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CellModel {
-    /// For people.
+    /// Display name.
     pub name: String,
     /// Label capacity, Ah: what SOH is relative to.
     pub rated_capacity_ah: f64,
@@ -84,7 +84,7 @@ pub struct CellModel {
     pub r0_ohm: Table,
     /// RC branches, 1 to [`MAX_BRANCHES`].
     pub branches: Vec<Branch>,
-    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = not known.
+    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = unknown.
     pub voltage_error_v: Option<Table>,
     /// Thermal parameters; `None` = no temperature fallback.
     pub thermal: Option<Thermal>,
@@ -93,30 +93,30 @@ pub struct CellModel {
 /// Time over which [`CellModel::voltage_error_v`] is averaged, s.
 pub const ERROR_WINDOW_S: f64 = 100.0;
 
-/// A temperature's place in the grid: found once, used for every SOC.
+/// Position of a temperature in the grid, shared by every SOC.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Row {
-    /// Number of the lower temperature.
+pub struct TemperaturePosition {
+    /// Index of the lower temperature.
     pub(super) t: usize,
     /// Weight of the upper temperature row, in [0, 1].
     pub(super) along_t: f64,
-    /// The same for resistances.
+    /// Weight of the upper row for resistances, in [0, 1].
     pub(super) along_arrhenius: f64,
 }
 
-/// The four grid corners round one (SOC, temperature) and their weights: found once, used for every table.
+/// The four grid corners around one (SOC, temperature) and their weights, shared by every table.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
+pub struct GridPosition {
     s: usize,
     /// Weight of the upper SOC column, in [0, 1].
     along_s: f64,
-    /// The same without the limit: the OCV goes on beyond 0 and 1.
+    /// Weight of the upper SOC column without that limit: the OCV continues beyond 0 and 1.
     beyond_s: f64,
-    row: Row,
+    temperature: TemperaturePosition,
 }
 
-impl Row {
-    /// `value` of the lower row and, where it counts, of the upper one, joined with weight `along`.
+impl TemperaturePosition {
+    /// Interpolates `value` between the lower and the upper row with weight `along`. Reads the upper row only if needed.
     fn between(&self, along: f64, value: impl Fn(usize) -> f64) -> f64 {
         let low = value(self.t);
         if along == 0.0 { low } else { low + along * (value(self.t + 1) - low) }
@@ -124,8 +124,8 @@ impl Row {
 }
 
 impl Table {
-    fn at(&self, place: &Place, along_s: f64, along_t: f64) -> f64 {
-        place.row.between(along_t, |t| interpolate(&self.values[t], place.s, along_s))
+    fn at(&self, position: &GridPosition, along_s: f64, along_t: f64) -> f64 {
+        position.temperature.between(along_t, |t| interpolate(&self.values[t], position.s, along_s))
     }
 }
 
@@ -141,13 +141,13 @@ fn locate(breakpoints: &[f64], x: f64) -> (usize, f64) {
 }
 
 impl CellModel {
-    /// The place of a SOC and a temperature in the grid.
-    pub fn place(&self, soc: f64, temperature_c: f64) -> Place {
-        self.place_in(&self.row(temperature_c), soc)
+    /// Grid position of a SOC and a temperature.
+    pub fn grid_position(&self, soc: f64, temperature_c: f64) -> GridPosition {
+        self.grid_position_at(&self.temperature_position(temperature_c), soc)
     }
 
-    /// The place of a temperature in the grid.
-    pub fn row(&self, temperature_c: f64) -> Row {
+    /// Grid position of a temperature.
+    pub fn temperature_position(&self, temperature_c: f64) -> TemperaturePosition {
         let (t, along_t) = match self.temperature_c.len() {
             1 => (0, 0.0),
             _ => locate(&self.temperature_c, temperature_c),
@@ -159,81 +159,82 @@ impl CellModel {
             let [low, high] = [self.temperature_c[t], self.temperature_c[t + 1]].map(arrhenius);
             (arrhenius(temperature_c) - low) / (high - low)
         };
-        Row { t, along_t, along_arrhenius }
+        TemperaturePosition { t, along_t, along_arrhenius }
     }
 
-    /// The place of a SOC at a temperature whose place is known.
-    pub fn place_in(&self, row: &Row, soc: f64) -> Place {
+    /// Grid position of a SOC at a temperature with a known position.
+    pub fn grid_position_at(&self, temperature: &TemperaturePosition, soc: f64) -> GridPosition {
         let (s, beyond_s) = locate(&self.soc, soc);
-        Place { s, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, row: *row }
+        GridPosition { s, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, temperature: *temperature }
     }
 
     /// Open-circuit voltage, V.
-    pub fn ocv_v(&self, place: &Place) -> f64 {
-        self.ocv_v.at(place, place.beyond_s, place.row.along_t)
+    pub fn ocv_v(&self, position: &GridPosition) -> f64 {
+        self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// SOC of a new cell whose open-circuit voltage a cell of `capacity_ah` at `soc` has.
+    /// SOC at which a new cell has the open-circuit voltage of a cell of `capacity_ah` at `soc`.
     ///
-    /// An ageing cell does not lose its charge evenly over the curve: lithium bound elsewhere lets the anode slip against
+    /// An ageing cell does not lose its charge evenly over the curve: lithium bound elsewhere shifts the anode against
     /// the cathode, so the top keeps its ampere-hours and the bottom loses them. s' = s + a s (1 - s) with
     /// a = shift * (1 - C / C_new); a shift of 1 would keep the slope over ampere-hours at SOC 1 exactly, 0 shrinks evenly.
     pub fn ocv_soc(&self, soc: f64, capacity_ah: f64) -> f64 {
         let lost = self.ocv_ageing_shift * (1.0 - capacity_ah / self.capacity_ah);
-        // Beyond +-1 the curve would fold; beyond the ends of the curve it keeps its course.
+        // Beyond +-1 the curve would fold; beyond its ends the curve is unchanged.
         let inside = soc.clamp(0.0, 1.0);
         soc + lost.clamp(-0.9, 0.9) * inside * (1.0 - inside)
     }
 
     /// Slope of the open-circuit voltage over SOC, V per unit of SOC.
-    pub fn ocv_slope_v(&self, place: &Place) -> f64 {
-        let rise = |t: usize| self.ocv_v.values[t][place.s + 1] - self.ocv_v.values[t][place.s];
-        place.row.between(place.row.along_t, rise) / (self.soc[place.s + 1] - self.soc[place.s])
+    pub fn ocv_slope_v(&self, position: &GridPosition) -> f64 {
+        let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
+        position.temperature.between(position.temperature.along_t, rise)
+            / (self.soc[position.s + 1] - self.soc[position.s])
     }
 
     /// Series resistance of a new cell, ohm.
-    pub fn r0_ohm(&self, place: &Place) -> f64 {
-        self.r0_ohm.at(place, place.along_s, place.row.along_arrhenius)
+    pub fn r0_ohm(&self, position: &GridPosition) -> f64 {
+        self.r0_ohm.at(position, position.along_s, position.temperature.along_arrhenius)
     }
 
     /// Resistance of branch `i` of a new cell, ohm.
-    pub fn branch_r_ohm(&self, i: usize, place: &Place) -> f64 {
-        self.branches[i].r_ohm.at(place, place.along_s, place.row.along_arrhenius)
+    pub fn branch_r_ohm(&self, i: usize, position: &GridPosition) -> f64 {
+        self.branches[i].r_ohm.at(position, position.along_s, position.temperature.along_arrhenius)
     }
 
-    /// Time constant of branch `i`, s. Ageing scales its resistance and leaves this alone.
-    pub fn branch_tau_s(&self, i: usize, place: &Place) -> f64 {
+    /// Time constant of branch `i`, s. Ageing scales the resistance and not the time constant.
+    pub fn branch_tau_s(&self, i: usize, position: &GridPosition) -> f64 {
         let Branch { r_ohm, c_farad } = &self.branches[i];
         let tau_s = |t: usize, s: usize| r_ohm.values[t][s] * c_farad.values[t][s];
         let row_tau_s = |t: usize| {
-            let low = tau_s(t, place.s);
-            low + place.along_s * (tau_s(t, place.s + 1) - low)
+            let low = tau_s(t, position.s);
+            low + position.along_s * (tau_s(t, position.s + 1) - low)
         };
-        place.row.between(place.row.along_t, row_tau_s)
+        position.temperature.between(position.temperature.along_t, row_tau_s)
     }
 
-    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = not known.
-    pub fn voltage_error_v(&self, place: &Place) -> Option<f64> {
-        Some(self.voltage_error_v.as_ref()?.at(place, place.along_s, place.row.along_t))
+    /// Standard deviation of the model's voltage error, averaged over [`ERROR_WINDOW_S`], V; `None` = unknown.
+    pub fn voltage_error_v(&self, position: &GridPosition) -> Option<f64> {
+        Some(self.voltage_error_v.as_ref()?.at(position, position.along_s, position.temperature.along_t))
     }
 
     /// Resistance of a new cell once every branch has settled, ohm.
-    pub fn settled_ohm(&self, place: &Place) -> f64 {
-        (0..self.branches.len()).fold(self.r0_ohm(place), |sum, i| sum + self.branch_r_ohm(i, place))
+    pub fn settled_ohm(&self, position: &GridPosition) -> f64 {
+        (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
     /// SOC whose open-circuit voltage is `voltage_v`, by bisection over [-0.5, 1.5]; outside, the nearest end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
-        self.soc_of_ocv_in(&self.row(temperature_c), voltage_v)
+        self.soc_of_ocv_at(&self.temperature_position(temperature_c), voltage_v)
     }
 
-    /// The same at a temperature whose place is known.
-    pub fn soc_of_ocv_in(&self, row: &Row, voltage_v: f64) -> f64 {
-        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.place_in(row, soc)))
+    /// SOC of an open-circuit voltage at a temperature with a known position, see [`Self::soc_of_ocv`].
+    pub fn soc_of_ocv_at(&self, temperature: &TemperaturePosition, voltage_v: f64) -> f64 {
+        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.grid_position_at(temperature, soc)))
     }
 }
 
-/// Where the falling function `f` crosses zero in [`low`, `high`], to 2^-40 of the width; the nearest end when it does not.
+/// Zero crossing of the falling function `f` in [`low`, `high`], to 2^-40 of the width; the nearest end if there is none.
 pub(crate) fn falling_crossing(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
     for _ in 0..40 {
         let middle = 0.5 * (low + high);
@@ -276,8 +277,8 @@ pub(crate) mod tests {
     #[test]
     fn tables_are_bilinear_inside_and_exact_at_the_nodes() {
         let model = small_model();
-        assert_eq!(model.ocv_v(&model.place(0.5, 40.0)), 3.7);
-        assert!((model.ocv_v(&model.place(0.25, 20.0)) - 3.325).abs() < 1e-12);
+        assert_eq!(model.ocv_v(&model.grid_position(0.5, 40.0)), 3.7);
+        assert!((model.ocv_v(&model.grid_position(0.25, 20.0)) - 3.325).abs() < 1e-12);
     }
 
     #[test]
@@ -288,7 +289,7 @@ pub(crate) mod tests {
             model.r0_ohm.values[0][warm] = cold;
             model.r0_ohm.values[1][warm] = cold / ratio;
         }
-        let at = |t_c: f64| model.r0_ohm(&model.place(1.0, t_c));
+        let at = |t_c: f64| model.r0_ohm(&model.grid_position(1.0, t_c));
         for t_c in [0.0, 7.0, 20.0, 33.0, 40.0] {
             assert!((at(t_c) / at(0.0) - arrhenius(t_c) / arrhenius(0.0)).abs() < 1e-12, "{t_c}");
         }
@@ -296,31 +297,31 @@ pub(crate) mod tests {
         for (t, s) in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)] {
             model.branches[0].c_farad.values[t][s] = 30.0 / model.branches[0].r_ohm.values[t][s];
         }
-        assert!((model.branch_tau_s(0, &model.place(0.2, 13.0)) - 30.0).abs() < 1e-12);
+        assert!((model.branch_tau_s(0, &model.grid_position(0.2, 13.0)) - 30.0).abs() < 1e-12);
     }
 
     #[test]
-    fn outside_the_grid_ocv_goes_on_in_soc_and_all_else_holds_its_edge() {
+    fn outside_the_grid_ocv_continues_in_soc_and_all_else_holds_its_edge() {
         let model = small_model();
-        assert!((model.ocv_v(&model.place(1.1, 0.0)) - 4.32).abs() < 1e-12);
-        assert!((model.ocv_v(&model.place(-0.1, 0.0)) - 2.88).abs() < 1e-12);
-        assert_eq!(model.r0_ohm(&model.place(-0.1, -30.0)), 0.08);
-        assert_eq!(model.r0_ohm(&model.place(1.1, 60.0)), 0.03);
+        assert!((model.ocv_v(&model.grid_position(1.1, 0.0)) - 4.32).abs() < 1e-12);
+        assert!((model.ocv_v(&model.grid_position(-0.1, 0.0)) - 2.88).abs() < 1e-12);
+        assert_eq!(model.r0_ohm(&model.grid_position(-0.1, -30.0)), 0.08);
+        assert_eq!(model.r0_ohm(&model.grid_position(1.1, 60.0)), 0.03);
     }
 
     #[test]
     fn soc_of_ocv_inverts_the_curve() {
         let model = small_model();
         for soc in [-0.1, 0.0, 0.3, 0.5, 0.77, 1.0, 1.05] {
-            let voltage = model.ocv_v(&model.place(soc, 17.0));
+            let voltage = model.ocv_v(&model.grid_position(soc, 17.0));
             assert!((model.soc_of_ocv(voltage, 17.0) - soc).abs() < 1e-9);
         }
     }
 
     #[test]
-    fn lost_capacity_bends_the_curve_between_its_ends_and_leaves_them() {
+    fn lost_capacity_bends_the_curve_between_its_ends_only() {
         let mut model = small_model();
-        assert_eq!(model.ocv_soc(0.4, 1.0), 0.4); // no shift: it only shrinks
+        assert_eq!(model.ocv_soc(0.4, 1.0), 0.4); // no shift: the curve only shrinks
         model.ocv_ageing_shift = 0.8;
         assert_eq!(model.ocv_soc(0.4, 2.0), 0.4); // a new cell
         for soc in [-0.2, 0.0, 1.0, 1.3] {
@@ -333,7 +334,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn the_bent_curve_rises_whatever_capacity_it_is_asked_for() {
+    fn the_shifted_curve_rises_at_every_capacity() {
         let mut model = small_model();
         model.ocv_ageing_shift = 5.0;
         for capacity_ah in [0.1, 1.0, 2.0, 3.0, 9.0] {

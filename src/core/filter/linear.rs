@@ -1,8 +1,8 @@
-//! The scalar linear Kalman filter with A = C = 1: a random walk measured directly, step by step.
+//! Scalar linear Kalman filter with A = C = 1: a random walk that is measured directly.
 //!
 //! State x (any unit), variance P. Predict: P += Q. Update with z, R: K = P / (P + R),
 //! x += K (z - x), P = (1 - K) P. Source: the paper's capacity filter (section 3.3.4), where x is the
-//! capacity in Ah and a step is a charge/discharge transition.
+//! capacity in Ah and a step is a charge/discharge transition. Inputs are not checked: a NaN stays a NaN.
 
 use serde::{Deserialize, Serialize};
 
@@ -40,19 +40,20 @@ impl ScalarGaussian {
         self.variance += process_variance;
     }
 
-    /// Takes a measurement in.
+    /// Updates the estimate with a measurement.
     pub fn update(&mut self, z: Measurement) {
         let gain = self.variance / (self.variance + z.variance);
         self.mean += gain * (z.value - self.mean);
         self.variance *= 1.0 - gain;
     }
 
-    /// What somebody must have measured to get from the belief `self` to `after`: 1/R = 1/P1 - 1/P0,
-    /// z = R (x1/P1 - x0/P0). It is independent of what was believed before, so it does not feed an
-    /// assumption back as if it were evidence. `None` when nothing was learned (P1 >= P0).
+    /// Measurement that leads from the estimate `self` to `after`: 1/R = 1/P1 - 1/P0, z = R (x1/P1 - x0/P0).
+    ///
+    /// The result is independent of the prior `self`, so a prior assumption does not count as evidence. `None` when the
+    /// variance has not fallen (P1 >= P0).
     pub fn information_until(&self, after: &Self) -> Option<Measurement> {
         let information = 1.0 / after.variance - 1.0 / self.variance;
-        // Below a millionth of what was known the difference is rounding, not evidence.
+        // A gain below a millionth of the prior information is rounding, not evidence.
         if !information.is_finite() || information <= 1e-6 / self.variance {
             return None;
         }
@@ -66,12 +67,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn information_between_two_beliefs_is_the_measurement_that_was_taken() {
+    fn information_between_two_estimates_is_the_measurement_between_them() {
         let before = ScalarGaussian::from_std(2.0, 0.2);
         let taken = Measurement { value: 1.7, variance: 0.01 };
         let mut after = before;
         after.update(taken);
-        let found = before.information_until(&after).expect("something was learned");
+        let found = before.information_until(&after).expect("the variance fell");
         assert!((found.value - taken.value).abs() < 1e-12);
         assert!((found.variance - taken.variance).abs() < 1e-12);
     }
@@ -87,14 +88,14 @@ mod tests {
     #[test]
     fn steady_state_variance_is_the_closed_form() {
         let (q, r) = (1.0, 0.1);
-        let mut belief = ScalarGaussian { mean: 30.0, variance: 1.0 };
+        let mut estimate = ScalarGaussian { mean: 30.0, variance: 1.0 };
         for _ in 0..100 {
-            belief.predict(q);
-            belief.update(Measurement { value: 29.0, variance: r });
+            estimate.predict(q);
+            estimate.update(Measurement { value: 29.0, variance: r });
         }
         // Positive root of P^2 + Q P - Q R = 0 (variance after the update).
         let expected = (-q + (q * q + 4.0 * q * r).sqrt()) / 2.0;
-        assert!((belief.variance - expected).abs() < 1e-12);
-        assert!((belief.mean - 29.0).abs() < 1e-9);
+        assert!((estimate.variance - expected).abs() < 1e-12);
+        assert!((estimate.mean - 29.0).abs() < 1e-9);
     }
 }

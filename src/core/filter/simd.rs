@@ -1,8 +1,8 @@
-//! L numbers at once: the arithmetic of filters that step several cells together.
+//! Arithmetic on L numbers at once, for filters that step several cells together.
 //!
 //! Every operation works on each lane alone, in one order of IEEE 754 operations (no fused multiply-add, no library
-//! function), so a lane gives the same bits whatever L is, what its neighbours hold and how wide the machine's
-//! instructions are. The compiler makes vector instructions of the loops.
+//! function), so a lane gives the same bits for every L, neighbour and instruction width. The compiler
+//! vectorises the loops. NaN and infinities follow IEEE 754 unless a method states otherwise.
 
 use std::array::from_fn;
 use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
@@ -11,7 +11,7 @@ use std::ops::{Add, BitAnd, Div, Mul, Neg, Not, Sub};
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Lanes<const L: usize>(pub [f64; L]);
 
-/// L answers, all bits set for yes and none for no: as wide as the numbers they choose between.
+/// L booleans: all bits set for true, none for false, as wide as the numbers they select.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Mask<const L: usize>([u64; L]);
 
@@ -70,44 +70,44 @@ impl<const L: usize> Not for Mask<L> {
 }
 
 impl<const L: usize> Mask<L> {
-    /// The answers a function gives.
+    /// Fills the mask from a predicate of the lane index.
     #[inline(always)]
-    fn from_fn(mut answer: impl FnMut(usize) -> bool) -> Self {
-        Self(from_fn(|i| if answer(i) { u64::MAX } else { 0 }))
+    fn from_fn(mut predicate: impl FnMut(usize) -> bool) -> Self {
+        Self(from_fn(|i| if predicate(i) { u64::MAX } else { 0 }))
     }
 
-    /// The same answer in every lane.
+    /// The same value in every lane.
     #[inline(always)]
-    pub const fn splat(answer: bool) -> Self {
-        Self([if answer { u64::MAX } else { 0 }; L])
+    pub const fn splat(value: bool) -> Self {
+        Self([if value { u64::MAX } else { 0 }; L])
     }
 
-    /// The answer of a lane.
+    /// Value of a lane.
     #[inline(always)]
     pub fn lane(self, lane: usize) -> bool {
         self.0[lane] != 0
     }
 
-    /// Changes the answer of a lane.
+    /// Sets the value of a lane.
     #[inline(always)]
-    pub fn set_lane(&mut self, lane: usize, answer: bool) {
-        self.0[lane] = if answer { u64::MAX } else { 0 };
+    pub fn set_lane(&mut self, lane: usize, value: bool) {
+        self.0[lane] = if value { u64::MAX } else { 0 };
     }
 
-    /// Whether every lane says yes.
+    /// Whether every lane is true.
     #[inline(always)]
     pub fn all(self) -> bool {
         self.0.iter().fold(u64::MAX, |all, lane| all & lane) != 0
     }
 
-    /// Whether one lane alone says yes.
+    /// Whether exactly one lane is true.
     #[inline(always)]
     pub fn is_one(self) -> bool {
-        // Yes is -1.
+        // True is -1.
         self.0.iter().fold(0, |sum: u64, lane| sum.wrapping_add(*lane)) == u64::MAX
     }
 
-    /// Whether any lane says yes.
+    /// Whether any lane is true.
     #[inline(always)]
     pub fn any(self) -> bool {
         self.0.iter().fold(0, |any, lane| any | lane) != 0
@@ -145,7 +145,7 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| self.0[i].abs()))
     }
 
-    /// The smaller of each lane and the other's; the other's where the lane is NaN.
+    /// Lane-wise minimum; the other's lane where this lane is NaN.
     #[inline(always)]
     pub fn smaller(self, other: Self) -> Self {
         Self(from_fn(|i| if self.0[i] < other.0[i] { self.0[i] } else { other.0[i] }))
@@ -163,13 +163,13 @@ impl<const L: usize> Lanes<L> {
         Self(from_fn(|i| if self.0[i] > limit { self.0[i] } else { limit }))
     }
 
-    /// Whether each lane is above the other's; no where one is NaN.
+    /// Whether each lane is above the other's; false where one is NaN.
     #[inline(always)]
     pub fn above(self, other: Self) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > other.0[i])
     }
 
-    /// The same for one limit.
+    /// Whether each lane is above `limit`; false where it is NaN.
     #[inline(always)]
     pub fn above_number(self, limit: f64) -> Mask<L> {
         Mask::from_fn(|i| self.0[i] > limit)
@@ -181,14 +181,14 @@ impl<const L: usize> Lanes<L> {
         Mask::from_fn(|i| self.0[i].abs() < f64::INFINITY)
     }
 
-    /// Each lane of `self` where the mask says yes, else of `other`.
+    /// Selects each lane of `self` where the mask is true, else of `other`.
     #[inline(always)]
     pub fn or_else(self, mask: Mask<L>, other: Self) -> Self {
         Self(from_fn(|i| if mask.0[i] != 0 { self.0[i] } else { other.0[i] }))
     }
 
-    /// e^x with a relative error below 3 x 2^-52; 0 from -708 down, e^709 above 709 and for NaN: who must know of a NaN looks at
-    /// what it was made of.
+    /// e^x with a relative error below 3 x 2^-52; 0 from -708 down, e^709 above 709 and for NaN. A caller
+    /// that must detect NaN checks the argument.
     #[inline(always)]
     pub fn exp(self) -> Self {
         let x = self.at_most(709.0);
@@ -220,7 +220,7 @@ struct ExpSeries<const L: usize> {
     shifted: Lanes<L>,
     /// Even powers of r.
     even: Lanes<L>,
-    /// Odd ones.
+    /// Odd powers of r.
     odd: Lanes<L>,
 }
 
@@ -230,17 +230,17 @@ impl<const L: usize> ExpSeries<L> {
         let shifted = x * std::f64::consts::LOG2_E + ROUNDER;
         let n = shifted - ROUNDER;
         let r = (x - n * LN_2_HIGH) - n * LN_2_LOW;
-        // Even and odd powers apart: two short chains instead of a long one.
+        // Separate even and odd powers: two short dependency chains instead of a long one.
         let r2 = r.square();
         let even = EXP_EVEN.iter().fold(Lanes::splat(1.0 / 479_001_600.0), |sum, factor| sum * r2 + *factor);
         let odd = EXP_ODD.iter().fold(Lanes::splat(1.0 / 39_916_800.0), |sum, factor| sum * r2 + *factor);
         Self { shifted, even, odd: odd * r }
     }
 
-    /// A sum with n added to its exponent's bits, or taken off.
+    /// A sum with n added to, or subtracted from, the bits of its exponent.
     #[inline(always)]
     fn scaled(&self, sum: Lanes<L>, change: fn(u64, u64) -> u64) -> Lanes<L> {
-        // What is above n in `shifted` falls off.
+        // The shift drops the bits above n.
         Lanes(from_fn(|i| f64::from_bits(change(sum.0[i].to_bits(), self.shifted.0[i].to_bits() << 52))))
     }
 }
@@ -248,11 +248,11 @@ impl<const L: usize> ExpSeries<L> {
 /// x = m 2^e with sqrt(1/2) <= m < sqrt(2); with s = (m - 1) / (m + 1) ln m = 2 (s + s^3/3 + s^5/5 ..).
 #[inline(always)]
 fn ln(x: f64) -> f64 {
-    // Subtracting the bits of sqrt(1/2) leaves e in the exponent's place.
+    // Subtracting the bits of sqrt(1/2) leaves e in the exponent field.
     let above = x.to_bits().wrapping_sub(SQRT_HALF_BITS);
     let exponent = above & 0xFFF0_0000_0000_0000;
     let m = f64::from_bits(x.to_bits().wrapping_sub(exponent));
-    // e as a number without a conversion of integers: its low bits into the mantissa of a large one.
+    // e as a float without an integer conversion: its low bits go into the mantissa of a large number.
     let biased = (exponent >> 52).wrapping_add(2048) & 0xFFF;
     let e = f64::from_bits(LARGE.to_bits() | biased) - (LARGE + 2048.0);
     let s = (m - 1.0) / (m + 1.0);
@@ -261,7 +261,7 @@ fn ln(x: f64) -> f64 {
     2.0 * s * series + e * std::f64::consts::LN_2
 }
 
-/// Below this e^x is taken for 0: the bits of smaller results would not be a normal number's.
+/// Below this e^x counts as 0: smaller results would be subnormal.
 const LEAST: f64 = -708.0;
 /// Adding it rounds a number below 2^51 to a whole one.
 const ROUNDER: f64 = 6_755_399_441_055_744.0; // 1.5 * 2^52
@@ -286,7 +286,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exp_is_that_of_the_library() {
+    fn exp_agrees_with_the_library() {
         let mut x = -745.0;
         while x < 709.0 {
             let (ours, theirs) = (Lanes([x]).exp().0[0], libm::exp(x));
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn exp_of_both_signs_is_that_of_the_library() {
+    fn exp_of_both_signs_agrees_with_the_library() {
         let mut x = -708.0;
         while x <= 708.0 {
             let (up, down) = Lanes([x]).exp_of_both_signs();
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn answers_are_counted_lane_by_lane() {
+    fn masks_are_counted_lane_by_lane() {
         let mut mask = Lanes([1.0, f64::NAN, -1.0, f64::INFINITY]).above_number(0.0);
         assert_eq!([0, 1, 2, 3].map(|lane| mask.lane(lane)), [true, false, false, true]);
         assert_eq!((mask.any(), mask.is_one(), mask.all()), (true, false, false));
@@ -331,7 +331,7 @@ mod tests {
     }
 
     #[test]
-    fn ln_is_that_of_the_library() {
+    fn ln_agrees_with_the_library() {
         let mut x = 1e-12_f64;
         while x < 1e12 {
             for x in [x, 1.0 + x.min(1.0)] {
@@ -344,7 +344,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lane_does_not_know_its_neighbours() {
+    fn a_lane_is_independent_of_its_neighbours() {
         let x = [0.3, -2.0, f64::NAN, 1e9, 7.5, 0.0, -1e-9, 55.0];
         let all = Lanes(x).exp() * Lanes(x).sqrt() + Lanes(x).at_most(3.0).reciprocal();
         for (i, x) in x.into_iter().enumerate() {

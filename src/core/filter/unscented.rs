@@ -1,4 +1,4 @@
-//! The unscented Kalman filter with additive noise and a scalar measurement.
+//! Unscented Kalman filter with additive noise and a scalar measurement.
 //!
 //! State x of N numbers with covariance P. Sigma points x, x +/- sqrt(N + lambda) L_i with L the lower
 //! Cholesky factor of P and lambda = alpha^2 (N + kappa) - N; weights as in Wan and van der Merwe (2000),
@@ -6,9 +6,8 @@
 //! points are **redrawn** from the predicted mean and covariance, then every point through h. (Reusing the
 //! propagated points instead, as some packages do, differs by up to 3e-4 of SOC on drive data.)
 //!
-//! Promises: the covariance that comes out is symmetric; a factorisation that fails or a number that is not
-//! finite is an error, nothing is repaired in silence. Sums are plain loops in a fixed order, so that every
-//! machine gives the same bits.
+//! The resulting covariance is symmetric. A failed factorisation or a number that is not finite is an error; nothing is
+//! repaired silently. Sums are plain loops in a fixed order, so that every machine gives the same bits.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -21,27 +20,27 @@ pub struct Gaussian<const N: usize> {
     pub covariance: SMatrix<f64, N, N>,
 }
 
-/// Why a step could not be made.
+/// Reason why a step failed; the state is unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum FilterError {
     /// The covariance has no Cholesky factor.
     #[error("covariance is not positive definite")]
     NotPositiveDefinite,
-    /// A NaN or an infinity came out.
+    /// The result contains a NaN or an infinity.
     #[error("a number is not finite")]
     NotFinite,
 }
 
-/// How the sigma points are spread, and their weights, for N states.
+/// Scale and weights of the sigma points for N states.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Spread {
+pub struct SigmaPointWeights {
     scale: f64,
     mean_0: f64,
     covariance_0: f64,
     others: f64,
 }
 
-impl Spread {
+impl SigmaPointWeights {
     /// From alpha (0 to 1], beta and kappa, for `n` states; `n` + `kappa` must be positive.
     pub fn new(n: usize, alpha: f64, beta: f64, kappa: f64) -> Self {
         let total = alpha * alpha * (n as f64 + kappa); // n + lambda
@@ -52,38 +51,38 @@ impl Spread {
 
 /// Variances of one scalar measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Noise {
-    /// Variance the filter weighs the measurement with.
+pub struct MeasurementNoise {
+    /// Variance that weighs the measurement.
     pub variance: f64,
-    /// Variance of a single reading's error for the gate; differs from `variance` where that one stands for
-    /// information per time rather than for a reading's size.
+    /// Variance of a single reading's error, for the gate. Differs from `variance` where that one counts information
+    /// per time.
     pub gate_variance: f64,
     /// Gate width in standard deviations.
     pub gate_sigma: f64,
 }
 
-/// What an update did.
+/// Outcome of a measurement update.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Update {
     /// Measured minus predicted.
     pub innovation: f64,
-    /// Predicted variance of the innovation: state and [`Noise::variance`].
+    /// Predicted variance of the innovation: state and [`MeasurementNoise::variance`].
     pub innovation_variance: f64,
-    /// innovation^2 over its variance with [`Noise::gate_variance`]: beyond gate_sigma^2 it is an outlier.
+    /// innovation^2 over its variance with [`MeasurementNoise::gate_variance`]: beyond gate_sigma^2 the measurement is an outlier.
     pub test_ratio: f64,
-    /// Whether the innovation passed the gate and the state was moved.
+    /// Whether the innovation passed the gate and moved the state.
     pub accepted: bool,
 }
 
 /// The sigma points in pairs: centre, then plus and minus along each column of the factor.
-struct Points<const N: usize> {
+struct SigmaPoints<const N: usize> {
     centre: SVector<f64, N>,
     plus: [SVector<f64, N>; N],
     minus: [SVector<f64, N>; N],
 }
 
 impl<const N: usize> Gaussian<N> {
-    fn points(&self, spread: &Spread) -> Result<Points<N>, FilterError> {
+    fn points(&self, spread: &SigmaPointWeights) -> Result<SigmaPoints<N>, FilterError> {
         let factor = self.covariance.cholesky().ok_or(FilterError::NotPositiveDefinite)?;
         let columns: [SVector<f64, N>; N] = std::array::from_fn(|i| factor.l_dirty().column(i).into_owned());
         let offset = |i: usize| {
@@ -91,20 +90,20 @@ impl<const N: usize> Gaussian<N> {
             column.iter_mut().take(i).for_each(|above| *above = 0.0); // l_dirty keeps the old upper half
             column
         };
-        Ok(Points {
+        Ok(SigmaPoints {
             centre: self.mean,
             plus: std::array::from_fn(|i| self.mean + offset(i)),
             minus: std::array::from_fn(|i| self.mean - offset(i)),
         })
     }
 
-    /// Moves the state through `f` and adds the process noise covariance `q`.
+    /// Propagates the state through `f` and adds the process noise covariance `q`.
     ///
     /// # Errors
     /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
     pub fn predict(
         &mut self,
-        spread: &Spread,
+        spread: &SigmaPointWeights,
         f: impl Fn(&SVector<f64, N>) -> SVector<f64, N>,
         q: &SMatrix<f64, N, N>,
     ) -> Result<(), FilterError> {
@@ -124,17 +123,17 @@ impl<const N: usize> Gaussian<N> {
         self.set(mean, p)
     }
 
-    /// Takes in the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported and
-    /// moves nothing.
+    /// Updates the state with the scalar measurement `z` = `h`(x) + `noise`. An innovation beyond the gate is reported
+    /// and leaves the state unchanged.
     ///
     /// # Errors
     /// When the covariance cannot be factored or the result is not finite; the state is then unchanged.
     pub fn update(
         &mut self,
-        spread: &Spread,
+        spread: &SigmaPointWeights,
         z: f64,
         h: impl Fn(&SVector<f64, N>) -> f64,
-        noise: &Noise,
+        noise: &MeasurementNoise,
     ) -> Result<Update, FilterError> {
         let points = self.points(spread)?;
         let centre = h(&points.centre);
@@ -198,8 +197,8 @@ mod tests {
     use super::*;
     use nalgebra::{matrix, vector};
 
-    fn noise(variance: f64, gate_sigma: f64) -> Noise {
-        Noise { variance, gate_variance: variance, gate_sigma }
+    fn noise(variance: f64, gate_sigma: f64) -> MeasurementNoise {
+        MeasurementNoise { variance, gate_variance: variance, gate_sigma }
     }
 
     fn start() -> Gaussian<2> {
@@ -208,7 +207,7 @@ mod tests {
 
     #[test]
     fn a_linear_model_gives_the_kalman_filter() {
-        let spread = Spread::new(2, 0.5, 2.0, 1.0);
+        let spread = SigmaPointWeights::new(2, 0.5, 2.0, 1.0);
         let f = matrix![1.0, 0.1; 0.0, 0.9];
         let q = matrix![1e-3, 0.0; 0.0, 2e-3];
         let (h, r, z) = (matrix![1.0, 0.4], 0.02, 1.3);
@@ -227,8 +226,8 @@ mod tests {
     }
 
     #[test]
-    fn an_outlier_is_reported_and_moves_nothing() {
-        let spread = Spread::new(2, 1.0, 2.0, 0.0);
+    fn an_outlier_is_reported_and_leaves_the_state_unchanged() {
+        let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let mut ukf = start();
         let update = ukf.update(&spread, 8.4, |x| x[0], &noise(1e-3, 5.0)).expect("update");
         assert!(!update.accepted);
@@ -238,7 +237,7 @@ mod tests {
 
     #[test]
     fn a_bad_covariance_is_an_error_and_changes_nothing() {
-        let spread = Spread::new(2, 1.0, 2.0, 0.0);
+        let spread = SigmaPointWeights::new(2, 1.0, 2.0, 0.0);
         let mut ukf = start();
         ukf.covariance[(0, 0)] = -1.0;
         let before = ukf;
@@ -252,7 +251,7 @@ mod tests {
     #[test]
     fn noise_that_matches_the_model_gives_consistent_innovations() {
         // Random walk observed in noise, both drawn by a small fixed generator: mean NIS must be 1 within 3 sigma.
-        let spread = Spread::new(1, 1.0, 2.0, 0.0);
+        let spread = SigmaPointWeights::new(1, 1.0, 2.0, 0.0);
         let mut seed = 0x2545_F491_4F6C_DD1D_u64;
         let mut normal = || {
             // Sum of 12 uniforms minus 6: variance 1, near enough to Gaussian for a variance test.

@@ -1,26 +1,26 @@
-//! Settings of what is learned at charge/discharge transitions.
+//! Settings of the learning at charge/discharge transitions. `config` checks their ranges.
 
-/// When the current counts as charge, rest or discharge.
+/// Classification of the current as charge, rest or discharge.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TransitionConfig {
     /// |current| (per pack) at and below which the pack rests, A.
     pub dead_band_a: f64,
     /// A mode is left only when the current is this far beyond the dead band's edge, A.
     pub hysteresis_a: f64,
-    /// A new mode must hold this long before it counts, s.
+    /// Shortest duration of a mode, s.
     pub min_duration_s: f64,
     /// Half-cycles with less charge than this fraction of the rated capacity are joined to their neighbours.
     pub min_swing: f64,
 }
 
-/// How a half-cycle's capacity measurement is formed.
+/// Source of a half-cycle's capacity measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CapacityMethod {
-    /// Charge over the SOC swing the voltages tell, variance computed from the swing's uncertainty.
+    /// Charge over the SOC swing by the voltages, with a variance from the swing's uncertainty.
     Swing,
-    /// As the paper: charge / nominal swing, fixed measurement variance.
+    /// As in the paper: charge / nominal swing, fixed measurement variance.
     Nominal {
-        /// The swing assumed, fraction (paper: 0.6).
+        /// Assumed swing, fraction (paper: 0.6).
         swing: f64,
         /// Measurement variance, Ah^2 (paper: 0.1).
         variance_ah2: f64,
@@ -34,15 +34,15 @@ pub struct CapacityConfig {
     pub method: CapacityMethod,
     /// Process noise: standard deviation gained per equivalent full cycle (Swing) or per event (Nominal), Ah.
     pub noise_ah_per_cycle: f64,
-    /// Process noise of rest: standard deviation gained in a day without current (capacity comes back), Ah; at
+    /// Process noise of rest: standard deviation gained in a day without current (capacity recovers), Ah; at
     /// most one day counts per half-cycle. Not used by `Nominal`.
     pub noise_ah_per_rest_day: f64,
-    /// Error of the cell's open-circuit voltage at the ends of a half-cycle, V: it repeats, so no number of readings there
-    /// averages it out. `Swing` only, as the next two.
+    /// Error of the cell's open-circuit voltage at the ends of a half-cycle, V: it repeats, so readings there do not average
+    /// it out. `Swing` only, as the next two.
     pub end_error_v: f64,
-    /// The same in proportion to the voltage the load drops in the cell, fraction.
+    /// Error of that voltage in proportion to the voltage that the load drops in the cell, fraction.
     pub end_load_error: f64,
-    /// The same from the curve's change of shape as capacity is lost: error of the model's `ocv_ageing_shift`.
+    /// Error of that voltage from the curve's change of shape with lost capacity: error of the model's `ocv_ageing_shift`.
     pub ageing_shift_error: f64,
     /// Standard deviation of the current sensor's gain: a floor under the capacity's uncertainty, fraction.
     pub current_gain_std: f64,
@@ -50,16 +50,16 @@ pub struct CapacityConfig {
     pub current_offset_std_a: f64,
     /// Standard deviation of the fade at the start, Ah per full cycle; 0 = not learned. Not used by `Nominal`.
     pub fade_std_ah_per_cycle: f64,
-    /// How fast the fade may change: standard deviation gained per equivalent full cycle, Ah per full cycle.
+    /// Process noise of the fade: standard deviation gained per equivalent full cycle, Ah per full cycle.
     pub fade_noise_ah_per_cycle: f64,
 }
 
-/// Which recharge period the rule about it compares.
+/// Recharge period that the alarm rule compares.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RechargeAlarm {
-    /// As it was, with the charger at hand.
+    /// Measured, with the actual charger.
     Raw,
-    /// What the reference charger would need.
+    /// Computed for the reference charger.
     Normalised,
 }
 
@@ -72,13 +72,13 @@ pub struct RechargeConfig {
     pub to_soc: f64,
     /// Current of the reference charger per cell, A, positive.
     pub reference_current_a: f64,
-    /// Part of the window a charge must cover to be told as a normalised period, fraction.
+    /// Part of the window that a charge must cover to report a normalised period, fraction.
     pub min_coverage: f64,
-    /// What the rule about the recharge period compares.
+    /// Period that the alarm rule compares.
     pub alarm_on: RechargeAlarm,
 }
 
-/// The load at which the usable capacity is stated.
+/// Load that defines the usable capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct UsableConfig {
     /// Discharge current per cell, A.
@@ -87,12 +87,12 @@ pub struct UsableConfig {
     pub temperature_c: f64,
     /// Voltage under load at which discharge ends, V.
     pub cutoff_v: f64,
-    /// A charge whose current has fallen to this (per cell, A) at the model's highest voltage ended full: the SOC
-    /// it left is where the next usable capacity starts. Until then, SOC 1.
+    /// A charge whose current has fallen to this (per cell, A) at the model's highest voltage ended full: the next usable
+    /// capacity starts from its final SOC. Before the first such charge, from SOC 1.
     pub taper_current_a: f64,
 }
 
-/// Everything about learning at transitions.
+/// Settings of the learning at transitions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HealthConfig {
     /// Mode detection.

@@ -1,13 +1,14 @@
-//! What drifts too slowly for one half-cycle to tell: a cell's capacity, what it loses per cycle, and the offset of the
-//! current sensor. A linear Kalman filter with one step per half-cycle.
+//! Slow drifts of a cell: its capacity, the fade per cycle, and the offset of the current sensor. A linear Kalman filter
+//! with one step per half-cycle.
 //!
-//! State x = [C (Ah), fade (Ah per full cycle), offset (A per cell)]. Measurement: what the half-cycle alone says of
-//! the capacity (`ScalarGaussian::information_until`), z = C + (C / I) d, with I the half-cycle's mean current (A, positive =
-//! discharge) and d what is wrong with the offset already taken off the current: an offset makes a discharge measure
-//! more charge and a charge less, so their capacities differ with opposite signs.
+//! State x = [C (Ah), fade (Ah per full cycle), offset (A per cell)]. Measurement: the capacity by
+//! the half-cycle alone (`ScalarGaussian::information_until`), z = C + (C / I) d, with I the half-cycle's mean current (A, positive =
+//! discharge) and d the error of the offset that is already subtracted from the current: an offset increases the measured
+//! charge of a discharge and lowers that of a charge, so the errors of their capacities have opposite signs.
 //! At the end of a charge of w full cycles: C -= w fade. C walks (the caller's noise), the offset walks slowly.
 //!
-//! Assumed: what a cycle takes shows from its end on; the offset is the same in charge and discharge.
+//! Assumed: the fade of a cycle shows from its end on; the offset is the same in charge and discharge. Inputs are not
+//! checked; a stored state is.
 
 use serde::{Deserialize, Serialize};
 
@@ -15,7 +16,7 @@ use super::CapacityConfig;
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::InvalidState;
 
-/// The offset walks by this part of its first standard deviation in a full cycle: sensors drift with temperature.
+/// Random walk of the offset in a full cycle, part of its first standard deviation: sensors drift with temperature.
 const OFFSET_WALK: f64 = 0.1;
 
 const C: usize = 0;
@@ -26,13 +27,13 @@ const N: usize = 3;
 /// The filter of one cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Drift {
+pub struct DriftFilter {
     x: [f64; N],
     p: [[f64; N]; N],
 }
 
-impl Drift {
-    /// For a cell that starts from this capacity.
+impl DriftFilter {
+    /// A filter that starts from this capacity.
     pub fn new(config: &CapacityConfig, capacity: ScalarGaussian) -> Self {
         let mut p = [[0.0; N]; N];
         p[C][C] = capacity.variance;
@@ -51,7 +52,7 @@ impl Drift {
         self.x[OFFSET]
     }
 
-    /// Whether a stored filter can be gone on with.
+    /// Checks a stored filter; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
         let all = self.x.iter().chain(self.p.iter().flatten());
@@ -61,7 +62,7 @@ impl Drift {
             InvalidState::unless_natural("a variance beside a learned capacity", self.p[i][i])?;
             for j in 0..i {
                 let (covariance, most) = (self.p[i][j], (self.p[i][i] * self.p[j][j]).sqrt());
-                // It is stored rounded.
+                // The stored numbers are rounded.
                 let fits = covariance.abs() <= most * (1.0 + 1e-5) && (covariance - self.p[j][i]).abs() <= most * 1e-5;
                 InvalidState::unless(
                     fits,
@@ -74,7 +75,7 @@ impl Drift {
         Ok(())
     }
 
-    /// Takes in what a half-cycle with this mean current says of the capacity.
+    /// Updates with the capacity measured by a half-cycle with this mean current.
     pub fn update(&mut self, z: Measurement, mean_current_a: f64) {
         let by_offset = self.x[C] / mean_current_a;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][C] + by_offset * self.p[i][OFFSET]);
@@ -88,8 +89,9 @@ impl Drift {
         }
     }
 
-    /// A half-cycle of `cycles` full ones has passed, of which `charged` count as loss; the capacity walks too.
-    pub fn pass(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
+    /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the
+    /// capacity's process noise.
+    pub fn predict(&mut self, config: &CapacityConfig, cycles: f64, charged: f64, capacity_variance: f64) {
         self.x[C] -= charged * self.x[FADE];
         for j in 0..N {
             self.p[C][j] -= charged * self.p[FADE][j];
@@ -123,8 +125,8 @@ mod tests {
     };
 
     /// 60 % cycles at 1 A of a cell that loses `loss_ah` at the end of each charge, measured with `offset_a`.
-    fn cycle(config: &CapacityConfig, loss_ah: f64, offset_a: f64) -> (Drift, f64) {
-        let mut drift = Drift::new(config, ScalarGaussian::from_std(2.5, 0.1));
+    fn cycle(config: &CapacityConfig, loss_ah: f64, offset_a: f64) -> (DriftFilter, f64) {
+        let mut drift = DriftFilter::new(config, ScalarGaussian::from_std(2.5, 0.1));
         let mut true_ah = 2.6;
         for k in 0..40 {
             let current_a = if k % 2 == 0 { 1.0 } else { -1.0 };
@@ -134,14 +136,14 @@ mod tests {
                 break;
             }
             let charged = if k % 2 == 0 { 0.0 } else { 0.6 };
-            drift.pass(config, 0.3, charged, 0.3e-4);
+            drift.predict(config, 0.3, charged, 0.3e-4);
             true_ah -= loss_ah * charged / 0.6;
         }
         (drift, true_ah)
     }
 
     #[test]
-    fn fade_and_offset_are_told_apart_and_the_capacity_is_free_of_both() {
+    fn fade_and_offset_are_separated_and_the_capacity_is_free_of_both() {
         let (drift, true_ah) = cycle(&CONFIG, 0.03, 0.01);
         assert!((drift.offset_a() - 0.01).abs() < 1e-3, "{drift:?}");
         assert!((drift.x[FADE] - 0.05).abs() < 2e-3, "{drift:?}");
@@ -149,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn without_room_for_them_neither_is_learned() {
+    fn fade_and_offset_without_prior_variance_are_not_learned() {
         let config = CapacityConfig { current_offset_std_a: 0.0, fade_std_ah_per_cycle: 0.0, ..CONFIG };
         let (drift, _) = cycle(&config, 0.03, 0.01);
         assert_eq!((drift.x[FADE], drift.x[OFFSET]), (0.0, 0.0));

@@ -1,24 +1,27 @@
-//! Remaining useful life: how much use, and how many days, until a cell's capacity passes an end-of-life threshold.
+//! Remaining useful life: use and days until a cell's capacity falls below an end-of-life threshold.
+//!
+//! In: use (equivalent full cycles, days) and learned capacities (Ah) with variances. Out: median and 90 % interval, or the
+//! reason why there is none ([`InsufficientData`]). Readings that are no number or negative are ignored.
 //!
 //! A linear Kalman filter over the learned capacities, one step per reading, whose cost and memory do not grow with the
 //! history. State x = [level, rate, recovery, first], capacities in parts of a reference capacity:
 //! * level: the capacity that only falls; level -= rate dt, with t the use (equivalent full cycles; days where the
-//!   use is not known);
+//!   cycles are unknown);
 //! * rate: loss per unit of use. Its logarithm walks: by `RATE_WALK` per square root of capacity lost, and by
 //!   `RATE_WALK_USE` per e-fold of use. Both are relative, so one pair of numbers serves cells that live for 50 cycles
 //!   and for 5,000; in the linear filter they become Q = (w1^2 rate dt + w2^2 ln(t1 / t0)) (rate^2 + P_rate);
-//! * recovery: capacity that comes back in rest and is used up again (an Ornstein-Uhlenbeck process; measured cells
-//!   show 1 to 5 % after days of rest). It is also what readings that follow each other have in common, so that ten
-//!   readings in one cycle do not count as ten;
-//! * first: the level at the first reading, which later readings tell too. What was lost since is first - level.
+//! * recovery: capacity that returns in rest and is used up again (an Ornstein-Uhlenbeck process; measured cells show
+//!   1 to 5 % after days of rest). It correlates successive readings, so that ten readings in one cycle do not count as
+//!   ten;
+//! * first: the level at the first reading, which later readings refine. The loss since then is first - level.
 //!
-//! A reading is level + recovery + noise; one far out of what is expected counts for less. The forecast takes the loss as the free variable, not the time: the use until
-//! the level has fallen by L is the integral of 1 / rate over the loss, a sum of lognormals, here one lognormal of the
-//! same mean and variance (closed form, see [`distribution`]). There is no first-passage problem, for the level only
-//! falls, and no sampling.
+//! A reading is level + recovery + noise; an outlier counts less. The forecast uses the loss as the free variable, not
+//! the time: the use until the level has fallen by L is the integral of 1 / rate over the loss, a sum of lognormals,
+//! approximated by one lognormal of the same mean and variance (closed form, see [`distribution`]). The level only falls,
+//! so there is no first-passage problem, and no sampling.
 //!
 //! Assumed: fade has no preferred curvature (it may slow down as well as speed up), so the median is the present rate
-//! held; a knee that no reading has shown lies outside the interval. `tests/rul.md` has what was tried and the figures.
+//! held; a knee that no reading has shown lies outside the interval. `tests/rul.md` lists the alternatives and figures.
 
 mod distribution;
 #[cfg(test)]
@@ -29,20 +32,20 @@ use serde::{Deserialize, Serialize};
 use self::distribution::Crossing;
 use crate::quantity::InvalidState;
 
-/// Standard deviation of the logarithm of the rate per square root of capacity lost (part of the reference): while 10 %
-/// is lost the rate changes by a factor of e^0.32 either way.
+/// Standard deviation of the logarithm of the rate per square root of capacity lost (part of the reference): over a
+/// loss of 10 % the rate changes by a factor of e^0.32 either way.
 const RATE_WALK: f64 = 1.0;
-/// The same per square root of an e-fold of use since the first reading.
+/// Standard deviation of the logarithm of the rate per square root of an e-fold of use since the first reading.
 const RATE_WALK_USE: f64 = 0.3;
 /// Standard deviation of the recovery while the cell is used, part of the reference.
 const RECOVERY_IN_USE: f64 = 0.01;
-/// Use that takes an e-fold of the recovery away, equivalent full cycles.
+/// Use over which the recovery decays by an e-fold, equivalent full cycles.
 const RECOVERY_CYCLES: f64 = 10.0;
-/// Standard deviation that rests, however many, give the recovery besides, part of the reference.
+/// Standard deviation of the recovery gained by rest, part of the reference.
 const RECOVERY_IN_REST: f64 = 0.02;
-/// Rest after which it has come, e-fold, days; also what takes it away where the use is not known.
+/// Time constant of the recovery in rest, days; also of its decay on the axis of days.
 const RECOVERY_DAYS: f64 = 1.0;
-/// Rest that is assumed where nobody knows how long a cell has rested, days: all that comes back has come back.
+/// Assumed duration of an unknown rest, days: the recovery is complete.
 const LONG_REST_DAYS: f64 = 30.0;
 const DAY_S: f64 = 86_400.0;
 /// Standard deviation of a reading's own noise beyond its stated variance, part of the reference.
@@ -52,18 +55,18 @@ const LEVEL_PRIOR: f64 = 1.0;
 /// Standard deviation of the rate before the first reading, part of the reference per unit of use: 2 % a cycle.
 const RATE_PRIOR: f64 = 0.02;
 
-/// Readings without which nothing is told.
+/// Fewest readings of a forecast.
 pub const MIN_READINGS: u32 = 6;
-/// The capacity lost must be this many times its standard deviation.
+/// Smallest capacity loss of a forecast, in its standard deviations.
 pub const MIN_FADE_DEVIATIONS: f64 = 1.5;
-/// The interval's ends may lie apart by this factor, where it reaches further ahead than there is use behind.
+/// Largest ratio of the interval's ends, where it reaches further ahead than the use so far.
 pub const MAX_SPREAD: f64 = 100.0;
-/// Days over which the rate of use is taken, e-fold.
+/// Time constant of the recent rate of use, days.
 const RECENT_DAYS: f64 = 30.0;
 
-/// A cell is at its end when its level is below the threshold by so many deviations: with 95 % probability.
+/// A cell is at its end when its level is below the threshold by this many deviations: with 95 % probability.
 const PASSED_DEVIATIONS: f64 = 1.645;
-/// Deviations by which a reading may miss what is expected; its noise is taken as so much larger that it misses by no more.
+/// Largest innovation of a reading, in deviations; the noise of an outlier is raised until it meets this bound.
 const MAX_MISS_DEVIATIONS: f64 = 5.0;
 
 /// Quantiles of the interval: 5, 50 and 95 %.
@@ -75,39 +78,39 @@ const RECOVERY: usize = 2;
 const FIRST: usize = 3;
 const N: usize = 4;
 
-/// What counts as use.
+/// Measure of use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Axis {
     /// Equivalent full cycles.
     Cycles,
-    /// Days: the history does not say how much the cell was used. Any of them may have been rest.
+    /// Days: the history does not record cycles. Any day may have been rest.
     Days,
 }
 
-/// What passed since the reading before.
+/// Use since the reading before.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Usage {
-    /// Equivalent full cycles, each twice the rated capacity moved; not looked at on the axis of days.
+    /// Equivalent full cycles, each twice the rated capacity moved; ignored on the axis of days.
     pub cycles: f64,
     /// Days, rest included.
     pub days: f64,
-    /// Days without current; not looked at on the axis of days.
+    /// Days without current; ignored on the axis of days.
     pub rest_days: f64,
 }
 
 /// A learned capacity.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Reading {
-    /// Ah.
+pub struct CapacityReading {
+    /// Capacity, Ah.
     pub capacity_ah: f64,
-    /// Variance of what this reading alone says, Ah^2: independent of the readings before.
+    /// Variance of this reading alone, Ah^2: independent of the readings before.
     pub variance_ah2: f64,
-    /// Variance of what all readings have wrong alike (the current sensor's gain, say), Ah^2; not in the other.
+    /// Variance of the error that all readings share (the current sensor's gain), Ah^2; not part of `variance_ah2`.
     pub shared_variance_ah2: f64,
 }
 
-/// Median and 90 % interval of an amount that remains.
+/// Median and 90 % interval of a remaining amount.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Remaining {
@@ -119,17 +122,17 @@ pub struct Remaining {
     pub high: f64,
 }
 
-/// Remaining useful life. At least one of both is known.
+/// Remaining useful life; at least one of both is known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RemainingLife {
     /// Equivalent full cycles; `None` on the axis of days.
     pub cycles: Option<Remaining>,
-    /// Days, if the cell goes on being used as of late (`RECENT_DAYS`); `None` while that is not known.
+    /// Days at the recent rate of use (`RECENT_DAYS`); `None` while that rate is unknown.
     pub days: Option<Remaining>,
 }
 
-/// Why there is no forecast.
+/// Reason why there is no forecast.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum InsufficientData {
@@ -139,21 +142,21 @@ pub enum InsufficientData {
         /// So far.
         found: u32,
     },
-    /// All readings are of one moment.
+    /// All readings are from one time.
     #[error("no use between the first reading and the last")]
     Use,
-    /// The fade is not told from noise.
+    /// The fade is not significant against its deviation.
     #[error(
         "capacity lost is {:.1} +- {:.1} %, must be {MIN_FADE_DEVIATIONS} times its deviation",
         100.0 * lost, 100.0 * std
     )]
     Fade {
-        /// Part of the reference.
+        /// Capacity lost, part of the reference.
         lost: f64,
         /// Its standard deviation.
         std: f64,
     },
-    /// The interval is too wide to be of use.
+    /// The interval is too wide.
     #[error("the interval would be from {low:.1} to {high:.1}, may not span more than a factor of {MAX_SPREAD}")]
     Spread {
         /// 5 % quantile, units of use.
@@ -163,7 +166,7 @@ pub enum InsufficientData {
     },
 }
 
-/// Capacity at a moment to come, for pictures.
+/// Capacity at a future use, for charts.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct FanPoint {
     /// Use from the last reading on, units of the axis.
@@ -176,7 +179,7 @@ pub struct FanPoint {
     pub high_ah: f64,
 }
 
-/// The filter of one cell: two dozen numbers, however long its history.
+/// The filter of one cell: two dozen numbers, independent of the length of its history.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Forecast {
@@ -188,19 +191,19 @@ pub struct Forecast {
     x: [f64; N],
     p: [[f64; N]; N],
     shared_variance: f64,
-    /// Equivalent full cycles and days of late.
+    /// Recent equivalent full cycles and days.
     recent: [f64; 2],
 }
 
 impl Usage {
-    /// In a half-cycle that moved this charge (Ah) in this time, and so long after the one before (seconds from end to
-    /// end; `None` = not known: it may have rested long).
+    /// Use of a half-cycle that moved `charge_ah` in `duration_s`, `since_before_s` after the one before (from end to end;
+    /// `None` = unknown, then a long rest is assumed).
     pub fn in_half_cycle(charge_ah: f64, duration_s: f64, since_before_s: Option<f64>, rated_capacity_ah: f64) -> Self {
         let used_days = duration_s / DAY_S;
         let known = since_before_s.map(|seconds| (seconds / DAY_S - used_days).max(0.0));
         Self {
             cycles: charge_ah / (2.0 * rated_capacity_ah),
-            // A rest nobody knows says nothing of how much the cell is used of late.
+            // An unknown rest does not change the recent rate of use.
             days: used_days + known.unwrap_or(0.0),
             rest_days: known.unwrap_or(LONG_REST_DAYS),
         }
@@ -208,14 +211,14 @@ impl Usage {
 }
 
 impl Forecast {
-    /// For a cell of this capacity when new, Ah; any capacity of its size serves, it is only a scale.
+    /// A filter for a cell of this capacity when new, Ah. The reference is only a scale: an approximate value is enough.
     pub fn new(axis: Axis, reference_ah: f64) -> Self {
         let mut p = [[0.0; N]; N];
         p[LEVEL][LEVEL] = LEVEL_PRIOR * LEVEL_PRIOR;
         p[RATE][RATE] = RATE_PRIOR * RATE_PRIOR;
         let rest = if axis == Axis::Days { RECOVERY_IN_REST } else { 0.0 };
         p[RECOVERY][RECOVERY] = RECOVERY_IN_USE * RECOVERY_IN_USE + rest * rest;
-        // Until there is a reading both are the same.
+        // Before the first reading both levels are the same.
         for (i, j) in [(FIRST, FIRST), (FIRST, LEVEL), (LEVEL, FIRST)] {
             p[i][j] = p[LEVEL][LEVEL];
         }
@@ -223,9 +226,9 @@ impl Forecast {
         Self { axis, reference_ah, readings: 0, used: 0.0, x, p, shared_variance: 0.0, recent: [0.0; 2] }
     }
 
-    /// Use and rest have passed; `reading` is what was learned at their end, if anything. What is not a number, or less
-    /// than 0, is taken for nothing.
-    pub fn update(&mut self, passed: Usage, reading: Option<Reading>) {
+    /// Predicts over use and rest, then updates with the capacity learned at their end, if any. Numbers that are NaN,
+    /// infinite or negative are ignored.
+    pub fn update(&mut self, passed: Usage, reading: Option<CapacityReading>) {
         let natural = |value: f64| if value.is_finite() { value.max(0.0) } else { 0.0 };
         let Usage { cycles, days, rest_days } = passed;
         let passed = Usage { cycles: natural(cycles), days: natural(days), rest_days: natural(rest_days) };
@@ -233,8 +236,8 @@ impl Forecast {
         if self.readings > 0 {
             self.advance(&passed);
         }
-        let is_sound = |reading: &Reading| {
-            let Reading { capacity_ah, variance_ah2, shared_variance_ah2 } = *reading;
+        let is_sound = |reading: &CapacityReading| {
+            let CapacityReading { capacity_ah, variance_ah2, shared_variance_ah2 } = *reading;
             [capacity_ah, variance_ah2, shared_variance_ah2].iter().all(|value| (0.0..1e9).contains(value))
         };
         if let Some(reading) = reading.filter(is_sound) {
@@ -242,7 +245,7 @@ impl Forecast {
         }
     }
 
-    /// Use and days in an exponential window: of days long ago little counts, also when they have passed in one go.
+    /// Adds use and days to the exponential window, exactly for a step of any length.
     fn count_recent(&mut self, passed: &Usage) {
         let ages = passed.days / RECENT_DAYS;
         let kept = libm::exp(-ages);
@@ -251,10 +254,10 @@ impl Forecast {
         self.recent = [cycles * kept + share * passed.cycles, days * kept + share * passed.days];
     }
 
-    /// Whether its numbers can be gone on with, on this axis.
+    /// Checks the numbers of a stored forecast on this axis.
     ///
     /// # Errors
-    /// Names the first that cannot.
+    /// The first impossible number.
     pub fn check(&self, axis: Axis) -> Result<(), InvalidState> {
         InvalidState::unless(self.axis == axis, "the axis of the remaining life", 1.0, "cycles")?;
         InvalidState::unless_capacity("the reference of the remaining life", self.reference_ah)?;
@@ -268,7 +271,7 @@ impl Forecast {
             InvalidState::unless_natural("a variance of the remaining life", self.p[i][i])?;
             for j in 0..i {
                 let [one, other] = [self.p[i][j], self.p[j][i]];
-                // An estimate's covariance may miss symmetry by roundings.
+                // Rounding may break the symmetry of an estimated covariance.
                 let bound = 1.001 * (self.p[i][i] * self.p[j][j]).sqrt() + 1e-12;
                 let is_sound = one.abs() <= bound && other.abs() <= bound;
                 InvalidState::unless(is_sound, "a covariance of the remaining life", one, "within its variances")?;
@@ -277,12 +280,12 @@ impl Forecast {
         Ok(())
     }
 
-    /// Readings so far.
+    /// Number of readings so far.
     pub fn readings(&self) -> u32 {
         self.readings
     }
 
-    /// Capacity without what rest has brought back, mean and standard deviation, Ah.
+    /// Capacity without recovery, mean and standard deviation, Ah.
     pub fn level_ah(&self) -> (f64, f64) {
         (self.reference_ah * self.x[LEVEL], self.reference_ah * self.level_variance().sqrt())
     }
@@ -292,10 +295,10 @@ impl Forecast {
         (self.reference_ah * self.x[RATE], self.reference_ah * self.p[RATE][RATE].sqrt())
     }
 
-    /// What remains until the level passes the threshold.
+    /// Remaining use until the level falls below the threshold.
     ///
     /// # Errors
-    /// While there is too little to tell it from.
+    /// While the data are insufficient.
     pub fn remaining(&self, threshold_ah: f64) -> Result<RemainingLife, InsufficientData> {
         self.check_readings()?;
         let threshold = threshold_ah / self.reference_ah;
@@ -311,22 +314,22 @@ impl Forecast {
         })
     }
 
-    /// The use until the level passes `threshold`, part of the reference, which it has perhaps not passed.
+    /// Remaining use until the level falls below `threshold`, part of the reference.
     fn time_to(&self, threshold: f64) -> Result<Remaining, InsufficientData> {
         self.check_fade()?;
         let crossing = self.crossing(threshold);
         let [low, median, high] = QUANTILES.map(|quantile| crossing.quantile(quantile));
-        // Near the threshold the lower end goes to 0, whatever is known.
+        // Near the threshold the lower end tends to 0 at any precision.
         if high > MAX_SPREAD * low && high > self.used {
             return Err(InsufficientData::Spread { low, high });
         }
         Ok(Remaining { low, median, high })
     }
 
-    /// Capacity at `points` moments, evenly spaced from now until `ahead` units of use from now. Not for use on line.
+    /// Capacity at `points` future uses, evenly spaced from 0 to `ahead`. Too slow for on-line use.
     ///
     /// # Errors
-    /// While there is too little to tell it from.
+    /// While the data are insufficient.
     pub fn fan(&self, ahead: f64, points: usize) -> Result<Vec<FanPoint>, InsufficientData> {
         self.check_readings()?;
         self.check_fade()?;
@@ -338,7 +341,7 @@ impl Forecast {
         Ok((0..points).map(at).collect())
     }
 
-    /// The recovery relaxes, the level falls by the rate, and both rate and recovery become less certain.
+    /// Predicts: the recovery relaxes, the level falls by the rate, rate and recovery become less certain.
     fn advance(&mut self, passed: &Usage) {
         let (used, rest_days, relaxation) = match self.axis {
             Axis::Cycles => (passed.cycles, passed.rest_days, RECOVERY_CYCLES),
@@ -364,7 +367,7 @@ impl Forecast {
         let (in_use, in_rest) = (RECOVERY_IN_USE * RECOVERY_IN_USE, RECOVERY_IN_REST * RECOVERY_IN_REST);
         let recovery = &mut p[RECOVERY][RECOVERY];
         *recovery += in_use * (1.0 - kept * kept);
-        // A rest upon a rest brings back only what the one before has left.
+        // A second rest adds only the recovery that the first one has not reached.
         *recovery += (1.0 - libm::exp(-2.0 * rest_days / RECOVERY_DAYS)) * (in_use + in_rest - *recovery).max(0.0);
         self.used += used;
     }
@@ -372,13 +375,13 @@ impl Forecast {
     /// Variance that the rate gains over `used` units of use.
     fn rate_walk(&self, used: f64) -> f64 {
         let rate = self.x[RATE].max(0.0);
-        // The first step has no e-folds: one.
+        // The first step counts as one e-fold.
         let e_folds = if self.used > 0.0 { libm::log1p(used / self.used) } else { 1.0 };
         let relative = RATE_WALK * RATE_WALK * rate * used + RATE_WALK_USE * RATE_WALK_USE * e_folds;
         relative * (rate * rate + self.p[RATE][RATE])
     }
 
-    fn observe(&mut self, reading: &Reading) {
+    fn observe(&mut self, reading: &CapacityReading) {
         let scale = self.reference_ah * self.reference_ah;
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][LEVEL] + self.p[i][RECOVERY]);
         let noise = READING_NOISE * READING_NOISE + reading.variance_ah2 / scale;
@@ -409,7 +412,7 @@ impl Forecast {
         if lost < MIN_FADE_DEVIATIONS * std { Err(InsufficientData::Fade { lost, std }) } else { Ok(()) }
     }
 
-    /// Of the level, with what all readings have wrong alike.
+    /// Variance of the level, with the error that all readings share.
     fn level_variance(&self) -> f64 {
         self.p[LEVEL][LEVEL] + self.shared_variance
     }
@@ -423,7 +426,7 @@ impl Forecast {
         )
     }
 
-    /// Quantile of the capacity after `ahead` units of use: the threshold that is passed by then with that probability.
+    /// Quantile of the capacity after `ahead` units of use: the threshold passed by then with that probability.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
         let (mut below, mut above) = (0.0, level + 5.0 * std);
@@ -440,7 +443,7 @@ impl Forecast {
 }
 
 impl Remaining {
-    /// In another unit.
+    /// Scales all three by `factor`.
     fn times(self, factor: f64) -> Self {
         Self { low: factor * self.low, median: factor * self.median, high: factor * self.high }
     }

@@ -1,23 +1,26 @@
-//! What each completed half-cycle teaches about each cell: charge moved, SOC swing, capacity.
+//! Learns from each completed half-cycle of each cell: charge moved, SOC swing, capacity.
+//!
+//! In: samples' times and temperatures, SOC and load of the cells at the ends of half-cycles, charge (A s). Out: half-cycles
+//! and capacity updates (Ah). A half-cycle without an estimated SOC gives no capacity.
 //!
 //! A half-cycle runs from where charge or discharge began to where it ended (both dated by the transition
-//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; by `Swing` with fade and offset beside it, [`super::drift`]) gets
-//! its measurement by one of two rules:
-//! * `Swing`: the information which the voltages since the last half-cycle have given about the capacity. The
-//!   sample-by-sample filter carries the capacity with its correlation to the SOC; the measurement is what leads
-//!   from its belief then to its belief now, `ScalarGaussian::information_until`. Charge / swing with the SOC of that same
-//!   filter would return the capacity it assumed; this does not.
+//! detector). The capacity filter (paper, section 3.3.4: random walk, one step per half-cycle; with `Swing` also fade and
+//! offset, [`super::drift`]) gets its measurement by one of two rules:
+//! * `Swing`: the information about the capacity in the voltages since the last half-cycle. The sample-by-sample filter
+//!   carries the capacity with its correlation to the SOC; the measurement is the step from its estimate then to its
+//!   estimate now, `ScalarGaussian::information_until`. Charge / swing with the SOC of that same filter would return the
+//!   capacity that it assumed.
 //! * `Nominal`: the paper's, charge / nominal swing with a fixed variance.
 
 use serde::{Deserialize, Serialize};
 
-use super::drift::Drift;
+use super::drift::DriftFilter;
 use super::{CapacityConfig, CapacityMethod, TransitionConfig};
 use crate::cell::{CellEstimator, CellModel};
 use crate::filter::{Measurement, ScalarGaussian};
 use crate::quantity::{InvalidState, Mode, Timestamp};
 
-/// A half-cycle's ends are weighed over no less than this swing: below it the variance is beyond use anyway.
+/// Smallest swing in the variance of a half-cycle's ends: below it the measurement has no use.
 const MIN_WEIGHED_SWING: f64 = 0.02;
 
 /// One completed half-cycle of one cell.
@@ -27,13 +30,13 @@ pub struct HalfCycle {
     pub mode: Mode,
     /// Charge moved, Ah, positive.
     pub charge_ah: f64,
-    /// SOC swing, fraction, positive when it goes with the charge, and its standard deviation (the errors of both
-    /// ends taken as independent); `None` when its beginning was not estimated.
+    /// SOC swing, fraction, positive when it agrees with the charge, and its variance (errors of both ends counted as
+    /// independent); `None` when its beginning was not estimated.
     pub swing: Option<ScalarGaussian>,
     /// SOC at its end, fraction.
     pub end_soc: Option<f64>,
-    /// Where its charge was weighed: both ends on the voltage curve; `None` when nothing was estimated.
-    pub ends: Option<[End; 2]>,
+    /// Both ends on the voltage curve; `None` when the SOC was not estimated.
+    pub ends: Option<[HalfCycleEnd; 2]>,
     /// Duration, s.
     pub duration_s: f64,
     /// Mean current, A, positive = discharge.
@@ -44,32 +47,32 @@ pub struct HalfCycle {
 
 /// One end of a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct End {
+pub struct HalfCycleEnd {
     /// State of charge, fraction.
     pub soc: f64,
-    /// Voltage which the load of the minutes before dropped in the cell, V.
+    /// Voltage that the load of the minutes before dropped in the cell, V.
     pub load_v: f64,
 }
 
-/// Where a cell is: at the end of a half-cycle, when it begins or ends now.
+/// A cell's present condition: the end of a half-cycle that begins or ends now.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CellEnd {
+pub struct CellCondition {
     /// State of charge; `None` before the first estimate.
     pub soc: Option<ScalarGaussian>,
-    /// Voltage which the load of the last minutes drops in the cell, V.
+    /// Voltage that the load of the last minutes drops in the cell, V.
     pub load_v: f64,
 }
 
-/// What the capacity filter made of a half-cycle.
+/// Outcome of the capacity filter's step over a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CapacityUpdate {
-    /// What the half-cycle alone says; `None` = nothing.
+    /// Measurement by the half-cycle alone; `None` = no information.
     pub measurement: Option<Measurement>,
-    /// The published capacity, gain error of the current sensor included.
+    /// The published capacity; its variance includes the gain error of the current sensor.
     pub capacity: ScalarGaussian,
 }
 
-/// The state of one cell's totals at a moment.
+/// Totals of one cell at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 struct CellMark {
     soc: Option<ScalarGaussian>,
@@ -80,7 +83,7 @@ struct CellMark {
 }
 
 impl CellMark {
-    fn put(&mut self, end: CellEnd) {
+    fn put(&mut self, end: CellCondition) {
         (self.soc, self.load_v) = (end.soc, end.load_v);
     }
 
@@ -94,7 +97,7 @@ impl CellMark {
     }
 }
 
-/// The state of all totals at a moment.
+/// Totals of all cells at one time.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Mark {
     time: Timestamp,
@@ -107,28 +110,28 @@ struct Mark {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
-    /// Where the present half-cycle began.
+    /// Beginning of the present half-cycle.
     start: Option<Mark>,
-    /// Where the mode that may follow began.
+    /// Beginning of the mode that may follow.
     candidate: Option<Mark>,
-    /// Capacity belief of each sample filter right after the last half-cycle's step.
+    /// Capacity in each sample filter after the last half-cycle's step.
     prior: Vec<ScalarGaussian>,
-    /// Event filter's belief.
+    /// Capacity in the event filter.
     capacity: Vec<ScalarGaussian>,
     /// Time without current since the last half-cycle, s.
     rest_s: f64,
-    /// When the present mode began.
+    /// Beginning of the present mode.
     mode_since: Option<Timestamp>,
-    /// Whether `start` is kept because too little was moved since.
+    /// Whether `start` is kept because too little charge has moved since.
     joining: bool,
-    /// Whether a half-cycle has taught something about each cell.
+    /// Whether each cell has a measured capacity.
     learned: Vec<bool>,
-    /// Capacity with what drifts beside it (`Swing`).
-    drift: Vec<Drift>,
+    /// Capacity, fade and offset (`Swing`).
+    drift: Vec<DriftFilter>,
 }
 
 impl Learner {
-    /// For cells that start from these beliefs.
+    /// A learner for cells that start from this capacity.
     pub fn new(config: &CapacityConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
         Self {
             totals: vec![CellMark::default(); cells],
@@ -140,13 +143,15 @@ impl Learner {
             mode_since: None,
             joining: false,
             learned: vec![false; cells],
-            drift: vec![Drift::new(config, initial_capacity); cells],
+            drift: vec![DriftFilter::new(config, initial_capacity); cells],
         }
     }
 
-    /// Takes a cell's sample into its totals: when, its temperature (degrees C), the time since the sample before in which
-    /// the current was measured, and that in which it was not (infinite before the first and after an unknown gap), s.
-    /// Whether what may begin next was marked in that gap: then it begins where the cell is after it ([`Self::move_mark`]).
+    /// Adds a cell's sample to its totals.
+    ///
+    /// `measured_s` and `gap_s` are the times since the sample before with and without a measured current, s; the gap is
+    /// infinite before the first sample and after an unknown gap. Returns whether the candidate's mark lies in that gap:
+    /// the candidate then begins at the cell's condition after the gap ([`Self::move_mark`]).
     #[inline]
     pub fn observe(
         &mut self,
@@ -164,29 +169,30 @@ impl Learner {
         gap_s > 0.0 && self.candidate.as_ref().is_some_and(|mark| time.since(mark.time) < gap_s)
     }
 
-    /// What begins next begins for a cell where it is now, not where it was when that was marked.
-    pub fn move_mark(&mut self, cell: usize, end: CellEnd) {
+    /// Moves the candidate's mark of a cell to its present condition.
+    pub fn move_mark(&mut self, cell: usize, end: CellCondition) {
         if let Some(mark) = &mut self.candidate {
             mark.cells[cell].put(end);
         }
     }
 
-    /// All cells have learned from the half-cycle at hand.
+    /// Ends the present half-cycle after all cells have learned from it.
     pub fn finish(&mut self) {
         self.rest_s = 0.0;
     }
 
-    /// A mode that may follow the present one begins here; `end` tells where each cell is.
-    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, end: impl Fn(usize) -> CellEnd) {
+    /// Marks the beginning of a mode that may follow the present one; `end` gives the condition of each cell.
+    pub fn mark_candidate(&mut self, time: Timestamp, charge_as: f64, end: impl Fn(usize) -> CellCondition) {
         let mut cells = self.candidate.take().map(|mark| mark.cells).unwrap_or_default();
         cells.clone_from(&self.totals);
         cells.iter_mut().enumerate().for_each(|(cell, mark)| mark.put(end(cell)));
         self.candidate = Some(Mark { time, charge_as, cells });
     }
 
-    /// Completes the mode `from`: the one that may follow is confirmed. When the charge moved since the last half-cycle
-    /// comes to the configured swing, appends each cell's half-cycle to `half_cycles` in cell order; a charge or
-    /// discharge of less is joined to what follows it.
+    /// Completes the mode `from` when the candidate is confirmed.
+    ///
+    /// When the charge moved since the last half-cycle reaches the configured swing, appends each cell's half-cycle to
+    /// `half_cycles` in cell order; a smaller charge or discharge is joined to its successor.
     pub fn complete(
         &mut self,
         config: &TransitionConfig,
@@ -230,10 +236,10 @@ impl Learner {
             CapacityMethod::Swing => self.learn_swing(model, config, cell, estimator, half_cycle),
             CapacityMethod::Nominal { swing, variance_ah2 } => {
                 let measurement = Measurement { value: half_cycle.charge_ah / swing, variance: variance_ah2 };
-                let belief = &mut self.capacity[cell];
-                belief.predict(config.noise_ah_per_cycle * config.noise_ah_per_cycle);
-                belief.update(measurement);
-                estimator.hold_capacity(belief.mean);
+                let capacity = &mut self.capacity[cell];
+                capacity.predict(config.noise_ah_per_cycle * config.noise_ah_per_cycle);
+                capacity.update(measurement);
+                estimator.hold_capacity(capacity.mean);
                 Some(measurement)
             }
         };
@@ -241,12 +247,12 @@ impl Learner {
         CapacityUpdate { measurement, capacity: self.capacity(config, cell) }
     }
 
-    /// Whether a cell's capacity is more than what it was configured to start from.
+    /// Whether a cell's capacity has been measured since its configured start.
     pub fn has_learned(&self, cell: usize) -> bool {
         self.learned.get(cell).copied().unwrap_or(false)
     }
 
-    /// Whether every cell's capacity is more than what it was configured to start from.
+    /// Whether every cell's capacity has been measured since its configured start.
     pub fn has_learned_all(&self) -> bool {
         self.learned.iter().all(|&learned| learned)
     }
@@ -274,43 +280,43 @@ impl Learner {
         let walk = config.noise_ah_per_cycle * config.noise_ah_per_cycle * cycles
             + config.noise_ah_per_rest_day * config.noise_ah_per_rest_day * rest_days;
         let charged = if half_cycle.mode == Mode::Charge { 2.0 * cycles } else { 0.0 };
-        drift.pass(config, cycles, charged, walk);
-        // The sample filter goes on from what is known now.
+        drift.predict(config, cycles, charged, walk);
+        // The sample filter continues from the event filter's capacity.
         estimator.restate_capacity(drift.capacity());
         self.prior[cell] = estimator.capacity();
         measurement
     }
 
-    /// The published capacity of a cell: the filter's, its variance widened by the gain error of the current
-    /// sensor, which no number of half-cycles averages out.
+    /// The published capacity of a cell: the filter's, with a variance widened by the gain error of the current sensor,
+    /// which half-cycles do not average out.
     pub fn capacity(&self, config: &CapacityConfig, cell: usize) -> ScalarGaussian {
-        let belief = self.capacity[cell];
-        let gain_ah = config.current_gain_std * belief.mean;
-        ScalarGaussian { mean: belief.mean, variance: belief.variance + gain_ah * gain_ah }
+        let filtered = self.capacity[cell];
+        let gain_ah = config.current_gain_std * filtered.mean;
+        ScalarGaussian { mean: filtered.mean, variance: filtered.variance + gain_ah * gain_ah }
     }
 
-    /// Offset of the current as a cell's half-cycles tell it, per cell, A: measured less true.
+    /// Offset of the current by a cell's half-cycles, per cell, A: measured less true.
     #[inline]
     pub fn current_offset_a(&self, cell: usize) -> f64 {
         self.drift[cell].offset_a()
     }
 
-    /// Whether the totals are for this many cells.
+    /// Whether a stored learner has this number of cells.
     pub fn fits(&self, cells: usize) -> bool {
         [self.totals.len(), self.prior.len(), self.capacity.len(), self.learned.len(), self.drift.len()] == [cells; 5]
             && [&self.start, &self.candidate].into_iter().flatten().all(|mark| mark.cells.len() == cells)
     }
 
-    /// Whether the numbers of a stored one can be gone on with.
+    /// Checks the numbers of a stored state.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
-        for belief in self.prior.iter().chain(&self.capacity) {
-            InvalidState::unless_capacity("a learned capacity", belief.mean)?;
-            InvalidState::unless_positive("the variance of a learned capacity", belief.variance)?;
+        for capacity in self.prior.iter().chain(&self.capacity) {
+            InvalidState::unless_capacity("a learned capacity", capacity.mean)?;
+            InvalidState::unless_positive("the variance of a learned capacity", capacity.variance)?;
         }
-        self.drift.iter().try_for_each(Drift::check)?;
+        self.drift.iter().try_for_each(DriftFilter::check)?;
         InvalidState::unless_natural("the time at rest", self.rest_s)?;
         let marks = [&self.start, &self.candidate].into_iter().flatten();
         marks
@@ -328,14 +334,14 @@ impl Learner {
     }
 }
 
-/// Variance which the voltage model's repeating error at both ends puts under a half-cycle's capacity, Ah^2:
-/// (C / swing)^2 times the variance of both ends' SOC.
+/// Variance of a half-cycle's capacity by the voltage model's repeating error at both ends, Ah^2: (C / swing)^2 times the
+/// variance of both ends' SOC.
 fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &HalfCycle, capacity_ah: f64) -> f64 {
     let Some(ends) = &half_cycle.ends else { return 0.0 };
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
     let lost = 1.0 - capacity_ah / model.capacity_ah;
     let soc_variance = ends.iter().fold(0.0, |sum, end| {
-        let slope_v = model.ocv_slope_v(&model.place(end.soc, temperature_c));
+        let slope_v = model.ocv_slope_v(&model.grid_position(end.soc, temperature_c));
         let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
         let shape = config.ageing_shift_error * lost * end.soc * (1.0 - end.soc);
         sum + volts * volts + shape * shape
@@ -357,9 +363,9 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
             .map(|(a, b)| ScalarGaussian { mean: sign * (a.mean - b.mean), variance: a.variance + b.variance }),
         end_soc: b.soc.map(|soc| soc.mean),
         ends: b.soc.map(|soc| {
-            let end = End { soc: soc.mean, load_v: b.load_v };
-            // A beginning that nobody saw is no better than the end.
-            [a.soc.map_or(end, |soc| End { soc: soc.mean, load_v: a.load_v }), end]
+            let end = HalfCycleEnd { soc: soc.mean, load_v: b.load_v };
+            // An unobserved beginning counts as uncertain as the end.
+            [a.soc.map_or(end, |soc| HalfCycleEnd { soc: soc.mean, load_v: a.load_v }), end]
         }),
         duration_s,
         mean_current_a: moved_ah * 3600.0 / duration_s,
@@ -407,11 +413,11 @@ mod tests {
     }
 
     #[test]
-    fn what_begins_behind_a_gap_begins_at_the_soc_after_it() {
+    fn a_mode_that_begins_in_a_gap_begins_at_the_soc_after_it() {
         let transition =
             TransitionConfig { dead_band_a: 0.05, hysteresis_a: 0.05, min_duration_s: 0.0, min_swing: 0.02 };
         let mut learner = Learner::new(&config(), 1, ScalarGaussian::from_std(2.0, 0.1));
-        let at = |soc: f64| CellEnd { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v: 0.0 };
+        let at = |soc: f64| CellCondition { soc: Some(ScalarGaussian::from_std(soc, 0.01)), load_v: 0.0 };
         let (start, end) = (Timestamp::from_secs(5000.0), Timestamp::from_secs(8600.0));
         assert!(!learner.observe(0, Timestamp::from_secs(1000.0), None, 10.0, 0.0));
         learner.mark_candidate(start, 0.0, |_| at(0.1));
@@ -426,7 +432,7 @@ mod tests {
     }
 
     #[test]
-    fn a_half_cycle_is_measured_by_what_it_alone_has_told() {
+    fn a_half_cycle_is_measured_by_its_own_information() {
         let config = config();
         let mut estimator = CellEstimator::new(&estimator_config());
         let mut learner = Learner::new(&config, 1, estimator.capacity());
@@ -436,14 +442,14 @@ mod tests {
         assert!(!learner.has_learned_all());
         let first = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert!(first.measurement.is_some() && learner.has_learned_all());
-        // Nothing was measured since: the same voltages must not be counted a second time.
+        // No new measurement: the same voltages must not count a second time.
         let second = learner.learn(&small_model(), &config, 0, &mut estimator, &moved);
         assert_eq!(second.measurement, None);
         assert_eq!(moved.swing.map(|swing| swing.mean), Some(0.5));
     }
 
     #[test]
-    fn the_repeating_error_of_both_ends_weighs_by_slope_load_ageing_and_swing() {
+    fn the_repeating_error_of_both_ends_depends_on_slope_load_ageing_and_swing() {
         let mut config = config();
         (config.end_error_v, config.end_load_error, config.ageing_shift_error) = (0.004, 0.1, 0.5);
         let model = small_model();
@@ -459,7 +465,7 @@ mod tests {
         let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
         let found = end_variance_ah2(&model, &config, &moved, 1.8);
         assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
-        // A tiny swing weighs no worse than the least one; one whose beginning nobody estimated has no ends.
+        // A tiny swing counts as the smallest one; a half-cycle without an estimated end has no ends.
         let tiny = HalfCycle { charge_ah: 0.001, ..moved };
         let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;
         assert!((end_variance_ah2(&model, &config, &tiny, 1.8) / least - 1.0).abs() < 1e-9);

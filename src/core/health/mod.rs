@@ -1,4 +1,8 @@
-//! What a battery loses over its life: half-cycles, capacity, recharge period, usable capacity.
+//! Battery ageing: half-cycles, capacity, recharge period, usable capacity, remaining life.
+//!
+//! In: currents (A), samples and estimates of the cells. Out: one [`HalfCycle`] and [`CapacityUpdate`] per cell and
+//! half-cycle, pack values, periods (s), usable capacity (Ah), [`Forecast`]s. Stored states are checked before use; a
+//! half-cycle without estimates teaches nothing.
 
 pub mod config;
 pub mod drift;
@@ -12,8 +16,8 @@ pub mod usable;
 pub use config::{
     CapacityConfig, CapacityMethod, HealthConfig, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig,
 };
-pub use forecast::{Axis, Forecast, InsufficientData, Reading, Remaining, RemainingLife, Usage};
-pub use learner::{CapacityUpdate, CellEnd, HalfCycle, Learner};
+pub use forecast::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
+pub use learner::{CapacityUpdate, CellCondition, HalfCycle, Learner};
 pub use pack::{CellShare, PackState};
-pub use recharge::{Charged, RechargeTimer};
+pub use recharge::{ChargeRecord, RechargeTimer};
 pub use transition::{ModeChange, TransitionDetector};

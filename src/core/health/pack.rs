@@ -1,18 +1,19 @@
-//! The pack's values from its cells, by a stated rule and never by a mean.
+//! The pack's values from its cells, by their limits and never by a mean.
 //!
 //! A series pack stops discharging when its weakest cell is empty and stops charging when its fullest is full:
 //! dischargeable = min_i SOC_i C_i; chargeable = min_i (1 - SOC_i) C_i; pack capacity = their sum;
-//! pack SOC = dischargeable / pack capacity. For one cell these are its own values.
+//! pack SOC = dischargeable / pack capacity. For one cell these are its own values. Without
+//! cells, or without capacity, there is no pack value.
 
 use serde::{Deserialize, Serialize};
 
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, InvalidState};
 
-/// One cell's part in the pack.
+/// One cell's contribution to the pack.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellShare {
-    /// Which cell.
+    /// Index of the cell.
     pub cell: CellIndex,
     /// State of charge, fraction.
     pub soc: ScalarGaussian,
@@ -20,14 +21,14 @@ pub struct CellShare {
     pub capacity: ScalarGaussian,
 }
 
-/// The pack as its limiting cells make it.
+/// Values of the pack, set by its limiting cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PackState {
     /// State of charge, fraction.
     pub soc: f64,
     /// Standard deviation of the limiting cell's SOC.
     pub soc_std: f64,
-    /// Charge the pack takes from where the fullest cell is full to where the weakest is empty, Ah.
+    /// Charge between the fullest cell full and the weakest cell empty, Ah.
     pub capacity_ah: f64,
     /// Standard deviation of the limiting cell's capacity, Ah.
     pub capacity_std_ah: f64,
@@ -58,10 +59,10 @@ pub fn combine(cells: impl Iterator<Item = CellShare>) -> Option<PackState> {
 }
 
 impl PackState {
-    /// Whether the numbers of a stored one can be shown.
+    /// Checks the numbers of a stored state.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("the pack's SOC", self.soc)?;
         let natural = [self.soc_std, self.capacity_ah, self.capacity_std_ah];

@@ -1,16 +1,16 @@
 //! Charge, rest or discharge, from the pack's current: dead band, hysteresis, minimum duration.
 //!
-//! Input: pack current in A (positive = discharge), `None` when it is stale. Output: a change of mode, told
-//! when the new mode has held for its minimum duration, dated from when it began.
+//! Input: pack current in A (positive = discharge), `None` when it is stale. Output: a change of mode,
+//! reported when the new mode has held for its minimum duration, dated from its beginning.
 
 use serde::{Deserialize, Serialize};
 
 use super::TransitionConfig;
 use crate::quantity::{Mode, Timestamp};
 
-/// A mode that has not yet held long enough.
+/// A mode that has not yet held for its minimum duration.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct Candidate {
+struct ModeCandidate {
     mode: Mode,
     since: Timestamp,
 }
@@ -22,16 +22,16 @@ pub struct ModeChange {
     pub from: Mode,
     /// Mode entered.
     pub to: Mode,
-    /// When the new mode began.
+    /// Beginning of the new mode.
     pub since: Timestamp,
 }
 
-/// What one observation did.
+/// Outcome of one observation.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Observed {
-    /// A mode that had held long enough by this time.
+pub struct TransitionOutcome {
+    /// A mode that has held for its minimum duration by this time.
     pub change: Option<ModeChange>,
-    /// A new candidate begins here: the caller marks its state.
+    /// Whether a new candidate begins here: the caller then marks its state.
     pub candidate_begins: bool,
 }
 
@@ -39,7 +39,7 @@ pub struct Observed {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct TransitionDetector {
     mode: Mode,
-    candidate: Option<Candidate>,
+    candidate: Option<ModeCandidate>,
 }
 
 impl Default for TransitionDetector {
@@ -54,24 +54,24 @@ impl TransitionDetector {
         self.mode
     }
 
-    /// Takes the current at `time`. A candidate that has matured by then is confirmed first.
-    pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> Observed {
+    /// Handles the current at `time`. First confirms a candidate that has held long enough by then.
+    pub fn observe(&mut self, config: &TransitionConfig, time: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
         let change = self.poll(config, time);
-        let seen = self.classify(config, current_a);
+        let observed = self.classify(config, current_a);
         let idle = |mode| matches!(mode, Mode::Rest | Mode::Unknown);
         let mut candidate_begins = false;
         self.candidate = match self.candidate {
-            _ if seen == self.mode => None,
-            // A load that ended and then a sensor that fell silent: the mode was left once, when the load ended.
-            Some(before) if before.mode == seen || (idle(before.mode) && idle(seen)) => {
-                Some(Candidate { mode: seen, since: before.since })
+            _ if observed == self.mode => None,
+            // A load that ends, then a sensor without readings: one change, dated at the end of the load.
+            Some(before) if before.mode == observed || (idle(before.mode) && idle(observed)) => {
+                Some(ModeCandidate { mode: observed, since: before.since })
             }
             _ => {
                 candidate_begins = true;
-                Some(Candidate { mode: seen, since: time })
+                Some(ModeCandidate { mode: observed, since: time })
             }
         };
-        Observed { change, candidate_begins }
+        TransitionOutcome { change, candidate_begins }
     }
 
     /// Confirms a candidate that has held long enough by `time`.
@@ -80,7 +80,7 @@ impl TransitionDetector {
         self.settle()
     }
 
-    /// Confirms the candidate at once: what came before is over, whatever its duration.
+    /// Confirms the candidate at once, whatever its duration.
     pub fn settle(&mut self) -> Option<ModeChange> {
         let candidate = self.candidate?;
         let from = std::mem::replace(&mut self.mode, candidate.mode);
@@ -88,7 +88,7 @@ impl TransitionDetector {
         Some(ModeChange { from, to: candidate.mode, since: candidate.since })
     }
 
-    /// Mode of a current, seen from the present mode: to enter charge or discharge takes the hysteresis on top of the dead band.
+    /// Mode of a current, given the present mode: entering charge or discharge takes dead band plus hysteresis.
     fn classify(&self, config: &TransitionConfig, current_a: Option<f64>) -> Mode {
         let Some(current_a) = current_a else { return Mode::Unknown };
         let enter = config.dead_band_a + config.hysteresis_a;

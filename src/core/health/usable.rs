@@ -1,8 +1,11 @@
-//! Usable capacity: what a full cell delivers at a stated current and temperature down to a cut-off voltage
-//! under load. It follows from the capacity and from how far the resistance has grown.
+//! Usable capacity: charge that a full cell delivers at a given current and temperature down to a cut-off voltage under
+//! load. It follows from the capacity and the resistance.
 //!
-//! The discharge is simulated with the circuit's own equations at constant current, from the SOC the charger
-//! leaves with relaxed branches, until the voltage falls to the cut-off. Standard deviation by first-order
+//! In: model, load, SOC at full, capacity (Ah) and resistance ratio. Out: Ah, with variance. A cell whose voltage starts
+//! below the cut-off delivers 0.
+//!
+//! The discharge is simulated with the circuit's own equations at constant current, from the SOC after
+//! a full charge with relaxed branches, until the voltage falls to the cut-off. Standard deviation by first-order
 //! propagation of (capacity, ln rho) with their covariance.
 
 use super::UsableConfig;
@@ -10,10 +13,10 @@ use crate::cell::circuit::{BranchAt, aged_terminal_v, soc_after};
 use crate::cell::{CellEstimator, CellModel, Discretisation, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 
-/// Steps a full capacity is cut into.
+/// Steps over a full capacity.
 const STEPS: f64 = 400.0;
 
-/// Steps after which a discharge that never reaches its cut-off is given up: five capacities.
+/// Largest number of steps of a discharge that does not reach its cut-off: five capacities.
 const MAX_STEPS: u32 = 2000;
 
 /// Steps of the numerical forward derivatives over ln rho and over ln capacity.
@@ -31,10 +34,10 @@ pub fn usable_ah(
     let step_s = 3600.0 * step_ah / config.current_a;
     let mut branch_v = [0.0; MAX_BRANCHES];
     let mut soc = full_soc;
-    let row = model.row(config.temperature_c);
+    let temperature = model.temperature_position(config.temperature_c);
     let voltage = |soc: f64, branch_v: &[f64; MAX_BRANCHES]| {
         let state = (soc, resistance_ratio, capacity_ah);
-        aged_terminal_v(model, state, &row, branch_v.iter().sum(), config.current_a)
+        aged_terminal_v(model, state, &temperature, branch_v.iter().sum(), config.current_a)
     };
     let mut before_v = voltage(soc, &branch_v);
     if before_v <= config.cutoff_v {
@@ -42,9 +45,9 @@ pub fn usable_ah(
     }
     for k in 0..MAX_STEPS {
         let next = soc_after(soc, 3600.0 * step_ah, capacity_ah);
-        let place = model.place_in(&row, 0.5 * (soc + next));
+        let position = model.grid_position_at(&temperature, 0.5 * (soc + next));
         for (i, v) in branch_v.iter_mut().enumerate().take(model.branches.len()) {
-            let branch = BranchAt::new(model, i, &place, resistance_ratio);
+            let branch = BranchAt::new(model, i, &position, resistance_ratio);
             *v = branch.voltage_after(Discretisation::Exact, *v, config.current_a, step_s);
         }
         let after_v = voltage(next, &branch_v);
@@ -57,8 +60,8 @@ pub fn usable_ah(
     step_ah * f64::from(MAX_STEPS)
 }
 
-/// Usable capacity and its variance, Ah. `capacity` is the published belief (its variance may hold more than
-/// the filter's own).
+/// Usable capacity and its variance, Ah. `capacity` is the published estimate, whose variance may exceed
+/// the filter's own.
 pub fn usable_capacity(
     model: &CellModel,
     config: &UsableConfig,
@@ -96,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn resistance_takes_its_share() {
+    fn resistance_lowers_the_usable_capacity() {
         // At 0.2 A every branch (20 to 40 s) has settled: 3.0 + 1.2 s - 0.2 rho (0.12 - 0.08 s) = 3.3.
         for ratio in [1.0, 3.0] {
             let end = (0.3 + 0.2 * ratio * 0.12) / (1.2 + 0.2 * ratio * 0.08);

@@ -1,8 +1,8 @@
 //! Whether the interfaces are in order, for the rule about them.
 //!
 //! An interface is out of order while it is down or missing, from bus-off until it is up again or a frame comes, and
-//! while frames of ours cannot be sent. What is not heard of yet is not known. Over a restart a fault goes on: it lasts from
-//! when it began, and is over only when the interface is heard of and in order.
+//! while frames of ours cannot be sent. Before its first report it is unknown. A fault lasts over a restart, from when it
+//! began until the interface is reported in order.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,14 +26,14 @@ struct BusState {
     unsent: Option<(Timestamp, Timestamp)>,
 }
 
-/// All interfaces that something was heard of.
+/// All interfaces with a report.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(super) struct Buses {
     states: Vec<BusState>,
 }
 
 impl Buses {
-    /// Takes what an interface reports.
+    /// Takes a report of an interface.
     pub(super) fn handle_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent) {
         let state = self.state(bus);
         state.is_known = true;
@@ -59,8 +59,8 @@ impl Buses {
         (state.is_known, state.off_since) = (true, None);
     }
 
-    /// For how long the worst of `interfaces` has been out of order, s; 0 = all that was heard of are in order, `None` =
-    /// nothing was heard of any. And whether something was heard of each.
+    /// For how long the worst of `interfaces` has been out of order, s; 0 = all that have reported are in order, `None` =
+    /// none has. And whether each has reported.
     pub(super) fn worst_s(&self, now: Timestamp, interfaces: usize) -> (Option<f64>, bool) {
         let known = self.states.iter().filter(|state| state.is_known);
         let worst_s = known.clone().map(|state| state.fault_s(now)).max_by(f64::total_cmp);
@@ -76,9 +76,9 @@ impl Buses {
         }
     }
 
-    /// As it was stored at `taken`, taken up at `now`: whether a fault goes on is not known before something is heard, nor
-    /// whether frames can be sent again before a second has passed.
-    pub(super) fn taken_up(mut self, taken: Timestamp, now: Timestamp) -> Self {
+    /// Continues at `now` with the faults stored at `taken`: whether a fault lasts is not known before the interface is
+    /// reported, nor whether frames can be sent again before a second has passed.
+    pub(super) fn restored(mut self, taken: Timestamp, now: Timestamp) -> Self {
         for state in &mut self.states {
             let unsent = state.unsent.filter(|(_, latest)| taken.since(*latest) <= SEND_RECOVERED_S);
             state.unsent = unsent.map(|(first, _)| (first, now));

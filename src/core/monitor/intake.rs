@@ -1,24 +1,55 @@
-//! What comes first when a frame arrives: is it one too many, and is its message protected and intact?
+//! Intake stage: from frames to judged readings and commands.
 //!
-//! In: frames with their time. Out: whether the frame is taken in and its readings may be used; counts, and events on
-//! change. A frame that fails its check keeps its place in the stream: its readings are bad, not missing.
+//! In: frames with their time, events of the interfaces. Out: the readings of an admitted frame, or its command; counts,
+//! and events on change. A frame that fails its end-to-end check keeps its place in the stream: its readings are bad,
+//! not missing. Frames beyond the flood limit are dropped and counted.
 
 use serde::{Deserialize, Serialize};
 
-use super::{Event, EventKind, MonitorConfig, Outputs};
+use super::buses::Buses;
+use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
+use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
-use crate::can::flood::{FloodCount, FloodGate};
-use crate::can::guard::{GuardCounts, Guards};
-use crate::quantity::{BusIndex, Fault, Timestamp};
+use crate::can::decode::InputMap;
+use crate::can::encode::{self, CommandFields, CommandPlan};
+use crate::can::flood::{FloodConfig, FloodCount, FloodGate};
+use crate::can::guard::{GuardConfig, GuardCounts, Guards};
+use crate::quantity::{BusIndex, Fault, Reading, Timestamp};
 
-/// The checks a frame passes before it is decoded.
-#[derive(Debug)]
-pub(super) struct Intake {
-    gate: FloodGate,
-    guards: Guards,
+/// Rejected command frames are reported at most this often, s.
+const BAD_COMMAND_S: f64 = 1.0;
+
+/// Commands that come from the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommandConfig {
+    /// Interface of the command frames.
+    pub bus: BusIndex,
+    /// Their layout; their protection is checked by one of the guards.
+    pub plan: CommandPlan,
 }
 
-/// What is kept over a restart.
+/// Settings of the stage.
+#[derive(Debug)]
+pub(super) struct IntakeConfig {
+    pub(super) interfaces: usize,
+    pub(super) input: InputMap,
+    pub(super) guards: Vec<GuardConfig>,
+    pub(super) flood: FloodConfig,
+    pub(super) commands: Option<CommandConfig>,
+}
+
+/// The intake stage.
+#[derive(Debug)]
+pub(super) struct Intake {
+    config: IntakeConfig,
+    gate: FloodGate,
+    guards: Guards,
+    buses: Buses,
+    /// When a rejected command frame was last reported.
+    bad_command_at: Option<Timestamp>,
+}
+
+/// Counts that are kept over a restart.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct IntakeState {
@@ -28,27 +59,46 @@ pub(super) struct IntakeState {
 
 impl Intake {
     pub(super) fn new(config: &MonitorConfig) -> Self {
+        let config = IntakeConfig {
+            interfaces: config.interfaces,
+            input: config.input.clone(),
+            guards: config.guards.clone(),
+            flood: config.flood,
+            commands: config.commands.clone(),
+        };
         let commands = config.commands.iter().map(|commands| (commands.bus, commands.plan.id(), 1));
-        let gate = FloodGate::new(&config.flood, config.input.messages().chain(commands));
-        Self { gate, guards: Guards::new(config.guards.clone()) }
+        Self {
+            gate: FloodGate::new(&config.flood, config.input.messages().chain(commands)),
+            guards: Guards::new(config.guards.clone()),
+            buses: Buses::default(),
+            bad_command_at: None,
+            config,
+        }
     }
 
-    /// Other bounds and checks for the same messages: what is counted and under way goes on.
+    /// The settings.
+    pub(super) fn config(&self) -> &IntakeConfig {
+        &self.config
+    }
+
+    /// Other limits and checks for the same messages: counts, and floods under way, stay.
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
         self.guards = new.guards.inheriting(&self.guards);
+        self.config = new.config;
     }
 
-    /// `None` = the frame is dropped; otherwise whether its readings may be used.
+    /// Judges a frame: `None` = it is dropped; otherwise whether its readings may be used.
     #[inline]
-    pub(super) fn judge(
+    pub(super) fn admit(
         &mut self,
         now: Timestamp,
         bus: BusIndex,
         frame: &Frame,
         out: &mut Outputs,
     ) -> Option<Result<(), Fault>> {
+        self.buses.handle_frame(bus);
         let admitted = self.gate.admit(now, bus, frame.id());
         let status = if admitted { self.guards.check(now, bus, frame) } else { None };
         self.report(now, out);
@@ -56,37 +106,86 @@ impl Intake {
         admitted.then_some(if usable { Ok(()) } else { Err(Fault::EndToEnd) })
     }
 
-    /// Periods without a frame, floods that are over.
+    /// Passes the readings of an admitted frame to `each`.
+    #[inline]
+    pub(super) fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
+        self.config.input.decode(bus, frame, each);
+    }
+
+    /// Whether a frame is a command.
+    #[inline]
+    pub(super) fn is_command(&self, bus: BusIndex, frame: &Frame) -> bool {
+        self.config.commands.as_ref().is_some_and(|commands| commands.bus == bus && commands.plan.id() == frame.id())
+    }
+
+    /// The command of a frame. One that is not intact, or that has no meaning, is reported at most once a second.
+    pub(super) fn command(
+        &mut self,
+        now: Timestamp,
+        bus: BusIndex,
+        frame: &Frame,
+        is_intact: bool,
+        out: &mut Outputs,
+    ) -> Option<Command> {
+        let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
+        let command = fields.and_then(|fields| command_of(&fields)).filter(|_| is_intact);
+        if command.is_none() && self.bad_command_at.is_none_or(|before| now.since(before) >= BAD_COMMAND_S) {
+            self.bad_command_at = Some(now);
+            out.events.push(Event { time: now, kind: EventKind::BadCommand { bus, intact: is_intact } });
+        }
+        command
+    }
+
+    /// Takes an event of an interface.
+    pub(super) fn handle_bus_event(&mut self, now: Timestamp, bus: BusIndex, event: BusEvent, out: &mut Outputs) {
+        self.buses.handle_event(now, bus, event);
+        out.events.push(Event { time: now, kind: EventKind::Bus { bus, what: event } });
+    }
+
+    /// The value of the rule about interfaces: for how long the worst of them has been out of order, s.
+    pub(super) fn bus_fault(&self, now: Timestamp) -> Observation {
+        let (fault_s, is_whole) = self.buses.worst_s(now, self.config.interfaces);
+        Observation { is_bound: !is_whole, ..Observation::new(fault_s) }
+    }
+
+    /// Finds periods without a frame, and floods that are over.
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.poll(now);
         self.gate.poll(now);
         self.report(now, out);
     }
 
-    /// Nobody listened, or the clock was set.
+    /// Begins again after time asleep or a step of the clock.
     pub(super) fn restart(&mut self, now: Timestamp, out: &mut Outputs) {
         self.guards.restart();
         self.gate.restart();
         self.report(now, out);
     }
 
-    /// Per protected message: how often each status was given.
+    /// How long ago a command was rejected is not known any more.
+    pub(super) fn handle_unknown_gap(&mut self) {
+        self.bad_command_at = None;
+    }
+
+    /// Per protected message: the count of each status.
     pub(super) fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.guards.counts()
     }
 
-    /// Messages of which frames were dropped.
+    /// Messages with dropped frames.
     pub(super) fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
         self.gate.counts()
     }
 
-    pub(super) fn snapshot(&self) -> IntakeState {
-        IntakeState { protected: self.guards.snapshot(), dropped: self.gate.counts().collect() }
+    pub(super) fn snapshot(&self) -> (IntakeState, Buses) {
+        let state = IntakeState { protected: self.guards.snapshot(), dropped: self.gate.counts().collect() };
+        (state, self.buses.clone())
     }
 
-    pub(super) fn restore(&mut self, state: &IntakeState) {
+    pub(super) fn restore(&mut self, state: &IntakeState, buses: Buses) {
         self.guards.restore(&state.protected);
         self.gate.restore(&state.dropped);
+        self.buses = buses;
     }
 
     #[inline]
@@ -97,14 +196,14 @@ impl Intake {
     }
 
     fn report_changes(&mut self, time: Timestamp, out: &mut Outputs) {
-        let turned = self.guards.take_changes().map(|c| EventKind::Protection {
+        let protection = self.guards.take_changes().map(|c| EventKind::Protection {
             bus: c.bus,
             id: c.id,
             status: c.status,
             usable: c.usable,
             count: c.count,
         });
-        out.events.extend(turned.map(|kind| Event { time, kind }));
+        out.events.extend(protection.map(|kind| Event { time, kind }));
         let floods = self.gate.take_changes().map(|c| EventKind::Flood {
             bus: c.bus,
             id: c.id,
@@ -113,4 +212,19 @@ impl Intake {
         });
         out.events.extend(floods.map(|kind| Event { time, kind }));
     }
+}
+
+/// A frame's command; `None` = it names a rule or severity that does not exist.
+fn command_of(fields: &CommandFields) -> Option<Command> {
+    let severity = |code: u8| Severity::ALL.into_iter().find(|severity| *severity as u8 == code);
+    let which = Selector {
+        rule: fields.rule.map(|number| Rule::from_number(number).ok_or(())).transpose().ok()?,
+        severity: fields.severity.map(|code| severity(code).ok_or(())).transpose().ok()?,
+        cell: fields.cell,
+    };
+    Some(match fields.command {
+        encode::Command::Acknowledge => Command::Acknowledge(which),
+        encode::Command::Clear => Command::Clear(which),
+        encode::Command::PackReplaced => Command::PackReplaced,
+    })
 }

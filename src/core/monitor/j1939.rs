@@ -1,11 +1,11 @@
-//! The J1939 node beside the frames of `[output]`: alarms as trouble codes.
+//! The J1939 node in addition to the frames of `[output]`: alarms as trouble codes.
 //!
-//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. Of the thresholds
-//! of a rule that share a parameter number and are raised for any cell, the gravest is told. The occurrence count is
-//! that of the one of its alarms that was raised most often.
+//! In: frames of the node's interface, alarms, ticks. Out: the node's frames and events. Of the raised thresholds of a
+//! rule that share a parameter number the gravest is sent, for any cell. The occurrence count is that of the one of its
+//! alarms that was raised most often.
 
-use super::{Event, EventKind, Monitor, Outputs, Transmit};
-use crate::alarm::{Rule, Severity};
+use super::{Event, EventKind, Outputs, Transmit};
+use crate::alarm::{AlarmEngine, Rule, Severity};
 use crate::can::Frame;
 use crate::can::j1939::{ActiveCode, Lamp, Node, NodeConfig, NodeOutputs, TroubleCode};
 use crate::quantity::{BusIndex, Timestamp};
@@ -15,15 +15,15 @@ use crate::quantity::{BusIndex, Timestamp};
 pub struct J1939Config {
     /// Interface the node is on.
     pub bus: BusIndex,
-    /// Who it is.
+    /// Its name and addresses.
     pub node: NodeConfig,
-    /// How each threshold of each rule shows.
+    /// Trouble code of each threshold of each rule.
     pub alarms: Vec<AlarmCode>,
-    /// What is told while a test runs.
+    /// Code that is active while a test runs.
     pub test_code: TroubleCode,
 }
 
-/// How the alarms of one threshold show on J1939.
+/// Trouble code of the alarms of one threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct AlarmCode {
     /// The rule.
@@ -36,7 +36,7 @@ pub struct AlarmCode {
     pub lamp: Lamp,
 }
 
-/// The node and what it tells.
+/// The node, and the trouble codes it sends.
 #[derive(Debug)]
 pub(super) struct J1939 {
     config: J1939Config,
@@ -57,8 +57,13 @@ impl J1939 {
         }
     }
 
-    /// Other codes for the same node; `false` = it is another node.
-    pub(super) fn take_over(&mut self, config: &J1939Config) -> bool {
+    /// The settings.
+    pub(super) fn config(&self) -> &J1939Config {
+        &self.config
+    }
+
+    /// Takes other codes for the same node; `false` = it is another node.
+    pub(super) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
         if is_same {
             self.config.clone_from(config);
@@ -70,58 +75,52 @@ impl J1939 {
         self.node.next_due()
     }
 
+    pub(super) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.node.handle_gap(now, &mut self.out);
+        self.dispatch_outputs(now, out);
+    }
+
+    pub(super) fn handle_frame(&mut self, now: Timestamp, frame: &Frame, out: &mut Outputs) {
+        self.node.handle_frame(now, frame, &mut self.out);
+        self.dispatch_outputs(now, out);
+    }
+
+    pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.node.poll(now, &mut self.out);
+        self.dispatch_outputs(now, out);
+    }
+
+    /// Sets the node's codes to the present alarms: those that are raised, and those that have been.
+    pub(super) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine, is_test_running: bool) {
+        self.active.clear();
+        self.previously_active.clear();
+        // Within a rule the gravest threshold comes last.
+        for threshold in engine.thresholds().rev() {
+            let same = |code: &&AlarmCode| (code.rule, code.severity) == (threshold.rule, threshold.severity);
+            let Some(own) = self.config.alarms.iter().find(same) else { continue };
+            let code = own.code.with_occurrences(threshold.occurrences);
+            if threshold.is_raised {
+                if self.active.iter().all(|graver| graver.code.spn() != code.spn()) {
+                    self.active.push(ActiveCode { code, lamp: own.lamp });
+                }
+            } else if threshold.occurrences > 0 {
+                self.previously_active.push(code);
+            }
+        }
+        // The gravest rule that was active comes first: a list that is too long is cut off at its end.
+        self.previously_active.reverse();
+        if is_test_running {
+            self.active.push(ActiveCode { code: self.config.test_code, lamp: Lamp::None });
+        }
+        let (_, unknown) = engine.unknown();
+        self.node.set_codes(now, &self.active, &self.previously_active, unknown == 0);
+    }
+
     fn dispatch_outputs(&mut self, now: Timestamp, out: &mut Outputs) {
         let bus = self.config.bus;
         let transmit = |frame| Transmit { time: now, bus, frame, announces: true };
         out.frames.extend(self.out.frames.drain(..).map(transmit));
         let event = |what| Event { time: now, kind: EventKind::J1939 { what } };
         out.events.extend(self.out.events.drain(..).map(event));
-    }
-}
-
-impl Monitor {
-    /// Claims the address: at the start, after time asleep, when the interface comes back.
-    pub(super) fn start_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
-        let Some(j1939) = &mut self.j1939 else { return };
-        j1939.node.handle_gap(now, &mut j1939.out);
-        j1939.dispatch_outputs(now, out);
-    }
-
-    pub(super) fn handle_j1939_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
-        let Some(j1939) = self.j1939.as_mut().filter(|j1939| j1939.config.bus == bus) else { return };
-        j1939.node.handle_frame(self.now, frame, &mut j1939.out);
-        j1939.dispatch_outputs(self.now, out);
-    }
-
-    pub(super) fn poll_j1939(&mut self, out: &mut Outputs) {
-        let Some(j1939) = &mut self.j1939 else { return };
-        j1939.node.poll(self.now, &mut j1939.out);
-        j1939.dispatch_outputs(self.now, out);
-    }
-
-    /// Hands the node what is raised and what has been.
-    pub(super) fn tell_j1939(&mut self) {
-        let Some(j1939) = &mut self.j1939 else { return };
-        j1939.active.clear();
-        j1939.previously_active.clear();
-        // Within a rule the gravest threshold comes last.
-        for threshold in self.alarms.thresholds().rev() {
-            let same = |code: &&AlarmCode| (code.rule, code.severity) == (threshold.rule, threshold.severity);
-            let Some(own) = j1939.config.alarms.iter().find(same) else { continue };
-            let code = own.code.with_occurrences(threshold.occurrences);
-            if threshold.is_raised {
-                if j1939.active.iter().all(|graver| graver.code.spn() != code.spn()) {
-                    j1939.active.push(ActiveCode { code, lamp: own.lamp });
-                }
-            } else if threshold.occurrences > 0 {
-                j1939.previously_active.push(code);
-            }
-        }
-        // The gravest rule that was active first: what does not fit is cut off at the end.
-        j1939.previously_active.reverse();
-        let test = self.test.map(|_| ActiveCode { code: j1939.config.test_code, lamp: Lamp::None });
-        j1939.active.extend(test);
-        let (_, unknown) = self.alarms.unknown();
-        j1939.node.set_codes(self.now, &j1939.active, &j1939.previously_active, unknown == 0);
     }
 }

@@ -1,152 +1,258 @@
-//! Transitions and what follows from them: half-cycles, capacities, usable capacities, recharge periods, and the
-//! pack's values.
+//! Learning stage: from estimates and the pack current to half-cycles, and from these to health values.
+//!
+//! In: the pack current, the cells' filters, their samples. Out: changes of mode; per half-cycle and cell the capacity,
+//! usable capacity, resistance and remaining life; per charge the recharge period; the pack's state. All of it goes to
+//! the [`Publisher`] as events and alarm values. A half-cycle that teaches nothing changes no value.
 
-use super::alarms::learned;
-use super::{Event, EventKind, Monitor, Outputs, end_state};
+use serde::{Deserialize, Serialize};
+
+use super::estimation::{end_state, resistance};
+use super::life::CellLife;
+use super::publisher::{Publisher, learned};
+use super::{EventKind, MonitorConfig};
 use crate::alarm::{Observation, Rule};
+use crate::can::encode::HealthFields;
+use crate::cell::{CellEstimator, CellModel, EstimatorBank};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
+use crate::health::transition::TransitionOutcome;
 use crate::health::usable::usable_capacity;
-use crate::health::{CapacityUpdate, CellShare, HalfCycle, ModeChange, PackState, RechargeAlarm, pack};
-use crate::quantity::{CellIndex, Mode};
+use crate::health::{
+    CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
+    RechargeTimer, TransitionDetector, pack,
+};
+use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::CellSample;
 
 /// Below the model's highest voltage by this, a charge is in its constant-voltage part, V.
 const TAPER_BAND_V: f64 = 0.03;
 
-impl Monitor {
-    /// Takes the pack current into the mode detector; `None` = stale.
-    pub(super) fn observe_current(&mut self, current_a: Option<f64>, out: &mut Outputs) {
-        let observed = self.detector.observe(&self.config.health.transition, self.now, current_a);
-        if observed.change.is_some() || observed.candidate_begins {
-            self.make_steps(out);
-        }
-        if let Some(change) = observed.change {
-            self.complete_mode(change, out);
-        }
-        if observed.candidate_begins {
-            let (charge_as, _) = self.sampler.counted(self.now);
-            let estimators = &self.estimators;
-            self.learner.mark_candidate(self.now, charge_as, |cell| end_state(estimators, cell));
+/// The learning stage.
+#[derive(Debug)]
+pub(super) struct Learning {
+    pub(super) config: HealthConfig,
+    pub(super) state: LearningState,
+    pub(super) cells: Vec<CellHealth>,
+    /// Half-cycles of the change of mode at hand, kept for their memory.
+    half_cycles: Vec<HalfCycle>,
+}
+
+/// The stage's part of the snapshot, without the cells.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct LearningState {
+    pub(super) detector: TransitionDetector,
+    pub(super) learner: Learner,
+    /// When the last half-cycle taught something; `None` = never, or an unknown time ago.
+    #[serde(default)]
+    pub(super) learned_at: Option<Timestamp>,
+    pub(super) recharge: RechargeTimer,
+    pub(super) recharge_period_s: Option<f64>,
+    #[serde(default)]
+    pub(super) normalised_recharge: Option<ScalarGaussian>,
+    pub(super) pack: Option<PackState>,
+}
+
+/// Health of one cell.
+#[derive(Debug, Clone)]
+pub(super) struct CellHealth {
+    /// SOC that the last full charge left; 1 until there was one.
+    pub(super) full_soc: f64,
+    /// Whether the present charge has tapered off at the highest voltage.
+    pub(super) tapered: bool,
+    pub(super) usable: Option<ScalarGaussian>,
+    /// Resistance relative to new after the last discharge.
+    pub(super) discharge_resistance: Option<ScalarGaussian>,
+    pub(super) life: CellLife,
+}
+
+impl CellHealth {
+    fn new(model: &CellModel, config: &HealthConfig) -> Self {
+        let life = CellLife::new(model, config);
+        Self { full_soc: 1.0, tapered: false, usable: None, discharge_resistance: None, life }
+    }
+}
+
+impl LearningState {
+    fn new(config: &HealthConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
+        Self {
+            detector: TransitionDetector::default(),
+            learner: Learner::new(&config.capacity, cells, initial_capacity),
+            learned_at: None,
+            recharge: RechargeTimer::default(),
+            recharge_period_s: None,
+            normalised_recharge: None,
+            pack: None,
         }
     }
 
-    /// A mode is over: its half-cycle, if it was one, teaches every cell.
-    pub(super) fn complete_mode(&mut self, change: ModeChange, out: &mut Outputs) {
-        out.events.push(Event { time: self.now, kind: EventKind::Mode { from: change.from, to: change.to } });
-        let mut half_cycles = std::mem::take(&mut self.scratch.half_cycles);
-        let rated_ah = self.config.model.rated_capacity_ah;
-        self.learner.complete(&self.config.health.transition, rated_ah, change.from, &mut half_cycles);
-        let life_before = self.pack_remaining_life();
-        let since_before_s = self.learned_at.map(|before| self.now.since(before));
-        let mut is_new = false;
+    /// Moves every stamp by `by_nanos`, onto another clock.
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        self.detector.rebase(by_nanos);
+        self.learner.rebase(by_nanos);
+        self.learned_at = self.learned_at.map(|at| at.plus_nanos(by_nanos));
+        self.recharge.rebase(by_nanos);
+    }
+}
+
+impl Learning {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        let cells = usize::from(config.sample.cells);
+        let initial_capacity = CellEstimator::new(&config.estimator).capacity();
+        Self {
+            config: config.health,
+            state: LearningState::new(&config.health, cells, initial_capacity),
+            cells: vec![CellHealth::new(&config.model, &config.health); cells],
+            half_cycles: Vec::new(),
+        }
+    }
+
+    /// Forgets all that was learned; `bank` is that of the new cells.
+    pub(super) fn forget(&mut self, bank: &EstimatorBank) {
+        let initial_capacity = CellEstimator::new(bank.config()).capacity();
+        self.state = LearningState::new(&self.config, self.cells.len(), initial_capacity);
+        self.cells.fill(CellHealth::new(bank.model(), &self.config));
+    }
+
+    /// Charge, rest or discharge.
+    pub(super) fn mode(&self) -> Mode {
+        self.state.detector.mode()
+    }
+
+    /// Published capacity of a cell.
+    pub(super) fn capacity(&self, index: usize) -> ScalarGaussian {
+        self.state.learner.capacity(&self.config.capacity, index)
+    }
+
+    /// Takes the pack current into the mode detector; `None` = stale.
+    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
+        self.state.detector.observe(&self.config.transition, now, current_a)
+    }
+
+    /// Marks where a mode begins that may follow the present one; `charge_as` is the charge counted so far.
+    pub(super) fn mark_candidate(&mut self, now: Timestamp, charge_as: f64, bank: &EstimatorBank) {
+        self.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
+    }
+
+    /// Ends a mode: its half-cycle, if it was one, teaches every cell.
+    pub(super) fn complete_mode(&mut self, change: ModeChange, bank: &mut EstimatorBank, to: &mut Publisher<'_>) {
+        to.event(EventKind::Mode { from: change.from, to: change.to });
+        let mut half_cycles = std::mem::take(&mut self.half_cycles);
+        let rated_ah = bank.model().rated_capacity_ah;
+        self.state.learner.complete(&self.config.transition, rated_ah, change.from, &mut half_cycles);
+        let was_life_known = self.pack_remaining_life().is_some();
+        let since_before_s = self.state.learned_at.map(|before| to.now.since(before));
+        let mut is_measured = false;
         for (index, half_cycle) in half_cycles.iter().enumerate() {
-            is_new |= self.learn_cell(index, half_cycle, since_before_s, out);
+            is_measured |= self.learn_cell(index, half_cycle, since_before_s, bank, to);
         }
         if change.from == Mode::Charge {
-            self.finish_charge(!half_cycles.is_empty(), out);
+            self.finish_charge(!half_cycles.is_empty(), bank, to);
         }
         if !half_cycles.is_empty() {
-            self.learner.finish();
-            self.learned_at = Some(self.now);
-            self.tell_life(life_before.is_some(), is_new, out);
+            self.state.learner.finish();
+            self.state.learned_at = Some(to.now);
+            self.publish_life(was_life_known, is_measured, to);
             half_cycles.clear();
         }
-        self.scratch.half_cycles = half_cycles;
+        self.half_cycles = half_cycles;
         if change.to == Mode::Charge {
             self.cells.iter_mut().for_each(|cell| cell.tapered = false);
         }
     }
 
-    /// What a half-cycle teaches a cell, so long after the one before (`None` = not known); whether its capacity was measured.
+    /// Learns from a cell's half-cycle, `since_before_s` after the one before (`None` = not known); whether its capacity
+    /// was measured.
     fn learn_cell(
         &mut self,
         index: usize,
         half_cycle: &HalfCycle,
         since_before_s: Option<f64>,
-        out: &mut Outputs,
+        bank: &mut EstimatorBank,
+        to: &mut Publisher<'_>,
     ) -> bool {
-        let cell = CellIndex(u16::try_from(index).unwrap_or(u16::MAX));
-        let slot = &mut self.cells[index];
-        if self.estimators.soc(index).is_none() {
-            slot.life.learn(&self.config, half_cycle, since_before_s, None);
+        let Self { config, state: LearningState { learner, .. }, cells, .. } = self;
+        let health = &mut cells[index];
+        if bank.soc(index).is_none() {
+            health.life.learn(bank.model(), config, half_cycle, since_before_s, None);
             return false;
         }
-        let (model, config, learner) = (&self.config.model, &self.config.health.capacity, &mut self.learner);
-        let mut estimator = self.estimators.cell(index);
-        let update = learner.learn(model, config, index, &mut estimator, half_cycle);
-        self.estimators.put(index, &estimator);
-        slot.life.learn(&self.config, half_cycle, since_before_s, Some(&update));
-        if half_cycle.mode == Mode::Charge && slot.tapered {
-            slot.full_soc = half_cycle.end_soc.unwrap_or(slot.full_soc);
+        let mut estimator = bank.cell(index);
+        let update = learner.learn(bank.model(), &config.capacity, index, &mut estimator, half_cycle);
+        bank.put(index, &estimator);
+        health.life.learn(bank.model(), config, half_cycle, since_before_s, Some(&update));
+        if half_cycle.mode == Mode::Charge && health.tapered {
+            health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
-        // What a discharge will deliver is restated by discharges: a charge leaves the resistance of charging.
-        let restate = half_cycle.mode == Mode::Discharge || slot.usable.is_none();
-        if let Some(config) = self.config.health.usable.as_ref().filter(|_| restate) {
-            let capacity = update.capacity;
-            slot.usable = Some(usable_capacity(&self.config.model, config, &estimator, capacity, slot.full_soc));
+        // Discharges restate the usable capacity: a charge leaves the resistance of charging.
+        let is_discharge = half_cycle.mode == Mode::Discharge;
+        let is_restated = is_discharge || health.usable.is_none();
+        if let Some(usable) = config.usable.as_ref().filter(|_| is_restated) {
+            let (capacity, full_soc) = (update.capacity, health.full_soc);
+            health.usable = Some(usable_capacity(bank.model(), usable, &estimator, capacity, full_soc));
         }
-        let resistance = self.resistance(index);
-        let slot = &mut self.cells[index];
-        if half_cycle.mode == Mode::Discharge {
-            slot.discharge_resistance = Some(resistance);
+        let resistance = resistance(bank, index);
+        if is_discharge {
+            health.discharge_resistance = Some(resistance);
         }
-        let (usable, discharge_resistance) = (slot.usable, slot.discharge_resistance);
-        out.events.push(Event { time: self.now, kind: half_cycle_event(cell, half_cycle) });
-        out.events.push(Event { time: self.now, kind: capacity_event(cell, usable, resistance, &update) });
-        if self.learner.has_learned(index) {
+        let (cell, usable) = (CellIndex(u16::try_from(index).unwrap_or(u16::MAX)), health.usable);
+        to.event(half_cycle_event(cell, half_cycle));
+        to.event(capacity_event(cell, usable, resistance, &update));
+        if self.state.learner.has_learned(index) {
             let capacity = Observation { is_new: update.measurement.is_some(), ..learned(update.capacity) };
-            self.observe_alarm(Rule::CapacityLow, Some(cell), capacity, out);
+            to.observe(Rule::CapacityLow, Some(cell), capacity);
         }
-        if let Some(usable) = usable.filter(|_| restate) {
-            self.observe_alarm(Rule::UsableCapacityLow, Some(cell), learned(usable), out);
+        if let Some(usable) = usable.filter(|_| is_restated) {
+            to.observe(Rule::UsableCapacityLow, Some(cell), learned(usable));
         }
-        if let Some(resistance) = discharge_resistance.filter(|_| half_cycle.mode == Mode::Discharge) {
-            self.observe_alarm(Rule::ResistanceHigh, Some(cell), learned(resistance), out);
+        if is_discharge {
+            to.observe(Rule::ResistanceHigh, Some(cell), learned(resistance));
         }
         update.measurement.is_some()
     }
 
-    /// Notes that a charge has tapered off at the highest voltage: what it leaves is "full".
-    pub(super) fn note_taper(&mut self, sample: &CellSample) {
-        let (Some(usable), Some(current_a)) = (&self.config.health.usable, sample.current_a) else { return };
-        let charging = current_a < 0.0 && -current_a <= usable.taper_current_a;
-        if charging && sample.voltage_v >= self.config.model.voltage_max_v - TAPER_BAND_V {
+    /// Takes a stepped sample. A charge that tapers off at the highest voltage leaves a full cell; after a filter reset
+    /// the SOC has jumped, and what it crossed on the way was not charged.
+    pub(super) fn handle_sample(&mut self, sample: &CellSample, was_reset: bool, model: &CellModel) {
+        if was_reset {
+            self.state.recharge.discard();
+        }
+        let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
+        let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;
+        if is_tapering && sample.voltage_v >= model.voltage_max_v - TAPER_BAND_V {
             self.cells[sample.cell.index()].tapered = true;
         }
     }
 
-    /// The pack's values from its cells', and the raw recharge period they make.
-    pub(super) fn combine_pack(&mut self, out: &mut Outputs) {
-        let known = self.sampler.voltages_fresh(self.now);
-        self.pack = if known { self.combined() } else { None };
-        let Some(pack) = self.pack else { return };
-        let config = &self.config.health.recharge;
-        if let Some(seconds) = self.recharge.observe(config, self.now, self.detector.mode(), pack.soc) {
-            self.recharge_period_s = Some(seconds);
+    /// Combines the cells to the pack; `all_fresh`: every cell's voltage is. A charge that has crossed the recharge window
+    /// gives the raw recharge period.
+    pub(super) fn combine_pack(&mut self, all_fresh: bool, bank: &EstimatorBank, to: &mut Publisher<'_>) {
+        self.state.pack = if all_fresh { self.combined(bank) } else { None };
+        let Some(pack) = self.state.pack else { return };
+        let (config, mode) = (&self.config.recharge, self.mode());
+        if let Some(seconds) = self.state.recharge.observe(config, to.now, mode, pack.soc) {
+            self.state.recharge_period_s = Some(seconds);
             if config.alarm_on == RechargeAlarm::Raw {
-                self.observe_alarm(Rule::RechargePeriodLow, None, Observation::new(Some(seconds)), out);
+                to.observe(Rule::RechargePeriodLow, None, Observation::new(Some(seconds)));
             }
         }
     }
 
-    /// The pack as the latest estimates of its cells make it, however old they are.
-    fn combined(&self) -> Option<PackState> {
-        let config = &self.config.health;
-        let shares = (0..self.config.sample.cells).filter_map(|index| {
-            let soc = self.estimators.soc(usize::from(index))?;
-            let capacity = self.learner.capacity(&config.capacity, usize::from(index));
-            Some(CellShare { cell: CellIndex(index), soc, capacity })
-        });
-        pack::combine(shares)
+    /// The pack by the latest estimates of its cells, however old they are.
+    fn combined(&self, bank: &EstimatorBank) -> Option<PackState> {
+        let cells = (0..u16::try_from(self.cells.len()).unwrap_or(u16::MAX)).map(CellIndex);
+        pack::combine(cells.filter_map(|cell| {
+            let (soc, capacity) = (bank.soc(cell.index())?, self.capacity(cell.index()));
+            Some(CellShare { cell, soc, capacity })
+        }))
     }
 
-    /// A charge is over, and its cells have `learned` from it or not: its recharge period, raw and normalised.
-    fn finish_charge(&mut self, has_learned: bool, out: &mut Outputs) {
-        let config = &self.config.health.recharge;
-        let charged = self.recharge.finish(config);
-        let told = charged.coverage >= config.min_coverage && has_learned && self.learner.has_learned_all();
-        let pack = if told { self.combined() } else { None };
+    /// Ends a charge, from which its cells have learned or not: the recharge period, raw and normalised.
+    fn finish_charge(&mut self, has_learned: bool, bank: &EstimatorBank, to: &mut Publisher<'_>) {
+        let config = &self.config.recharge;
+        let charged = self.state.recharge.finish(config);
+        let is_covered = charged.coverage >= config.min_coverage;
+        let is_measured = is_covered && has_learned && self.state.learner.has_learned_all();
+        let pack = if is_measured { self.combined(bank) } else { None };
         let normalised = pack.map(|pack| {
             let capacity = ScalarGaussian::from_std(pack.capacity_ah, pack.capacity_std_ah);
             normalised_period(config, capacity)
@@ -154,16 +260,71 @@ impl Monitor {
         if charged.raw_s.is_none() && normalised.is_none() {
             return;
         }
-        let kind = EventKind::RechargePeriod {
+        to.event(EventKind::RechargePeriod {
             seconds: charged.raw_s,
             normalised_s: normalised.map(|period| period.mean),
             normalised_std_s: normalised.as_ref().map(ScalarGaussian::std),
-        };
-        out.events.push(Event { time: self.now, kind });
+        });
         let Some(period) = normalised else { return };
-        self.normalised_recharge = Some(period);
-        if self.config.health.recharge.alarm_on == RechargeAlarm::Normalised {
-            self.observe_alarm(Rule::RechargePeriodLow, None, learned(period), out);
+        self.state.normalised_recharge = Some(period);
+        if config.alarm_on == RechargeAlarm::Normalised {
+            to.observe(Rule::RechargePeriodLow, None, learned(period));
+        }
+    }
+
+    /// The last recharge period, of the kind that its rule compares.
+    pub(super) fn known_recharge_period(&self) -> Option<Observation> {
+        match self.config.recharge.alarm_on {
+            RechargeAlarm::Raw => self.state.recharge_period_s.map(|seconds| Observation::new(Some(seconds))),
+            RechargeAlarm::Normalised => self.state.normalised_recharge.map(learned),
+        }
+    }
+
+    /// Restates the recharge periods for another window or current; without an exact restatement they are unknown.
+    pub(super) fn restate_recharge(&mut self, old: &RechargeConfig) {
+        let new = &self.config.recharge;
+        if (old.from_soc, old.to_soc) != (new.from_soc, new.to_soc) {
+            self.state.recharge.change_window();
+            self.state.recharge_period_s = None;
+        }
+        // Both are the same capacity over another window or current.
+        let seconds_per_ah = |config: &RechargeConfig| (config.to_soc - config.from_soc) / config.reference_current_a;
+        let ratio = seconds_per_ah(new) / seconds_per_ah(old);
+        self.state.normalised_recharge = self
+            .state
+            .normalised_recharge
+            .map(|period| ScalarGaussian { mean: ratio * period.mean, variance: ratio * ratio * period.variance });
+    }
+
+    /// Capacity of the cell with the lowest; `None` until half-cycles have taught something about every cell.
+    pub(super) fn weakest_capacity(&self) -> Option<ScalarGaussian> {
+        let capacities = (0..self.cells.len()).map(|index| self.capacity(index));
+        capacities.min_by(|a, b| a.mean.total_cmp(&b.mean)).filter(|_| self.state.learner.has_learned_all())
+    }
+
+    /// Health of the pack: that of its weakest cell, once half-cycles have taught something about every cell.
+    pub(super) fn health_fields(&self, bank: &EstimatorBank) -> HealthFields {
+        let recharge_period_s = self.state.recharge_period_s;
+        if !self.state.learner.has_learned_all() {
+            return HealthFields { recharge_period_s, ..HealthFields::default() };
+        }
+        let capacity = self.weakest_capacity();
+        let usable = self.cells.iter().filter_map(|cell| cell.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
+        let log_resistance = (0..self.cells.len()).map(|cell| bank.log_resistance(cell).mean).max_by(f64::total_cmp);
+        let life = self.pack_remaining_life().map(|(_, life)| life);
+        let cycles = life.and_then(|life| life.cycles);
+        HealthFields {
+            capacity_ah: capacity.map(|c| c.mean),
+            capacity_std_ah: capacity.map(|c| c.std()),
+            soh: capacity.map(|c| c.mean / bank.model().rated_capacity_ah),
+            recharge_period_s,
+            normalized_recharge_period_s: self.state.normalised_recharge.map(|period| period.mean),
+            usable_capacity_ah: usable.map(|u| u.mean),
+            usable_capacity_std_ah: usable.map(|u| u.std()),
+            resistance_ratio: log_resistance.map(libm::exp),
+            remaining_cycles: cycles.map(|cycles| cycles.median),
+            remaining_cycles_low: cycles.map(|cycles| cycles.low),
+            remaining_days: life.and_then(|life| life.days).map(|days| days.median),
         }
     }
 }

@@ -1,20 +1,24 @@
-//! The Monitor's state as a versioned document, and how it is taken up again.
+//! The monitor's state as a versioned document: assembled from the stages' parts, checked, and restored.
+//!
+//! In: a [`Snapshot`], from a store or a file. Out: the monitor that continues from it at its first input, or the number
+//! that is damaged. The JSON form of a snapshot is stored in the field: its names and their order do not change.
 
 use serde::{Deserialize, Serialize};
 
+use super::batch::CellBatch;
 use super::buses::Buses;
-use super::cyclic::Schedule;
-use super::identity::Identity;
+use super::estimation::Consumed;
 use super::intake::IntakeState;
+use super::learning::{CellHealth, LearningState};
 use super::life::CellLife;
-use super::steps::CellBatch;
-use super::{
-    CellSlot, Consumed, Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, MonitorConfig, Outputs, Statistics,
-};
-use crate::alarm::{AlarmState, StoredAlarm};
-use crate::cell::{CellEstimator, CellState};
+use super::sampling::Identity;
+use super::sender::Schedule;
+use super::stages::Stages;
+use super::{Downtime, Event, EventKind, MERGE_TOLERANCE_NS, Monitor, Outputs, Statistics};
+use crate::alarm::{AlarmSnapshot, StoredAlarm};
+use crate::cell::{CellEstimator, CellModel, CellState};
 use crate::filter::ScalarGaussian;
-use crate::health::{Axis, Forecast, Learner, PackState, RechargeTimer, TransitionDetector};
+use crate::health::{Axis, Forecast, HealthConfig, PackState};
 use crate::quantity::{InvalidState, Timestamp};
 use crate::sample::{CellSample, SamplerState};
 
@@ -29,24 +33,17 @@ pub struct Snapshot {
     pub version: u32,
     /// When it was taken, on the clock of the inputs.
     pub time: Timestamp,
-    cells: Vec<CellDocument>,
-    /// Samples whose step was not made yet.
+    cells: Vec<StoredCell>,
+    /// Samples without their step.
     #[serde(default)]
     waiting: Vec<CellSample>,
     sampler: SamplerState,
-    detector: TransitionDetector,
-    learner: Learner,
-    #[serde(default)]
-    learned_at: Option<Timestamp>,
-    recharge: RechargeTimer,
-    recharge_period_s: Option<f64>,
-    #[serde(default)]
-    normalised_recharge: Option<ScalarGaussian>,
-    pack: Option<PackState>,
-    /// For programs before this one; here the cells that have reported are counted.
+    #[serde(flatten)]
+    learning: LearningState,
+    /// For earlier programs; this one counts the cells that have reported.
     updated_cells: usize,
     time_backwards: u64,
-    alarms: AlarmState,
+    alarms: AlarmSnapshot,
     schedule: Schedule,
     #[serde(default)]
     intake: IntakeState,
@@ -58,9 +55,10 @@ pub struct Snapshot {
     statistics: Statistics,
 }
 
+/// One cell of a snapshot.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct CellDocument {
+struct StoredCell {
     estimator: CellState,
     consumed: Option<Consumed>,
     trusted: bool,
@@ -69,7 +67,7 @@ struct CellDocument {
     usable: Option<ScalarGaussian>,
     #[serde(default)]
     discharge_resistance: Option<ScalarGaussian>,
-    /// A state of before there were forecasts has none: it begins with the next reading.
+    /// `None` in states of programs without forecasts: it begins with the next reading.
     #[serde(default)]
     forecast: Option<Forecast>,
     updated_in_round: bool,
@@ -94,16 +92,16 @@ pub enum RestoreError {
         /// Configured.
         allowed: String,
     },
-    /// A number in it cannot be: it is damaged.
+    /// A number in it is impossible: it is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
         /// Which number.
         what: &'static str,
         /// Of which cell, counted from 0, where it is of one.
         cell: Option<usize>,
-        /// What it is.
+        /// Its value.
         found: f64,
-        /// What it may be.
+        /// Allowed values.
         allowed: &'static str,
     },
 }
@@ -114,22 +112,22 @@ impl From<InvalidState> for RestoreError {
     }
 }
 
-/// What became of a restore that waited.
+/// How a monitor began at its first input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Taken {
-    /// There was none.
-    Nothing,
-    /// The state is taken up, and was taken at `Monitor::now`.
-    Aged,
-    /// The state is taken up, but nobody knows when it was taken.
-    Ageless,
+pub(super) enum Beginning {
+    /// Without a stored state.
+    New,
+    /// With a state that was taken at the clock's present time.
+    Restored,
+    /// With a state of unknown age.
+    RestoredAgeless,
 }
 
-/// A restore that waits for the first input, whose time is "now".
+/// A restore that waits for the first input, which gives the present time.
 #[derive(Debug)]
 pub(super) struct PendingRestore {
     snapshot: Box<Snapshot>,
-    away: Downtime,
+    downtime: Downtime,
 }
 
 impl Monitor {
@@ -138,140 +136,143 @@ impl Monitor {
         if let Some(PendingRestore { snapshot, .. }) = &self.pending {
             return (**snapshot).clone();
         }
+        let Stages { sampling, estimation, learning, alarming, sender, statistics } = &self.stages;
+        let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
-            time: self.now,
-            cells: (0..self.cells.len()).map(|cell| self.document(cell)).collect(),
-            waiting: self.round.waiting.clone(),
-            sampler: self.sampler.snapshot(),
-            detector: self.detector.clone(),
-            learner: self.learner.clone(),
-            learned_at: self.learned_at,
-            recharge: self.recharge.clone(),
-            recharge_period_s: self.recharge_period_s,
-            normalised_recharge: self.normalised_recharge,
-            pack: self.pack,
-            updated_cells: self.round.reported(),
-            time_backwards: self.time_backwards,
-            alarms: self.alarms.snapshot(),
-            schedule: self.schedule.clone(),
-            intake: self.intake.snapshot(),
-            buses: self.buses.clone(),
-            identity: self.identity,
-            statistics: self.statistics.clone(),
+            time: self.clock.now(),
+            cells: (0..estimation.cells()).map(|cell| self.stages.stored_cell(cell)).collect(),
+            waiting: estimation.batch.waiting.clone(),
+            sampler: sampling.sampler.snapshot(),
+            learning: learning.state.clone(),
+            updated_cells: estimation.batch.reported(),
+            time_backwards: self.clock.time_backwards(),
+            alarms: alarming.engine.snapshot(),
+            schedule: sender.snapshot(),
+            intake,
+            buses,
+            identity: sampling.identity,
+            statistics: statistics.clone(),
         }
     }
 
-    /// Takes up a stored state in a monitor that has had no input yet. The first input's time is "now": the
-    /// snapshot was taken `away` before it, its stamps are moved onto the present clock, and the time away is a gap like
-    /// any other.
+    /// Restores a stored state in a monitor without any input yet. The first input gives the present time: the snapshot
+    /// was taken `downtime` before it, its stamps are moved onto the present clock, and the downtime is a gap like any
+    /// other.
     ///
     /// # Errors
-    /// When the snapshot's version or shape does not fit, or a number in it cannot be. Then none of it is used: where one
-    /// number is damaged nobody knows which others are.
-    pub fn restore(&mut self, snapshot: Snapshot, away: Downtime) -> Result<(), RestoreError> {
+    /// When the snapshot's version or shape does not fit, or a number in it is impossible. Then none of it is used: one
+    /// damaged number leaves the others in doubt.
+    pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
             return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
         }
-        let branches = self.config.model.branches.len();
-        let fits = snapshot.cells.len() == self.cells.len()
-            && snapshot.learner.fits(self.cells.len())
-            && self.sampler.fits(&snapshot.sampler)
+        let Stages { sampling, estimation, .. } = &self.stages;
+        let (branches, cells) = (estimation.bank.model().branches.len(), estimation.cells());
+        let fits = snapshot.cells.len() == cells
+            && snapshot.learning.learner.fits(cells)
+            && sampling.sampler.fits(&snapshot.sampler)
             && snapshot.waiting_fits()
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
             return Err(RestoreError::Shape {
                 found: format!("{} cells, another number of branches, or samples of no cell", snapshot.cells.len()),
-                allowed: format!("{} cells of {branches} branches", self.cells.len()),
+                allowed: format!("{cells} cells of {branches} branches"),
             });
         }
         snapshot.check()?;
-        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), away });
+        self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
         Ok(())
     }
 
-    /// Takes the waiting snapshot up, if there is one; `self.now` becomes when it was taken, on the present clock.
-    pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Taken {
-        let Some(PendingRestore { mut snapshot, away }) = self.pending.take() else { return Taken::Nothing };
-        let taken = match away {
+    /// Continues from the waiting snapshot, if there is one; the clock then shows when it was taken. The downtime is left
+    /// to the caller.
+    pub(super) fn apply_pending(&mut self, now: Timestamp, out: &mut Outputs) -> Beginning {
+        let Some(PendingRestore { mut snapshot, downtime }) = self.pending.take() else { return Beginning::New };
+        let taken = match downtime {
             Downtime::AsStamped if snapshot.time <= now.plus_nanos(MERGE_TOLERANCE_NS) => Some(snapshot.time.min(now)),
-            Downtime::Seconds(away_s) => Some(now.plus_secs(-away_s)),
+            Downtime::Seconds(seconds) => Some(now.plus_secs(-seconds)),
             Downtime::AsStamped | Downtime::Unknown => None,
         };
-        let outcome = if taken.is_some() { Taken::Aged } else { Taken::Ageless };
-        let taken = taken.unwrap_or(now);
-        let by_nanos = taken.nanos().saturating_sub(snapshot.time.nanos());
-        snapshot.rebase(by_nanos);
-        let branches = self.config.model.branches.len();
-        for (cell, document) in snapshot.cells.iter().enumerate() {
-            self.cells[cell].take_up(document, &self.config);
-            self.progress[cell].consumed = document.consumed;
-            if let Some(estimator) = CellEstimator::restore(&document.estimator, branches) {
-                self.estimators.put(cell, &estimator);
-            }
-        }
-        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
-        self.round = CellBatch::resume(has_reported, snapshot.waiting);
-        self.all_trusted = self.cells.iter().all(|cell| cell.trusted);
-        // Checked in `restore`.
-        let _ = self.sampler.restore(&snapshot.sampler);
-        self.detector = snapshot.detector;
-        self.learner = snapshot.learner;
-        self.learned_at = snapshot.learned_at;
-        self.recharge = snapshot.recharge;
-        self.recharge_period_s = snapshot.recharge_period_s;
-        self.normalised_recharge = snapshot.normalised_recharge;
-        self.pack = snapshot.pack;
-        self.time_backwards = snapshot.time_backwards;
-        self.schedule = snapshot.schedule;
-        self.restore_alarms(now, &snapshot.alarms, out);
-        self.intake.restore(&snapshot.intake);
-        self.identity = snapshot.identity;
-        self.buses = snapshot.buses.taken_up(snapshot.time, now);
-        self.statistics = snapshot.statistics;
-        self.statistics.restores += 1;
-        // From here the time away is a gap like any other.
-        self.now = snapshot.time;
-        outcome
+        snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
+        self.clock.restore(snapshot.time, snapshot.time_backwards);
+        self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
+        self.stages.restore(*snapshot, now, out);
+        if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
     }
 }
 
-impl Monitor {
-    /// Takes the stored alarms up. Those that nothing watches any more end, here and for whoever saw them on the bus.
-    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmState, out: &mut Outputs) {
-        self.all_valid_told = false;
-        for orphan in self.alarms.restore(state) {
+impl Stages {
+    fn stored_cell(&self, cell: usize) -> StoredCell {
+        let Self { estimation, learning, .. } = self;
+        let health = &learning.cells[cell];
+        StoredCell {
+            estimator: estimation.bank.cell(cell).snapshot(),
+            consumed: estimation.consumed(cell),
+            trusted: estimation.is_trusted(cell),
+            full_soc: health.full_soc,
+            tapered: health.tapered,
+            usable: health.usable,
+            discharge_resistance: health.discharge_resistance,
+            forecast: Some(health.life.forecast.clone()),
+            updated_in_round: estimation.batch.has_reported(cell),
+        }
+    }
+
+    /// Continues from a checked and rebased snapshot.
+    fn restore(&mut self, snapshot: Snapshot, now: Timestamp, out: &mut Outputs) {
+        let Self { sampling, estimation, learning, .. } = self;
+        let branches = estimation.bank.model().branches.len();
+        for (index, cell) in snapshot.cells.iter().enumerate() {
+            learning.cells[index] = cell.health(estimation.bank.model(), &learning.config);
+            if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
+                estimation.bank.put(index, &estimator);
+            }
+        }
+        let has_reported = snapshot.cells.iter().map(|cell| cell.updated_in_round).collect();
+        let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted));
+        estimation.restore(cells, CellBatch::restore(has_reported, snapshot.waiting));
+        // Its shape is checked in `Monitor::restore`.
+        let _ = sampling.sampler.restore(&snapshot.sampler);
+        sampling.identity = snapshot.identity;
+        learning.state = snapshot.learning;
+        self.sender.restore(snapshot.schedule);
+        self.restore_alarms(now, &snapshot.alarms, out);
+        self.statistics = snapshot.statistics;
+        self.statistics.restores += 1;
+    }
+
+    /// Restores the stored alarms. Those without a configured threshold end, here and for their receivers on the bus.
+    fn restore_alarms(&mut self, time: Timestamp, state: &AlarmSnapshot, out: &mut Outputs) {
+        self.alarming.knows_all_valid = false;
+        for orphan in self.alarming.engine.restore(state) {
             let StoredAlarm { rule, severity, cell, .. } = orphan;
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
-            out.events
-                .push(Event { time, kind: EventKind::AlarmDropped { rule, severity, cell, active, occurrences } });
-            self.send_alarm_end(rule, severity, cell, out);
+            let kind = EventKind::AlarmDropped { rule, severity, cell, active, occurrences };
+            out.events.push(Event { time, kind });
+            self.sender.send_alarm_end(time, (rule, severity, cell), out);
         }
     }
 }
 
 impl Snapshot {
-    /// Whether the samples that wait are of its cells, each of another, and known to have come.
+    /// Whether the waiting samples are of its cells, each of another, and known to have come.
     fn waiting_fits(&self) -> bool {
         let mut has_come: Vec<bool> = self.cells.iter().map(|cell| cell.updated_in_round).collect();
         let mut is_first = |cell: usize| has_come.get_mut(cell).is_some_and(std::mem::take);
         self.waiting.iter().all(|sample| is_first(sample.cell.index()))
     }
 
-    /// Whether its numbers can be gone on with.
+    /// Checks that every number is possible.
     fn check(&self) -> Result<(), RestoreError> {
-        for (cell, document) in self.cells.iter().enumerate() {
+        for (cell, stored) in self.cells.iter().enumerate() {
             let at_cell =
                 |InvalidState { what, found, allowed }| RestoreError::Number { what, cell: Some(cell), found, allowed };
-            document.check().map_err(at_cell)?;
+            stored.check().map_err(at_cell)?;
         }
         self.waiting.iter().try_for_each(CellSample::check)?;
         self.sampler.check()?;
-        self.learner.check()?;
-        self.recharge.check()?;
-        self.pack.iter().try_for_each(PackState::check)?;
-        InvalidState::unless_natural("the recharge period", self.recharge_period_s.unwrap_or(0.0))?;
-        Ok(check_belief("the normalised recharge period", self.normalised_recharge)?)
+        Ok(self.learning.check()?)
     }
 
     /// Moves every stamp by `by_nanos`.
@@ -282,61 +283,50 @@ impl Snapshot {
         }
         self.waiting.iter_mut().for_each(|sample| sample.time = sample.time.plus_nanos(by_nanos));
         self.sampler.rebase(by_nanos);
-        self.detector.rebase(by_nanos);
-        self.learner.rebase(by_nanos);
-        self.learned_at = self.learned_at.map(|at| at.plus_nanos(by_nanos));
-        self.recharge.rebase(by_nanos);
+        self.learning.rebase(by_nanos);
         self.alarms.rebase(by_nanos);
         self.schedule.rebase(by_nanos);
         self.buses.rebase(by_nanos);
     }
 }
 
-impl CellDocument {
+impl LearningState {
+    fn check(&self) -> Result<(), InvalidState> {
+        self.learner.check()?;
+        self.recharge.check()?;
+        self.pack.iter().try_for_each(PackState::check)?;
+        InvalidState::unless_natural("the recharge period", self.recharge_period_s.unwrap_or(0.0))?;
+        check_positive("the normalised recharge period", self.normalised_recharge)
+    }
+}
+
+impl StoredCell {
     fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
         InvalidState::unless_number("the SOC of a full cell", self.full_soc)?;
-        check_belief("the usable capacity", self.usable)?;
-        check_belief("the resistance of discharge", self.discharge_resistance)?;
+        check_positive("the usable capacity", self.usable)?;
+        check_positive("the resistance of discharge", self.discharge_resistance)?;
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         InvalidState::unless_number("the charge taken in", charge_as)?;
         InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
     }
-}
 
-/// A mean that is not below 0, and its variance.
-fn check_belief(what: &'static str, belief: Option<ScalarGaussian>) -> Result<(), InvalidState> {
-    let Some(ScalarGaussian { mean, variance }) = belief else { return Ok(()) };
-    InvalidState::unless_natural(what, mean)?;
-    InvalidState::unless_natural(what, variance)
-}
-
-impl Monitor {
-    fn document(&self, cell: usize) -> CellDocument {
-        let slot = &self.cells[cell];
-        CellDocument {
-            estimator: self.estimators.cell(cell).snapshot(),
-            consumed: self.progress[cell].consumed,
-            trusted: slot.trusted,
-            full_soc: slot.full_soc,
-            tapered: slot.tapered,
-            usable: slot.usable,
-            discharge_resistance: slot.discharge_resistance,
-            forecast: Some(slot.life.forecast.clone()),
-            updated_in_round: self.round.has_reported(cell),
+    fn health(&self, model: &CellModel, config: &HealthConfig) -> CellHealth {
+        let forecast = self.forecast.clone();
+        CellHealth {
+            full_soc: self.full_soc,
+            tapered: self.tapered,
+            usable: self.usable,
+            discharge_resistance: self.discharge_resistance,
+            life: forecast.map_or_else(|| CellLife::new(model, config), |forecast| CellLife::restore(forecast, config)),
         }
     }
 }
 
-impl CellSlot {
-    fn take_up(&mut self, document: &CellDocument, config: &MonitorConfig) {
-        self.trusted = document.trusted;
-        self.full_soc = document.full_soc;
-        self.tapered = document.tapered;
-        self.usable = document.usable;
-        self.discharge_resistance = document.discharge_resistance;
-        let forecast = document.forecast.clone();
-        self.life = forecast.map_or_else(|| CellLife::new(config), |forecast| CellLife::of(forecast, config));
-    }
+/// Checks that mean and variance are 0 or more.
+fn check_positive(what: &'static str, value: Option<ScalarGaussian>) -> Result<(), InvalidState> {
+    let Some(ScalarGaussian { mean, variance }) = value else { return Ok(()) };
+    InvalidState::unless_natural(what, mean)?;
+    InvalidState::unless_natural(what, variance)
 }

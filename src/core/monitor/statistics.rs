@@ -1,6 +1,6 @@
-//! What the core has done so far, as plain counts for the status socket and its metrics.
+//! Plain counts of the core's work for the status socket and its metrics.
 //!
-//! Part of the stored state: they go on after a restart of the program. What others count is not counted again:
+//! Part of the stored state: they continue after a restart of the program. Counts that are kept elsewhere are not here:
 //! readings ([`crate::sample::ReadingCounts`]), checks of protected messages ([`Monitor::protected`](super::Monitor)),
 //! floods ([`Monitor::dropped`](super::Monitor)), steps back in time ([`Monitor::time_backwards`](super::Monitor)).
 
@@ -16,7 +16,7 @@ use crate::quantity::BusIndex;
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Statistics {
-    /// Per interface, in the order of the configuration; interfaces nothing came from may be missing at the end.
+    /// Per interface, in the order of the configuration; interfaces without input may be missing at the end.
     pub buses: Vec<BusStatistics>,
     /// Voltage readings that moved an estimate.
     pub voltages_used: u64,
@@ -28,7 +28,7 @@ pub struct Statistics {
     pub filter_resets: u64,
     /// Times an estimate lost its trust.
     pub trust_lost: u64,
-    /// Times nobody measured for a while: asleep, away, or a hole in the record.
+    /// Times without measurement: asleep, not running, or a hole in the record.
     pub gaps: u64,
     /// Changes of mode.
     pub mode_changes: u64,
@@ -42,13 +42,13 @@ pub struct Statistics {
     pub recharge_periods: u64,
     /// Alarms raised.
     pub alarms_raised: AlarmCounts,
-    /// Commands done, from the bus and from this computer.
+    /// Executed commands, from the bus and from this computer.
     pub commands: u64,
-    /// Command frames not obeyed.
+    /// Rejected command frames.
     pub bad_commands: u64,
     /// Times the pack was replaced.
     pub packs_replaced: u64,
-    /// Times a stored state was taken up.
+    /// Times a stored state was restored.
     pub restores: u64,
     /// Times the files could not be written (any more).
     pub store_failures: u64,
@@ -58,7 +58,7 @@ pub struct Statistics {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct BusStatistics {
-    /// Frames taken in.
+    /// Received frames.
     pub frames: u64,
     /// Error frames.
     pub error_frames: u64,
@@ -108,7 +108,7 @@ impl AlarmCounts {
 }
 
 impl Statistics {
-    /// What was counted since they were `before`.
+    /// The counts since `before`.
     pub fn since(&self, before: &Self) -> Self {
         let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
         let buses = self.buses.iter().enumerate();
@@ -138,8 +138,8 @@ impl Statistics {
         }
     }
 
-    /// Takes an input and what came of it.
-    pub(super) fn note(&mut self, input: &Input<'_>, told: &[Event]) {
+    /// Counts an input and its events.
+    pub(super) fn note(&mut self, input: &Input<'_>, events: &[Event]) {
         match *input {
             Input::Frame { bus, .. } => self.bus(bus).frames += 1,
             Input::Bus { bus, event: BusEvent::ErrorFrame { class }, .. } => {
@@ -153,12 +153,12 @@ impl Statistics {
             | Input::Command { .. }
             | Input::Store { .. } => {}
         }
-        self.note_events(told);
+        self.note_events(events);
     }
 
-    /// Takes what came of something that was no input.
-    pub(super) fn note_events(&mut self, told: &[Event]) {
-        told.iter().for_each(|event| self.note_event(&event.kind));
+    /// Counts events without an input.
+    pub(super) fn note_events(&mut self, events: &[Event]) {
+        events.iter().for_each(|event| self.note_event(&event.kind));
     }
 
     fn note_event(&mut self, kind: &EventKind) {

@@ -1,15 +1,19 @@
-//! The core as it stands, for those who only look: what is known now, and `None` for what is not (any more).
+//! The present values of cells and pack for readers: status, tables, reports. `None` = not known (any more).
 
-use super::{Monitor, Statistics, Validity};
+use super::stages::Stages;
+use super::{Estimate, Monitor, Statistics, Validity};
+use crate::alarm::AlarmEngine;
+use crate::can::flood::FloodCount;
+use crate::can::guard::GuardCounts;
 use crate::filter::ScalarGaussian;
-use crate::health::{InsufficientData, RemainingLife};
+use crate::health::{InsufficientData, PackState, RemainingLife};
 use crate::quantity::{CellIndex, Channel, Mode, Timestamp};
 use crate::sample::{ReadingCounts, VoltageSource};
 
 /// One cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CellView {
-    /// Which.
+    /// Its number.
     pub cell: CellIndex,
     /// Voltage, V, while its last good reading is fresh.
     pub voltage_v: Option<f64>,
@@ -25,7 +29,7 @@ pub struct CellView {
     pub usable_capacity: Option<ScalarGaussian>,
     /// Resistance relative to new, while its voltage is fresh.
     pub resistance_ratio: Option<ScalarGaussian>,
-    /// What remains until the end of life, or why that is not known.
+    /// Remaining life, or why it is not known.
     pub remaining_life: Result<RemainingLife, InsufficientData>,
     /// Whether its innovations agree with their covariance; `None` while there is no SOC.
     pub trusted: Option<bool>,
@@ -58,7 +62,7 @@ pub struct PackView {
     pub remaining_life: Option<(CellIndex, RemainingLife)>,
     /// Last recorded recharge period, s.
     pub recharge_period_s: Option<f64>,
-    /// What the reference charger would need, s.
+    /// Time the reference charger needs for the window, s.
     pub normalised_recharge_period: Option<ScalarGaussian>,
     /// SOC as the pack itself reports it, fraction.
     pub reported_soc: Option<f64>,
@@ -69,80 +73,171 @@ pub struct PackView {
 impl Monitor {
     /// Time of the latest input.
     pub fn now(&self) -> Timestamp {
-        self.now
+        self.clock.now()
+    }
+
+    /// Inputs with a time before that of an earlier one.
+    pub fn time_backwards(&self) -> u64 {
+        self.clock.time_backwards()
+    }
+
+    /// Per protected input message: the count of each status of its check.
+    pub fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
+        self.intake.protected()
+    }
+
+    /// Input messages with dropped frames, because more came than the limit allows.
+    pub fn dropped(&self) -> impl Iterator<Item = FloodCount> + '_ {
+        self.intake.dropped()
+    }
+
+    /// Readings by outcome.
+    pub fn reading_counts(&self) -> ReadingCounts {
+        self.stages.sampling.sampler.reading_counts()
+    }
+
+    /// Whether a usable reading has come since the first input. Values of a restored state do not count.
+    pub fn has_heard(&self) -> bool {
+        self.stages.sampling.has_usable_reading()
+    }
+
+    /// Configured signals with a last good value that is too old: no reading came, or only bad ones. A signal without any
+    /// reading is lost once it should have come.
+    pub fn lost_inputs(&self) -> impl Iterator<Item = Channel> + '_ {
+        let sampler = &self.stages.sampling.sampler;
+        sampler.channels().iter().copied().filter(|&channel| sampler.is_lost(channel, self.now()))
+    }
+
+    /// How many signals are configured.
+    pub fn inputs(&self) -> usize {
+        self.stages.sampling.sampler.channels().len()
+    }
+
+    /// Identity of the connected pack; `None` = no signal is configured, or it has not been read yet.
+    pub fn pack_identity(&self) -> Option<f64> {
+        self.stages.sampling.identity.known()
+    }
+
+    /// The latest estimate of every cell, for live tables; `None` before its first. Samples since the last
+    /// [`settle`](Self::settle) are not in it.
+    pub fn latest(&self) -> impl Iterator<Item = Option<Estimate>> {
+        (0..self.stages.estimation.cells()).map(|index| self.stages.estimate(index))
+    }
+
+    /// The pack by its limiting cells; `None` before every cell has an estimate.
+    pub fn pack(&self) -> Option<&PackState> {
+        self.stages.learning.state.pack.as_ref()
+    }
+
+    /// Charge, rest or discharge.
+    pub fn mode(&self) -> Mode {
+        self.stages.learning.mode()
+    }
+
+    /// The last recorded recharge period, s.
+    pub fn recharge_period_s(&self) -> Option<f64> {
+        self.stages.learning.state.recharge_period_s
+    }
+
+    /// Time the reference charger needs for the window, s, after the last charge that covered enough of it.
+    pub fn normalised_recharge_period(&self) -> Option<ScalarGaussian> {
+        self.stages.learning.state.normalised_recharge
+    }
+
+    /// Usable capacity of a cell after its last half-cycle.
+    pub fn usable_capacity(&self, cell: CellIndex) -> Option<ScalarGaussian> {
+        self.stages.learning.cells.get(cell.index())?.usable
+    }
+
+    /// Published capacity of a cell.
+    pub fn capacity(&self, cell: CellIndex) -> ScalarGaussian {
+        self.stages.learning.capacity(cell.index())
+    }
+
+    /// Remaining life of a cell until its capacity passes the configured end of life.
+    ///
+    /// # Errors
+    /// While too little is known.
+    pub fn remaining_life(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
+        self.stages.learning.remaining_life(cell)
+    }
+
+    /// The cell whose life ends first, and when; `None` until every cell's is known.
+    pub fn pack_remaining_life(&self) -> Option<(CellIndex, RemainingLife)> {
+        self.stages.learning.pack_remaining_life()
+    }
+
+    /// The alarm engine, with the raised alarms.
+    pub fn alarms(&self) -> &AlarmEngine {
+        &self.stages.alarming.engine
     }
 
     /// Counts since the first start.
     pub fn statistics(&self) -> &Statistics {
-        &self.statistics
+        &self.stages.statistics
     }
 
-    /// Readings by what became of them.
-    pub fn reading_counts(&self) -> ReadingCounts {
-        self.sampler.reading_counts()
-    }
-
-    /// Every cell as it stands.
+    /// Every cell as it is now.
     pub fn cell_views(&self) -> impl ExactSizeIterator<Item = CellView> + '_ {
-        (0..self.config.sample.cells).map(CellIndex).map(|cell| self.cell_view(cell))
+        self.stages.estimation.cell_indices().map(|cell| self.cell_view(cell))
     }
 
     fn cell_view(&self, cell: CellIndex) -> CellView {
-        let slot = &self.cells[cell.index()];
-        let channel = self.voltage_channel(cell);
-        let is_fresh = self.sampler.is_fresh(channel, self.now);
-        let soc = self.estimators.soc(cell.index()).filter(|_| is_fresh);
+        let Stages { sampling, estimation, learning, .. } = &self.stages;
+        let (sampler, channel, now) = (&sampling.sampler, sampling.voltage_channel(cell), self.now());
+        let is_fresh = sampler.is_fresh(channel, now);
+        let soc = estimation.bank.soc(cell.index()).filter(|_| is_fresh);
+        let has_learned = learning.state.learner.has_learned(cell.index());
         CellView {
             cell,
-            voltage_v: self.sampler.reported(channel, self.now).filter(|_| is_fresh),
-            current_a: self.sampler.cell_current_a(self.now),
-            temperature_c: self.sampler.temperature_c(cell, self.now),
+            voltage_v: sampler.reported(channel, now).filter(|_| is_fresh),
+            current_a: sampler.cell_current_a(now),
+            temperature_c: sampler.temperature_c(cell, now),
             soc,
-            capacity: self.learner.has_learned(cell.index()).then(|| self.capacity(cell)),
-            usable_capacity: slot.usable.filter(|_| self.learner.has_learned(cell.index())),
-            resistance_ratio: soc.map(|_| self.resistance(cell.index())),
-            remaining_life: self.remaining_life(cell),
-            trusted: soc.map(|_| slot.trusted),
+            capacity: has_learned.then(|| learning.capacity(cell.index())),
+            usable_capacity: learning.cells[cell.index()].usable.filter(|_| has_learned),
+            resistance_ratio: soc.map(|_| estimation.resistance(cell.index())),
+            remaining_life: learning.remaining_life(cell),
+            trusted: soc.map(|_| estimation.is_trusted(cell.index())),
         }
     }
 
     /// Sum of the cells' voltages, while all are fresh.
     fn pack_voltage_v(&self) -> Option<f64> {
         let sum_v: Option<f64> = self.cell_views().map(|view| view.voltage_v).sum();
-        match self.config.sample.voltage_source {
+        match self.stages.sampling.sampler.config().voltage_source {
             VoltageSource::Cells => sum_v,
             VoltageSource::PackTotal { series } => sum_v.map(|cell_v| cell_v * f64::from(series)),
         }
     }
 
-    /// The pack as it stands.
+    /// The pack as it is now.
     pub fn pack_view(&self) -> PackView {
-        let pack = self.pack.as_ref();
-        let health = self.health_fields();
+        let Stages { sampling, estimation, learning, .. } = &self.stages;
+        let (sampler, now, pack) = (&sampling.sampler, self.now(), self.pack());
+        let health = learning.health_fields(&estimation.bank);
         let capacities = self.cell_views().filter_map(|view| view.capacity.map(|capacity| (view.cell, capacity)));
         let weakest = capacities.min_by(|a, b| a.1.mean.total_cmp(&b.1.mean));
+        let hottest = sampler.hottest_c(now);
         PackView {
-            validity: self.validity(),
-            mode: self.detector.mode(),
+            validity: self.stages.validity(),
+            mode: learning.mode(),
             soc: pack.map(|pack| ScalarGaussian::from_std(pack.soc, pack.soc_std)),
             limiting_cell: pack.map(|pack| pack.limiting_cell),
             voltage_v: self.pack_voltage_v(),
-            current_a: self.sampler.pack_current_a(self.now),
-            temperature_max_c: self
-                .sampler
-                .hottest_c(self.now)
-                .and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)),
-            weakest: weakest.filter(|_| self.learner.has_learned_all()),
+            current_a: sampler.pack_current_a(now),
+            temperature_max_c: hottest.and_then(|(hottest_c, is_whole)| is_whole.then_some(hottest_c)),
+            weakest: weakest.filter(|_| learning.state.learner.has_learned_all()),
             usable_capacity: health
                 .usable_capacity_ah
                 .zip(health.usable_capacity_std_ah)
                 .map(|(mean, std)| ScalarGaussian::from_std(mean, std)),
             soh: health.soh,
-            remaining_life: self.pack_remaining_life(),
-            recharge_period_s: self.recharge_period_s,
-            normalised_recharge_period: self.normalised_recharge,
-            reported_soc: self.sampler.reported(Channel::ReportedSoc, self.now),
-            reported_soh: self.sampler.reported(Channel::ReportedSoh, self.now),
+            remaining_life: learning.pack_remaining_life(),
+            recharge_period_s: learning.state.recharge_period_s,
+            normalised_recharge_period: learning.state.normalised_recharge,
+            reported_soc: sampler.reported(Channel::ReportedSoc, now),
+            reported_soh: sampler.reported(Channel::ReportedSoh, now),
         }
     }
 }

@@ -1,14 +1,13 @@
-//! Counts the charge that went through the pack, and the time in which nobody measured it.
+//! Counts the charge through the pack, and the time without a current measurement.
 //!
 //! In: good current readings, A, positive = discharge. Out: cumulative charge, As, and cumulative unmeasured
-//! time, s; both only mean something as differences. The rule for an interval between two current readings:
-//! * no longer than the current's `max_age_s`: trapezoid over the time that really passed;
-//! * longer: the first reading holds for `max_age_s` (that is how long a value may be used at all), the rest of
-//!   the interval is unmeasured. Nothing is interpolated across a hole, however it came about (bad readings,
-//!   lost frames, time asleep, a restart).
+//! time, s; only their differences have a meaning. The rule for an interval between two current readings:
+//! * no longer than the current's `max_age_s`: trapezoid over the elapsed time;
+//! * longer: the first reading holds for `max_age_s` (the longest time that a value may be used), the rest of the
+//!   interval is unmeasured. No hole is interpolated, whatever its cause (bad readings, lost frames, sleep, a restart).
 //!
 //! Between readings the latest one holds in the same way; the next reading replaces that hold by the trapezoid.
-//! So unmeasured time never falls, and never grows faster than time; before the first current all is unmeasured.
+//! Unmeasured time never falls and never grows faster than time; before the first current all time is unmeasured.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,7 +15,7 @@ use crate::quantity::{InvalidState, Timestamp};
 
 /// Cumulative charge and unmeasured time at one moment.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
-pub struct Totals {
+pub struct ChargeTotals {
     /// Charge taken out of the pack, As.
     pub charge_as: f64,
     /// Time without a usable current, s.
@@ -30,20 +29,20 @@ pub struct Totals {
 /// The counter: totals up to a moment, and the current from there on.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct ChargeCounter {
-    totals: Totals,
-    /// To when the totals are final; `None` = nothing has come yet.
+    totals: ChargeTotals,
+    /// End of the final totals; `None` = no input yet.
     counted_to: Option<Timestamp>,
     /// The reading at `counted_to`, A; `None` = unmeasured from there on.
     current_a: Option<f64>,
 }
 
 impl ChargeCounter {
-    /// Time began (first input of any kind): from here on a missing current is unmeasured time.
+    /// Starts the clock at the first input of any kind: from here on a missing current is unmeasured time.
     pub(super) fn begin(&mut self, time: Timestamp) {
         self.counted_to.get_or_insert(time);
     }
 
-    /// Takes a good reading. `flow_a` is the smallest current that counts as flowing.
+    /// Counts a good reading. `flow_a` is the smallest current that counts as flowing.
     pub(super) fn handle_current(&mut self, time: Timestamp, current_a: f64, max_age_s: f64, flow_a: f64) {
         let dt_s = self.passed_s(time);
         match self.current_a {
@@ -54,9 +53,9 @@ impl ChargeCounter {
         self.current_a = Some(current_a);
     }
 
-    /// Totals at `time`, with the latest reading held as long as it may be.
+    /// Totals at `time`; the latest reading holds for at most `max_age_s`.
     #[inline]
-    pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> Totals {
+    pub(super) fn totals_at(&self, time: Timestamp, max_age_s: f64) -> ChargeTotals {
         let dt_s = self.passed_s(time);
         let mut totals = self.totals;
         let held_s = self.current_a.map_or(0.0, |_| dt_s.min(max_age_s));
@@ -65,7 +64,7 @@ impl ChargeCounter {
         totals
     }
 
-    /// The record goes on at `time` after a gap of unknown length: what was told up to `latest` stays told.
+    /// Handles a gap of unknown length: totals are final up to `latest` and continue at `time`.
     pub(super) fn handle_gap(&mut self, latest: Timestamp, time: Timestamp, max_age_s: f64) {
         self.totals = self.totals_at(latest, max_age_s);
         self.counted_to = Some(time);
@@ -76,9 +75,9 @@ impl ChargeCounter {
         self.counted_to = self.counted_to.map(|stamp| stamp.plus_nanos(by_nanos));
     }
 
-    /// Whether a stored counter can be gone on with.
+    /// Checks a stored counter; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
-        let Totals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
+        let ChargeTotals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
         let all = [charge_as, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
         all.into_iter()
             .try_for_each(|found| InvalidState::unless_number("the counted charge, a time or its current", found))
@@ -89,7 +88,7 @@ impl ChargeCounter {
     }
 }
 
-impl Totals {
+impl ChargeTotals {
     fn add(&mut self, current_a: f64, dt_s: f64, flow_a: f64) {
         self.charge_as += current_a * dt_s;
         if current_a.abs() >= flow_a {
@@ -117,7 +116,7 @@ mod tests {
         counter
     }
 
-    fn told(counter: &ChargeCounter, time: f64) -> (f64, f64) {
+    fn charge_and_gap(counter: &ChargeCounter, time: f64) -> (f64, f64) {
         let totals = counter.totals_at(at(time), 2.0);
         (totals.charge_as, totals.unmeasured_s)
     }
@@ -126,23 +125,23 @@ mod tests {
     fn uneven_steps_of_a_ramp_integrate_exactly() {
         // i = t: charge t^2 / 2 whatever the steps.
         let counter = counter(&[(0.0, 0.0), (0.5, 0.5), (2.5, 2.5), (2.75, 2.75), (4.0, 4.0)]);
-        assert_eq!(told(&counter, 4.0), (8.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 4.0), (8.0, 0.0));
     }
 
     #[test]
-    fn the_hold_is_replaced_by_the_trapezoid() {
+    fn the_next_reading_replaces_the_hold_by_the_trapezoid() {
         let mut counter = counter(&[(0.0, 1.0)]);
-        assert_eq!(told(&counter, 1.0), (1.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 1.0), (1.0, 0.0));
         counter.handle_current(at(2.0), 3.0, 2.0, 0.1);
-        assert_eq!(told(&counter, 2.0), (4.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 2.0), (4.0, 0.0));
     }
 
     #[test]
     fn a_hole_is_held_for_the_age_limit_and_unmeasured_beyond() {
         let mut counter = counter(&[(0.0, 1.0)]);
-        assert_eq!(told(&counter, 10.0), (2.0, 8.0));
+        assert_eq!(charge_and_gap(&counter, 10.0), (2.0, 8.0));
         counter.handle_current(at(10.0), 50.0, 2.0, 0.1);
-        assert_eq!(told(&counter, 10.0), (2.0, 8.0), "the same, and nothing of the 50 A");
+        assert_eq!(charge_and_gap(&counter, 10.0), (2.0, 8.0), "the same, and nothing of the 50 A");
     }
 
     #[test]
@@ -150,21 +149,21 @@ mod tests {
         let mut counter = ChargeCounter::default();
         counter.begin(at(5.0));
         counter.handle_current(at(8.0), 1.0, 2.0, 0.1);
-        assert_eq!(told(&counter, 9.0), (1.0, 3.0));
+        assert_eq!(charge_and_gap(&counter, 9.0), (1.0, 3.0));
     }
 
     #[test]
     fn an_unknown_gap_counts_neither_charge_nor_time() {
         let mut counter = counter(&[(0.0, 1.0), (1.0, 1.0)]);
         counter.handle_gap(at(2.0), at(1000.0), 2.0);
-        assert_eq!(told(&counter, 1000.0), (2.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 1000.0), (2.0, 0.0));
         counter.handle_current(at(1000.0), 1.0, 2.0, 0.1);
-        assert_eq!(told(&counter, 1001.0), (3.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 1001.0), (3.0, 0.0));
     }
 
     #[test]
     fn a_stamp_that_goes_back_counts_nothing() {
         let counter = counter(&[(10.0, 1.0), (4.0, 1.0), (11.0, 1.0)]);
-        assert_eq!(told(&counter, 11.0), (1.0, 0.0));
+        assert_eq!(charge_and_gap(&counter, 11.0), (1.0, 0.0));
     }
 }

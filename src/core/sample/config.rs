@@ -1,8 +1,8 @@
-//! Settings of the sample stage: what a plausible value is, how old it may be, which sensor serves which cell.
+//! Settings of the sample stage: plausible values, largest ages, and the sensor of each cell. `config` checks their ranges.
 
 use crate::quantity::SensorIndex;
 
-/// Limits on one kind of reading. A value outside them is a bad reading and moves no estimate.
+/// Limits on one kind of reading. A value outside them is a bad reading and changes no estimate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Smallest plausible value, in the channel's unit.
@@ -11,13 +11,13 @@ pub struct Limits {
     pub max: f64,
     /// Fastest plausible change, unit per second; `None` = not checked.
     pub max_rate_per_s: Option<f64>,
-    /// A value that does not move at all for this long, while the current does, is stuck; `None` = not checked.
+    /// A value unchanged for this long while current flows is stuck; `None` = not checked.
     pub stuck_after_s: Option<f64>,
     /// A value older than this is stale.
     pub max_age_s: f64,
 }
 
-/// Where the cells' voltages come from.
+/// Source of the cells' voltages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum VoltageSource {
     /// One reading per cell.
@@ -34,7 +34,7 @@ pub enum VoltageSource {
 pub struct SampleConfig {
     /// Estimated cells (1 with [`VoltageSource::PackTotal`]), 1 to [`crate::quantity::MAX_CELLS`].
     pub cells: u16,
-    /// Where voltages come from.
+    /// Source of the voltages.
     pub voltage_source: VoltageSource,
     /// Parallel strings that share the pack current equally.
     pub strings: u16,
@@ -48,8 +48,8 @@ pub struct SampleConfig {
     pub reported_soc: Option<Limits>,
     /// Limits of the SOH the pack reports; `None` = it reports none.
     pub reported_soh: Option<Limits>,
-    /// For each cell the sensor that serves it; `None` = no sensor, the thermal model alone.
+    /// Temperature sensor of each cell; `None` = no sensor, the thermal model alone.
     pub sensor_of_cell: Vec<Option<SensorIndex>>,
-    /// Temperature assumed for surroundings when no sensor says otherwise, degrees C.
+    /// Ambient temperature without a sensor, degrees C.
     pub ambient_c: f64,
 }

@@ -1,24 +1,26 @@
-//! How many readings were used, and why the others were not.
+//! Counts of used readings, and of rejected ones by reason.
+//!
+//! In: outcomes of readings. Out: counts, which saturate.
 
 use serde::{Deserialize, Serialize};
 
 use crate::quantity::Fault;
 
-/// Readings by what became of them, since the first start (they are part of the stored state).
+/// Readings by outcome since the first start (part of the stored state).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReadingCounts {
     /// Used.
     pub accepted: u64,
-    /// For channels that feed nothing.
+    /// For channels without a use.
     pub unused: u64,
-    /// Steps to another level that were refused at first and believed when they stayed.
+    /// Steps to another level, rejected at first and accepted when they stayed.
     pub levels_believed: u64,
     /// The frame was too short.
     pub short_frame: u64,
     /// The frame failed its end-to-end check.
     pub end_to_end: u64,
-    /// The sender said that there is no value.
+    /// The sender marks the signal as not available.
     pub not_available: u64,
     /// NaN or infinite.
     pub not_finite: u64,
@@ -26,14 +28,14 @@ pub struct ReadingCounts {
     pub out_of_range: u64,
     /// Moved too fast.
     pub rate_too_high: u64,
-    /// Did not move although it should have.
+    /// Unchanged although it should have moved.
     pub stuck: u64,
-    /// No reading at all: times a signal became too old.
+    /// Times a signal became too old.
     pub stale: u64,
 }
 
 impl ReadingCounts {
-    /// What was counted since they were `before`.
+    /// Difference to the earlier counts `before`.
     pub fn since(&self, before: &Self) -> Self {
         let of = |count: fn(&Self) -> u64| count(self).saturating_sub(count(before));
         Self {
@@ -51,7 +53,7 @@ impl ReadingCounts {
         }
     }
 
-    /// Counts a reading by its judgement.
+    /// Counts a reading by its fault.
     pub(super) fn note(&mut self, fault: Option<Fault>) {
         let count = match fault {
             None => &mut self.accepted,

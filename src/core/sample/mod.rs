@@ -1,10 +1,10 @@
-//! Readings that arrive at different times and rates, made into samples a cell can use.
+//! Readings that arrive at different times and rates, combined into samples for the cells' estimators.
 //!
 //! In: readings (V, A with positive = discharge, degrees C) with their time. Out: one [`CellSample`] per good
-//! voltage reading, and [`SignalChange`]s when a signal turns bad or good.
-//! * [`signal`] judges one signal: range, rate, stuck, stale;
-//! * [`charge`] counts charge, and the time nobody measured it;
-//! * [`sampler`] holds one signal per channel and puts samples together.
+//! voltage reading, and [`SignalChange`]s when a signal turns bad or good. A bad reading changes no sample.
+//! * [`signal`] checks one signal: range, rate, stuck, stale;
+//! * [`charge`] counts charge and the time without a current measurement;
+//! * [`sampler`] holds one signal per channel and combines samples.
 
 pub mod charge;
 pub mod config;
@@ -14,4 +14,4 @@ pub mod signal;
 
 pub use config::{Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
-pub use sampler::{CellSample, Sampler, SamplerShape, SamplerState, SignalChange};
+pub use sampler::{CellSample, Sampler, SamplerState, SignalChange, SignalCountMismatch};

@@ -1,27 +1,28 @@
-//! One signal per configured channel, the charge counter, and the samples made of them.
+//! The sampler: one signal per configured channel, the charge counter, and the samples made of them.
 //!
-//! A sample is made when a good voltage arrives: with the current and temperature that are fresh at that
-//! moment, and the charge and unmeasured time counted up to it. A bad voltage makes none. What comes for a
-//! channel that feeds nothing is counted ([`Sampler::unused_readings`]).
+//! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and temperature
+//! that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage makes no sample.
+//! Readings of channels without a use are counted ([`Sampler::unused_readings`]).
 //!
-//! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records
-//! lie together and not field by field. Nothing is allocated per reading.
+//! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records are stored
+//! together and not field by field. Nothing is allocated per reading.
 
 use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
-use super::charge::{ChargeCounter, Totals};
+use super::charge::{ChargeCounter, ChargeTotals};
 use super::config::{Limits, SampleConfig, VoltageSource};
 use super::counts::ReadingCounts;
 use super::signal::Signal;
+
 use crate::quantity::{CellIndex, Channel, Fault, InvalidState, Reading, SensorIndex, Timestamp};
 
 /// Current that counts as flowing, as a share of the largest plausible one: above the noise and offset of a
 /// sensor at rest, below any load under which a voltage or temperature has to move.
 pub const FLOW_SHARE: f64 = 0.01;
 
-/// Everything a cell's update needs, at the time of its voltage.
+/// Inputs of a cell's update, at the time of its voltage.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellSample {
@@ -33,20 +34,20 @@ pub struct CellSample {
     pub voltage_v: f64,
     /// Cell current, A, positive = discharge; `None` = the last good one is too old.
     pub current_a: Option<f64>,
-    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it by
-    /// what the current did between its last reading and `time`.
+    /// Charge that left the cell so far, As; only differences mean anything. Later readings may correct it for
+    /// the current between its last reading and `time`.
     pub charge_as: f64,
-    /// Time so far without a usable current, s: charge of unknown size went by in it.
+    /// Time so far without a usable current, s: the charge of that time is unknown.
     pub unmeasured_s: f64,
     /// Cell temperature, degrees C; `None` = no sensor, or its last good value is too old.
     pub temperature_c: Option<f64>,
 }
 
 impl CellSample {
-    /// Whether the numbers of a stored one can be gone on with.
+    /// Checks the numbers of a stored sample.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         let known = [self.current_a, self.temperature_c].into_iter().flatten();
         let mut numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
@@ -54,16 +55,16 @@ impl CellSample {
     }
 }
 
-/// A signal turned bad (`Err`: why) or good again (`Ok`: after so many bad readings).
+/// A signal that has turned bad (`Err`: the fault) or good again (`Ok`: the number of bad readings before).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SignalChange {
-    /// Which signal.
+    /// Channel of the signal.
     pub channel: Channel,
-    /// What it is now.
+    /// Its new state.
     pub state: Result<u64, Fault>,
 }
 
-/// State of a [`Sampler`], to be stored.
+/// State of a [`Sampler`] for storing.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SamplerState {
     signals: Vec<Signal>,
@@ -76,10 +77,10 @@ pub struct SamplerState {
 }
 
 impl SamplerState {
-    /// Whether its numbers can be gone on with.
+    /// Checks the numbers of a stored state.
     ///
     /// # Errors
-    /// The first that cannot.
+    /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.charge.check()?;
         self.signals.iter().try_for_each(Signal::check)
@@ -94,10 +95,10 @@ impl SamplerState {
     }
 }
 
-/// A stored state has another number of signals than the configuration.
+/// Error of a stored state with another number of signals than the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("sample state has {found} signals, the configuration has {allowed}")]
-pub struct SamplerShape {
+pub struct SignalCountMismatch {
     /// Stored.
     pub found: usize,
     /// Configured.
@@ -110,38 +111,37 @@ pub struct Sampler {
     config: SampleConfig,
     /// Channels in the order of their signals: current, sensors, voltages, what the pack reports.
     channels: Vec<Channel>,
-    /// Temperature sensors that serve a cell.
+    /// Number of temperature sensors in use.
     sensors: usize,
-    /// Channels with a voltage.
+    /// Number of voltage channels.
     voltages: usize,
-    /// The signals of the cells' own voltages; none where the pack's total is measured.
+    /// Signals of the cells' own voltages; empty where the pack's total is measured.
     cell_voltages: Range<usize>,
     flow_a: f64,
     state: SamplerState,
-    /// Before this no signal can become stale; `None` = not known.
+    /// No signal becomes stale before this time; `None` = unknown.
     next_stale: Option<Timestamp>,
-    /// How many signals are known to be bad.
+    /// Number of bad signals.
     bad_signals: usize,
-    /// What the latest readings had in common.
-    moment: Moment,
+    /// Inputs shared by the readings of the latest time.
+    shared: SharedInputs,
 }
 
-/// What is the same for every reading of one time, as long as no current comes (and no temperature, for what was asked of
-/// its sensor).
+/// Inputs shared by all readings of one time, until a current arrives (for the sensor's value, until a temperature does).
 #[derive(Debug, Clone, Copy, Default)]
-struct Moment {
-    /// Whether the rest holds (still).
+struct SharedInputs {
+    /// Whether the other fields are valid.
     is_known: bool,
     time: Timestamp,
-    totals: Totals,
+    totals: ChargeTotals,
     cell_current_a: Option<f64>,
     cell_charge_as: f64,
-    /// The sensor that was asked last, and its value: neighbouring cells mostly share one.
+    /// The sensor of the last sample, and its value: neighbouring cells mostly share a sensor.
     sensor: Option<(SensorIndex, Option<f64>)>,
 }
 
 impl Sampler {
-    /// A sampler that has heard nothing yet.
+    /// A sampler before its first reading.
     pub fn new(config: SampleConfig) -> Self {
         let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
         let voltages = match config.voltage_source {
@@ -173,41 +173,46 @@ impl Sampler {
             state,
             next_stale: None,
             bad_signals: 0,
-            moment: Moment::default(),
+            shared: SharedInputs::default(),
         }
     }
 
-    /// Other limits for the same signals.
+    /// The settings.
+    pub fn config(&self) -> &SampleConfig {
+        &self.config
+    }
+
+    /// Replaces the limits of the same signals.
     ///
     /// # Panics
-    /// When the signals are others: the caller has checked.
+    /// When the signals differ; the caller checks that.
     pub fn reconfigure(&mut self, config: &SampleConfig) {
         let state = std::mem::replace(self, Self::new(config.clone())).state;
         assert!(self.restore(&state).is_ok(), "the same signals");
     }
 
-    /// Takes a reading; the sample it completes, if it is a good voltage. Changes of the signal go to `changes`.
+    /// Handles a reading; returns a sample if it is a good voltage. Appends changes of the signal to `changes`.
     pub fn handle_reading(
         &mut self,
         time: Timestamp,
         reading: Reading,
         changes: &mut Vec<SignalChange>,
     ) -> Option<CellSample> {
-        let time = self.pass(time);
+        let time = self.advance(time);
         let channel = reading.channel;
         let Some(slot) = self.slot(channel) else {
             self.state.unused_readings += 1;
             return None;
         };
-        self.renew_moment(time);
+        self.refresh_shared_inputs(time);
         let limits = limits(&self.config, channel);
         let value = reading.value.map(|value| value / self.divisor(channel));
-        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &self.moment.totals));
+        let judged = self.state.signals[slot].handle(time, value, limits, should_move_s(channel, &self.shared.totals));
         self.state.counts.note(judged.value.err());
         self.state.counts.levels_believed += u64::from(judged.is_new_level);
         if let Some(state) = judged.change {
             changes.push(SignalChange { channel, state });
-            // Only a good signal turns bad, and only a bad one good: the count never passes below 0.
+            // Only a good signal turns bad, and only a bad one good: the count never falls below 0.
             self.bad_signals = if state.is_err() { self.bad_signals + 1 } else { self.bad_signals - 1 };
             self.next_stale = None;
         }
@@ -216,11 +221,11 @@ impl Sampler {
             Channel::Current => {
                 let max_age_s = self.config.current.max_age_s;
                 self.state.charge.handle_current(time, value, max_age_s, self.flow_a);
-                self.moment.is_known = false;
+                self.shared.is_known = false;
                 None
             }
             Channel::Temperature(_) => {
-                self.moment.sensor = None;
+                self.shared.sensor = None;
                 None
             }
             Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => None,
@@ -229,15 +234,16 @@ impl Sampler {
         }
     }
 
-    /// Takes the most frequent reading, as [`handle_reading`](Self::handle_reading) would, by the shortest way: a cell's
-    /// good voltage after many others. `None` when it may be anything else: then it has still to be taken.
+    /// Handles the most frequent reading, a cell's good voltage after many others, as
+    /// [`handle_reading`](Self::handle_reading) would, with less work. `None` when it may be any other reading: the caller
+    /// then calls `handle_reading`.
     #[inline]
     pub fn take_ordinary_voltage(&mut self, time: Timestamp, cell: CellIndex, voltage_v: f64) -> Option<CellSample> {
-        let time = self.pass(time);
-        self.renew_moment(time);
-        let Self { config, state, cell_voltages, moment, .. } = self;
+        let time = self.advance(time);
+        self.refresh_shared_inputs(time);
+        let Self { config, state, cell_voltages, shared, .. } = self;
         let signal = state.signals[cell_voltages.clone()].get_mut(cell.index())?;
-        let clock_s = should_move_s(Channel::CellVoltage(cell), &moment.totals);
+        let clock_s = should_move_s(Channel::CellVoltage(cell), &shared.totals);
         if !signal.take_ordinary(time, voltage_v, &config.voltage, clock_s) {
             return None;
         }
@@ -245,9 +251,9 @@ impl Sampler {
         Some(self.sample(cell, voltage_v))
     }
 
-    /// Judges the ages at `now`; signals that have become stale go to `changes`.
+    /// Checks the ages at `now`; appends signals that have become stale to `changes`.
     pub fn poll(&mut self, now: Timestamp, changes: &mut Vec<SignalChange>) {
-        let now = self.pass(now);
+        let now = self.advance(now);
         if self.next_stale.is_some_and(|next| now <= next) {
             return;
         }
@@ -269,18 +275,17 @@ impl Sampler {
         self.next_stale = Some(next);
     }
 
-    /// The record goes on at `time` after a gap of unknown length: no value is fresh, no charge is counted
-    /// over it, ages start anew.
+    /// Handles a gap of unknown length before `time`: no value is fresh, no charge is counted over it, ages start again.
     pub fn handle_gap(&mut self, time: Timestamp) {
         self.state.charge.handle_gap(self.state.latest, time, self.config.current.max_age_s);
         self.state.signals.iter_mut().for_each(Signal::handle_gap);
         self.state.began = Some(time);
         self.state.latest = time;
-        (self.next_stale, self.moment.is_known) = (None, false);
+        (self.next_stale, self.shared.is_known) = (None, false);
     }
 
-    /// The computer was asleep until `time`: values are as old as they are, but nothing is called silent or stale
-    /// for the time in which nobody listened.
+    /// Handles the end of a sleep at `time`: values keep their age, but no signal counts as silent or stale for the time
+    /// asleep.
     pub fn wake(&mut self, time: Timestamp) {
         self.state.began = Some(time);
         self.next_stale = None;
@@ -308,29 +313,29 @@ impl Sampler {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Age of the last good value, s; from the start or the last waking when there is none since. `None` = the channel feeds nothing.
+    /// Age of the last good value, s; from the start or the last waking when there is none since.
+    /// `None` = the channel has no use.
     pub fn age_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         self.slot(channel).map(|slot| self.since(self.state.signals[slot].good_at(), now))
     }
 
-    /// Time since anything came on the channel, good or bad, s (the value of the rule `input_missing`).
+    /// Time since the channel's latest reading, good or bad, s (the value of the rule `input_missing`).
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        self.slot(channel).map(|slot| self.since(self.state.signals[slot].heard_at(), now))
+        self.slot(channel).map(|slot| self.since(self.state.signals[slot].received_at(), now))
     }
 
     /// Share of bad readings on a channel, fraction, forgotten over about
-    /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = nothing came yet.
+    /// [`BAD_SHARE_READINGS`](super::signal::BAD_SHARE_READINGS) readings; `None` = no reading yet.
     pub fn bad_share(&self, channel: Channel) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].bad_share())
     }
 
-    /// The channels that feed something: current, sensors, voltages, what the pack reports.
+    /// The channels in use: current, sensors, voltages, values that the pack reports.
     pub fn channels(&self) -> &[Channel] {
         &self.channels
     }
 
-    /// The highest temperature of the sensors whose last good reading is fresh, degrees C, and whether that is all of
-    /// them; `None` = no sensor is.
+    /// The highest fresh temperature, degrees C, and whether all sensors are fresh; `None` = no sensor is.
     pub fn hottest_c(&self, now: Timestamp) -> Option<(f64, bool)> {
         let sensors = &self.state.signals[1..=self.sensors];
         let fresh = sensors.iter().map(|signal| signal.fresh(now, &self.config.temperature));
@@ -338,30 +343,30 @@ impl Sampler {
         Some((hottest, fresh.clone().all(|value| value.is_some())))
     }
 
-    /// The last good value of a channel, when it is young enough.
+    /// The last good value of a channel, unless it is stale.
     pub fn reported(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         self.slot(channel).and_then(|slot| self.state.signals[slot].fresh(now, limits(&self.config, channel)))
     }
 
-    /// Whether a channel is lost: its latest reading is bad or too old, and so is its last good one. A single bad reading
-    /// loses nothing, and one from which nothing came yet is not lost as long as it may come.
+    /// Whether a channel is lost: its latest reading is bad or stale, and its last good one is stale. A single bad reading
+    /// does not lose a channel, and a channel before its first reading is not lost until it is stale.
     pub fn is_lost(&self, channel: Channel, now: Timestamp) -> bool {
         let is_bad = self.slot(channel).is_some_and(|slot| self.state.signals[slot].is_bad());
         is_bad && self.reported(channel, now).is_none()
     }
 
-    /// Whether a good value that is young enough has come since the start or the last waking.
+    /// Whether the channel has a fresh good value, and a reading since the start or the last waking.
     pub fn is_fresh(&self, channel: Channel, now: Timestamp) -> bool {
-        self.heard_since_waking(channel) && self.reported(channel, now).is_some()
+        self.has_input_since_waking(channel) && self.reported(channel, now).is_some()
     }
 
-    /// Whether nothing, good or bad, came for longer than a value may be old.
+    /// Whether the channel's latest reading, good or bad, is older than its largest age.
     pub fn is_silent(&self, channel: Channel, now: Timestamp) -> bool {
         self.silence_s(channel, now).is_none_or(|silence_s| silence_s > limits(&self.config, channel).max_age_s)
     }
 
-    /// The longest silence of a channel, s, and the largest share of bad readings, while something has come on every
-    /// channel and none is silent; `None` otherwise.
+    /// The longest silence of a channel, s, and the largest share of bad readings; `None` when a channel is silent or has
+    /// no reading yet.
     pub fn worst_input(&self, now: Timestamp) -> Option<(f64, f64)> {
         let began = self.state.began?;
         let (mut longest_s, mut share) = (0.0_f64, 0.0_f64);
@@ -373,8 +378,8 @@ impl Sampler {
         for (slots, limits) in parts {
             let mut oldest = now;
             for signal in &self.state.signals[slots] {
-                let (heard, bad_share) = signal.latest_since(began)?;
-                oldest = oldest.min(heard);
+                let (received, bad_share) = signal.latest_since(began)?;
+                oldest = oldest.min(received);
                 share = if bad_share > share { bad_share } else { share };
             }
             let silence_s = now.since(oldest);
@@ -384,19 +389,19 @@ impl Sampler {
             longest_s = longest_s.max(silence_s);
         }
         for &channel in &self.channels[reported..] {
-            let heard = self.heard_since_waking(channel) && !self.is_silent(channel, now);
-            longest_s = longest_s.max(self.silence_s(channel, now).filter(|_| heard)?);
+            let received = self.has_input_since_waking(channel) && !self.is_silent(channel, now);
+            longest_s = longest_s.max(self.silence_s(channel, now).filter(|_| received)?);
             share = share.max(self.bad_share(channel).unwrap_or(0.0));
         }
         Some((longest_s, share))
     }
 
-    /// Whether anything has come on the channel since the start or the last waking.
-    pub fn heard_since_waking(&self, channel: Channel) -> bool {
-        self.slot(channel).is_some_and(|slot| self.state.signals[slot].heard_at() >= self.state.began)
+    /// Whether the channel has a reading, good or bad, since the start or the last waking.
+    pub fn has_input_since_waking(&self, channel: Channel) -> bool {
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].received_at() >= self.state.began)
     }
 
-    /// Whether every voltage has a good reading that is young enough.
+    /// Whether every voltage has a fresh good reading.
     pub fn voltages_fresh(&self, now: Timestamp) -> bool {
         let first = 1 + self.sensors;
         let voltages = &self.state.signals[first..first + self.voltages];
@@ -404,71 +409,71 @@ impl Sampler {
         oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
     }
 
-    /// Whether any signal the estimates are made of is bad or stale.
+    /// Whether any signal that the estimates use is bad or stale.
     pub fn any_bad(&self) -> bool {
         self.any_lost() && self.state.signals[..1 + self.sensors + self.voltages].iter().any(Signal::is_bad)
     }
 
-    /// Whether any signal at all is bad or stale.
+    /// Whether any signal is bad or stale.
     pub fn any_lost(&self) -> bool {
         self.bad_signals > 0
     }
 
-    /// Whether a stored state is of this many signals.
+    /// Whether a stored state has this sampler's number of signals.
     pub fn fits(&self, state: &SamplerState) -> bool {
         state.signals.len() == self.state.signals.len()
     }
 
-    /// Readings that came for channels that feed nothing.
+    /// Readings of channels without a use.
     pub fn unused_readings(&self) -> u64 {
         self.state.unused_readings
     }
 
-    /// Readings by what became of them.
+    /// Readings by outcome.
     pub fn reading_counts(&self) -> ReadingCounts {
         ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
     }
 
-    /// What is to be stored.
+    /// Returns the state for storing.
     pub fn snapshot(&self) -> SamplerState {
         self.state.clone()
     }
 
-    /// Takes up a stored state (rebased by the caller): the time away is unmeasured like any other hole.
+    /// Restores a stored state (rebased by the caller). The downtime is unmeasured like any other hole.
     ///
     /// # Errors
-    /// When it has another number of signals; the present state is kept.
-    pub fn restore(&mut self, state: &SamplerState) -> Result<(), SamplerShape> {
+    /// When the state has another number of signals; the present state is kept.
+    pub fn restore(&mut self, state: &SamplerState) -> Result<(), SignalCountMismatch> {
         let (found, allowed) = (state.signals.len(), self.state.signals.len());
         if found != allowed {
-            return Err(SamplerShape { found, allowed });
+            return Err(SignalCountMismatch { found, allowed });
         }
         self.state.clone_from(state);
         self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
-        (self.next_stale, self.moment.is_known) = (None, false);
+        (self.next_stale, self.shared.is_known) = (None, false);
         Ok(())
     }
 
     #[inline]
-    fn renew_moment(&mut self, time: Timestamp) {
-        if self.moment.is_known && self.moment.time == time {
+    fn refresh_shared_inputs(&mut self, time: Timestamp) {
+        if self.shared.is_known && self.shared.time == time {
             return;
         }
         let totals = self.state.charge.totals_at(time, self.config.current.max_age_s);
         let cell_charge_as = totals.charge_as / self.strings();
         let cell_current_a = self.cell_current_a(time);
-        self.moment = Moment { is_known: true, time, totals, cell_current_a, cell_charge_as, sensor: None };
+        self.shared = SharedInputs { is_known: true, time, totals, cell_current_a, cell_charge_as, sensor: None };
     }
 
-    /// The sample of a good voltage at the moment.
+    /// The sample of a good voltage at the latest time.
     #[inline]
     fn sample(&mut self, cell: CellIndex, voltage_v: f64) -> CellSample {
-        let time = self.moment.time;
-        let temperature_c = self.sensor_of(cell).and_then(|sensor| match self.moment.sensor {
-            Some((asked, value)) if asked == sensor => value,
+        let time = self.shared.time;
+        let temperature_c = self.sensor_of(cell).and_then(|sensor| match self.shared.sensor {
+            Some((cached, value)) if cached == sensor => value,
             _ => {
                 let value = self.sensor_c(sensor, time);
-                self.moment.sensor = Some((sensor, value));
+                self.shared.sensor = Some((sensor, value));
                 value
             }
         });
@@ -476,9 +481,9 @@ impl Sampler {
             time,
             cell,
             voltage_v,
-            current_a: self.moment.cell_current_a,
-            charge_as: self.moment.cell_charge_as,
-            unmeasured_s: self.moment.totals.unmeasured_s,
+            current_a: self.shared.cell_current_a,
+            charge_as: self.shared.cell_charge_as,
+            unmeasured_s: self.shared.totals.unmeasured_s,
             temperature_c,
         }
     }
@@ -491,9 +496,9 @@ impl Sampler {
         self.state.signals[1 + sensor.index()].fresh(now, &self.config.temperature)
     }
 
-    /// Notes that time has come to `time`; the latest time, should it have gone back.
+    /// Advances the clock to `time`; returns the latest time so far, should `time` have gone back.
     #[inline]
-    fn pass(&mut self, time: Timestamp) -> Timestamp {
+    fn advance(&mut self, time: Timestamp) -> Timestamp {
         if self.state.began.is_none() {
             self.state.began = Some(time);
             self.state.latest = time;
@@ -504,7 +509,7 @@ impl Sampler {
     }
 
     fn since(&self, stamp: Option<Timestamp>, now: Timestamp) -> f64 {
-        // `None` < `Some`: what came before the start or the last sleep counts from there.
+        // `None` < `Some`: a stamp before the start or the last waking counts from there.
         stamp.max(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
     }
 
@@ -512,7 +517,7 @@ impl Sampler {
         f64::from(self.config.strings.max(1))
     }
 
-    /// What a reading is divided by to become a cell's: a total voltage is shared by the cells in series.
+    /// Divisor from a reading to a cell's value: a total voltage is shared by the cells in series.
     #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
         match (channel, self.config.voltage_source) {
@@ -542,7 +547,7 @@ impl Sampler {
             }
             (Channel::PackVoltage, VoltageSource::Cells)
             | (Channel::CellVoltage(_), VoltageSource::PackTotal { .. })
-            // Known by the monitor, not sampled.
+            // Used by the monitor, not sampled.
             | (Channel::PackIdentity, _) => None,
             (Channel::ReportedSoc | Channel::ReportedSoh, _) => {
                 let first = voltage + self.voltages;
@@ -563,7 +568,7 @@ fn limits(config: &SampleConfig, channel: Channel) -> &Limits {
     }
 }
 
-/// Every channel that feeds something, in the order of the signals.
+/// Every channel in use, in the order of the signals.
 fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     let narrow = |index: usize| u16::try_from(index).unwrap_or(u16::MAX);
     let mut channels = vec![Channel::Current];
@@ -577,13 +582,13 @@ fn channels(config: &SampleConfig, sensors: usize) -> Vec<Channel> {
     channels
 }
 
-/// The clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
-/// on purpose, so only discharging counts for it; temperature and current should move while current flows.
-fn should_move_s(channel: Channel, totals: &Totals) -> f64 {
+/// Clock of the stuck check: time in which the signal should have moved, s. A charger may hold the voltage
+/// constant, so only discharging counts for a voltage; temperature and current should move while current flows.
+fn should_move_s(channel: Channel, totals: &ChargeTotals) -> f64 {
     match channel {
         Channel::Current | Channel::Temperature(_) => totals.flowing_s,
         Channel::PackVoltage | Channel::CellVoltage(_) => totals.discharging_s,
-        // Nothing is known of how they should move.
+        // No rule says when they should move.
         Channel::ReportedSoc | Channel::ReportedSoh | Channel::PackIdentity => 0.0,
     }
 }

@@ -1,69 +1,74 @@
-//! Judges the readings of one signal: range, rate, stuck, stale.
+//! Checks the readings of one signal: range, rate, stuck, stale.
+//!
+//! In: readings in the channel's unit, with their time. Out: the value or its fault, and changes between good and bad.
 //!
 //! * **Range**: outside the limits is bad.
 //! * **Rate**: further from the last good value than the fastest plausible change allows is bad, unless
-//!   [`ACCEPT_AFTER`] readings in a row agree with each other: then the step was real (or the last good value was
-//!   wrong), and refusing it for ever would lock a healthy sensor out.
+//!   [`ACCEPT_AFTER`] consecutive readings agree with each other: then the step was real (or the last good value was
+//!   wrong), and rejecting it would lock out a healthy sensor.
 //! * **Stuck**: exactly the same value for too long while it should move is bad until it moves. The caller passes
-//!   the clock that counts only the time in which it should.
+//!   a clock that runs only while the value should move.
 //! * **Stale**: no good value for too long.
 //!
-//! A fault found by the decoder passes through. A bad reading never becomes the value.
+//! A fault found by the decoder is passed on. A bad reading never becomes the value.
 
 use serde::{Deserialize, Serialize};
 
 use super::config::Limits;
 use crate::quantity::{Fault, InvalidState, Timestamp};
 
-/// Readings in a row that must agree on a new level: two could be one disturbance seen twice.
+/// Consecutive readings that must agree on a new level: two could be one disturbance.
 pub const ACCEPT_AFTER: u32 = 3;
 
-/// Shortest time the rate is judged over, s: stamps of neighbouring frames jitter by about this much, and
-/// a change divided by no time would be infinitely fast.
+/// Shortest interval for the rate check, s: stamps of neighbouring frames jitter by about this much, and the rate over
+/// no time would be infinite.
 pub const MIN_RATE_INTERVAL_S: f64 = 1e-3;
 
 /// Readings after which an old one has lost most of its weight in the share of bad readings.
 pub const BAD_SHARE_READINGS: u32 = 100;
 
-/// A value and when it was measured.
+/// A value and its time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct Stamped {
+struct TimedValue {
     value: f64,
     time: Timestamp,
 }
 
-/// What is known about one signal.
+/// State of one signal.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {
-    good: Option<Stamped>,
-    /// Latest reading refused for its rate, and how many in a row agree with it.
-    refused: Option<Stamped>,
+    good: Option<TimedValue>,
+    /// Latest reading rejected for its rate.
+    refused: Option<TimedValue>,
+    /// Consecutive readings that agree with it.
     refused_count: u32,
-    /// Value the signal rests at, and the stuck clock when it came to rest there.
+    /// Unchanged value.
     rests_at: Option<f64>,
+    /// Stuck clock when the value became unchanged, s.
     rests_since_s: f64,
-    /// When anything came, good or bad.
-    heard: Option<Timestamp>,
-    /// Why the signal is bad at present.
+    /// Time of the latest reading, good or bad.
+    #[serde(rename = "heard")]
+    received: Option<Timestamp>,
+    /// Present fault of the signal.
     fault: Option<Fault>,
     /// Bad readings since it turned bad.
     bad_readings: u64,
-    /// Readings taken, up to [`BAD_SHARE_READINGS`].
+    /// Readings so far, up to [`BAD_SHARE_READINGS`].
     readings: u32,
     bad_share: f64,
 }
 
-/// Outcome of a reading: the judged value, and the state to tell when it changed (`Ok` = good again after so
-/// many bad readings).
-pub(super) struct Judged {
+/// Outcome of a reading: the checked value, and the signal's new state if it changed (`Ok` = good again, with the number
+/// of bad readings before).
+pub(super) struct SignalUpdate {
     pub(super) value: Result<f64, Fault>,
     pub(super) change: Option<Result<u64, Fault>>,
-    /// A step to another level that was refused before is believed now.
+    /// A step to another level, rejected before, is accepted now.
     pub(super) is_new_level: bool,
 }
 
 impl Signal {
-    /// Takes a reading. `should_move_s` is the clock for the stuck check.
+    /// Checks a reading and updates the signal. `should_move_s` is the clock of the stuck check.
     #[inline]
     pub(super) fn handle(
         &mut self,
@@ -71,26 +76,26 @@ impl Signal {
         value: Result<f64, Fault>,
         limits: &Limits,
         should_move_s: f64,
-    ) -> Judged {
-        self.heard = Some(time);
+    ) -> SignalUpdate {
+        self.received = Some(time);
         let value = self.judge(time, value, limits, should_move_s);
         self.count(value.is_err());
         let is_new_level = value.is_ok() && self.refused_count >= ACCEPT_AFTER;
         if let Ok(value) = value {
-            self.good = Some(Stamped { value, time });
+            self.good = Some(TimedValue { value, time });
             self.refused_count = 0;
         }
-        Judged { value, change: self.turn(value.err(), 1), is_new_level }
+        SignalUpdate { value, change: self.turn(value.err(), 1), is_new_level }
     }
 
-    /// Takes a good reading of a signal that has been good for long, as [`handle`](Self::handle) would, with less to look
-    /// at; `false` and nothing changed when it may be anything else.
+    /// Handles a good reading of a signal that has been good for long, as [`handle`](Self::handle) would, with fewer
+    /// checks; returns `false` and changes nothing when it may be any other reading.
     #[inline]
     pub(super) fn take_ordinary(&mut self, time: Timestamp, value: f64, limits: &Limits, should_move_s: f64) -> bool {
         let (Some(good), None, 0) = (self.good, self.fault, self.refused_count) else { return false };
         // Also false for NaN.
         let is_plausible = value >= limits.min && value <= limits.max;
-        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, Stamped { value, time }, rate)) {
+        if !is_plausible || limits.max_rate_per_s.is_some_and(|rate| !agree(good, TimedValue { value, time }, rate)) {
             return false;
         }
         if self.rests_at != Some(value) {
@@ -98,56 +103,56 @@ impl Signal {
         } else if limits.stuck_after_s.is_some_and(|limit_s| should_move_s - self.rests_since_s >= limit_s) {
             return false;
         }
-        self.good = Some(Stamped { value, time });
-        self.heard = Some(time);
+        self.good = Some(TimedValue { value, time });
+        self.received = Some(time);
         self.count(false);
         true
     }
 
-    /// Nothing good came for too long, on a signal that was good; says so.
+    /// Turns a good signal stale; returns the fault.
     pub(super) fn turn_stale(&mut self) -> Fault {
         self.turn(Some(Fault::Stale), 0);
         Fault::Stale
     }
 
-    /// From when on the signal is called stale if nothing good comes: its age counts from when somebody began to listen.
+    /// Time from which the signal is stale without a good reading; its age counts from `began` at the earliest.
     pub(super) fn stale_from(&self, began: Timestamp, limits: &Limits) -> Timestamp {
         self.good.map_or(began, |good| good.time.max(began)).plus_secs(limits.max_age_s)
     }
 
-    /// Whether the signal is known to be bad.
+    /// Whether the signal is bad.
     pub(super) fn is_bad(&self) -> bool {
         self.fault.is_some()
     }
 
-    /// The last good value when it is young enough.
+    /// The last good value, unless it is stale.
     #[inline]
     pub(super) fn fresh(&self, now: Timestamp, limits: &Limits) -> Option<f64> {
         self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
     }
 
-    /// When the last good value came.
+    /// Time of the last good value.
     pub(super) fn good_at(&self) -> Option<Timestamp> {
         self.good.map(|good| good.time)
     }
 
-    /// When anything came, good or bad.
-    pub(super) fn heard_at(&self) -> Option<Timestamp> {
-        self.heard
+    /// Time of the latest reading, good or bad.
+    pub(super) fn received_at(&self) -> Option<Timestamp> {
+        self.received
     }
 
-    /// When anything came, and the share of bad readings; `None` = nothing since `began`.
+    /// Time of the latest reading, and the share of bad readings; `None` = no reading since `began`.
     #[inline]
     pub(super) fn latest_since(&self, began: Timestamp) -> Option<(Timestamp, f64)> {
-        Some((self.heard.filter(|&heard| heard >= began)?, self.bad_share))
+        Some((self.received.filter(|&received| received >= began)?, self.bad_share))
     }
 
-    /// Share of bad readings, the recent ones weighing most; `None` before the first reading.
+    /// Share of bad readings, recent ones weighted most; `None` before the first reading.
     pub(super) fn bad_share(&self) -> Option<f64> {
         (self.readings > 0).then_some(self.bad_share)
     }
 
-    /// How old anything is has become unknown: start afresh, keep only whether the signal was bad.
+    /// Handles a gap of unknown length: forgets all values and times, keeps the fault and the share of bad readings.
     pub(super) fn handle_gap(&mut self) {
         *self = Self {
             fault: self.fault,
@@ -158,7 +163,7 @@ impl Signal {
         };
     }
 
-    /// Whether a stored signal can be gone on with.
+    /// Checks a stored signal; the error is its first impossible number.
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
         let others = [self.rests_since_s, self.rests_at.unwrap_or(0.0), self.bad_share];
@@ -169,7 +174,7 @@ impl Signal {
         for stamped in [&mut self.good, &mut self.refused].into_iter().flatten() {
             stamped.time = stamped.time.plus_nanos(by_nanos);
         }
-        self.heard = self.heard.map(|stamp| stamp.plus_nanos(by_nanos));
+        self.received = self.received.map(|stamp| stamp.plus_nanos(by_nanos));
     }
 
     #[inline]
@@ -190,7 +195,7 @@ impl Signal {
         if self.is_stuck(value, limits, should_move_s) {
             return Err(Fault::Stuck);
         }
-        if self.is_too_fast(Stamped { value, time }, limits) {
+        if self.is_too_fast(TimedValue { value, time }, limits) {
             return Err(Fault::RateTooHigh);
         }
         Ok(value)
@@ -206,7 +211,7 @@ impl Signal {
     }
 
     #[inline]
-    fn is_too_fast(&mut self, reading: Stamped, limits: &Limits) -> bool {
+    fn is_too_fast(&mut self, reading: TimedValue, limits: &Limits) -> bool {
         let (Some(rate), Some(good)) = (limits.max_rate_per_s, self.good) else { return false };
         if agree(good, reading, rate) {
             return false;
@@ -249,7 +254,7 @@ impl Signal {
 }
 
 #[inline]
-fn agree(earlier: Stamped, later: Stamped, max_rate_per_s: f64) -> bool {
+fn agree(earlier: TimedValue, later: TimedValue, max_rate_per_s: f64) -> bool {
     let dt_s = later.time.since(earlier.time).max(MIN_RATE_INTERVAL_S);
     (later.value - earlier.value).abs() <= max_rate_per_s * dt_s
 }

@@ -117,23 +117,23 @@ impl TruthCell {
 
     /// Terminal voltage, V, while `current_a` flows.
     pub fn voltage_v(&self, model: &CellModel, hysteresis: &Hysteresis, current_a: f64) -> f64 {
-        let place = model.place(self.soc, self.temperature_c);
+        let place = model.grid_position(self.soc, self.temperature_c);
         self.unloaded_v(model, hysteresis) - current_a * model.r0_ohm(&place) * self.resistance_ratio
     }
 
     /// The current, A, at which the terminal voltage would be `voltage_v`.
     pub fn current_at_a(&self, model: &CellModel, hysteresis: &Hysteresis, voltage_v: f64) -> f64 {
-        let place = model.place(self.soc, self.temperature_c);
+        let place = model.grid_position(self.soc, self.temperature_c);
         (self.unloaded_v(model, hysteresis) - voltage_v) / (model.r0_ohm(&place) * self.resistance_ratio)
     }
 
     fn unloaded_v(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
-        let place = model.place(self.soc, self.temperature_c);
+        let place = model.grid_position(self.soc, self.temperature_c);
         model.ocv_v(&place) + hysteresis.magnitude_v * self.hysteresis - self.branch_v.iter().sum::<f64>()
     }
 
     fn step(&mut self, model: &CellModel, settings: &PackSettings, current_a: f64, dt_s: f64) {
-        let place = model.place(self.soc, self.temperature_c);
+        let place = model.grid_position(self.soc, self.temperature_c);
         let mut heat_w = current_a * current_a * model.r0_ohm(&place) * self.resistance_ratio;
         for i in 0..model.branches.len() {
             let r = model.branch_r_ohm(i, &place) * self.resistance_ratio;

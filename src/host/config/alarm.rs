@@ -1,102 +1,36 @@
-//! The keys of `[[alarm]]`: thresholds as people write them, what must fit together, and the rules they make.
+//! The keys of `[[alarm]]`: what must fit together, and the rules they make.
 
-use toml::Spanned;
-use toml::de::{DeTable, DeValue};
-
-use super::convert::Raw;
 use super::document::Faults;
-use super::keys::{Alarm, Recharge};
-use super::setting::{Allowed, Setting, Wrong};
-use crate::alarm::{Direction, Rule, RuleConfig, Severity, Unit, When};
+use super::keys::{Alarm, Recharge, ReportedSocInput, ReportedSohInput, Usable};
+use super::tables::RawTables;
+use super::threshold::{Level, Threshold};
+
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Severity, Unit};
 use crate::health::RechargeAlarm;
 
 /// Part of a threshold by which a value must be back on the healthy side, unless the file says otherwise.
-const USUAL_HYSTERESIS: f64 = 0.02;
+const DEFAULT_HYSTERESIS: f64 = 0.02;
 
-/// A value to compare with: in the rule's unit, or relative.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Level {
-    /// In the rule's unit.
-    Absolute(f64),
-    /// A part of what a new cell has, from a text like "80 %".
-    Relative(f64),
-}
-
-/// `2.08`, `"80 %"`, or `{ set = ..., clear = ... }` with either.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Threshold {
-    pub set: Level,
-    /// `None` = by the hysteresis.
-    pub clear: Option<Level>,
-}
-
-impl Level {
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
-        let DeValue::String(text) = value.get_ref() else {
-            return f64::read(value, allowed).map(Self::Absolute);
-        };
-        let percent = text.trim().strip_suffix('%').and_then(|number| number.trim().parse::<f64>().ok());
-        match percent {
-            None => Err(Wrong::Type(value.span())),
-            Some(percent) if (0.0..=1000.0).contains(&percent) => Ok(Self::Relative(percent / 100.0)),
-            Some(_) => Err(Wrong::Range(value.span())),
-        }
-    }
-}
-
-impl Setting for Threshold {
-    const KIND: &'static str = "a number, a text like \"80 %\", or { set = ..., clear = ... } of these";
-
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
-        let DeValue::Table(table) = value.get_ref() else {
-            return Level::read(value, allowed).map(|set| Self { set, clear: None });
-        };
-        if table.iter().any(|(key, _)| !matches!(key.get_ref().as_ref(), "set" | "clear")) {
-            return Err(Wrong::Type(value.span()));
-        }
-        let set = table.get("set").ok_or_else(|| Wrong::Type(value.span()))?;
-        let clear = table.get("clear").map(|clear| Level::read(clear, allowed)).transpose()?;
-        Ok(Self { set: Level::read(set, allowed)?, clear })
-    }
-}
-
-impl Setting for When {
-    const KIND: &'static str = "\"mean\", or { probability = ... } above 0 and below 1";
-
-    fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
-        match value.get_ref() {
-            DeValue::String(text) if text.as_ref() == "mean" => Ok(Self::Mean),
-            DeValue::Table(table) if table.len() == 1 => probability(table).ok_or_else(|| Wrong::Type(value.span())),
-            _ => Err(Wrong::Type(value.span())),
-        }
-    }
-}
-
-fn probability(table: &DeTable<'_>) -> Option<When> {
-    let level = f64::read(table.get("probability")?, &Allowed::Any).ok()?;
-    (level > 0.0 && level < 1.0).then_some(When::Probability(level))
-}
-
-/// What relative thresholds are relative to.
+/// The values of a new cell that relative thresholds refer to.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Rated {
+pub(super) struct RatedCell {
     /// Capacity on the label, Ah.
     pub capacity_ah: f64,
     /// What the reference charger needs for the recharge window of a cell with that capacity, s.
     pub recharge_period_s: f64,
 }
 
-impl Rated {
+impl RatedCell {
     /// From the rated capacity and the recharge window.
     pub(super) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
-        let current_a = recharge.reference_current_a.unwrap_or(capacity_ah / 2.0);
+        let recharge = recharge.config(capacity_ah);
         let window = recharge.to_soc - recharge.from_soc;
-        Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / current_a }
+        Self { capacity_ah, recharge_period_s: 3600.0 * window * capacity_ah / recharge.reference_current_a }
     }
 
-    /// What 100 % means for a rule; `None` = nothing.
+    /// The value that is 100 % for a rule; `None` where none is.
     fn whole(&self, rule: Rule) -> Option<f64> {
-        match (rule, rule.row().unit) {
+        match (rule, rule.spec().unit) {
             (_, Unit::AmpereHours) => Some(self.capacity_ah),
             (Rule::RechargePeriodLow, _) => Some(self.recharge_period_s),
             (Rule::ResistanceHigh, _) | (_, Unit::Fraction) => Some(1.0),
@@ -124,20 +58,20 @@ impl Alarm {
     }
 
     /// The value back at which an alarm clears.
-    fn clear(&self, rated: &Rated, set: f64, threshold: &Threshold) -> Option<f64> {
+    fn clear(&self, rated: &RatedCell, set: f64, threshold: &Threshold) -> Option<f64> {
         match threshold.clear {
             Some(clear) => rated.value(self.rule, clear),
-            // A fault that has only just begun is no end of the one before.
+            // A fault that has just begun does not end the one before.
             None if lasts_only_while_there(self.rule) => Some(0.0),
             None => {
-                let hysteresis = self.hysteresis.unwrap_or(USUAL_HYSTERESIS * set.abs());
+                let hysteresis = self.hysteresis.unwrap_or(DEFAULT_HYSTERESIS * set.abs());
                 Some(set - beyond_sign(self.rule) * hysteresis)
             }
         }
     }
 
     /// The rules it makes; relative thresholds of a rule that has no whole were noted by [`check`].
-    pub(super) fn rules(&self, rated: &Rated) -> Vec<RuleConfig> {
+    pub(super) fn rules(&self, rated: &RatedCell) -> Vec<RuleConfig> {
         let rule = |(_, severity, threshold): (_, _, Threshold)| {
             let set = rated.value(self.rule, threshold.set)?;
             Some(RuleConfig {
@@ -155,21 +89,21 @@ impl Alarm {
     }
 }
 
-/// Whether the value of a rule is for how long something has been out of order: only 0 says that it is in order.
+/// Whether the value of a rule is the duration of a fault: then only 0 means that there is none.
 fn lasts_only_while_there(rule: Rule) -> bool {
     matches!(rule, Rule::BusFault | Rule::StoreFailed)
 }
 
 /// 1 where larger values are worse, -1 where smaller ones are.
 fn beyond_sign(rule: Rule) -> f64 {
-    match rule.row().direction {
+    match rule.spec().direction {
         Direction::Below => -1.0,
         Direction::Above => 1.0,
     }
 }
 
-/// Notes what does not fit together in the alarms.
-pub(super) fn check(raw: &Raw, rated: Option<&Rated>, faults: &mut Faults) {
+/// Notes keys of the alarms that do not fit together.
+pub(super) fn check(raw: &RawTables, rated: Option<&RatedCell>, faults: &mut Faults) {
     for (index, alarm) in raw.alarms.iter().enumerate() {
         let place = &alarm.place;
         for (key, severity, _) in alarm.thresholds() {
@@ -190,14 +124,15 @@ pub(super) fn check(raw: &Raw, rated: Option<&Rated>, faults: &mut Faults) {
     }
 }
 
-/// What a rule needs from the rest of the file.
-fn check_needs(alarm: &Alarm, raw: &Raw, faults: &mut Faults) {
-    let cells = raw.pack.as_ref().map_or(2, |pack| if raw.voltages_written.1 { 1 } else { pack.cells });
+/// Notes what a rule needs from the rest of the file and is missing.
+fn check_needs(alarm: &Alarm, raw: &RawTables, faults: &mut Faults) {
+    let cells = raw.pack.as_ref().map_or(2, |pack| if raw.is_pack_total() { 1 } else { pack.cells });
+    let is_reported = raw.is_written::<ReportedSocInput>() || raw.is_written::<ReportedSohInput>();
     let missing = match alarm.rule {
-        Rule::UsableCapacityLow if !raw.usable_written => "must have a table [usable] that states the load",
+        Rule::UsableCapacityLow if !raw.is_written::<Usable>() => "must have a table [usable] that states the load",
         Rule::TemperatureHigh if raw.temperatures.is_empty() && !raw.broken => "must have an [[input.temperature]]",
         Rule::CellImbalance if cells < 2 => "must have the voltages of at least two cells",
-        Rule::BmsDisagrees if !raw.reported_written => "must have [input.reported_soc] or [input.reported_soh]",
+        Rule::BmsDisagrees if !is_reported => "must have [input.reported_soc] or [input.reported_soh]",
         _ => "",
     };
     if !missing.is_empty() {
@@ -205,7 +140,7 @@ fn check_needs(alarm: &Alarm, raw: &Raw, faults: &mut Faults) {
     }
     let is_raw_period = alarm.rule == Rule::RechargePeriodLow
         && raw.recharge.as_ref().is_some_and(|recharge| recharge.alarm_on == RechargeAlarm::Raw);
-    if alarm.when != When::Mean && (!alarm.rule.row().has_deviation || is_raw_period) {
+    if alarm.when != Comparison::Mean && (!alarm.rule.spec().has_deviation || is_raw_period) {
         let what = if is_raw_period {
             "must be \"mean\" with recharge.alarm_on = \"raw\": that period has no standard deviation"
         } else {
@@ -215,8 +150,8 @@ fn check_needs(alarm: &Alarm, raw: &Raw, faults: &mut Faults) {
     }
 }
 
-/// Each clear threshold on the healthy side, each graver threshold further out.
-fn check_thresholds(alarm: &Alarm, rated: &Rated, faults: &mut Faults) {
+/// Each clear threshold on the healthy side, each more severe threshold further out.
+fn check_thresholds(alarm: &Alarm, rated: &RatedCell, faults: &mut Faults) {
     let (place, sign) = (&alarm.place, beyond_sign(alarm.rule));
     let side = if sign > 0.0 { "below" } else { "above" };
     let mut milder: Option<(&str, f64)> = None;
@@ -243,8 +178,8 @@ fn check_thresholds(alarm: &Alarm, rated: &Rated, faults: &mut Faults) {
     }
 }
 
-/// An alarm that no value can clear would stay for ever.
-fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold: &Threshold, faults: &mut Faults) {
+/// Notes an alarm that no value can clear: it would stay for ever.
+fn check_reachable(alarm: &Alarm, key: &str, rated: &RatedCell, set: f64, threshold: &Threshold, faults: &mut Faults) {
     let written = if threshold.clear.is_some() { key } else { "hysteresis" };
     if lasts_only_while_there(alarm.rule) {
         if alarm.hysteresis.is_some() || threshold.clear.is_some_and(|clear| clear != Level::Absolute(0.0)) {
@@ -253,7 +188,7 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold:
         return;
     }
     let Some(clear) = alarm.clear(rated, set, threshold) else { return };
-    let (low, high) = match alarm.rule.row().unit {
+    let (low, high) = match alarm.rule.spec().unit {
         Unit::Fraction => (0.0, 1.0),
         Unit::AmpereHours | Unit::Seconds | Unit::Ratio | Unit::Cycles => (0.0, f64::INFINITY),
         Unit::Celsius => return,
@@ -269,9 +204,9 @@ fn check_reachable(alarm: &Alarm, key: &str, rated: &Rated, set: f64, threshold:
     }
 }
 
-/// A percent written without its sign would be a threshold that is never or always passed.
+/// Notes a percent written without its sign: such a threshold is always or never passed.
 fn check_unit(alarm: &Alarm, key: &str, set: f64, faults: &mut Faults) {
-    if alarm.rule.row().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
+    if alarm.rule.spec().unit == Unit::Fraction && !(0.0..=1.0).contains(&set) {
         alarm.place.fault(faults, key, "must be 0 to 1, or a text like \"20 %\"");
     }
 }

@@ -6,10 +6,10 @@
 
 use std::path::Path;
 
-use super::document::{Document, Faults, Place};
+use super::document::{Document, Faults, TablePlace};
 use super::schema::Presence::{Default, Optional, Required};
-use super::schema::{Section as _, SectionInfo, Walk, section};
-use super::setting::Allowed::{Above, Between, NotEmpty};
+use super::schema::{SchemaReader, Section as _, SectionInfo, section};
+use super::setting::ValueRange::{Above, Between, NotEmpty};
 use super::{ConfigFaults, ReadFile, read_text};
 use crate::cell::{Branch, CellModel, MAX_BRANCHES, Table, Thermal};
 
@@ -20,7 +20,7 @@ section! {
     Head at "" {
         /// Version of this layout.
         format: u16, "", Between(1.0, 1.0), Required;
-        /// What people call the cell.
+        /// Name of the cell, for people.
         name: String, "", NotEmpty, Required;
         /// Chemistry, for people.
         chemistry: Option<String>, "", NotEmpty, Optional;
@@ -48,7 +48,7 @@ section! {
         ocv_v: Vec<Vec<f64>>, "V", Above(0.0, 100.0), Required;
         /// Series resistance of a new cell.
         r0_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
-        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` finds it. Without it the estimator's `model_error_v_sqrt_s` holds.
+        /// Standard deviation of the model's voltage error, averaged over 100 s, as `packwatch fit` determines it. Without it: the estimator's `model_error_v_sqrt_s`.
         voltage_error_v: Option<Vec<Vec<f64>>>, "V", Above(0.0, 10.0), Optional;
     }
 }
@@ -74,7 +74,7 @@ section! {
 }
 
 /// Every table of a cell model file, in the order of the reference page.
-pub const SECTIONS: &[SectionInfo] = &[
+pub(super) const SECTIONS: &[SectionInfo] = &[
     SectionInfo::one::<Head>(),
     SectionInfo::notes(
         "provenance",
@@ -96,23 +96,21 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
 }
 
 /// As [`load`], through `read`; faults are noted beside those of other files.
-pub fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
+pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
     let text = read_text(path, read, faults)?;
     let document = Document::parse(&path.display().to_string(), &text, faults);
-    let mut walk = Walk::new(&document, SECTIONS, faults);
-    let head = walk.one::<Head>();
-    let tables = walk.one::<Tables>();
-    let branches = walk.many::<BranchTables>();
-    let thermal = walk.optional::<ThermalKeys>();
-    let written = walk.count(BranchTables::PATH);
+    let mut reader = SchemaReader::new(&document, SECTIONS, faults);
+    let head = reader.one::<Head>();
+    let tables = reader.one::<Tables>();
+    let branches = reader.many::<BranchTables>();
+    let thermal = reader.optional::<ThermalKeys>();
+    let written = reader.count(BranchTables::PATH);
     if let Some(head) = &head {
         check_head(head, faults);
     }
     let tables = tables?;
     check_tables(&tables, faults);
-    if let Some(written) = written {
-        check_branch_count(&tables.place, written, faults);
-    }
+    check_branch_count(&tables.place, written, faults);
     check_branches(&tables, &branches, faults);
     Some(model(head?, tables, branches, thermal))
 }
@@ -171,7 +169,7 @@ fn check_tables(tables: &Tables, faults: &mut Faults) {
     }
 }
 
-fn check_branch_count(place: &Place, written: usize, faults: &mut Faults) {
+fn check_branch_count(place: &TablePlace, written: usize, faults: &mut Faults) {
     if written == 0 || written > MAX_BRANCHES {
         let what = format!("{written} tables [[tables.branches]], must be 1 to {MAX_BRANCHES}");
         place.note(faults, "branches", &what);
@@ -186,7 +184,7 @@ fn check_branches(tables: &Tables, branches: &[BranchTables], faults: &mut Fault
 }
 
 /// No hole: as many rows as temperatures, as many columns as SOC breakpoints.
-fn check_shape(place: &Place, key: &str, rows: &[Vec<f64>], tables: &Tables, faults: &mut Faults) {
+fn check_shape(place: &TablePlace, key: &str, rows: &[Vec<f64>], tables: &Tables, faults: &mut Faults) {
     let (temperatures, socs) = (tables.temperature_c.len(), tables.soc.len());
     if rows.len() != temperatures {
         let what = format!("{} rows, must be {temperatures}, one per temperature_c", rows.len());

@@ -1,31 +1,32 @@
 //! Commands from the bus: `[commands]` to the plan that reads them and the guard that checks them.
 
-use super::convert::Raw;
 use super::document::Faults;
-use super::keys::Commands;
-use super::resolve::{Resolved, bus_of};
+use super::keys::{Commands, Output};
+use super::resolve::ResolvedSignal;
+use super::tables::RawTables;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::CheckConfig;
 use crate::can::encode::CommandPlan;
 use crate::can::guard::GuardConfig;
 use crate::monitor::{CommandConfig, OutputConfig};
+use crate::quantity::BusIndex;
 
-/// What reads commands, and what checks them; `None` = none are obeyed, or faults are noted.
+/// The plan that reads commands and the guard that checks them; `None` = commands are off, or faults are noted.
 pub(super) fn commands(
-    raw: &Raw,
+    raw: &RawTables,
     output: Option<&(OutputConfig, Database)>,
-    found: &[Resolved<'_>],
+    found: &[ResolvedSignal<'_>],
     faults: &mut Faults,
 ) -> Option<(CommandConfig, GuardConfig)> {
     let keys = raw.commands.as_ref().filter(|commands| commands.enabled)?;
-    if !raw.output_written || raw.output.as_ref().is_some_and(|output| !output.enabled) {
+    if !raw.is_written::<Output>() || raw.is_output_disabled() {
         keys.place.fault(
             faults,
             "enabled",
-            "must have a table [output] that is enabled: what became of a command is sent",
+            "must have a table [output] that is enabled: the outcome of a command is sent",
         );
     }
-    let bus = bus_of(raw, keys.interface.as_deref())?;
+    let bus = raw.bus_of(keys.interface.as_deref())?;
     let (output, database) = output?;
     let note = |error: &String, faults: &mut Faults| keys.place.fault(faults, "enabled", error);
     let plan = CommandPlan::new(database).map_err(|all| all.0.iter().for_each(|e| note(e, faults))).ok()?;
@@ -41,21 +42,18 @@ pub(super) fn commands(
     if let Some(interface) = raw.interfaces.get(bus.index()).filter(|interface| is_fd && !interface.fd) {
         keys.place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
     }
-    let check = CheckConfig {
-        max_delta_counter_init: u8::try_from(keys.max_delta_counter).unwrap_or(u8::MAX),
-        ..CheckConfig::new(protection)
-    };
+    let check = CheckConfig { max_delta_counter_init: keys.max_delta_counter, ..CheckConfig::new(protection) };
     let guard = GuardConfig { bus, id: plan.id(), check, cycle_time_s: None };
     Some((CommandConfig { bus, plan }, guard))
 }
 
-/// The identifier is nobody else's on its interface.
+/// Notes an identifier that another frame has on the same interface.
 fn check_id(
     keys: &Commands,
     plan: &CommandPlan,
-    bus: crate::quantity::BusIndex,
+    bus: BusIndex,
     output: &OutputConfig,
-    found: &[Resolved<'_>],
+    found: &[ResolvedSignal<'_>],
     faults: &mut Faults,
 ) {
     let id = plan.id();

@@ -1,9 +1,9 @@
 //! Checks that concern several keys, or a key and the cell model. Nothing here stops at the first fault.
 
-use super::alarm::{self, Rated};
-use super::convert::Raw;
-use super::document::{Faults, Place};
-use super::keys::{Interface, Method, Pack, TemperatureInput};
+use super::alarm::{self, RatedCell};
+use super::document::{Faults, TablePlace};
+use super::keys::{CellVoltageInput, MethodKey, Pack, PackVoltageInput, TemperatureInput};
+use super::tables::RawTables;
 use crate::cell::{CapacityState, CellModel};
 
 /// Interfaces one daemon may watch: more than any vehicle computer has, few enough for one byte in journals.
@@ -11,8 +11,8 @@ const MAX_INTERFACES: usize = 16;
 /// Longest kernel name of an interface (IFNAMSIZ without its closing zero).
 const MAX_INTERFACE_NAME: usize = 15;
 
-/// Notes everything that does not fit together.
-pub(super) fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
+/// Notes keys that do not fit together.
+pub(super) fn check(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
     interfaces(raw, faults);
     voltages(raw, faults);
     if let Some(pack) = &raw.pack {
@@ -21,13 +21,13 @@ pub(super) fn check(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     limits(raw, faults);
     health(raw, model, faults);
     let rated_ah = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
-    let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| Rated::new(rated_ah, recharge));
+    let rated = rated_ah.zip(raw.recharge.as_ref()).map(|(rated_ah, recharge)| RatedCell::new(rated_ah, recharge));
     alarm::check(raw, rated.as_ref(), faults);
     output(raw, faults);
 }
 
-fn interfaces(raw: &Raw, faults: &mut Faults) {
-    if raw.interfaces.is_empty() && raw.interfaces_whole {
+fn interfaces(raw: &RawTables, faults: &mut Faults) {
+    if raw.interfaces.is_empty() && raw.has_all_interfaces() {
         faults.add(&raw.file, 1, "interface is missing, must be at least one table [[interface]]");
     }
     if let Some(one_too_many) = raw.interfaces.get(MAX_INTERFACES) {
@@ -44,42 +44,30 @@ fn interfaces(raw: &Raw, faults: &mut Faults) {
             interface.place.fault(faults, "name", &what);
         }
     }
-    let current = raw.current.iter().map(|s| s.source());
-    let cells = raw.cell_voltage.iter().map(|s| s.source());
-    let pack = raw.pack_voltage.iter().map(|s| s.source());
-    let temperatures = raw.temperatures.iter().map(|s| s.source());
-    let reported = raw.reported_soc.iter().map(|s| s.source()).chain(raw.reported_soh.iter().map(|s| s.source()));
-    let reported = reported.chain(raw.pack_identity.iter().map(|s| s.source()));
-    if !raw.interfaces_whole {
+    if !raw.has_all_interfaces() {
         return;
     }
-    let signals = current.chain(cells).chain(pack).chain(temperatures).chain(reported);
-    let signals = signals.map(|source| (source.interface, source.place));
+    let signals = raw.sources().map(|(_, source)| (source.interface, source.place));
     let protected = raw.protected.iter().map(|protected| (protected.interface.as_deref(), &protected.place));
     for (interface, place) in signals.chain(protected) {
         match interface {
-            Some(name) => known_interface(name, place, "interface", &raw.interfaces, faults),
+            Some(name) => known_interface(name, place, "interface", raw, faults),
             None if raw.interfaces.len() > 1 => {
-                place.fault(faults, "interface", &format!("must be {}", names(&raw.interfaces)));
+                place.fault(faults, "interface", &format!("must be {}", raw.interface_names()));
             }
             None => {}
         }
     }
 }
 
-fn known_interface(name: &str, place: &Place, key: &str, interfaces: &[Interface], faults: &mut Faults) {
-    if !interfaces.is_empty() && !interfaces.iter().any(|interface| interface.name == name) {
-        place.fault(faults, key, &format!("must be {}", names(interfaces)));
+fn known_interface(name: &str, place: &TablePlace, key: &str, raw: &RawTables, faults: &mut Faults) {
+    if !raw.interfaces.is_empty() && !raw.interfaces.iter().any(|interface| interface.name == name) {
+        place.fault(faults, key, &format!("must be {}", raw.interface_names()));
     }
 }
 
-fn names(interfaces: &[Interface]) -> String {
-    let names: Vec<&str> = interfaces.iter().map(|interface| interface.name.as_str()).collect();
-    names.join(" or ")
-}
-
-fn voltages(raw: &Raw, faults: &mut Faults) {
-    match raw.voltages_written {
+fn voltages(raw: &RawTables, faults: &mut Faults) {
+    match (raw.is_written::<CellVoltageInput>(), raw.is_written::<PackVoltageInput>()) {
         (false, false) if raw.broken => {}
         (false, false) => {
             let line = raw.input.as_ref().map_or(1, |input| input.place.line);
@@ -95,8 +83,8 @@ fn voltages(raw: &Raw, faults: &mut Faults) {
 }
 
 /// Every cell has at most one sensor, and every numbered cell exists.
-fn temperatures(pack: &Pack, raw: &Raw, faults: &mut Faults) {
-    if raw.voltages_written == (false, true) {
+fn temperatures(pack: &Pack, raw: &RawTables, faults: &mut Faults) {
+    if raw.is_pack_total() && !raw.is_written::<CellVoltageInput>() {
         for sensor in raw.temperatures.iter().skip(1) {
             let text = format!("{} is one too many, must be one: the pack is estimated as one cell", sensor.place.path);
             faults.add(&sensor.place.file, sensor.place.line, text);
@@ -129,8 +117,8 @@ fn cells_of(sensor: &TemperatureInput, cells: u16) -> Vec<u16> {
     }
 }
 
-fn limits(raw: &Raw, faults: &mut Faults) {
-    let rising = |place: &Place, key: &str, low: Option<f64>, high: Option<f64>, faults: &mut Faults| {
+fn limits(raw: &RawTables, faults: &mut Faults) {
+    let rising = |place: &TablePlace, key: &str, low: Option<f64>, high: Option<f64>, faults: &mut Faults| {
         if let (Some(low), Some(high)) = (low, high)
             && high <= low
         {
@@ -145,7 +133,7 @@ fn limits(raw: &Raw, faults: &mut Faults) {
     }
 }
 
-fn health(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
+fn health(raw: &RawTables, model: Option<&CellModel>, faults: &mut Faults) {
     if let Some(recharge) = &raw.recharge
         && recharge.to_soc <= recharge.from_soc
     {
@@ -157,9 +145,9 @@ fn health(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     if let (Some(capacity), Some(estimator)) = (&raw.capacity, &raw.estimator) {
         // The paper's filter holds the capacity between half-cycles, ours carries it: half of each is neither.
         let (key, needed) = match (capacity.method, estimator.capacity_state) {
-            (Method::Swing, CapacityState::Joint) | (Method::Nominal, CapacityState::Held) => ("", ""),
-            (Method::Swing, CapacityState::Held) => ("swing", "joint"),
-            (Method::Nominal, CapacityState::Joint) => ("nominal", "held"),
+            (MethodKey::Swing, CapacityState::Joint) | (MethodKey::Nominal, CapacityState::Held) => ("", ""),
+            (MethodKey::Swing, CapacityState::Held) => ("swing", "joint"),
+            (MethodKey::Nominal, CapacityState::Joint) => ("nominal", "held"),
         };
         if !key.is_empty() {
             let what = format!("must be \"{needed}\" with capacity.method = \"{key}\"");
@@ -174,11 +162,11 @@ fn health(raw: &Raw, model: Option<&CellModel>, faults: &mut Faults) {
     }
 }
 
-fn output(raw: &Raw, faults: &mut Faults) {
-    let Some(output) = raw.output.as_ref().filter(|output| raw.output_written && output.enabled) else {
+fn output(raw: &RawTables, faults: &mut Faults) {
+    let Some(output) = raw.output.as_ref().filter(|output| output.enabled && raw.has_all_interfaces()) else {
         return;
     };
-    for name in output.interfaces.iter().flatten().filter(|_| raw.interfaces_whole) {
-        known_interface(name, &output.place, "interfaces", &raw.interfaces, faults);
+    for name in output.interfaces.iter().flatten() {
+        known_interface(name, &output.place, "interfaces", raw, faults);
     }
 }

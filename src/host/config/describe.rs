@@ -1,36 +1,36 @@
-//! What a configuration means, in words and numbers: for `packwatch check`, people and scripts.
+//! The meaning of a configuration in words and numbers, for `packwatch check`.
 
 use std::ops::RangeInclusive;
 
 use serde::Serialize;
 
-use super::convert::Raw;
 use super::keys::TemperatureInput;
-use super::resolve::{Resolved, channel_words};
+use super::resolve::{ResolvedSignal, channel_words};
+use super::tables::RawTables;
 use super::{Config, InterfaceConfig, protect};
-use crate::alarm::{Direction, Rule, RuleConfig, Unit, When};
+use crate::alarm::{Comparison, Direction, Rule, RuleConfig, Unit};
 use crate::can::dbc::Message;
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::health::{RechargeAlarm, RechargeConfig};
 use crate::quantity::{BusIndex, Channel};
 use crate::sample::VoltageSource;
 
-/// What a good configuration means.
+/// Meaning of a good configuration.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Description {
     /// The configuration file.
     pub file: String,
     /// The cell model.
     pub cell: String,
-    /// What is assumed about the pack, in sentences.
+    /// Assumptions about the pack, in sentences.
     pub pack: Vec<String>,
     /// Interfaces and the identifiers the kernel is asked to let through.
     pub interfaces: Vec<InterfaceUse>,
-    /// What each configured signal resolves to.
+    /// Every configured signal as found in its DBC file.
     pub signals: Vec<SignalUse>,
-    /// What a plausible reading is.
+    /// Ranges of plausible readings.
     pub limits: Vec<String>,
-    /// What becomes of a frame before it is read: the bound on frames, end-to-end protection; in sentences.
+    /// Checks of a frame before it is read: limit on frames, end-to-end protection; in sentences.
     pub intake: Vec<String>,
     /// Frames that are sent.
     pub outputs: Vec<OutputUse>,
@@ -40,7 +40,7 @@ pub struct Description {
     pub j1939: Vec<String>,
 }
 
-/// An interface and what is read from it.
+/// An interface and the identifiers read from it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct InterfaceUse {
     /// Kernel name.
@@ -54,9 +54,9 @@ pub struct InterfaceUse {
 /// A configured signal as found in its DBC.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SignalUse {
-    /// What it feeds: `pack current`, `cell 7 voltage`.
+    /// Input that it feeds: `pack current`, `cell 7 voltage`.
     pub channel: String,
-    /// Interface it comes on.
+    /// Interface that carries it.
     pub interface: String,
     /// Identifier as candump writes it.
     pub id: String,
@@ -112,7 +112,12 @@ pub struct OutputUse {
 }
 
 /// Describes a checked configuration and the signals found for it.
-pub(super) fn describe(raw: &Raw, config: &Config, found: &[Resolved<'_>], outputs: Vec<OutputUse>) -> Description {
+pub(super) fn describe(
+    raw: &RawTables,
+    config: &Config,
+    found: &[ResolvedSignal<'_>],
+    outputs: Vec<OutputUse>,
+) -> Description {
     let model = &config.monitor.model;
     let cell = format!(
         "{}: rated {} Ah, {} Ah when new, {} to {} V, {} RC branch{}{}",
@@ -161,7 +166,7 @@ fn pack(config: &Config) -> Vec<String> {
             true => String::new(),
             false => format!(" for cells {}", cell_list(&bare)),
         };
-        let from = if config.monitor.model.thermal.is_some() { "from the thermal model round" } else { "taken as" };
+        let from = if config.monitor.model.thermal.is_some() { "from the thermal model at" } else { "taken as" };
         words.push(format!("no temperature sensor{cells}: {from} {ambient_c} degrees C"));
     }
     words.push("a positive current is a discharge in everything reported".to_owned());
@@ -173,7 +178,7 @@ fn interface(bus: BusIndex, interface: &InterfaceConfig, config: &Config) -> Int
     InterfaceUse { name: interface.name.clone(), fd: interface.fd, filter_ids }
 }
 
-fn signal(raw: &Raw, config: &Config, resolved: &Resolved<'_>) -> SignalUse {
+fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> SignalUse {
     let layout = &resolved.signal.layout;
     let range = resolved.range();
     let interface = config.interfaces.get(resolved.bus.index()).map(|i| i.name.clone()).unwrap_or_default();
@@ -216,7 +221,7 @@ fn signal(raw: &Raw, config: &Config, resolved: &Resolved<'_>) -> SignalUse {
     }
 }
 
-fn multiplex(resolved: &Resolved<'_>) -> String {
+fn multiplex(resolved: &ResolvedSignal<'_>) -> String {
     let name = |message: &Message, index: usize| message.signals.get(index).map(|s| s.name.clone()).unwrap_or_default();
     let range = |&(low, high): &(u64, u64)| if low == high { format!("{low}") } else { format!("{low}-{high}") };
     let conditions = resolved.signal.multiplex.conditions.iter().map(|condition| {
@@ -282,7 +287,7 @@ fn alarms(config: &Config) -> Vec<String> {
 }
 
 fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String {
-    let row = rule.rule.row();
+    let row = rule.rule.spec();
     let what = match (rule.rule, recharge.alarm_on) {
         (Rule::RechargePeriodLow, RechargeAlarm::Normalised) => "the normalised recharge period",
         _ => row.about,
@@ -298,8 +303,8 @@ fn alarm(rule: &RuleConfig, rated_ah: f64, recharge: &RechargeConfig) -> String 
     };
     let (set, clear) = (amount(rule.threshold, row.unit), amount(rule.clear, row.unit));
     let mut words = match rule.when {
-        When::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
-        When::Probability(level) => {
+        Comparison::Mean => format!("{severity} when {what} is {side} {set}{of_rated}"),
+        Comparison::Probability(level) => {
             format!(
                 "{severity} when {what} is {side} {set}{of_rated} with a probability above {} %",
                 round(100.0 * level)

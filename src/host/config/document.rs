@@ -10,18 +10,18 @@ use toml::de::{DeTable, DeValue};
 
 /// Longest piece of the file quoted in a fault, characters: enough to recognise it, short enough for one line.
 const MAX_QUOTE: usize = 48;
-/// Faults of syntax told one by one; more than these mean a file of another kind.
+/// Faults of syntax listed one by one; a file with more is of another kind.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
 /// Everything found wrong, in files of any kind.
 #[derive(Debug, Default)]
-pub struct Faults {
+pub(crate) struct Faults {
     list: Vec<(String, usize, String)>,
 }
 
 impl Faults {
     /// Notes `text` about line `line` of `file`; line 0 = the file as a whole.
-    pub fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
+    pub(crate) fn add(&mut self, file: &str, line: usize, text: impl Into<String>) {
         let fault = (file.to_owned(), line, text.into());
         if !self.list.contains(&fault) {
             self.list.push(fault);
@@ -29,17 +29,17 @@ impl Faults {
     }
 
     /// How many faults there are.
-    pub fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.list.len()
     }
 
     /// Whether nothing was found.
-    pub fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.list.is_empty()
     }
 
     /// One line each: the files in the order in which they first failed, each by line.
-    pub fn into_lines(self) -> Vec<String> {
+    pub(crate) fn into_lines(self) -> Vec<String> {
         let mut files: Vec<&str> = Vec::new();
         for (file, _, _) in &self.list {
             if !files.contains(&file.as_str()) {
@@ -62,18 +62,18 @@ impl Faults {
 pub(super) struct Document<'t> {
     /// As people named it.
     pub file: String,
-    /// Whether the syntax is broken somewhere: what is missing may then stand in the broken part.
+    /// Whether the syntax is broken somewhere: a missing key may then stand in the broken part.
     pub broken: bool,
-    text: &'t str,
+    source: &'t str,
     root: DeTable<'t>,
 }
 
 impl<'t> Document<'t> {
-    /// Parses `text`. Syntax faults go to `faults`; what could be understood is kept, so that the rest of
-    /// the file is still checked.
+    /// Parses `text`. Syntax faults go to `faults`; the readable rest is kept and checked.
     pub(super) fn parse(file: &str, text: &'t str, faults: &mut Faults) -> Self {
         let (root, errors) = DeTable::parse_recoverable(text);
-        let document = Self { file: file.to_owned(), broken: !errors.is_empty(), text, root: root.into_inner() };
+        let document =
+            Self { file: file.to_owned(), broken: !errors.is_empty(), source: text, root: root.into_inner() };
         for error in errors.iter().take(MAX_SYNTAX_FAULTS) {
             let line = error.span().map_or(0, |span| document.line(&span));
             faults.add(file, line, error.message().trim().replace('\n', ", "));
@@ -90,34 +90,50 @@ impl<'t> Document<'t> {
         &self.root
     }
 
+    /// The value at a dotted path.
+    pub(super) fn find(&self, path: &str) -> Option<&Spanned<DeValue<'t>>> {
+        let mut parts = path.split('.');
+        let mut value = self.root.get(parts.next()?)?;
+        for part in parts {
+            let DeValue::Table(table) = value.get_ref() else { return None };
+            value = table.get(part)?;
+        }
+        Some(value)
+    }
+
+    /// The text at a dotted path, also where another key of its table is faulty.
+    pub(super) fn text(&self, path: &str) -> Option<&str> {
+        self.find(path)?.get_ref().as_str()
+    }
+
     /// Line, from 1, on which `span` begins.
     pub(super) fn line(&self, span: &Range<usize>) -> usize {
-        let before = self.text.as_bytes().get(..span.start).unwrap_or(self.text.as_bytes());
+        let before = self.source.as_bytes().get(..span.start).unwrap_or(self.source.as_bytes());
         1 + before.iter().filter(|&&b| b == b'\n').count()
     }
 
-    /// What stands at `span`, cut to one short line.
+    /// The text at `span`, cut to one short line.
     pub(super) fn quote(&self, span: &Range<usize>) -> String {
-        let words: Vec<&str> = self.text.get(span.clone()).unwrap_or("").split_whitespace().collect();
+        let words: Vec<&str> = self.source.get(span.clone()).unwrap_or("").split_whitespace().collect();
         shorten(&words.join(" "))
     }
 
     /// Whether the table at `span` is written `{ ... }`.
     pub(super) fn is_inline(&self, span: &Range<usize>) -> bool {
-        self.text.get(span.clone()).is_some_and(|text| text.starts_with('{'))
+        self.source.get(span.clone()).is_some_and(|text| text.starts_with('{'))
     }
 
     /// The place of a table: its path for people, its line, and where its keys stand.
-    pub(super) fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> Place {
+    pub(super) fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> TablePlace {
         let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
             let key: &Spanned<std::borrow::Cow<'_, str>> = key;
             let found = match value.get_ref() {
                 DeValue::Table(_) if !self.is_inline(&value.span()) => "a table".to_owned(),
                 _ => self.quote(&value.span()),
             };
-            (key.get_ref().to_string(), Spot { line: self.line(&key.span()), found })
+            (key.get_ref().to_string(), KeyPlace { line: self.line(&key.span()), found })
         };
-        Place { file: self.file.clone(), path: path.to_owned(), line, spots: table.iter().map(spot).collect() }
+        TablePlace { file: self.file.clone(), path: path.to_owned(), line, spots: table.iter().map(spot).collect() }
     }
 }
 
@@ -129,48 +145,48 @@ pub(super) fn shorten(text: &str) -> String {
     }
 }
 
-/// Where one key stands and what it says.
+/// Place of a key and the text of its value.
 #[derive(Debug, Clone, PartialEq)]
-struct Spot {
+struct KeyPlace {
     line: usize,
     found: String,
 }
 
 /// Where a table stands, so that a later check can still name file, line, key and found.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Place {
+pub(crate) struct TablePlace {
     /// File as people named it.
     pub file: String,
     /// `input.current`, `alarm[2]`; empty for the top of the file.
     pub path: String,
     /// Line of the table's header.
     pub line: usize,
-    spots: BTreeMap<String, Spot>,
+    spots: BTreeMap<String, KeyPlace>,
 }
 
-impl Place {
+impl TablePlace {
     /// Full name of a key of this table.
-    pub fn key(&self, key: &str) -> String {
+    pub(crate) fn key(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
     /// Whether the key is written in the file.
-    pub fn has(&self, key: &str) -> bool {
+    pub(crate) fn has(&self, key: &str) -> bool {
         self.spots.contains_key(key)
     }
 
-    /// What is written at a key, cut to one short line.
-    pub fn found(&self, key: &str) -> Option<&str> {
+    /// The text of a key's value, cut to one short line.
+    pub(crate) fn found(&self, key: &str) -> Option<&str> {
         self.spots.get(key).map(|spot| spot.found.as_str())
     }
 
     /// Line of a key; of the table when the key is not written.
-    pub fn line_of(&self, key: &str) -> usize {
+    pub(crate) fn line_of(&self, key: &str) -> usize {
         self.spots.get(key).map_or(self.line, |spot| spot.line)
     }
 
     /// Notes `KEY = FOUND, WHAT`.
-    pub fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
+    pub(crate) fn fault(&self, faults: &mut Faults, key: &str, what: &str) {
         let name = self.key(key);
         let text = match self.spots.get(key) {
             Some(spot) => format!("{name} = {}, {what}", spot.found),
@@ -180,7 +196,7 @@ impl Place {
     }
 
     /// Notes `KEY: WHAT`, where the value as a whole is too long to quote.
-    pub fn note(&self, faults: &mut Faults, key: &str, what: &str) {
+    pub(crate) fn note(&self, faults: &mut Faults, key: &str, what: &str) {
         faults.add(&self.file, self.line_of(key), format!("{}: {what}", self.key(key)));
     }
 }

@@ -1,12 +1,12 @@
 //! `[j1939]` and the `spn` of each alarm to a node's settings: its NAME, and each alarm as a trouble code.
 //!
-//! Nothing the node sends may be taken for an input or for a frame of `[output]`, and no two rules may share a code.
+//! Nothing the node sends may be mistaken for an input or for a frame of `[output]`, and no two rules may share a code.
 
 use super::Config;
-use super::convert::Raw;
 use super::document::Faults;
 use super::keys::{Alarm, J1939};
-use super::resolve::Resolved;
+use super::resolve::ResolvedSignal;
+use super::tables::RawTables;
 use crate::alarm::{Direction, Rule, Severity};
 use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
 use crate::monitor::{AlarmCode, J1939Config, OutputConfig};
@@ -20,16 +20,16 @@ const TEST_FMI: u8 = 31;
 
 /// The node; `None` = there is none (not configured, silenced, or faults noted).
 pub(super) fn node(
-    raw: &Raw,
-    found: &[Resolved<'_>],
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
     output: Option<&OutputConfig>,
     faults: &mut Faults,
 ) -> Option<J1939Config> {
     let Some(keys) = &raw.j1939 else {
-        if !raw.broken && !raw.j1939_written {
+        if !raw.broken && !raw.is_written::<J1939>() {
             for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
                 let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
-                alarm.place.fault(faults, key, "must have a table [j1939], without it nothing is told on J1939");
+                alarm.place.fault(faults, key, "must have a table [j1939], without it nothing is sent on J1939");
             }
         }
         return None;
@@ -38,14 +38,13 @@ pub(super) fn node(
     let bus = bus(raw, keys, faults);
     let node = NodeConfig { name: name(keys, faults)?, address: address(keys, faults)? };
     check_ids(keys, &node, bus?, found, output, faults);
-    let is_silenced = raw.output_written && raw.output.as_ref().is_some_and(|output| !output.enabled);
     let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
     let test_code = test_code.map_err(|error| keys.place.fault(faults, "test_spn", &error.to_string())).ok()?;
-    Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !is_silenced)
+    Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
 }
 
 fn address(keys: &J1939, faults: &mut Faults) -> Option<u8> {
-    let address = u8::try_from(keys.address).ok().filter(|address| *address <= MAX_ADDRESS);
+    let address = Some(keys.address).filter(|address| *address <= MAX_ADDRESS);
     if address.is_none() {
         keys.place.fault(faults, "address", &format!("must be 0 to {MAX_ADDRESS}"));
     }
@@ -53,30 +52,27 @@ fn address(keys: &J1939, faults: &mut Faults) -> Option<u8> {
 }
 
 fn name(keys: &J1939, faults: &mut Faults) -> Option<Name> {
-    // The keys' ranges are those of the fields; what does not fit a byte would be refused by the NAME as well.
-    let small = |number: u16| u8::try_from(number).unwrap_or(u8::MAX);
     let fields = NameFields {
         arbitrary_address_capable: false,
-        industry_group: small(keys.industry_group),
-        vehicle_system_instance: small(keys.vehicle_system_instance),
-        vehicle_system: small(keys.vehicle_system),
-        function: small(keys.function),
-        function_instance: small(keys.function_instance),
-        ecu_instance: small(keys.ecu_instance),
+        industry_group: keys.industry_group,
+        vehicle_system_instance: keys.vehicle_system_instance,
+        vehicle_system: keys.vehicle_system,
+        function: keys.function,
+        function_instance: keys.function_instance,
+        ecu_instance: keys.ecu_instance,
         manufacturer_code: keys.manufacturer_code,
         identity_number: keys.identity_number,
     };
     Name::new(&fields).map_err(|error| keys.place.fault(faults, error.field, &error.to_string())).ok()
 }
 
-fn bus(raw: &Raw, keys: &J1939, faults: &mut Faults) -> Option<BusIndex> {
-    let names = || raw.interfaces.iter().map(|i| i.name.as_str()).collect::<Vec<_>>().join(" or ");
+fn bus(raw: &RawTables, keys: &J1939, faults: &mut Faults) -> Option<BusIndex> {
     let index = match &keys.interface {
         Some(name) => raw.interfaces.iter().position(|interface| interface.name == *name),
         None => (raw.interfaces.len() == 1).then_some(0),
     };
-    if index.is_none() && raw.interfaces_whole && !raw.interfaces.is_empty() {
-        keys.place.fault(faults, "interface", &format!("must be {}", names()));
+    if index.is_none() && raw.has_all_interfaces() && !raw.interfaces.is_empty() {
+        keys.place.fault(faults, "interface", &format!("must be {}", raw.interface_names()));
     }
     index.and_then(|index| u8::try_from(index).ok()).map(BusIndex)
 }
@@ -108,8 +104,7 @@ fn codes(alarms: &[Alarm], faults: &mut Faults) -> Option<Vec<AlarmCode>> {
 fn code(alarm: &Alarm, severity: Severity, faults: &mut Faults) -> Option<AlarmCode> {
     // The rule's number as in alarm frames.
     let spn = alarm.spn.unwrap_or(FIRST_MAKER_SPN + u32::from(alarm.rule as u8));
-    let configured = alarm.fmi.and_then(|fmi| u8::try_from(fmi).ok());
-    let fmi = configured.unwrap_or_else(|| failure_mode(alarm.rule, severity));
+    let fmi = alarm.fmi.unwrap_or_else(|| failure_mode(alarm.rule, severity));
     match TroubleCode::new(spn, fmi, 0) {
         Ok(code) => Some(AlarmCode { rule: alarm.rule, severity, code, lamp: lamp(severity) }),
         Err(error) => {
@@ -134,7 +129,7 @@ fn failure_mode(rule: Rule, severity: Severity) -> u8 {
         | Rule::SocLow
         | Rule::TemperatureHigh
         | Rule::CellImbalance
-        | Rule::RemainingLifeLow => match (rule.row().direction, severity) {
+        | Rule::RemainingLifeLow => match (rule.spec().direction, severity) {
             // Data valid, but beyond normal: least, moderately, most severe.
             (Direction::Below, Severity::Info) => 17,
             (Direction::Below, Severity::Warning) => 18,
@@ -160,7 +155,7 @@ fn check_ids(
     keys: &J1939,
     node: &NodeConfig,
     bus: BusIndex,
-    found: &[Resolved<'_>],
+    found: &[ResolvedSignal<'_>],
     output: Option<&OutputConfig>,
     faults: &mut Faults,
 ) {
@@ -176,13 +171,13 @@ fn check_ids(
     }
 }
 
-/// What the node is and tells, for people.
+/// Describes the node and its codes.
 pub(super) fn words(config: &Config) -> Vec<String> {
     let Some(j1939) = &config.monitor.j1939 else { return Vec::new() };
     let interface = config.interfaces.get(j1939.bus.index()).map_or("", |interface| interface.name.as_str());
     let [dm1, dm2, ..] = j1939.node.sent_ids();
     let node = format!(
-        "address {} ({0:02X}) on {interface}, NAME {}; DM1 {dm1} every second and on change, DM2 {dm2} when asked for",
+        "address {} ({0:02X}) on {interface}, NAME {}; DM1 {dm1} every second and on change, DM2 {dm2} on request",
         j1939.node.address, j1939.node.name
     );
     let alarms = j1939.alarms.iter().map(|AlarmCode { rule, severity, code, lamp }| {

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::schema::{Key, SectionInfo};
-use super::{cell_model, keys, reference};
+use super::{cell_model, reference, tables};
 
 /// The page, for `man`.
 pub fn manual() -> String {
@@ -19,7 +19,7 @@ pub fn manual() -> String {
          good, and what it means.",
     ));
     page.push_str(".SH CONFIGURATION\n");
-    sections(&mut page, keys::SECTIONS);
+    sections(&mut page, tables::SECTIONS);
     page.push_str(".SH CELL MODEL\n");
     page.push_str(&roff("A file of its own, named by `pack.cell_model`."));
     sections(&mut page, cell_model::SECTIONS);
@@ -80,7 +80,7 @@ mod tests {
     #[test]
     fn the_page_has_every_table_and_key() {
         let page = manual();
-        for info in keys::SECTIONS.iter().chain(cell_model::SECTIONS) {
+        for info in tables::SECTIONS.iter().chain(cell_model::SECTIONS) {
             assert!(page.contains(&format!(".SS {}", roff(&reference::heading(info)))), "{}", info.path);
             for key in info.keys.unwrap_or(&[]) {
                 assert!(page.contains(&format!(".TP\n\\&\\fB{}\\fR: ", key.name)), "{}.{}", info.path, key.name);

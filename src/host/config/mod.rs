@@ -1,11 +1,36 @@
 //! The TOML configuration: as written, then checked; every fault at once, with file, line, key, found and allowed.
 //!
-//! `keys` says what each key is, `schema` and `setting` read them, `cross` checks what concerns several keys,
-//! `convert` makes the settings the other modules take, `cell_model` does the same for cell files.
+//! In: the configuration file and the files it names (DBC files, cell model). Out: [`Config`], the settings of the other
+//! modules, which cannot be wrong; or [`ConfigFaults`], a line per fault.
+//!
+//! | file | content |
+//! | --- | --- |
+//! | `document` | TOML text, places of keys, list of faults |
+//! | `setting`, `threshold` | types a key may have |
+//! | `schema` | the mechanism: what a declared key gives |
+//! | `keys` | every key, declared once |
+//! | `tables` | every table of the file |
+//! | `resolve`, `pattern` | signals looked up in the DBC files |
+//! | `cross`, `alarm`, `output`, `commands`, `j1939`, `protect` | what concerns several keys |
+//! | `convert` | the settings of the core |
+//! | `cell_model` | cell model files, by the same mechanism |
+//! | `describe`, `reference`, `manual` | the configuration in words |
+//! | `partial` | as much of a faulty configuration as can be read |
+//!
+//! # How a key is added
+//! 1. In `keys`, a line in the table's `section!`: doc comment, name, type, unit, range, presence. In a table that `gives`
+//!    the parameters of an algorithm it fills the field of the same name; another field, or one that needs other values,
+//!    stands behind `=>` on the same line.
+//! 2. In the algorithm, that field.
+//! 3. `packwatch check --reference > config/REFERENCE.md`; a test compares the two.
+//!
+//! Reading, default, range check, fault texts, reference and manual page follow from the line. A check that concerns
+//! several keys goes into `cross`. A new table needs a line in `tables` too.
 
 use std::path::{Path, PathBuf};
 
 use crate::can::dbc::Database;
+use crate::cell::CellModel;
 use crate::monitor::MonitorConfig;
 
 mod alarm;
@@ -19,20 +44,26 @@ mod j1939;
 mod keys;
 mod manual;
 mod output;
+mod partial;
 mod pattern;
 mod protect;
 mod reference;
 mod resolve;
 mod schema;
 mod setting;
-mod survey;
+mod tables;
+mod threshold;
 
 pub use describe::{Description, InterfaceUse, OutputUse, SignalUse};
+pub(crate) use document::TablePlace;
 use document::{Document, Faults};
+pub(crate) use keys::SignalSource;
 pub use manual::manual;
+pub(crate) use partial::PartialConfig;
+pub(crate) use pattern::Pattern;
 pub use reference::reference;
-use resolve::Databases;
-pub use survey::{Survey, survey};
+pub(crate) use resolve::{Databases, ResolvedSignal, input_map};
+pub(crate) use tables::RawTables;
 
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
@@ -41,9 +72,9 @@ pub struct Config {
     pub path: PathBuf,
     /// CAN interfaces; a `BusIndex` counts in this order.
     pub interfaces: Vec<InterfaceConfig>,
-    /// What the core needs.
+    /// Settings of the core.
     pub monitor: MonitorConfig,
-    /// Layout of what is sent, for consumers; `None` = nothing is sent.
+    /// Layout of the sent frames, for receivers; `None` = nothing is sent.
     pub output_layout: Option<Database>,
     /// How state and history are kept.
     pub store: StoreConfig,
@@ -56,7 +87,7 @@ impl Config {
     }
 }
 
-/// Half-cycles kept where nobody says otherwise.
+/// Half-cycles kept where no configuration says otherwise.
 pub const DEFAULT_MAX_HALF_CYCLES: u32 = 200_000;
 
 /// How state and history are kept.
@@ -81,7 +112,7 @@ pub struct InterfaceConfig {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConfigFaults(pub Vec<String>);
 
-/// How a file's bytes are had: from the disk, or (demo, tests) from memory.
+/// Reads the bytes of a file: from the disk, or (demo, tests) from memory.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> std::io::Result<Vec<u8>>;
 
 /// Reads and checks a configuration with everything it names (DBC files, cell model; paths are relative to it).
@@ -92,7 +123,7 @@ pub fn load(path: &Path) -> Result<Config, ConfigFaults> {
     load_with(path, &read_file)
 }
 
-/// As [`load`], with the files had through `read`.
+/// As [`load`], with files read by `read`.
 ///
 /// # Errors
 /// Every fault found, not only the first.
@@ -100,7 +131,7 @@ pub fn load_with(path: &Path, read: ReadFile<'_>) -> Result<Config, ConfigFaults
     read_all(path, read).map(|(config, _)| config)
 }
 
-/// Reads and checks a configuration, and says what it means.
+/// Reads and checks a configuration and describes it.
 ///
 /// # Errors
 /// Every fault found, not only the first.
@@ -112,7 +143,7 @@ fn read_all(path: &Path, read: ReadFile<'_>) -> Result<(Config, Description), Co
     let mut faults = Faults::default();
     match read_config(path, read, &mut faults) {
         Some(good) if faults.is_empty() => Ok(good),
-        // A part that could not be made without anything said would be a fault of this program: never silent.
+        // A part that cannot be made and has no fault is an error of this program, which is reported too.
         None if faults.is_empty() => Err(ConfigFaults(vec![format!("{}: not usable", path.display())])),
         _ => Err(ConfigFaults(faults.into_lines())),
     }
@@ -121,8 +152,8 @@ fn read_all(path: &Path, read: ReadFile<'_>) -> Result<(Config, Description), Co
 fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(Config, Description)> {
     let text = read_text(path, read, faults)?;
     let document = Document::parse(&path.display().to_string(), &text, faults);
-    let raw = convert::Raw::read(&document, faults);
-    let model = raw.cell_model.as_ref().and_then(|named| cell_model::load_with(&beside(path, named), read, faults));
+    let raw = RawTables::read(&document, faults);
+    let model = read_model(path, &document, read, faults);
     cross::check(&raw, model.as_ref(), faults);
     let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
     let databases = Databases::load(path, names, read, faults);
@@ -138,12 +169,17 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);
     let interfaces = raw.interfaces.iter().map(|i| InterfaceConfig { name: i.name.clone(), fd: i.fd }).collect();
-    let traffic = convert::Traffic { input: resolve::input_map(&found)?, guards, output, commands, j1939 };
+    let traffic = convert::Traffic { input: input_map(&found)?, guards, output, commands, j1939 };
     let monitor = convert::monitor(&raw, model?, &ranges, traffic)?;
-    let store = convert::store(raw.store.as_ref()?);
+    let store = raw.store.as_ref()?.config();
     let config = Config { path: path.to_owned(), interfaces, monitor, output_layout, store };
     let description = describe::describe(&raw, &config, &found, outputs);
     Some((config, description))
+}
+
+/// The cell model that `pack.cell_model` names, also where another key of `[pack]` is faulty.
+fn read_model(path: &Path, document: &Document<'_>, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
+    cell_model::load_with(&beside(path, document.text("pack.cell_model")?), read, faults)
 }
 
 /// `named`, relative to the folder of `path`.

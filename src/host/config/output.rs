@@ -1,16 +1,16 @@
-//! What is sent: layout, identifiers, interfaces, periods, protection, and that nothing sent can be taken for an input.
+//! The sent frames: layout, identifiers, interfaces, periods, protection. No sent frame may be mistaken for an input.
 
 use std::path::Path;
 
-use super::convert::Raw;
 use super::describe::OutputUse;
 use super::document::Faults;
-use super::keys::{Commands, E2e, FrameKeys, Output};
-use super::resolve::{Resolved, read_dbc};
+use super::keys::{Commands, E2eKey, FrameKeys, Output};
+use super::resolve::{ResolvedSignal, read_dbc};
+use super::tables::RawTables;
 use super::{ReadFile, beside};
 use crate::can::CanId;
 use crate::can::dbc::{Database, FrameFormat};
-use crate::can::e2e::{Profile, Protection};
+use crate::can::e2e::Protection;
 use crate::can::encode::{E2eSetting, LayoutBase, LayoutMessage, LayoutSettings, MessageSettings, OutputPlan, layout};
 use crate::cell::CellModel;
 use crate::monitor::OutputConfig;
@@ -19,16 +19,16 @@ use crate::quantity::BusIndex;
 /// Names of the frames, in the order of the plan.
 const FRAMES: [&str; 3] = ["status", "health", "alarm"];
 
-/// What is sent and its layout; `None` = nothing (not configured, or faults noted).
+/// The sent frames and their layout; `None` = none (not configured, or faults noted).
 pub(super) fn output(
-    raw: &Raw,
+    raw: &RawTables,
     config: &Path,
     model: Option<&CellModel>,
-    found: &[Resolved<'_>],
+    found: &[ResolvedSignal<'_>],
     read: ReadFile<'_>,
     faults: &mut Faults,
 ) -> Option<(OutputConfig, Database)> {
-    let keys = raw.output.as_ref().filter(|keys| raw.output_written && keys.enabled)?;
+    let keys = raw.output.as_ref().filter(|keys| keys.enabled)?;
     let command = raw.commands.as_ref().filter(|commands| commands.enabled);
     let frames =
         [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
@@ -87,10 +87,8 @@ fn protection(keys: &FrameKeys<'_>, faults: &mut Faults) -> Option<E2eSetting> {
             return None;
         }
         None => return Some(E2eSetting::AsBase),
-        Some(E2e::Off) => return Some(E2eSetting::Off),
-        Some(E2e::P01A) => Profile::P01A,
-        Some(E2e::P01C) => Profile::P01C,
-        Some(E2e::P05) => Profile::P05,
+        Some(E2eKey(None)) => return Some(E2eSetting::Off),
+        Some(E2eKey(Some(profile))) => profile,
     };
     let Some(data_id) = keys.data_id else {
         let what = format!("must be given, 0 to {:#X}, with e2e = \"{}\"", profile.max_data_id(), profile.name());
@@ -120,12 +118,12 @@ fn database(
     None
 }
 
-/// No identifier twice, and none that an input has on the same interface.
+/// Notes an identifier that is used twice or that an input has on the same interface.
 fn check_ids(
     frames: &[FrameKeys<'_>; 3],
     plan: &OutputPlan,
     buses: &[BusIndex],
-    found: &[Resolved<'_>],
+    found: &[ResolvedSignal<'_>],
     faults: &mut Faults,
 ) {
     let ids = plan.ids();
@@ -141,7 +139,7 @@ fn check_ids(
     }
 }
 
-/// No data id twice: one frame must not pass for another.
+/// Notes a data id that is used twice: one frame could be accepted as another.
 fn check_data_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, faults: &mut Faults) {
     let data_ids = plan.protections().map(|protection| protection.map(|protection| protection.data_id));
     for (index, (data_id, frame)) in data_ids.iter().zip(frames).enumerate() {
@@ -154,9 +152,9 @@ fn check_data_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, faults: &mut F
     }
 }
 
-/// FD frames go only where FD is switched on.
+/// Notes an FD frame on an interface without FD.
 fn check_interfaces(
-    raw: &Raw,
+    raw: &RawTables,
     frames: &[FrameKeys<'_>; 3],
     plan: &OutputPlan,
     buses: &[BusIndex],
@@ -174,15 +172,15 @@ fn check_interfaces(
     }
 }
 
-/// The interfaces frames go out on.
-fn buses(raw: &Raw, keys: &Output) -> Vec<BusIndex> {
+/// The interfaces on which frames are sent.
+fn buses(raw: &RawTables, keys: &Output) -> Vec<BusIndex> {
     let wanted = |name: &str| keys.interfaces.as_ref().is_none_or(|names| names.iter().any(|n| n == name));
     let indexed = (0..).zip(&raw.interfaces).filter(|(_, interface)| wanted(&interface.name));
     indexed.map(|(index, _)| BusIndex(index)).collect()
 }
 
-/// What is sent, for people.
-pub(super) fn uses(raw: &Raw, output: Option<&OutputConfig>) -> Vec<OutputUse> {
+/// Describes the sent frames.
+pub(super) fn uses(raw: &RawTables, output: Option<&OutputConfig>) -> Vec<OutputUse> {
     let Some(output) = output else { return Vec::new() };
     let names = output.buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
     let names: Vec<String> = names.map(|interface| interface.name.clone()).collect();

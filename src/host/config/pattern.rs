@@ -2,7 +2,7 @@
 
 /// One piece of a pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]
-enum Piece {
+enum PatternPiece {
     Text(String),
     /// `{n}`: the cell's number, leading zeros allowed.
     Cell,
@@ -12,55 +12,55 @@ enum Piece {
 
 /// A parsed pattern.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Pattern(Vec<Piece>);
+pub(crate) struct Pattern(Vec<PatternPiece>);
 
 impl Pattern {
     /// Parses; `Err` says what must be otherwise.
-    pub(super) fn parse(text: &str) -> Result<Self, String> {
+    pub(crate) fn parse(text: &str) -> Result<Self, String> {
         let mut pieces = Vec::new();
         let mut rest = text;
         while let Some((before, after)) = rest.split_once('{') {
             let Some((name, tail)) = after.split_once('}') else {
                 return Err("must close { with }".to_owned());
             };
-            pieces.push(Piece::Text(before.to_owned()));
+            pieces.push(PatternPiece::Text(before.to_owned()));
             pieces.push(match name {
-                "n" => Piece::Cell,
-                "m" => Piece::Any,
+                "n" => PatternPiece::Cell,
+                "m" => PatternPiece::Any,
                 _ => return Err("must have {n} (cell's number) and {m} (any number) as its only braces".to_owned()),
             });
             rest = tail;
         }
-        pieces.push(Piece::Text(rest.to_owned()));
+        pieces.push(PatternPiece::Text(rest.to_owned()));
         Ok(Self(pieces))
     }
 
     /// Whether the cell's number is in it.
-    pub(super) fn has_cell(&self) -> bool {
-        self.0.contains(&Piece::Cell)
+    pub(crate) fn has_cell(&self) -> bool {
+        self.0.contains(&PatternPiece::Cell)
     }
 
     /// The cell's number when `name` fits; `Some(None)` when it fits and carries no number.
-    pub(super) fn fits(&self, name: &str) -> Option<Option<u32>> {
+    pub(crate) fn fits(&self, name: &str) -> Option<Option<u32>> {
         fits(&self.0, name, None)
     }
 }
 
-fn fits(pieces: &[Piece], name: &str, cell: Option<u32>) -> Option<Option<u32>> {
+fn fits(pieces: &[PatternPiece], name: &str, cell: Option<u32>) -> Option<Option<u32>> {
     let Some((piece, pieces)) = pieces.split_first() else {
         return name.is_empty().then_some(cell);
     };
-    if let Piece::Text(text) = piece {
+    if let PatternPiece::Text(text) = piece {
         return fits(pieces, name.strip_prefix(text.as_str())?, cell);
     }
     let digits = name.bytes().take_while(u8::is_ascii_digit).count();
     (1..=digits).rev().find_map(|end| {
         let (number, rest) = name.split_at(end);
         match (piece, number.parse::<u32>().ok()) {
-            (Piece::Cell, None) => None,
-            (Piece::Cell, number) if cell.is_some() && cell != number => None,
-            (Piece::Cell, number) => fits(pieces, rest, number),
-            (Piece::Any | Piece::Text(_), _) => fits(pieces, rest, cell),
+            (PatternPiece::Cell, None) => None,
+            (PatternPiece::Cell, number) if cell.is_some() && cell != number => None,
+            (PatternPiece::Cell, number) => fits(pieces, rest, number),
+            (PatternPiece::Any | PatternPiece::Text(_), _) => fits(pieces, rest, cell),
         }
     })
 }

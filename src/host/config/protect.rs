@@ -1,23 +1,29 @@
 //! End-to-end protection of inputs: `[[input.protected]]` to the guards of the core, and in words.
 
 use super::Config;
-use super::convert::Raw;
 use super::document::Faults;
 use super::keys::ProtectedInput;
-use super::resolve::{Resolved, bus_of};
+use super::resolve::ResolvedSignal;
 use super::schema::did_you_mean;
+use super::tables::RawTables;
 use crate::can::MAX_DATA;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
+use crate::quantity::BusIndex;
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub(super) fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faults: &mut Faults) -> Vec<GuardConfig> {
+pub(super) fn guards(
+    raw: &RawTables,
+    found: &[ResolvedSignal<'_>],
+    inputs_whole: bool,
+    faults: &mut Faults,
+) -> Vec<GuardConfig> {
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
         check_profile(keys, faults);
-        let Some(bus) = bus_of(raw, keys.interface.as_deref()) else { continue };
+        let Some(bus) = raw.bus_of(keys.interface.as_deref()) else { continue };
         let inputs = found.iter().filter(|input| input.bus == bus && input.message.name == keys.message);
         let inputs: Vec<_> = inputs.collect();
         let Some(first) = inputs.first() else {
@@ -45,30 +51,28 @@ pub(super) fn guards(raw: &Raw, found: &[Resolved<'_>], inputs_whole: bool, faul
     guards.into_iter().map(|(guard, _)| guard).collect()
 }
 
-fn guard(keys: &ProtectedInput, input: &Resolved<'_>, bus: crate::quantity::BusIndex) -> GuardConfig {
-    // The keys' ranges end at 255.
-    let byte = |key: u16| u8::try_from(key).unwrap_or(u8::MAX);
+fn guard(keys: &ProtectedInput, input: &ResolvedSignal<'_>, bus: BusIndex) -> GuardConfig {
     GuardConfig {
         bus,
         id: input.message.id,
         check: CheckConfig {
             protection: Protection { profile: keys.profile, data_id: keys.data_id },
-            max_delta_counter_init: byte(keys.max_delta_counter),
-            max_no_new_or_repeated_data: byte(keys.max_repeated),
-            sync_counter_init: byte(keys.sync_counter),
+            max_delta_counter_init: keys.max_delta_counter,
+            max_no_new_or_repeated_data: keys.max_repeated,
+            sync_counter_init: keys.sync_counter,
         },
         cycle_time_s: input.message.cycle_time_ms.map(|period_ms| f64::from(period_ms) / 1000.0),
     }
 }
 
-/// What the keys say among themselves.
+/// Notes keys that do not fit the profile.
 fn check_profile(keys: &ProtectedInput, faults: &mut Faults) {
     let profile = keys.profile;
     if keys.data_id > profile.max_data_id() {
         let what = format!("must be 0 to {:#X} with profile \"{}\"", profile.max_data_id(), profile.name());
         keys.place.fault(faults, "data_id", &what);
     }
-    if keys.max_delta_counter > u16::from(profile.max_counter()) {
+    if keys.max_delta_counter > profile.max_counter() {
         let what = format!("must be 0 to {} with profile \"{}\"", profile.max_counter(), profile.name());
         keys.place.fault(faults, "max_delta_counter", &what);
     }
@@ -81,7 +85,7 @@ fn not_an_input<'n>(keys: &ProtectedInput, there: impl Iterator<Item = &'n str>,
 }
 
 /// The header must fit into the message, and no input, nor what decides whether an input is there, may lie in it.
-fn check_layout(keys: &ProtectedInput, inputs: &[&Resolved<'_>], faults: &mut Faults) {
+fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &mut Faults) {
     let (profile, Some(first)) = (keys.profile, inputs.first()) else { return };
     let (shortest, longest) = (profile.header_bytes(), profile.max_bytes());
     let length = usize::from(first.message.len_bytes);
@@ -93,11 +97,11 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&Resolved<'_>], faults: &mut Fa
         );
         keys.place.fault(faults, "message", &what);
     }
-    let mut told: Vec<&str> = Vec::new();
+    let mut noted: Vec<&str> = Vec::new();
     for input in inputs {
         for signal in read_with(input.message, input.signal) {
-            if lies_in(signal, profile.header_mask()) && !told.contains(&signal.name.as_str()) {
-                told.push(&signal.name);
+            if lies_in(signal, profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
+                noted.push(&signal.name);
                 let what = format!(
                     "must not lie in {}, which profile \"{}\" writes: {}.{} does",
                     header_words(profile.header_mask()),
@@ -132,18 +136,19 @@ fn header_words(mask: [u8; 3]) -> &'static str {
     }
 }
 
-/// What is taken in, for people.
-pub(super) fn describe(config: &Config, found: &[Resolved<'_>]) -> Vec<String> {
+/// Describes how frames are checked before they are read.
+pub(super) fn describe(config: &Config, found: &[ResolvedSignal<'_>]) -> Vec<String> {
     let monitor = &config.monitor;
     let rate = monitor.flood.max_frames_per_s;
     let mut words = vec![format!("at most {rate} frames a second of one identifier, a tenth of them at once")];
     if monitor.guards.is_empty() {
         words.push(
-            "no end-to-end protection: a damaged, repeated or old frame cannot be told from a good one".to_owned(),
+            "no end-to-end protection: a damaged, repeated or old frame cannot be distinguished from a good one"
+                .to_owned(),
         );
     }
     if monitor.commands.is_none() {
-        words.push("commands of other ECUs are not taken".to_owned());
+        words.push("commands of other ECUs are not executed".to_owned());
     }
     for guard in &monitor.guards {
         let input = found.iter().find(|input| (input.bus, input.message.id) == (guard.bus, guard.id));

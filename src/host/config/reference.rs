@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::schema::{Key, Presence, SectionInfo};
-use super::{cell_model, keys};
+use super::{cell_model, tables};
 
 /// The page, as Markdown; `config/REFERENCE.md` is exactly this.
 pub fn reference() -> String {
@@ -13,7 +13,7 @@ pub fn reference() -> String {
          written in hex (`0x7FF`). Inside and in everything reported, positive current is discharge and SOC is a\n\
          fraction.\n\n# Configuration\n",
     );
-    sections(&mut page, keys::SECTIONS);
+    sections(&mut page, tables::SECTIONS);
     page.push_str("\n# Cell model\n\nA file of its own, named by `pack.cell_model`.\n");
     sections(&mut page, cell_model::SECTIONS);
     page
@@ -38,7 +38,7 @@ fn row(key: &Key) -> String {
     format!("| `{}` | {value} | {} | {without} | {} |\n", key.name, key.unit, key.about.trim())
 }
 
-/// What may be written.
+/// Allowed values.
 pub(super) fn value(key: &Key) -> String {
     match (key.choices.is_empty(), key.range()) {
         (false, choices) => choices.replace(" | ", ", "),
@@ -47,7 +47,7 @@ pub(super) fn value(key: &Key) -> String {
     }
 }
 
-/// What holds where it is not written.
+/// Effect of leaving it out.
 pub(super) fn without(key: &Key) -> String {
     match key.presence {
         Presence::Required => "required".to_owned(),

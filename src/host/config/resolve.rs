@@ -6,35 +6,36 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use super::convert::{Ranges, Raw, UNLIMITED};
+use super::convert::{DbcRanges, UNLIMITED};
 use super::document::Faults;
-use super::keys::{CellVoltageInput, Positive, SignalSource};
+use super::keys::{PositiveCurrent, SignalSource};
 use super::pattern::Pattern;
 use super::schema::did_you_mean;
+use super::tables::RawTables;
 use super::{ReadFile, beside};
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::signal::LayoutFault;
-use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+use crate::quantity::{BusIndex, CellIndex, Channel};
 
 /// Most cell numbers named in one fault.
 const MAX_NAMED_CELLS: usize = 8;
 
-/// Longest identity, bits: what a reading tells apart.
+/// Longest identity, bits: the whole numbers a reading represents exactly.
 const MAX_IDENTITY_BITS: u16 = 53;
 
 /// The DBC files of a configuration.
 #[derive(Debug)]
-pub(super) struct Databases {
+pub(crate) struct Databases {
     files: Vec<(String, Database)>,
 }
 
 /// A configured signal, found.
 #[derive(Debug, Clone)]
-pub(super) struct Resolved<'d> {
-    /// What it feeds.
+pub(crate) struct ResolvedSignal<'d> {
+    /// Input that it feeds.
     pub channel: Channel,
-    /// Interface it comes on.
+    /// Interface that carries it.
     pub bus: BusIndex,
     /// DBC it was found in.
     pub file: &'d str,
@@ -63,7 +64,7 @@ impl Databases {
     }
 
     /// Every signal with its file and message.
-    pub(super) fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
+    pub(crate) fn signals(&self) -> impl Iterator<Item = (&str, &Message, &Signal)> {
         let messages = self.files.iter().flat_map(|(file, db)| db.messages.iter().map(move |m| (file.as_str(), m)));
         messages.flat_map(|(file, message)| message.signals.iter().map(move |signal| (file, message, signal)))
     }
@@ -82,51 +83,41 @@ pub(super) fn read_dbc(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> 
 }
 
 /// Finds every configured signal.
-pub(super) fn resolve<'d>(raw: &Raw, databases: &'d Databases, faults: &mut Faults) -> Vec<Resolved<'d>> {
+pub(super) fn resolve<'d>(raw: &RawTables, databases: &'d Databases, faults: &mut Faults) -> Vec<ResolvedSignal<'d>> {
     let mut search = Search { raw, databases, faults, found: Vec::new() };
-    if let Some(current) = &raw.current {
-        let sign = match current.positive {
-            Positive::Charge => -1.0,
-            Positive::Discharge => 1.0,
-        };
-        search.one(Channel::Current, &current.source(), sign);
-    }
-    for (index, temperature) in (0..).zip(&raw.temperatures) {
-        search.one(Channel::Temperature(SensorIndex(index)), &temperature.source(), 1.0);
-    }
-    if let Some(voltage) = &raw.pack_voltage {
-        search.one(Channel::PackVoltage, &voltage.source(), 1.0);
-    }
-    if let Some(soc) = &raw.reported_soc {
-        search.one(Channel::ReportedSoc, &soc.source(), 1.0);
-    }
-    if let Some(soh) = &raw.reported_soh {
-        search.one(Channel::ReportedSoh, &soh.source(), 1.0);
-    }
-    if let Some(identity) = &raw.pack_identity {
-        search.one(Channel::PackIdentity, &identity.source(), 1.0);
-    }
-    if let (Some(voltage), Some(pack)) = (&raw.cell_voltage, &raw.pack) {
-        search.cells(voltage, pack.cells);
+    for (channel, source) in raw.sources() {
+        match channel {
+            Channel::CellVoltage(_) => search.cells(&source),
+            Channel::Current => search.one(channel, &source, current_sign(raw)),
+            _ => search.one(channel, &source, 1.0),
+        }
     }
     search.found
 }
 
+/// Factor from the bus's sign of the current to ours.
+fn current_sign(raw: &RawTables) -> f64 {
+    match raw.current.as_ref().map(|keys| keys.positive) {
+        Some(PositiveCurrent::Charge) => -1.0,
+        Some(PositiveCurrent::Discharge) | None => 1.0,
+    }
+}
+
 struct Search<'s, 'd> {
-    raw: &'s Raw,
+    raw: &'s RawTables,
     databases: &'d Databases,
     faults: &'s mut Faults,
-    found: Vec<Resolved<'d>>,
+    found: Vec<ResolvedSignal<'d>>,
 }
 
 /// Where a name was found.
-type Hit<'d> = (&'d str, &'d Message, &'d Signal);
+type SignalMatch<'d> = (&'d str, &'d Message, &'d Signal);
 
 impl<'d> Search<'_, 'd> {
     /// A signal with a name of its own.
     fn one(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64) {
         let name = source.signal;
-        let hits: Vec<Hit<'d>> = self.databases.signals().filter(|(_, m, s)| is_named(name, m, s)).collect();
+        let hits: Vec<SignalMatch<'d>> = self.databases.signals().filter(|(_, m, s)| is_named(name, m, s)).collect();
         match hits[..] {
             [] => self.not_found(source),
             [hit] => self.add(channel, source, sign, hit),
@@ -145,8 +136,10 @@ impl<'d> Search<'_, 'd> {
     }
 
     /// The signals of all cells, by their pattern.
-    fn cells(&mut self, keys: &CellVoltageInput, cells: u16) {
-        let source = keys.source();
+    fn cells(&mut self, source: &SignalSource<'_>) {
+        let raw = self.raw;
+        let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return };
+        let cells = pack.cells;
         let pattern = match Pattern::parse(source.signal) {
             Ok(pattern) => pattern,
             Err(what) => return source.place.fault(self.faults, "signal", &what),
@@ -154,20 +147,20 @@ impl<'d> Search<'_, 'd> {
         if !pattern.has_cell() && cells > 1 {
             return source.place.fault(self.faults, "signal", "must have {n} in place of the cell's number");
         }
-        let mut hits: BTreeMap<u32, Vec<Hit<'d>>> = BTreeMap::new();
+        let mut hits: BTreeMap<u32, Vec<SignalMatch<'d>>> = BTreeMap::new();
         for hit in self.databases.signals() {
             if let Some(number) = pattern.fits(&format!("{}.{}", hit.1.name, hit.2.name)) {
                 hits.entry(number.unwrap_or(u32::from(keys.first))).or_default().push(hit);
             }
         }
         if hits.is_empty() {
-            return self.not_found(&source);
+            return self.not_found(source);
         }
         let mut missing = Vec::new();
         for (index, number) in (0..cells).zip(u32::from(keys.first)..) {
             match hits.get(&number).map(Vec::as_slice) {
                 None | Some([]) => missing.push(number),
-                Some([hit]) => self.add(Channel::CellVoltage(CellIndex(index)), &source, 1.0, *hit),
+                Some([hit]) => self.add(Channel::CellVoltage(CellIndex(index)), source, 1.0, *hit),
                 Some([a, .., b]) => {
                     let what = format!(
                         "must give each cell one signal, {number} is {}.{} and {}.{}",
@@ -183,8 +176,14 @@ impl<'d> Search<'_, 'd> {
         }
     }
 
-    fn add(&mut self, channel: Channel, source: &SignalSource<'_>, sign: f64, (file, message, signal): Hit<'d>) {
-        let Some(bus) = bus_of(self.raw, source.interface) else {
+    fn add(
+        &mut self,
+        channel: Channel,
+        source: &SignalSource<'_>,
+        sign: f64,
+        (file, message, signal): SignalMatch<'d>,
+    ) {
+        let Some(bus) = self.raw.bus_of(source.interface) else {
             return; // an interface that is not there was noted by the cross checks
         };
         let full_name = format!("{}.{}", message.name, signal.name);
@@ -220,24 +219,15 @@ impl<'d> Search<'_, 'd> {
         let is_percent = signal.unit == "%" && matches!(channel, Channel::ReportedSoc | Channel::ReportedSoh);
         let usual_scale = if is_percent && !source.place.has("scale") { 0.01 } else { source.scale };
         let (scale, offset) = (sign * usual_scale, sign * source.offset);
-        self.found.push(Resolved { channel, bus, file, message, signal, scale, offset, not_available });
+        self.found.push(ResolvedSignal { channel, bus, file, message, signal, scale, offset, not_available });
     }
-}
-
-/// The interface a table names, the first when it names none; `None` = not there (noted by the cross checks).
-pub(super) fn bus_of(raw: &Raw, interface: Option<&str>) -> Option<BusIndex> {
-    let index = match interface {
-        Some(name) => raw.interfaces.iter().position(|interface| interface.name == name)?,
-        None => 0,
-    };
-    u8::try_from(index).ok().map(BusIndex)
 }
 
 fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
     full_name.strip_prefix(message.name.as_str()).and_then(|rest| rest.strip_prefix('.')) == Some(signal.name.as_str())
 }
 
-/// What a channel is, for people (cells and sensors from 1).
+/// Name of a channel, for people (cells and sensors from 1).
 pub(super) fn channel_words(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
@@ -258,9 +248,9 @@ fn list(numbers: &[u32]) -> String {
     words.join(", ")
 }
 
-impl Resolved<'_> {
+impl ResolvedSignal<'_> {
     /// The signal as the decoder takes it. Its range is left open: the sample stage judges plausibility.
-    pub(super) fn binding(&self) -> Result<Binding, LayoutFault> {
+    pub(crate) fn binding(&self) -> Result<Binding, LayoutFault> {
         let mut binding = Binding::new(self.bus, self.message, self.signal, self.channel)?;
         binding.scale = self.scale;
         binding.offset = self.offset;
@@ -280,15 +270,15 @@ impl Resolved<'_> {
 }
 
 /// The decoder's map; `None` when a layout cannot be read (noted when it was found).
-pub(super) fn input_map(found: &[Resolved<'_>]) -> Option<InputMap> {
-    let bindings: Result<Vec<_>, _> = found.iter().map(Resolved::binding).collect();
+pub(crate) fn input_map(found: &[ResolvedSignal<'_>]) -> Option<InputMap> {
+    let bindings: Result<Vec<_>, _> = found.iter().map(ResolvedSignal::binding).collect();
     bindings.ok().map(InputMap::new)
 }
 
 /// The widest range the DBC gives each kind of value; a total voltage counts per cell.
-pub(super) fn ranges(found: &[Resolved<'_>], series: u16) -> Ranges {
+pub(super) fn ranges(found: &[ResolvedSignal<'_>], series: u16) -> DbcRanges {
     let widest = |belongs: fn(Channel) -> bool, divisor: f64| {
-        let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(Resolved::range);
+        let ranges = found.iter().filter(|resolved| belongs(resolved.channel)).map(ResolvedSignal::range);
         let widest = ranges.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1))).unwrap_or(UNLIMITED);
         (widest.0 / divisor, widest.1 / divisor)
     };
@@ -297,7 +287,7 @@ pub(super) fn ranges(found: &[Resolved<'_>], series: u16) -> Ranges {
     } else {
         widest(|channel| matches!(channel, Channel::CellVoltage(_)), 1.0)
     };
-    Ranges {
+    DbcRanges {
         current_a: widest(|channel| channel == Channel::Current, 1.0),
         voltage_v,
         temperature_c: widest(|channel| matches!(channel, Channel::Temperature(_)), 1.0),

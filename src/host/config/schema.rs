@@ -1,31 +1,31 @@
-//! What a key is: meaning, unit, type, range and default in one line; reading, faults and the reference
-//! page all come from that line.
+//! The mechanism behind every declared key: a line of [`section!`] gives its type, reading, faults and reference text.
 //!
-//! A table of the file is declared with [`section!`]; [`Walk`] reads declared tables from a document and
-//! notes everything wrong: missing, unknown, of the wrong type, out of range.
+//! [`section!`] declares a table of a file and, where the table `gives` a parameter struct, makes that struct of the keys.
+//! [`tables!`] lists the tables of a file. [`SchemaReader`] reads declared tables from a document and notes every fault:
+//! missing, unknown, of the wrong type, out of range.
 
 use std::collections::BTreeSet;
 
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::document::{Document, Faults, Place};
-use super::setting::{Allowed, Setting, Wrong};
+use super::document::{Document, Faults, TablePlace};
+use super::setting::{Setting, ValueFault, ValueRange};
 
-/// What happens when a key is not written.
+/// Effect of a key that is not written.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Presence {
+pub(crate) enum Presence {
     /// It is a fault.
     Required,
-    /// The program goes without; the key's text says what then holds.
+    /// None is needed; the key's text says what holds without it.
     Optional,
-    /// This TOML text stands in.
+    /// This TOML text is read instead.
     Default(&'static str),
 }
 
 /// One key.
 #[derive(Debug)]
-pub struct Key {
+pub(crate) struct Key {
     /// As written.
     pub name: &'static str,
     /// What it means.
@@ -37,21 +37,21 @@ pub struct Key {
     /// Words it may be, when it is a choice.
     pub choices: &'static [&'static str],
     /// Its range.
-    pub allowed: Allowed,
-    /// What happens without it.
+    pub allowed: ValueRange,
+    /// Effect of leaving it out.
     pub presence: Presence,
 }
 
 impl Key {
     /// The range for people; empty when anything of the type goes.
-    pub fn range(&self) -> String {
+    pub(crate) fn range(&self) -> String {
         if self.choices.is_empty() { self.allowed.to_string() } else { self.choices.join(" or ") }
     }
 
-    /// What must be written, type included.
-    pub fn must_be(&self) -> String {
+    /// The allowed values with their type, as a fault says it.
+    pub(crate) fn must_be(&self) -> String {
         let range = self.range();
-        if self.allowed == Allowed::NotEmpty {
+        if self.allowed == ValueRange::NotEmpty {
             return format!("must be {} that is not empty", self.kind);
         }
         let unit = if self.unit.is_empty() { String::new() } else { format!(" ({})", self.unit) };
@@ -62,17 +62,17 @@ impl Key {
         }
     }
 
-    /// What must be written, for a value of the right type.
+    /// The allowed values, for a value of the right type.
     fn must_be_in_range(&self) -> String {
         match self.range() {
-            range if range.is_empty() || self.allowed == Allowed::NotEmpty => self.must_be(),
+            range if range.is_empty() || self.allowed == ValueRange::NotEmpty => self.must_be(),
             range => format!("must be {range}"),
         }
     }
 }
 
 /// A declared table of a file.
-pub trait Section: Sized {
+pub(crate) trait Section: Sized {
     /// Dotted path; empty for the top of the file.
     const PATH: &'static str;
     /// What the table is for.
@@ -83,57 +83,106 @@ pub trait Section: Sized {
     fn read(table: &mut TableReader<'_>) -> Option<Self>;
 }
 
-/// What the unknown-key check and the reference page know of a table.
+/// A declared table, for the check of unknown keys and for the reference page.
 #[derive(Debug)]
-pub struct SectionInfo {
+pub(crate) struct SectionInfo {
     /// Dotted path.
     pub path: &'static str,
     /// Whether it is written `[[path]]`, any number of times.
     pub many: bool,
     /// What the table is for.
     pub about: &'static str,
-    /// Its keys; `None` = anything goes (notes for people).
+    /// Its keys; `None` = any key (notes for people).
     pub keys: Option<&'static [Key]>,
 }
 
 impl SectionInfo {
     /// A table written once.
-    pub const fn one<S: Section>() -> Self {
+    pub(crate) const fn one<S: Section>() -> Self {
         Self { path: S::PATH, many: false, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
+    /// A table written once or not at all.
+    pub(crate) const fn optional<S: Section>() -> Self {
+        Self::one::<S>()
+    }
+
     /// A table written any number of times.
-    pub const fn many<S: Section>() -> Self {
+    pub(crate) const fn many<S: Section>() -> Self {
         Self { path: S::PATH, many: true, about: S::ABOUT, keys: Some(S::KEYS) }
     }
 
     /// A table for people, never read.
-    pub const fn notes(path: &'static str, about: &'static str) -> Self {
+    pub(crate) const fn notes(path: &'static str, about: &'static str) -> Self {
         Self { path, many: false, about, keys: None }
     }
 }
 
-/// Declares a table of a file: the struct, its keys and how it is read.
+/// Declares a table of a file: the struct, its keys, how it is read and, after `gives`, the parameters it stands for.
 ///
 /// ```text
 /// section! {
 ///     /// What the table is for.
-///     Pack at "pack" {
-///         /// What the key means.
-///         cells: u16, "", Allowed::Between(1.0, 1024.0), Required;
+///     Transition at "transition" gives TransitionConfig, |keys, pack_ah: f64| {
+///         /// A key that is the field of the same name.
+///         min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
+///         /// A key from which a field is computed; behind an arrow alone, no field is.
+///         dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional => dead_band_a: keys.dead_band_a.unwrap_or(pack_ah / 50.0);
+///     } and {
+///         a_field_without_a_key: 1.0,
 ///     }
 /// }
 /// ```
+///
+/// The parameters are then those of `config(&self, pack_ah: f64) -> TransitionConfig`.
 macro_rules! section {
+    // Collects the fields of the parameters, one key at a time.
+    (@fields $target:ident $keys:ident [$($done:tt)*]) => { $target { $($done)* } };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)* $key: $keys.$key,] $($rest)*)
+    };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident []; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)*] $($rest)*)
+    };
+    (@fields $target:ident $keys:ident [$($done:tt)*] $key:ident [$field:ident: $value:expr]; $($rest:tt)*) => {
+        $crate::config::schema::section!(@fields $target $keys [$($done)* $field: $value,] $($rest)*)
+    };
+    (
+        $(#[doc = $about:literal])+
+        $name:ident at $path:literal gives $target:ident, |$keys:ident $(, $argument:ident: $argument_type:ty)*| {
+            $(
+                $(#[doc = $doc:literal])+
+                $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr
+                $(=> $($field:ident: $value:expr)?)?;
+            )*
+        } $(and { $($more:ident: $more_value:expr),* $(,)? })?
+    ) => {
+        $crate::config::schema::section! {
+            $(#[doc = $about])+
+            $name at $path {
+                $( $(#[doc = $doc])+ $key: $type, $unit, $allowed, $presence; )*
+            }
+        }
+
+        impl $name {
+            /// The parameters these keys stand for.
+            pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target {
+                let $keys = self;
+                $crate::config::schema::section!(
+                    @fields $target $keys [] $( $key $([ $($field: $value)? ])?; )* $($( $more [$more: $more_value]; )*)?
+                )
+            }
+        }
+    };
     ($(#[doc = $about:literal])+ $name:ident at $path:literal {
         $( $(#[doc = $doc:literal])+ $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr; )*
     }) => {
         $(#[doc = $about])+
         #[derive(Debug, Clone)]
         #[allow(dead_code, reason = "some keys are for people only, and not every table is checked again at its place")]
-        pub struct $name {
-            /// Where it stands in the file.
-            pub place: $crate::config::document::Place,
+        pub(crate) struct $name {
+            /// Place in the file.
+            pub place: $crate::config::document::TablePlace,
             $( $(#[doc = $doc])+ pub $key: $type, )*
         }
 
@@ -162,19 +211,83 @@ macro_rules! section {
 }
 pub(crate) use section;
 
+/// The field of [`tables!`] for a table: a list where it may be written many times.
+macro_rules! table_field {
+    (many $section:ty) => { Vec<$section> };
+    ($kind:ident $section:ty) => { Option<$section> };
+}
+pub(crate) use table_field;
+
+/// Lists the tables of a file, in the order of the reference page: the struct of all of them and how it is read.
+///
+/// Each is `one` (always read: without it in the file its defaults hold, and its required keys are missing), `optional`
+/// (read where it is written) or `many` (`[[path]]`, any number of times).
+macro_rules! tables {
+    ($(#[$about:meta])* $name:ident, $sections:ident { $($field:ident: $kind:ident $section:ident),+ $(,)? }) => {
+        $(#[$about])*
+        #[derive(Debug)]
+        pub(crate) struct $name {
+            /// The file, as people named it.
+            pub file: String,
+            /// Whether the file's syntax or a table is broken, so that a table not found may still be there.
+            pub broken: bool,
+            /// How often each table is written, faulty or not.
+            written: std::collections::BTreeMap<&'static str, usize>,
+            $( pub $field: $crate::config::schema::table_field!($kind $section), )+
+        }
+
+        impl $name {
+            /// Reads every table; faults of single keys and unknown keys are noted.
+            pub(super) fn read(
+                document: &$crate::config::document::Document<'_>,
+                faults: &mut $crate::config::document::Faults,
+            ) -> Self {
+                use $crate::config::schema::Section as _;
+                let mut reader = $crate::config::schema::SchemaReader::new(document, $sections, faults);
+                Self {
+                    file: document.file.clone(),
+                    broken: reader.broken,
+                    written: [$( ($section::PATH, reader.count($section::PATH)) ),+].into_iter().collect(),
+                    $( $field: reader.$kind(), )+
+                }
+            }
+
+            /// Whether a table is written, faulty or not.
+            pub(crate) fn is_written<S: $crate::config::schema::Section>(&self) -> bool {
+                self.count::<S>() > 0
+            }
+
+            /// How often a table is written, faulty or not.
+            pub(crate) fn count<S: $crate::config::schema::Section>(&self) -> usize {
+                self.written.get(S::PATH).copied().unwrap_or_default()
+            }
+
+            /// Where each table stands.
+            pub(crate) fn places(&self) -> impl Iterator<Item = &$crate::config::document::TablePlace> {
+                std::iter::empty() $( .chain(self.$field.iter().map(|keys| &keys.place)) )+
+            }
+        }
+
+        /// Every table, in the order of the reference page.
+        pub(crate) const $sections: &[$crate::config::schema::SectionInfo] =
+            &[$( $crate::config::schema::SectionInfo::$kind::<$section>() ),+];
+    };
+}
+pub(crate) use tables;
+
 /// Reads the keys of one table.
-pub struct TableReader<'a> {
+pub(crate) struct TableReader<'a> {
     document: &'a Document<'a>,
     broken: bool,
     table: Option<&'a DeTable<'a>>,
-    /// Where the table stands.
-    pub place: Place,
+    /// Place in the file.
+    pub place: TablePlace,
     faults: &'a mut Faults,
 }
 
 impl TableReader<'_> {
     /// The value of `key`, its default, or `None` with a fault noted.
-    pub fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
+    pub(crate) fn setting<T: Setting>(&mut self, key: &Key) -> Option<T> {
         let Some(value) = self.table.and_then(|table| table.get(key.name)) else {
             return self.absent(key);
         };
@@ -182,10 +295,10 @@ impl TableReader<'_> {
             Ok(setting) => Some(setting),
             Err(wrong) => {
                 let what = match &wrong {
-                    Wrong::Type(_) => key.must_be(),
-                    Wrong::Range(_) => key.must_be_in_range(),
+                    ValueFault::Type(_) => key.must_be(),
+                    ValueFault::Range(_) => key.must_be_in_range(),
                 };
-                let (Wrong::Type(span) | Wrong::Range(span)) = wrong;
+                let (ValueFault::Type(span) | ValueFault::Range(span)) = wrong;
                 let found = match value.get_ref() {
                     DeValue::Table(_) if !self.document.is_inline(&value.span()) => "a table".to_owned(),
                     _ => self.document.quote(&span),
@@ -215,15 +328,15 @@ impl TableReader<'_> {
 }
 
 /// Reads the declared tables of one document.
-pub(super) struct Walk<'a> {
+pub(crate) struct SchemaReader<'a> {
     document: &'a Document<'a>,
-    /// Whether syntax or tables are broken somewhere, so that what is not found may still be there: then nothing
-    /// is called missing.
+    /// Whether syntax or tables are broken somewhere, so that a missing key may still be there: then none is reported as
+    /// missing.
     pub broken: bool,
     faults: &'a mut Faults,
 }
 
-impl<'a> Walk<'a> {
+impl<'a> SchemaReader<'a> {
     /// A walk that has checked the document for unknown keys.
     pub(super) fn new(document: &'a Document<'a>, known: &[SectionInfo], faults: &'a mut Faults) -> Self {
         let mut walk = Self { document, broken: document.broken, faults };
@@ -237,7 +350,7 @@ impl<'a> Walk<'a> {
             let root = self.document.root();
             return self.read(S::PATH, 1, Some(root));
         }
-        match self.find(S::PATH) {
+        match self.document.find(S::PATH) {
             None => self.read(S::PATH, self.line_above(S::PATH), None),
             Some(value) => match value.get_ref() {
                 DeValue::Table(table) => self.read(S::PATH, self.document.line(&value.span()), Some(table)),
@@ -248,12 +361,12 @@ impl<'a> Walk<'a> {
 
     /// A table that may be left out.
     pub(super) fn optional<S: Section>(&mut self) -> Option<S> {
-        if self.has::<S>() { self.one() } else { None }
+        self.document.find(S::PATH).and_then(|_| self.one())
     }
 
     /// A table that may be written any number of times; faulty ones are left out (and noted).
     pub(super) fn many<S: Section>(&mut self) -> Vec<S> {
-        let Some(DeValue::Array(items)) = self.find(S::PATH).map(Spanned::get_ref) else {
+        let Some(DeValue::Array(items)) = self.document.find(S::PATH).map(Spanned::get_ref) else {
             return Vec::new();
         };
         let mut sections = Vec::new();
@@ -266,39 +379,19 @@ impl<'a> Walk<'a> {
         sections
     }
 
-    /// Whether the table is in the file.
-    pub(super) fn has<S: Section>(&self) -> bool {
-        self.find(S::PATH).is_some()
-    }
-
-    /// How many tables `[[path]]` are written; `None` when something else stands there.
-    pub(super) fn count(&self, path: &str) -> Option<usize> {
-        match self.find(path).map(Spanned::get_ref) {
-            None => Some(0),
-            Some(DeValue::Array(items)) => Some(items.len()),
-            Some(_) => None,
+    /// How often the table at `path` is written; what is no list of tables counts once.
+    pub(super) fn count(&self, path: &str) -> usize {
+        match self.document.find(path).map(Spanned::get_ref) {
+            None => 0,
+            Some(DeValue::Array(items)) => items.len(),
+            Some(_) => 1,
         }
-    }
-
-    /// The text at a full path, whatever else its table says.
-    pub(super) fn text(&self, path: &str) -> Option<String> {
-        self.find(path)?.get_ref().as_str().map(str::to_owned)
     }
 
     /// Line of the table that the table at `path`, which is not written, would be in.
     fn line_above(&self, path: &str) -> usize {
-        let above = path.rsplit_once('.').and_then(|(above, _)| self.find(above));
+        let above = path.rsplit_once('.').and_then(|(above, _)| self.document.find(above));
         above.map_or(1, |value| self.document.line(&value.span()))
-    }
-
-    fn find(&self, path: &str) -> Option<&'a Spanned<DeValue<'a>>> {
-        let mut parts = path.split('.');
-        let mut value = self.document.root().get(parts.next()?)?;
-        for part in parts {
-            let DeValue::Table(table) = value.get_ref() else { return None };
-            value = table.get(part)?;
-        }
-        Some(value)
     }
 
     fn read<S: Section>(&mut self, path: &str, line: usize, table: Option<&'a DeTable<'a>>) -> Option<S> {

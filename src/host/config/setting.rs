@@ -8,7 +8,7 @@ use toml::de::{DeInteger, DeValue};
 
 /// The range of a key's value; of each element when the value is a list.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Allowed {
+pub(crate) enum ValueRange {
     /// Anything of the type (numbers must still be finite).
     Any,
     /// A number from the first to the second, both included.
@@ -19,7 +19,7 @@ pub enum Allowed {
     NotEmpty,
 }
 
-impl Allowed {
+impl ValueRange {
     fn has(&self, number: f64) -> bool {
         number.is_finite()
             && match *self {
@@ -30,7 +30,7 @@ impl Allowed {
     }
 }
 
-impl fmt::Display for Allowed {
+impl fmt::Display for ValueRange {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::Any => Ok(()),
@@ -46,7 +46,7 @@ impl fmt::Display for Allowed {
 
 /// Why a value is refused, and where exactly.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Wrong {
+pub(crate) enum ValueFault {
     /// Not the key's type.
     Type(Range<usize>),
     /// The type, but not in the range.
@@ -54,14 +54,14 @@ pub enum Wrong {
 }
 
 /// A type a key may have.
-pub trait Setting: Sized {
+pub(crate) trait Setting: Sized {
     /// The type in words.
     const KIND: &'static str;
     /// The words it may be, when it is a choice.
     const CHOICES: &'static [&'static str] = &[];
     /// Reads and checks a value.
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong>;
-    /// What stands for a key that is not written and has no default.
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault>;
+    /// Value of a key that is not written and has no default.
     fn absent() -> Option<Self> {
         None
     }
@@ -71,7 +71,7 @@ impl<T: Setting> Setting for Option<T> {
     const KIND: &'static str = T::KIND;
     const CHOICES: &'static [&'static str] = T::CHOICES;
 
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
         T::read(value, allowed).map(Some)
     }
 
@@ -83,10 +83,10 @@ impl<T: Setting> Setting for Option<T> {
 impl Setting for bool {
     const KIND: &'static str = "true or false";
 
-    fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
+    fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         match value.get_ref() {
             DeValue::Boolean(value) => Ok(*value),
-            _ => Err(Wrong::Type(value.span())),
+            _ => Err(ValueFault::Type(value.span())),
         }
     }
 }
@@ -94,13 +94,13 @@ impl Setting for bool {
 impl Setting for f64 {
     const KIND: &'static str = "a number";
 
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
         let number = match value.get_ref() {
-            DeValue::Float(float) => float.as_str().parse::<f64>().map_err(|_| Wrong::Type(value.span()))?,
-            DeValue::Integer(integer) => whole(integer).ok_or_else(|| Wrong::Range(value.span()))? as f64,
-            _ => return Err(Wrong::Type(value.span())),
+            DeValue::Float(float) => float.as_str().parse::<f64>().map_err(|_| ValueFault::Type(value.span()))?,
+            DeValue::Integer(integer) => whole(integer).ok_or_else(|| ValueFault::Range(value.span()))? as f64,
+            _ => return Err(ValueFault::Type(value.span())),
         };
-        if allowed.has(number) { Ok(number) } else { Err(Wrong::Range(value.span())) }
+        if allowed.has(number) { Ok(number) } else { Err(ValueFault::Range(value.span())) }
     }
 }
 
@@ -109,12 +109,12 @@ fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }
 
-fn read_whole<T: TryFrom<i128>>(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<T, Wrong> {
+fn read_whole<T: TryFrom<i128>>(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<T, ValueFault> {
     let DeValue::Integer(integer) = value.get_ref() else {
-        return Err(Wrong::Type(value.span()));
+        return Err(ValueFault::Type(value.span()));
     };
     let number = whole(integer).filter(|&number| allowed.has(number as f64));
-    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| Wrong::Range(value.span()))
+    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| ValueFault::Range(value.span()))
 }
 
 macro_rules! whole_numbers {
@@ -122,24 +122,24 @@ macro_rules! whole_numbers {
         impl Setting for $type {
             const KIND: &'static str = "a whole number";
 
-            fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+            fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
                 read_whole(value, allowed)
             }
         }
     )+};
 }
-whole_numbers!(u16, u32, u64);
+whole_numbers!(u8, u16, u32, u64);
 
 impl Setting for String {
     const KIND: &'static str = "a text";
 
-    fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
         match value.get_ref() {
-            DeValue::String(text) if *allowed == Allowed::NotEmpty && text.trim().is_empty() => {
-                Err(Wrong::Range(value.span()))
+            DeValue::String(text) if *allowed == ValueRange::NotEmpty && text.trim().is_empty() => {
+                Err(ValueFault::Range(value.span()))
             }
             DeValue::String(text) => Ok(text.to_string()),
-            _ => Err(Wrong::Type(value.span())),
+            _ => Err(ValueFault::Type(value.span())),
         }
     }
 }
@@ -149,13 +149,13 @@ macro_rules! lists {
         impl Setting for Vec<$type> {
             const KIND: &'static str = $kind;
 
-            fn read(value: &Spanned<DeValue<'_>>, allowed: &Allowed) -> Result<Self, Wrong> {
+            fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
                 match value.get_ref() {
-                    DeValue::Array(items) if *allowed == Allowed::NotEmpty && items.is_empty() => {
-                        Err(Wrong::Range(value.span()))
+                    DeValue::Array(items) if *allowed == ValueRange::NotEmpty && items.is_empty() => {
+                        Err(ValueFault::Range(value.span()))
                     }
                     DeValue::Array(items) => items.iter().map(|item| <$type>::read(item, allowed)).collect(),
-                    _ => Err(Wrong::Type(value.span())),
+                    _ => Err(ValueFault::Type(value.span())),
                 }
             }
         }
@@ -170,7 +170,7 @@ lists! {
 
 /// Cell numbers as people write them: `"1-12, 15"`, counted from 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct CellRanges(pub Vec<RangeInclusive<u16>>);
+pub(crate) struct CellRanges(pub Vec<RangeInclusive<u16>>);
 
 impl CellRanges {
     fn parse(text: &str) -> Option<Self> {
@@ -186,10 +186,10 @@ impl CellRanges {
 impl Setting for CellRanges {
     const KIND: &'static str = "cell numbers from 1, like \"1-12, 15\"";
 
-    fn read(value: &Spanned<DeValue<'_>>, _: &Allowed) -> Result<Self, Wrong> {
+    fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
         match value.get_ref() {
-            DeValue::String(text) => Self::parse(text).ok_or_else(|| Wrong::Type(value.span())),
-            _ => Err(Wrong::Type(value.span())),
+            DeValue::String(text) => Self::parse(text).ok_or_else(|| ValueFault::Type(value.span())),
+            _ => Err(ValueFault::Type(value.span())),
         }
     }
 }
@@ -203,14 +203,14 @@ macro_rules! choice {
 
             fn read(
                 value: &toml::Spanned<toml::de::DeValue<'_>>,
-                _: &$crate::config::setting::Allowed,
-            ) -> Result<Self, $crate::config::setting::Wrong> {
+                _: &$crate::config::setting::ValueRange,
+            ) -> Result<Self, $crate::config::setting::ValueFault> {
                 match value.get_ref() {
                     toml::de::DeValue::String(text) => match text.as_ref() {
                         $($word => Ok($value),)+
-                        _ => Err($crate::config::setting::Wrong::Range(value.span())),
+                        _ => Err($crate::config::setting::ValueFault::Range(value.span())),
                     },
-                    _ => Err($crate::config::setting::Wrong::Type(value.span())),
+                    _ => Err($crate::config::setting::ValueFault::Type(value.span())),
                 }
             }
         }

@@ -160,7 +160,7 @@ fn readings_have_our_sign_scale_and_cells() {
     let second_page = decoded(&config, 0x110, &[1, 0xE8, 0x03, 0xD0, 0x07, 0, 0, 0]);
     let (cell_3, cell_4) = (Channel::CellVoltage(CellIndex(2)), Channel::CellVoltage(CellIndex(3)));
     assert_eq!(second_page, [(cell_3, Ok(1.0)), (cell_4, Ok(2.0))]);
-    assert!(decoded(&config, 0x120, &[0; 8]).is_empty(), "a message nobody configured");
+    assert!(decoded(&config, 0x120, &[0; 8]).is_empty(), "a message that is not configured");
 }
 
 #[test]
@@ -494,7 +494,7 @@ fn text_that_is_not_utf_8_is_refused_with_its_line() {
 #[test]
 fn every_default_is_a_value_its_key_allows() {
     use super::schema::Presence;
-    for info in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS) {
+    for info in tables::SECTIONS.iter().chain(super::cell_model::SECTIONS) {
         for key in info.keys.unwrap_or(&[]) {
             assert!(!key.about.trim().is_empty() && key.about.trim().ends_with('.'), "{}.{}", info.path, key.name);
             if key.presence == Presence::Optional {
@@ -518,8 +518,8 @@ fn every_default_is_a_value_its_key_allows() {
 fn the_reference_page_is_the_one_in_the_repository() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/REFERENCE.md");
     let page = std::fs::read_to_string(path).unwrap();
-    assert!(page == reference(), "write it anew: packwatch check --reference > config/REFERENCE.md");
-    for key in keys::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
+    assert!(page == reference(), "regenerate it: packwatch check --reference > config/REFERENCE.md");
+    for key in tables::SECTIONS.iter().chain(super::cell_model::SECTIONS).filter_map(|info| info.keys).flatten() {
         assert!(page.contains(&format!("| `{}` |", key.name)), "{}", key.name);
     }
 }

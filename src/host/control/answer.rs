@@ -2,7 +2,7 @@
 
 use super::MAX_LISTED;
 use super::protocol::{AlarmList, Answer, Done, UnknownAlarms};
-use crate::alarm::{Alarm, AlarmEngine, Selector, State};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Selector};
 use crate::monitor::{Command, Event, EventKind, Source};
 use crate::quantity::Timestamp;
 
@@ -22,8 +22,13 @@ pub fn alarm_list(engine: &AlarmEngine, time: Timestamp, all: bool) -> AlarmList
 
 fn needs_eyes(alarm: &Alarm) -> bool {
     match alarm.state {
-        State::Inactive | State::Unknown => alarm.occurrences > 0 && !alarm.is_acknowledged,
-        State::Pending | State::Active | State::Clearing | State::Suppressed | State::Latched | State::Cleared => true,
+        AlarmState::Inactive | AlarmState::Unknown => alarm.occurrences > 0 && !alarm.is_acknowledged,
+        AlarmState::Pending
+        | AlarmState::Active
+        | AlarmState::Clearing
+        | AlarmState::Suppressed
+        | AlarmState::Latched
+        | AlarmState::Cleared => true,
     }
 }
 
@@ -86,9 +91,9 @@ pub fn outcome(engine: &AlarmEngine, command: &Command, events: &[Event], time: 
 /// Why an alarm was not cleared, for people.
 pub fn refusal(alarm: &Alarm) -> &'static str {
     match alarm.state {
-        State::Suppressed => "its value is not known",
-        State::Clearing => "healthy again, but not yet for long enough",
-        State::Active if alarm.value.is_none() => "its value is not known",
+        AlarmState::Suppressed => "its value is not known",
+        AlarmState::Clearing => "healthy again, but not yet for long enough",
+        AlarmState::Active if alarm.value.is_none() => "its value is not known",
         _ => "still beyond its threshold",
     }
 }
@@ -96,7 +101,7 @@ pub fn refusal(alarm: &Alarm) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, Rule, RuleConfig, Severity, When};
+    use crate::alarm::{Comparison, Observation, Rule, RuleConfig, Severity};
     use crate::quantity::CellIndex;
 
     fn engine(cells: u16) -> AlarmEngine {
@@ -105,7 +110,7 @@ mod tests {
             severity: Severity::Warning,
             threshold,
             clear,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,

@@ -12,7 +12,7 @@ use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
 use super::{ControlSetting, MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
-use crate::io::unix_socket::{BindError, Bound, SocketFile, bind};
+use crate::io::unix_socket::{BindError, BoundSocket, SocketFile, bind};
 
 /// Pause after a connection could not be taken (no descriptor left): trying at once would find the same.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -60,7 +60,7 @@ impl ControlServer {
         }
     }
 
-    fn serve(bound: Bound, requests: mpsc::Sender<Asked>, max_silence: Duration) -> std::io::Result<Self> {
+    fn serve(bound: BoundSocket, requests: mpsc::Sender<Asked>, max_silence: Duration) -> std::io::Result<Self> {
         // The kernel's own word for who we are, in the same terms as for a peer.
         let own_uid = UnixStream::pair()?.0.peer_cred()?.uid();
         tracing::info!(path = %bound.file.path.display(), "control socket open");

@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep};
 
 use super::client::ControlClient;
 use super::protocol::{Done, Request};
-use crate::alarm::{Rule, State};
+use crate::alarm::{AlarmState, Rule};
 use crate::can::dbc::Message;
 use crate::can::e2e::{CheckConfig, Receiver, Status, StatusCounts};
 use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
@@ -199,7 +199,7 @@ impl Seen {
             Some((rule, _, true)) if rule != wanted as u8 => self.foreign += 1,
             Some((_, state, true)) => {
                 self.note_test(time);
-                self.ended = state == State::Inactive.wire_code();
+                self.ended = state == AlarmState::Inactive.wire_code();
             }
         }
     }

@@ -1,7 +1,7 @@
-//! A file written by a thread of its own, so that a slow disk never holds up the loop.
+//! A file written by its own thread, so that a slow disk never delays the loop.
 //!
-//! Bytes are collected and handed over in pieces. When the disk is so far behind that the pieces in waiting reach
-//! their limit, or a write failed, every further write is an error: the caller gives the file up and goes on.
+//! Bytes are collected and sent to the thread in pieces. When the waiting pieces reach their limit because the disk is too
+//! slow, or a write failed, every further write is an error: the caller abandons the file and continues.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -10,17 +10,17 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Bytes collected before they are handed over, unless flushed.
+/// Bytes collected before they are sent to the thread, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
 /// Pieces waiting at most: 4 MB, ten seconds of a full 1 Mbit/s bus.
 const MAX_PIECES: usize = 64;
 
 /// Longest wait for the last bytes at the end: half of what systemd waits before it kills.
 pub const MAX_FINISH: Duration = Duration::from_secs(5);
-/// How often the end is looked for.
+/// Period of looking whether the thread has ended.
 const FINISH_POLL: Duration = Duration::from_millis(5);
 
-/// See the module.
+/// A file and the thread that writes it.
 #[derive(Debug)]
 pub struct BackgroundFile {
     piece: Vec<u8>,
@@ -42,22 +42,22 @@ impl BackgroundFile {
         Ok(Self { piece: Vec::with_capacity(PIECE_BYTES), pieces: Some(pieces), writer: Some(writer) })
     }
 
-    /// Writes what is left, makes it last on the disk, and waits for that.
+    /// Writes the rest, synchronises the file with the disk, and waits for that.
     ///
     /// # Errors
     /// The first error of any write.
     pub fn finish(mut self) -> io::Result<()> {
-        let handed_over = self.hand_over();
+        let sent = self.send_piece();
         self.join()?;
-        handed_over
+        sent
     }
 
-    fn hand_over(&mut self) -> io::Result<()> {
+    fn send_piece(&mut self) -> io::Result<()> {
         if self.piece.is_empty() {
             return Ok(());
         }
         let piece = std::mem::replace(&mut self.piece, Vec::with_capacity(PIECE_BYTES));
-        let Some(pieces) = &self.pieces else { return Err(io::Error::other("file given up")) };
+        let Some(pieces) = &self.pieces else { return Err(io::Error::other("file abandoned")) };
         match pieces.try_send(piece) {
             Ok(()) => Ok(()),
             Err(TrySendError::Full(_)) => {
@@ -74,18 +74,18 @@ impl BackgroundFile {
         self.pieces = None;
         let Some(writer) = self.writer.take() else { return Ok(()) };
         if !ends_in_time(&writer) {
-            let why = "the disk does not answer, the file is not complete";
+            let why = "the disk does not respond, the file is incomplete";
             return Err(io::Error::new(io::ErrorKind::TimedOut, why));
         }
         writer.join().unwrap_or_else(|_| Err(io::Error::other("writer panicked")))
     }
 }
 
-/// Waits for a thread that was told to end, up to [`MAX_FINISH`]; whether it has.
+/// Waits for a thread to end, up to [`MAX_FINISH`]; returns whether it has.
 pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
-    let asked = Instant::now();
+    let began = Instant::now();
     while !thread.is_finished() {
-        if asked.elapsed() > MAX_FINISH {
+        if began.elapsed() > MAX_FINISH {
             return false;
         }
         std::thread::sleep(FINISH_POLL);
@@ -93,7 +93,7 @@ pub fn ends_in_time<T>(thread: &JoinHandle<T>) -> bool {
     true
 }
 
-/// A record of an earlier run becomes `NAME.1`: what led to a crash is what somebody will want to read.
+/// Renames the file of an earlier run to `NAME.1`: it may show what led to a crash.
 fn keep_earlier(path: &Path) -> io::Result<()> {
     let Ok(earlier) = std::fs::metadata(path) else { return Ok(()) };
     if !earlier.is_file() || earlier.len() == 0 {
@@ -108,13 +108,13 @@ impl Write for BackgroundFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         self.piece.extend_from_slice(bytes);
         if self.piece.len() >= PIECE_BYTES {
-            self.hand_over()?;
+            self.send_piece()?;
         }
         Ok(bytes.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.hand_over()
+        self.send_piece()
     }
 }
 
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_full_disk_is_told_at_the_latest_at_the_end() {
+    fn a_full_disk_is_an_error_at_the_latest_at_the_end() {
         if let Ok(mut file) = BackgroundFile::create(Path::new("/dev/full")) {
             let early = file.write_all(b"x");
             assert!(early.is_err() || file.finish().is_err());

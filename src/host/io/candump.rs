@@ -25,7 +25,7 @@ const ERROR_FLAG: u32 = 0x2000_0000;
 /// Largest 29-bit identifier, and the mask of an error frame's class bits.
 const MAX_EXTENDED: u32 = 0x1FFF_FFFF;
 
-/// What one line of a candump log says.
+/// A line of a candump log.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Line<'a> {
     /// A frame.
@@ -104,7 +104,7 @@ const HEX: [u8; 256] = {
     table
 };
 
-/// Reads one line (without its line feed; a carriage return at its end does no harm).
+/// Reads one line (without its line feed; a carriage return at its end is ignored).
 ///
 /// # Errors
 /// When the line begins with `(` and breaks the grammar.
@@ -146,7 +146,7 @@ fn parse_drop_count(line: &[u8]) -> Option<Line<'_>> {
     Some(Line::Dropped { interface, frames })
 }
 
-/// What follows the interface's name.
+/// The part of a line after the interface's name.
 enum Body {
     Frame(Frame),
     Error(u32),

@@ -6,7 +6,7 @@
 //! * a software stamp becomes `stamp - (realtime - boottime)` with that difference measured when the frame is read.
 //!   Around a step of the clock the difference of the previous reading is tried too and the later time taken; a
 //!   stamp that fits neither becomes the time of reading;
-//! * what "fits" means is known exactly: a frame that is read now came after the socket was last found empty. So
+//! * what "fits" means is known exactly: a frame that is read now arrived after the socket was last found empty. So
 //!   the error of any one stamp is bounded by the time since then, and a step bends no time difference by more;
 //! * a hardware stamp becomes `stamp + offset`, the offset being the least seen lately of (arrival - stamp): queueing
 //!   only ever adds, so the least is the truest, and forgetting old ones lets the adapter's quartz drift.
@@ -105,20 +105,20 @@ impl StampMapper {
         }
     }
 
-    /// The socket was found empty at `reading`: what comes from now on is younger.
+    /// Notes that the socket was found empty at `reading`: later frames are younger.
     pub fn socket_empty(&mut self, reading: Reading) {
         self.emptied_ns = reading.boottime_ns;
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// The socket was found empty by the very call that gave the frame answered last, read at `reading`: what comes from now
-    /// on is younger than that frame.
+    /// Notes that the call that returned the latest frame, read at `reading`, emptied the socket: later frames are younger
+    /// than that frame.
     pub fn socket_emptied(&mut self, reading: Reading) {
         self.emptied_ns = self.latest.nanos().saturating_sub(self.clock.origin_ns);
         self.emptied_offset_ns = reading.offset_ns();
     }
 
-    /// When a frame read at `reading` arrived; never before an earlier answer.
+    /// When a frame read at `reading` arrived; never before an earlier result.
     pub fn arrival(&mut self, stamps: KernelStamps, reading: Reading) -> Timestamp {
         let software = self.software(stamps.software_ns, reading);
         let arrived_ns = match stamps.hardware_ns {
@@ -131,7 +131,7 @@ impl StampMapper {
         self.never_back(Timestamp::from_nanos(self.clock.origin_ns + arrived_ns))
     }
 
-    /// The time of something the interface told us at `reading`, in order with its frames.
+    /// Time of an event of the interface, noticed at `reading`; in order with its frames.
     pub fn event(&mut self, reading: Reading) -> Timestamp {
         self.never_back(self.clock.at(reading))
     }
@@ -181,7 +181,7 @@ impl HardwareClock {
         stamp_ns.saturating_add(current.min(previous))
     }
 
-    /// The adapter's clock jumped (it was reset, or slept): begins anew.
+    /// The adapter's clock jumped (it was reset, or slept): starts again.
     fn restart(&mut self, stamp_ns: i64, arrived_ns: i64) -> i64 {
         let offset = arrived_ns.saturating_sub(stamp_ns);
         *self = Self { least_ns: Some((offset, offset)), window_start_ns: arrived_ns };

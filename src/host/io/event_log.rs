@@ -1,5 +1,5 @@
-//! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are told
-//! once, then as a count: a bus without a partner makes thousands a second, for as long as it has none. And as JSON lines, all of them.
+//! Core events as log lines: on change, with fields, by severity. Error frames, and frames lost or not sent, are logged
+//! once, then as a count: a bus without a partner makes thousands a second. As JSON lines, every event is written.
 
 use std::io::{self, Write};
 
@@ -9,9 +9,9 @@ use crate::can::e2e::Status;
 use crate::monitor::{BusEvent, Event, EventKind};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
-/// What one interface does again and again is told as a sum after this long, s; then after twice that, and so on.
+/// Repeated faults of one interface are logged as a sum after this long, s; then after twice that, and so on.
 const SUMMARY_S: f64 = 10.0;
-/// At least this often, s.
+/// Longest time between two sums, s.
 const LONGEST_SUMMARY_S: f64 = 3600.0;
 
 /// Writes one event as a line of JSON: the form of `--events` in `run` and `replay`.
@@ -20,50 +20,50 @@ pub fn write_line(out: &mut impl Write, event: &Event) -> io::Result<()> {
     out.write_all(b"\n")
 }
 
-/// Frames of one kind on one interface that are told of as a sum.
+/// Frames of one kind on one interface that are logged as a sum.
 #[derive(Debug, Clone, Copy, Default)]
-struct Sum {
-    told: Option<Timestamp>,
-    untold: u64,
+struct EventSum {
+    reported: Option<Timestamp>,
+    unreported: u64,
     /// Until the next sum, s.
     period_s: f64,
 }
 
-impl Sum {
-    /// Adds frames; gives how many there are to be told, when it is time to.
+impl EventSum {
+    /// Adds frames; returns how many to log, when it is time.
     fn add(&mut self, time: Timestamp, frames: u64) -> Option<u64> {
-        self.untold += frames;
-        let since_s = self.told.map_or(f64::INFINITY, |told| time.since(told));
+        self.unreported += frames;
+        let since_s = self.reported.map_or(f64::INFINITY, |reported| time.since(reported));
         if since_s < self.period_s {
             return None;
         }
-        // After a pause it is news again.
-        let goes_on = since_s < 2.0 * self.period_s;
-        self.period_s = if goes_on { (2.0 * self.period_s).min(LONGEST_SUMMARY_S) } else { SUMMARY_S };
-        self.told = Some(time);
-        Some(std::mem::take(&mut self.untold))
+        // After a pause it is logged at once again.
+        let continues = since_s < 2.0 * self.period_s;
+        self.period_s = if continues { (2.0 * self.period_s).min(LONGEST_SUMMARY_S) } else { SUMMARY_S };
+        self.reported = Some(time);
+        Some(std::mem::take(&mut self.unreported))
     }
 }
 
 /// The sums of one interface.
 #[derive(Debug, Clone, Copy, Default)]
-struct Sums {
-    errors: Sum,
-    dropped: Sum,
-    unsent: Sum,
+struct InterfaceSums {
+    errors: EventSum,
+    dropped: EventSum,
+    unsent: EventSum,
 }
 
 /// Logs events.
 #[derive(Debug)]
 pub struct EventLog {
     interfaces: Vec<String>,
-    sums: Vec<Sums>,
+    sums: Vec<InterfaceSums>,
 }
 
 impl EventLog {
     /// For these interfaces, in the order of the configuration.
     pub fn new(interfaces: Vec<String>) -> Self {
-        let sums = vec![Sums::default(); interfaces.len()];
+        let sums = vec![InterfaceSums::default(); interfaces.len()];
         Self { interfaces, sums }
     }
 
@@ -104,7 +104,7 @@ impl EventLog {
             }
             EventKind::BadCommand { bus, intact } => {
                 let interface = self.interfaces.get(bus.index()).map_or("?", String::as_str);
-                tracing::warn!(interface, intact, "command frame not obeyed");
+                tracing::warn!(interface, intact, "command frame not executed");
             }
             EventKind::Test { rule, running } => {
                 tracing::info!(?rule, "{}", if running { "test of an alarm begins" } else { "test of an alarm ends" });
@@ -113,7 +113,7 @@ impl EventLog {
                 tracing::warn!(
                     capacity_ah,
                     capacity_std_ah,
-                    "another pack: what was learned of the old one is forgotten"
+                    "another pack: learned values of the old one are discarded"
                 );
             }
             EventKind::PackIdentity { identity } => tracing::info!(identity, "pack identity"),
@@ -241,17 +241,17 @@ mod tests {
 
     #[test]
     fn what_goes_on_for_a_day_is_told_in_some_forty_lines_and_nothing_is_left_out_of_the_sums() {
-        let mut sum = Sum::default();
-        let told: Vec<u64> =
+        let mut sum = EventSum::default();
+        let logged: Vec<u64> =
             (0..86_400 * 4).filter_map(|n| sum.add(Timestamp::from_secs(f64::from(n) * 0.25), 2)).collect();
-        assert!((20..=45).contains(&told.len()), "{} lines", told.len());
-        assert_eq!(told[0], 2, "the first is told at once");
-        assert_eq!(told.iter().sum::<u64>() + sum.untold, 86_400 * 4 * 2);
+        assert!((20..=45).contains(&logged.len()), "{} lines", logged.len());
+        assert_eq!(logged[0], 2, "the first is logged at once");
+        assert_eq!(logged.iter().sum::<u64>() + sum.unreported, 86_400 * 4 * 2);
     }
 
     #[test]
     fn after_a_pause_it_is_told_at_once_again() {
-        let mut sum = Sum::default();
+        let mut sum = EventSum::default();
         let mut add = |at_s: f64| sum.add(Timestamp::from_secs(at_s), 1);
         assert_eq!([add(0.0), add(1.0), add(10.0), add(11.0)], [Some(1), None, Some(2), None]);
         assert_eq!([add(1000.0), add(1001.0), add(1010.0)], [Some(2), None, Some(2)]);

@@ -14,21 +14,21 @@
 //! RELOAD (1700000000.600000000)
 //! ```
 //!
-//! `RELOAD`: from here on another configuration held, which the journal does not carry.
-//! `RESTORE` stands first in the journal of a run that took up a stored state, and says how long it was away (`-`: as
-//! the stamps say).
+//! `RELOAD`: from here on another configuration is in force, which the journal does not contain.
+//! `RESTORE` is the first line of a run that restored a stored state, with the time it did not run (`-`: as the stamps
+//! say).
 //! A last line without line feed was torn by a power cut and is a bad line, even where it could be read.
 
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::Timestamp;
 
 /// First line of every journal.
 pub const HEADER: &str = "PACKWATCH-JOURNAL 1";
 
-/// A journal line that is no frame.
+/// A journal line other than a frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Mark<'a> {
     Tick { time: Timestamp },
@@ -40,10 +40,10 @@ pub enum Mark<'a> {
     Reload { time: Timestamp },
 }
 
-/// Reads a journal line that does not begin with `(`; `None` = none of the journal's.
+/// Reads a journal line that does not begin with `(`; `None` = not a line of the journal.
 ///
 /// # Errors
-/// When the line begins as one of the journal's and goes on otherwise.
+/// When the line begins as one of the journal's and breaks its grammar.
 pub fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
     let Some(space) = memchr::memchr(b' ', line) else { return Ok(None) };
@@ -102,7 +102,7 @@ fn parse_bus(text: &[u8]) -> Option<(&[u8], BusEvent)> {
     (!interface.is_empty() && words.next().is_none()).then_some((interface, event))
 }
 
-/// Writes a journal. `W` should be buffered; nothing is flushed but by [`flush`](Self::flush).
+/// Writes a journal. `W` should be buffered; only [`flush`](Self::flush) flushes it.
 #[derive(Debug)]
 pub struct JournalWriter<W: Write> {
     out: W,
@@ -119,7 +119,7 @@ impl<W: Write> JournalWriter<W> {
         Ok(Self { out, interfaces })
     }
 
-    /// Notes that a stored state was taken up, and how old it was; before any input.
+    /// Notes that a stored state was restored, and how old it was; before any input.
     ///
     /// # Errors
     /// Those of the file.
@@ -128,7 +128,7 @@ impl<W: Write> JournalWriter<W> {
         writeln!(self.out, " {away}")
     }
 
-    /// Notes that another configuration was taken over.
+    /// Notes that another configuration is in force.
     ///
     /// # Errors
     /// Those of the file.
@@ -137,7 +137,7 @@ impl<W: Write> JournalWriter<W> {
         self.out.write_all(b"\n")
     }
 
-    /// Appends one input, as it is handed to the core.
+    /// Appends one input, as the core receives it.
     ///
     /// # Errors
     /// Those of the file; an interface that is not configured is invalid input.

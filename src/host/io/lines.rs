@@ -1,8 +1,8 @@
-//! Lines of a file, plain, gzip or zstd, read in large blocks and lent without copying.
+//! Lines of a file, plain, gzip or zstd, read in large blocks and borrowed without copying.
 //!
-//! The compression is told by the content, never by the name. A line longer than the block is handed on as
-//! [`RawLine::TooLong`] and skipped to its end. Bytes taken from the file are counted for the progress bar. What is
-//! compressed is unpacked on a thread of its own; plain files need none.
+//! The content decides the compression, never the name. A line longer than the block is returned as
+//! [`RawLine::TooLong`] and skipped to its end. Bytes read from the file are counted for the progress bar. Compressed
+//! files are unpacked on a thread of their own; plain files need none.
 
 mod ahead;
 
@@ -12,9 +12,9 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use ahead::Ahead;
+use ahead::ReadAhead;
 
-/// Bytes asked of the file or decompressor at once; also the longest line taken. A CAN XL line has 4,200.
+/// Bytes read from the file or decompressor at once; also the longest line accepted. A CAN XL line has 4,200.
 const BLOCK: usize = 256 * 1024;
 
 /// One line without its line feed.
@@ -28,34 +28,34 @@ pub enum RawLine<'a> {
     TooLong,
 }
 
-/// Opens a log: `-` is standard input; gzip and zstd are unpacked. `read_bytes` counts what the file gave.
+/// Opens a log: `-` is standard input; gzip and zstd are unpacked. `read_bytes` counts the bytes read from the file.
 ///
 /// # Errors
 /// When the file cannot be opened or its first bytes cannot be read.
 pub fn open(path: &Path, read_bytes: &Arc<AtomicU64>) -> io::Result<Box<dyn Read>> {
     let raw: Box<dyn Read + Send> =
         if path == Path::new("-") { Box::new(io::stdin()) } else { Box::new(File::open(path)?) };
-    let mut counted = Counted { inner: raw, bytes: Arc::clone(read_bytes) };
+    let mut counted = CountingReader { inner: raw, bytes: Arc::clone(read_bytes) };
     let mut magic = Vec::with_capacity(4);
     (&mut counted).take(4).read_to_end(&mut magic)?;
     let (gzip, zstd) = (magic.starts_with(&[0x1F, 0x8B]), magic == [0x28, 0xB5, 0x2F, 0xFD]);
     let whole = Cursor::new(magic).chain(counted);
     if gzip {
         let packed = io::BufReader::with_capacity(BLOCK, whole);
-        Ok(Box::new(Ahead::new(flate2::bufread::MultiGzDecoder::new(packed), BLOCK)?))
+        Ok(Box::new(ReadAhead::new(flate2::bufread::MultiGzDecoder::new(packed), BLOCK)?))
     } else if zstd {
-        Ok(Box::new(Ahead::new(zstd::stream::read::Decoder::new(whole)?, BLOCK)?))
+        Ok(Box::new(ReadAhead::new(zstd::stream::read::Decoder::new(whole)?, BLOCK)?))
     } else {
         Ok(Box::new(whole))
     }
 }
 
-struct Counted {
+struct CountingReader {
     inner: Box<dyn Read + Send>,
     bytes: Arc<AtomicU64>,
 }
 
-impl Read for Counted {
+impl Read for CountingReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let count = self.inner.read(buffer)?;
         self.bytes.fetch_add(count as u64, Ordering::Relaxed);
@@ -86,12 +86,12 @@ impl Lines {
         Self { source, buffer: vec![0; BLOCK], start: 0, end: 0, number: 0, ended: false }
     }
 
-    /// Number of the line last handed out, from 1.
+    /// Number of the line last returned, from 1.
     pub fn number(&self) -> u64 {
         self.number
     }
 
-    /// What was read and not handed out yet; may end within a line, or be empty before the end of the source.
+    /// Bytes read and not returned yet; may end within a line, or be empty before the end of the source.
     #[inline]
     pub(super) fn unread(&self) -> &[u8] {
         &self.buffer[self.start..self.end]
@@ -148,7 +148,7 @@ impl Lines {
         }
     }
 
-    /// What is unread, then the rest of the source, as one reader.
+    /// The unread bytes, then the rest of the source, as one reader.
     pub fn into_reader(self) -> impl Read {
         Cursor::new(self.buffer[self.start..self.end].to_vec()).chain(self.source)
     }
@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_last_line_without_line_feed_is_told_apart() {
+    fn a_last_line_without_line_feed_is_recognised() {
         assert_eq!(all(b"ab\n\nc"), [(2, true), (0, true), (1, false)]);
         assert_eq!(all(b""), []);
     }

@@ -1,8 +1,8 @@
 //! One stream of the core's inputs from logs of any form: journals, candump logs, CSV; plain, gzip or zstd.
 //!
-//! The form is told by the first line (CSV also by the name). Several logs are read one after another on one clock:
+//! The first line decides the form (for CSV also the name). Several logs are read one after another on one clock:
 //! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
-//! after it, and an unknown gap is put before it. Everything that is not handed on is counted in [`LogCounts`].
+//! after it, and an unknown gap is put before it. Everything that becomes no record is counted in [`LogCounts`].
 
 mod record;
 
@@ -17,6 +17,7 @@ use super::candump::{self, Line, fast_line};
 use super::csv_log::{CsvLog, CsvOptions, RowResult};
 use super::journal::{self, Mark};
 use super::lines::{self, Lines, RawLine};
+use super::table::TableError;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
@@ -24,7 +25,7 @@ use crate::quantity::{BusIndex, Timestamp};
 
 pub use record::{Batch, Record};
 
-/// Where a part with an unknown gap before it is put: this long after the record so far.
+/// Distance between the records so far and a part with an unknown gap before it.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Names of unconfigured interfaces counted apart; more are counted together under "...".
 const MAX_FOREIGN_NAMES: usize = 64;
@@ -32,12 +33,18 @@ const MAX_FOREIGN_NAMES: usize = 64;
 /// Most interfaces, configured and adopted: a log has a handful.
 pub const MAX_ADOPTED: usize = 64;
 
-/// Why reading cannot go on, with file and line.
+/// Reason why reading cannot continue, with file and line.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
 pub struct LogError(pub String);
 
-/// Turns one CSV row's values into the frames that would have carried them; gives how many values no frame could carry.
+impl From<TableError> for LogError {
+    fn from(error: TableError) -> Self {
+        Self(error.0)
+    }
+}
+
+/// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
 
 /// How logs are to be read.
@@ -58,18 +65,18 @@ impl std::fmt::Debug for LogOptions {
     }
 }
 
-/// What was read, and what of it was not handed on.
+/// Counts of what was read, and of what became no record.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct LogCounts {
     /// Lines and CSV rows read, bad ones included.
     pub lines: u64,
-    /// Frames handed on.
+    /// Frames returned.
     pub frames: u64,
     /// Lines that break their grammar, and files that end damaged.
     pub bad_lines: u64,
-    /// The first of them: file, line, found and expected.
+    /// The first of them: file, line, found and allowed.
     pub first_bad_line: Option<String>,
-    /// Lines that are no record: headers, comments, blank ones.
+    /// Lines without a record: headers, comments, blank ones.
     pub ignored_lines: u64,
     /// CAN XL frames, not supported.
     pub xl_frames: u64,
@@ -83,19 +90,19 @@ pub struct LogCounts {
     pub time_backwards: u64,
     /// Parts with an unknown gap before them.
     pub unknown_gaps: u64,
-    /// CSV values that no input frame could carry (out of the signal's range, or no such signal).
+    /// CSV values that no input frame can carry (out of the signal's range, or no such signal).
     pub uncarried_values: u64,
 }
 
 /// Reads logs one after another.
 pub struct LogSource {
     files: VecDeque<PathBuf>,
-    current: Option<Open>,
+    current: Option<OpenLog>,
     queue: VecDeque<Record>,
     frames: Vec<(BusIndex, Frame)>,
     encode_row: RowEncoder,
     csv: CsvOptions,
-    state: State,
+    state: ReadState,
     read_bytes: Arc<AtomicU64>,
 }
 
@@ -105,18 +112,18 @@ impl std::fmt::Debug for LogSource {
     }
 }
 
-struct Open {
+struct OpenLog {
     name: String,
-    form: Form,
+    form: LogForm,
 }
 
-enum Form {
+enum LogForm {
     Text { lines: Lines, journal: bool },
     Csv(Box<CsvLog>),
 }
 
-/// What the parsers share: counts, names, the clock.
-struct State {
+/// State shared by the parsers: counts, names, the clock.
+struct ReadState {
     counts: LogCounts,
     strict: bool,
     interfaces: Vec<String>,
@@ -126,9 +133,9 @@ struct State {
     adopt: bool,
     shift_ns: i64,
     latest: Option<Timestamp>,
-    /// The next record begins a file or a section.
+    /// Whether the next record begins a file or a section.
     fresh: bool,
-    /// ... and how long after the record so far is unknown.
+    /// Whether the time between the records so far and that one is unknown.
     unknown: bool,
 }
 
@@ -142,7 +149,7 @@ impl LogSource {
             frames: Vec::new(),
             encode_row: options.encode_row,
             csv: options.csv,
-            state: State {
+            state: ReadState {
                 counts: LogCounts::default(),
                 strict: options.strict,
                 fast_line: fast_line::FastLineParser::new(&options.interfaces),
@@ -157,8 +164,7 @@ impl LogSource {
         }
     }
 
-    /// From here on interfaces that are not configured are handed on too: each gets the next number, up to
-    /// [`MAX_ADOPTED`] of them.
+    /// Returns records of interfaces that are not configured too: each gets the next number, up to [`MAX_ADOPTED`] of them.
     pub fn adopt_foreign(&mut self) {
         self.state.adopt = true;
     }
@@ -168,7 +174,7 @@ impl LogSource {
         &self.state.interfaces
     }
 
-    /// What was read so far.
+    /// Counts of what was read so far.
     pub fn counts(&self) -> &LogCounts {
         &self.state.counts
     }
@@ -180,7 +186,7 @@ impl LogSource {
 
     /// Whether the log being read carries its own ticks.
     pub fn carries_ticks(&self) -> bool {
-        matches!(self.current, Some(Open { form: Form::Text { journal: true, .. }, .. }))
+        matches!(self.current, Some(OpenLog { form: LogForm::Text { journal: true, .. }, .. }))
     }
 
     /// The next record; `None` at the end of the last log.
@@ -192,9 +198,9 @@ impl LogSource {
             if let Some(record) = self.queue.pop_front() {
                 return Ok(Some(record));
             }
-            if let Some(Open { form: Form::Text { lines, .. }, .. }) = &mut self.current
-                && let mut slot = [record::NOTHING]
-                && self.state.usual_records(lines, &mut slot) > 0
+            if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
+                && let mut slot = [record::UNUSED]
+                && self.state.fast_records(lines, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
             }
@@ -204,7 +210,7 @@ impl LogSource {
                 continue;
             };
             let more = match &mut open.form {
-                Form::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
+                LogForm::Text { lines, journal } => match self.state.next_text(lines, *journal, &open.name)? {
                     Some(record) => {
                         let (gap, time) = self.state.place(record.time());
                         let record = record.at(time);
@@ -214,7 +220,7 @@ impl LogSource {
                     }
                     None => false,
                 },
-                Form::Csv(log) => self.state.next_row(log, &open.name)?.is_some_and(|raw| {
+                LogForm::Csv(log) => self.state.next_row(log)?.is_some_and(|raw| {
                     let (gap, time) = self.state.place(raw);
                     self.queue.extend(gap);
                     let uncarried = (self.encode_row)(&log.values, &mut self.frames);
@@ -230,19 +236,19 @@ impl LogSource {
         }
     }
 
-    /// The next records, at least one: what can be had without waiting for more of the file. `false` at the end of the last
+    /// The next records, at least one: those available without waiting for more of the file. `false` at the end of the last
     /// log.
     ///
     /// # Errors
-    /// As [`next_record`](Self::next_record), and only once every record before has been given.
+    /// As [`next_record`](Self::next_record), after every record before the error was returned.
     pub fn next_batch(&mut self, batch: &mut Batch) -> Result<bool, LogError> {
         batch.len = 0;
         if let Some(open) = &mut self.current
-            && let Form::Text { lines, journal } = &mut open.form
+            && let LogForm::Text { lines, journal } = &mut open.form
             && self.queue.is_empty()
         {
             batch.carries_ticks = *journal;
-            batch.len = self.state.usual_records(lines, &mut batch.slots);
+            batch.len = self.state.fast_records(lines, &mut batch.slots);
             if batch.len > 0 {
                 return Ok(true);
             }
@@ -252,7 +258,7 @@ impl LogSource {
         Ok(true)
     }
 
-    fn open(&mut self, path: &Path) -> Result<Open, LogError> {
+    fn open(&mut self, path: &Path) -> Result<OpenLog, LogError> {
         let name = path.display().to_string();
         let failed = |e: std::io::Error| LogError(format!("{name}: cannot be read: {e}"));
         let mut lines = Lines::new(lines::open(path, &self.read_bytes).map_err(failed)?);
@@ -265,11 +271,11 @@ impl LogSource {
         let csv = !journal && (named_csv(path) || (!first.starts_with(b"(") && first.contains(&b',')));
         (self.state.fresh, self.state.unknown) = (true, false);
         let form = if csv {
-            Form::Csv(Box::new(CsvLog::open(Box::new(lines.into_reader()), &name, &self.csv)?))
+            LogForm::Csv(Box::new(CsvLog::open(Box::new(lines.into_reader()), &name, &self.csv)?))
         } else {
-            Form::Text { lines, journal }
+            LogForm::Text { lines, journal }
         };
-        Ok(Open { name, form })
+        Ok(OpenLog { name, form })
     }
 }
 
@@ -279,11 +285,11 @@ fn named_csv(path: &Path) -> bool {
     name.trim_end_matches(".gz").trim_end_matches(".zst").ends_with(".csv")
 }
 
-impl State {
-    /// The next records of a text log into these slots, as long as they are frames in usual lines of known interfaces and
-    /// not the first of their file; how many. Exactly what the long way ([`next_text`](Self::next_text),
-    /// [`place`](Self::place)) gives for them.
-    fn usual_records(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
+impl ReadState {
+    /// Fills slots with the next records of a text log, as long as they are frames in fast lines of known interfaces and not
+    /// the first of their file; returns how many. The result equals that of the full grammar ([`next_text`](Self::next_text),
+    /// [`place`](Self::place)).
+    fn fast_records(&mut self, lines: &mut Lines, slots: &mut [Record]) -> usize {
         let Some(mut latest) = self.latest.filter(|_| !self.fresh) else { return 0 };
         let all = lines.unread();
         let (mut text, mut count, mut backwards) = (all, 0, 0);
@@ -428,23 +434,23 @@ impl State {
     }
 
     /// The next good row's time on the file's own clock.
-    fn next_row(&mut self, log: &mut CsvLog, name: &str) -> Result<Option<Timestamp>, LogError> {
+    fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
             match log.next() {
-                Ok(RowResult::Row(row)) => {
+                Ok(RowResult::Good(row)) => {
                     self.counts.lines += 1;
                     if row.after_unknown_gap {
                         (self.fresh, self.unknown) = (true, true);
                     }
                     return Ok(Some(row.time));
                 }
-                Ok(RowResult::Bad { line, what }) => {
+                Ok(RowResult::Bad(error)) => {
                     self.counts.lines += 1;
-                    self.bad(|| format!("{name}:{line}: {what}"))?;
+                    self.bad(|| error.0)?;
                 }
                 Ok(RowResult::End) => return Ok(None),
                 Err(error) => {
-                    self.bad(|| format!("{name}: damaged: {error}"))?;
+                    self.bad(|| error.0)?;
                     return Ok(None);
                 }
             }

@@ -1,20 +1,20 @@
-//! Files a command writes: complete or not at all, and every failure told.
+//! Files a command writes: complete or not at all, and every failure is reported.
 //!
-//! A regular file is written beside its place as `NAME.part` and renamed when it is complete; given up, nothing is
-//! left. `-` is standard output, and a device or pipe is written straight to.
+//! A regular file is written as `NAME.part` in the same folder and renamed when it is complete; an abandoned one is deleted.
+//! `-` is standard output; a device or pipe is written directly.
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// Bytes collected before the operating system is asked.
+/// Bytes collected before a system call.
 const BUFFER: usize = 256 * 1024;
 
 /// A file being written.
 #[derive(Debug)]
 pub struct ResultFile {
     path: PathBuf,
-    /// Where it is written until it is complete; `None` = in place.
+    /// Path of the incomplete file; `None` = written in place.
     part: Option<PathBuf>,
     out: BufWriter<Target>,
 }
@@ -90,13 +90,13 @@ impl Write for ResultFile {
 impl Drop for ResultFile {
     fn drop(&mut self) {
         if let Some(part) = &self.part {
-            // Given up: what is not complete is not left behind. A failure here has nobody to be told.
+            // An incomplete file is deleted. A failure here cannot be reported.
             let _ = fs::remove_file(part);
         }
     }
 }
 
-/// Before hours of work: a result can be written where it shall be, and is none of the files that are read.
+/// Checks, before hours of work, that a result can be written to its path and is not one of the files that are read.
 ///
 /// # Errors
 /// Names the result and what is wrong with its place.
@@ -117,7 +117,7 @@ pub fn check_place<'a>(result: &Path, mut inputs: impl Iterator<Item = &'a PathB
     Ok(())
 }
 
-/// The error with the file's name; its kind is kept, so that a closed pipe is still known as one.
+/// The error with the file's name and its kind, so that a closed pipe is still recognised.
 fn named(path: &Path, error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::Interrupted {
         return error;
@@ -130,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_file_given_up_leaves_the_old_one_and_no_part() {
+    fn an_abandoned_file_leaves_the_old_one_and_no_part() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("out.csv");
         fs::write(&path, "old").expect("written");
@@ -147,12 +147,12 @@ mod tests {
         let [log, other] = ["a.log", "b.log"].map(|name| folder.path().join(name));
         fs::write(&log, "").expect("written");
         let inputs = [log.clone(), PathBuf::from("-")];
-        let told = |result: &Path| check_place(result, inputs.iter());
-        assert_eq!((told(&other), told(Path::new("-"))), (Ok(()), Ok(())));
+        let check = |result: &Path| check_place(result, inputs.iter());
+        assert_eq!((check(&other), check(Path::new("-"))), (Ok(()), Ok(())));
         let again = folder.path().join(".").join("a.log");
-        assert!(told(&again).is_err_and(|error| error.ends_with("a.log: is read, cannot be written too")));
+        assert!(check(&again).is_err_and(|error| error.ends_with("a.log: is read, cannot be written too")));
         let nowhere = folder.path().join("none").join("x.csv");
-        assert!(told(&nowhere).is_err_and(|error| error.contains("there is no folder")));
+        assert!(check(&nowhere).is_err_and(|error| error.contains("there is no folder")));
     }
 
     #[test]

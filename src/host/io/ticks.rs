@@ -1,13 +1,13 @@
-//! The ticks of a record that carries none: which moments between two records the core is told of.
+//! The ticks of a log that carries none: the moments between two records at which the core receives a tick.
 //!
 //! Live, the driver ticks every [`TICK_PERIOD_MS`](crate::monitor::TICK_PERIOD_MS) while it is awake. A plain log
-//! says only when frames came, so the same ticks are made here, at multiples of the period: a tick at T comes after
+//! says only when frames arrived, so the same ticks are made here, at multiples of the period: a tick at T comes after
 //! every record of T and before the first later one. After a record the recorder stays awake for the sleep gap, as a
-//! daemon on a silent bus does (so a lost input is noticed), and then is taken to be asleep. The first record, and the
+//! daemon on a silent bus does (so that a lost input is noticed); after it, the recorder is assumed to be asleep. The first record, and the
 //! first after sleep, wake it: one tick at that record's own time. Nothing follows the last record.
 //!
-//! The caller says when the core next cares ([`Ticks::pop`]'s `due`); ticks before that are skipped, which costs
-//! nothing and changes nothing.
+//! The caller passes the time at which the core next needs a tick ([`Ticks::pop`]'s `due`). Ticks before that are skipped:
+//! they would change nothing.
 
 use crate::monitor::MERGE_TOLERANCE_NS;
 use crate::quantity::Timestamp;
@@ -23,7 +23,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Where ticks go on once those before the hole are popped.
+    /// Where ticks continue once those before the hole are popped.
     wake_ns: Option<i64>,
 }
 
@@ -40,7 +40,7 @@ impl Ticks {
         }
     }
 
-    /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then hand the record on. Whether the
+    /// A record at `time` comes next; then [`pop`](Self::pop) until `None`, then process the record. Returns whether the
     /// recorder was asleep before it (the first record, or one after a hole). A time a little before the latest (interfaces
     /// merged out of order) makes no tick.
     #[inline]
@@ -53,7 +53,7 @@ impl Ticks {
             return true;
         };
         if time_ns < latest_ns.saturating_sub(MERGE_TOLERANCE_NS) {
-            // The record's clock was set back: the grid goes on from there.
+            // The recorder's clock was set back: the grid continues from there.
             (self.limit_ns, self.latest_ns, self.wake_ns) = (i64::MIN, Some(time_ns), Some(time_ns));
             return true;
         }
@@ -86,7 +86,7 @@ impl Ticks {
         true
     }
 
-    /// The record ends here, or goes on after an unknown gap: what is left up to the latest record may be popped,
+    /// The log ends here, or continues after an unknown gap: the ticks left up to the latest record may be popped,
     /// and the next record wakes the recorder whatever its stamp.
     pub fn sleep(&mut self) {
         if let Some(latest_ns) = self.latest_ns.take() {
@@ -94,13 +94,13 @@ impl Ticks {
         }
     }
 
-    /// Whether [`pop`](Self::pop) has something to do, whatever the core cares for: no, for most records.
+    /// Whether [`pop`](Self::pop) has work to do, whatever the core needs: for most records it has none.
     #[inline]
     pub fn is_pending(&self) -> bool {
         self.next_ns < self.limit_ns || self.wake_ns.is_some()
     }
 
-    /// The next tick that is due and that the core cares for: none before `due` (`None` = it cares for none).
+    /// The next tick that is due and that the core needs: none before `due` (`None` = it needs none).
     pub fn pop(&mut self, due: Option<Timestamp>) -> Option<Timestamp> {
         if self.next_ns < self.limit_ns {
             let due_ns = due.map_or(self.limit_ns, |d| d.nanos().min(self.limit_ns));

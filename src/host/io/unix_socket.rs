@@ -1,4 +1,4 @@
-//! A Unix socket's file: made so that a dead daemon's is replaced and a live daemon's is not.
+//! Unix sockets and their files: the file of a dead daemon is replaced, that of a live one is not.
 
 use std::fs::Permissions;
 use std::io::{self, ErrorKind};
@@ -9,13 +9,13 @@ use std::time::Duration;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::time::timeout;
 
-/// How long a look at an earlier daemon's socket may take; one that is stopped has a full queue and lets us wait.
+/// Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
 const LOOK: Duration = Duration::from_secs(1);
 
 /// The folder of a daemon that systemd did not start.
 const STANDARD_FOLDER: &str = "/run/packwatch";
 
-/// Where the sockets are when nobody says where: the folder systemd made, else `/run/packwatch`.
+/// Default folder of the sockets: the one systemd made, else `/run/packwatch`.
 pub fn runtime_folder() -> PathBuf {
     let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
     // systemd puts a colon between several; the first is the unit's own.
@@ -23,10 +23,10 @@ pub fn runtime_folder() -> PathBuf {
     folder.unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
-/// Where a socket of the daemon is to be.
+/// Place of a socket of the daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SocketSetting {
-    /// In `$RUNTIME_DIRECTORY` under systemd, else in `/run/packwatch`; where that cannot be made, the daemon goes
+    /// In `$RUNTIME_DIRECTORY` under systemd, else in `/run/packwatch`; where that cannot be made, the daemon runs
     /// without.
     Standard,
     /// There is none.
@@ -46,9 +46,9 @@ impl SocketSetting {
     }
 }
 
-/// A bound socket and its file, which goes when this is dropped.
+/// A bound socket and its file, which is removed on drop.
 #[derive(Debug)]
-pub struct Bound {
+pub struct BoundSocket {
     pub listener: UnixListener,
     pub file: SocketFile,
 }
@@ -60,10 +60,10 @@ pub struct SocketFile {
     inode: (u64, u64),
 }
 
-/// Why there is no socket.
+/// Reason why there is no socket.
 #[derive(Debug)]
 pub enum BindError {
-    /// Another daemon has it.
+    /// Another daemon uses it.
     Taken(String),
     /// It cannot be made.
     Io(io::Error),
@@ -75,16 +75,16 @@ impl From<io::Error> for BindError {
     }
 }
 
-/// Binds a socket there; `mode` says who may connect.
-pub async fn bind(path: &Path, mode: u32) -> Result<Bound, BindError> {
+/// Binds a socket at `path`; the file mode `mode` decides who may connect.
+pub async fn bind(path: &Path, mode: u32) -> Result<BoundSocket, BindError> {
     remove_stale(path).await?;
     let listener = UnixListener::bind(path)?;
     std::fs::set_permissions(path, Permissions::from_mode(mode))?;
     let file = SocketFile { path: path.to_owned(), inode: inode(path)? };
-    Ok(Bound { listener, file })
+    Ok(BoundSocket { listener, file })
 }
 
-/// Removes the socket of a daemon that is no more.
+/// Removes the socket of a daemon that has ended.
 async fn remove_stale(path: &Path) -> Result<(), BindError> {
     match std::fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(()),
@@ -99,11 +99,11 @@ async fn remove_stale(path: &Path) -> Result<(), BindError> {
         Ok(Err(error)) if error.kind() == ErrorKind::NotFound => Ok(()),
         Ok(Err(error)) => Err(error.into()),
         Ok(Ok(stream)) => Err(BindError::Taken(owner(&stream))),
-        Err(_) => Err(BindError::Taken("a process that does not answer".to_owned())),
+        Err(_) => Err(BindError::Taken("a process that does not respond".to_owned())),
     }
 }
 
-/// Who listens, as the kernel knows it.
+/// The listening process, as the kernel knows it.
 fn owner(stream: &UnixStream) -> String {
     match stream.peer_cred() {
         Ok(who) => {
@@ -120,7 +120,7 @@ fn inode(path: &Path) -> io::Result<(u64, u64)> {
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        // Unless somebody has put another one there meanwhile.
+        // Another daemon may have put its own socket there meanwhile.
         if inode(&self.path).is_ok_and(|found| found == self.inode)
             && let Err(error) = std::fs::remove_file(&self.path)
         {

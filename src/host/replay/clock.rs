@@ -1,20 +1,20 @@
-//! The times of a replay: which part of the log is wanted, how much time it covers, and at what pace it goes.
+//! The times of a replay: the wanted part of the log, the time it covers, and the pace.
 
 use std::time::{Duration, Instant};
 
-use super::Settings;
+use super::ReplaySettings;
 use crate::quantity::Timestamp;
 
-/// A moment of the log as the user gives it.
+/// A time of the log as the user gives it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum When {
+pub enum LogTime {
     /// A stamp on the log's own clock.
     At(Timestamp),
     /// Nanoseconds after the log's first record.
     After(i64),
 }
 
-impl When {
+impl LogTime {
     pub(super) fn resolve(self, first: Timestamp) -> Timestamp {
         match self {
             Self::At(time) => time,
@@ -23,39 +23,39 @@ impl When {
     }
 }
 
-/// Which records are wanted.
-pub(super) struct Window {
-    from: Option<When>,
-    pub(super) until: Option<When>,
+/// The wanted part of the log.
+pub(super) struct TimeWindow {
+    from: Option<LogTime>,
+    pub(super) until: Option<LogTime>,
     /// The log's first stamp, wanted or not.
     pub(super) first: Option<Timestamp>,
 }
 
-pub(super) enum Place {
+pub(super) enum WindowPosition {
     Before,
     Inside,
     After,
 }
 
-impl Window {
-    pub(super) fn new(settings: &Settings) -> Self {
+impl TimeWindow {
+    pub(super) fn new(settings: &ReplaySettings) -> Self {
         Self { from: settings.from, until: settings.until, first: None }
     }
 
-    pub(super) fn judge(&mut self, time: Timestamp) -> Place {
+    pub(super) fn judge(&mut self, time: Timestamp) -> WindowPosition {
         let first = *self.first.get_or_insert(time);
         if self.from.is_some_and(|from| time < from.resolve(first)) {
-            Place::Before
+            WindowPosition::Before
         } else if self.until.is_some_and(|until| time > until.resolve(first)) {
-            Place::After
+            WindowPosition::After
         } else {
-            Place::Inside
+            WindowPosition::Inside
         }
     }
 }
 
-/// How much time the record covers, and how long that took here.
-pub(super) struct Span {
+/// The time the log covers, and the time its replay takes.
+pub(super) struct RecordSpan {
     sleep_gap_ns: i64,
     pub(super) first: Option<Timestamp>,
     pub(super) latest: Option<Timestamp>,
@@ -64,7 +64,7 @@ pub(super) struct Span {
     pub(super) started: Instant,
 }
 
-impl Span {
+impl RecordSpan {
     pub(super) fn new(sleep_gap_s: f64) -> Self {
         Self {
             sleep_gap_ns: (sleep_gap_s * 1e9) as i64,
@@ -75,7 +75,7 @@ impl Span {
         }
     }
 
-    /// Notes a record; whether it follows a hole.
+    /// Adds a record; returns whether it follows a hole.
     pub(super) fn advance(&mut self, time: Timestamp) -> bool {
         self.first.get_or_insert(time);
         let latest = *self.latest.get_or_insert(time);
@@ -109,7 +109,7 @@ impl Pace {
         Self { speed, anchor: None }
     }
 
-    /// Time starts anew with the next record: holes and unknown gaps are not waited out.
+    /// Restarts the pace at the next record: holes and unknown gaps are not waited out.
     pub(super) fn rebase(&mut self) {
         self.anchor = None;
     }
@@ -137,7 +137,7 @@ mod tests {
 
     #[test]
     fn a_hole_of_exactly_the_sleep_gap_is_awake_and_a_longer_one_is_not() {
-        let mut span = Span::new(30.0);
+        let mut span = RecordSpan::new(30.0);
         let mut advance = |nanos| span.advance(Timestamp::from_nanos(nanos));
         assert_eq!([0, 30_000_000_000, 60_000_000_001].map(&mut advance), [false, false, true]);
         assert_eq!(span.awake_ns, 30_000_000_000);

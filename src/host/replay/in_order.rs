@@ -1,36 +1,36 @@
 //! Work on many items by several threads, with the results in the items' order.
 //!
-//! Promise: what is kept waiting is bounded by the number of threads, not of items: nobody begins an item far beyond the
-//! first one that is not done.
+//! Promise: the number of threads, not of items, bounds the waiting results: no thread begins an item far beyond the first
+//! one that is not done.
 
 use std::collections::VecDeque;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 
-/// Per thread, items that may be begun beyond the first one not handed on: a long item does not stop the others soon.
+/// Items per thread that may be begun beyond the first one not returned, so that a long item does not stop the others soon.
 const AHEAD: usize = 4;
 
-/// What the threads share.
-struct State<R> {
+/// State shared by the threads.
+struct Schedule<R> {
     /// The next item to begin.
     next: usize,
-    /// The first item whose result was not handed on.
+    /// The first item whose result was not returned.
     first: usize,
     /// Results from that one on, of those that are done.
     done: VecDeque<Option<R>>,
-    /// Nothing is begun any more.
+    /// Whether no further item is begun.
     stopped: bool,
 }
 
-struct Shared<R> {
-    state: Mutex<State<R>>,
+struct SharedSchedule<R> {
+    state: Mutex<Schedule<R>>,
     changed: Condvar,
 }
 
-/// Stops the others when its thread panics: nobody waits for a result that will not come.
-struct Guard<'a, R>(&'a Shared<R>);
+/// Stops the others when its thread panics, so that none waits for a result that will not come.
+struct PanicGuard<'a, R>(&'a SharedSchedule<R>);
 
-impl<R> Drop for Guard<'_, R> {
+impl<R> Drop for PanicGuard<'_, R> {
     fn drop(&mut self) {
         if thread::panicking() {
             self.0.lock().stopped = true;
@@ -39,17 +39,17 @@ impl<R> Drop for Guard<'_, R> {
     }
 }
 
-impl<R> Shared<R> {
-    fn lock(&self) -> MutexGuard<'_, State<R>> {
-        // Nobody panics while holding it.
+impl<R> SharedSchedule<R> {
+    fn lock(&self) -> MutexGuard<'_, Schedule<R>> {
+        // No thread panics while holding it.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn wait<'a>(&self, state: MutexGuard<'a, State<R>>) -> MutexGuard<'a, State<R>> {
+    fn wait<'a>(&self, state: MutexGuard<'a, Schedule<R>>) -> MutexGuard<'a, Schedule<R>> {
         self.changed.wait(state).unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The next item to work on; waits while too many results wait themselves.
+    /// The next item to work on; blocks while too many results are waiting.
     fn begin(&self, items: usize, ahead: usize) -> Option<usize> {
         let mut state = self.lock();
         while !state.stopped && state.next < items && state.next >= state.first + ahead {
@@ -89,7 +89,7 @@ impl<R> Shared<R> {
 }
 
 /// Gives every item to `work` on up to `jobs` threads, and each result to `take` on this one: in the items' order, and as soon
-/// as all before are done. When `take` gives `false` nothing more is begun, and no result is handed on.
+/// as all before are done. When `take` gives `false` no further item is begun and no result returned.
 pub fn in_order<T: Sync, R: Send>(
     items: &[T],
     jobs: usize,
@@ -97,12 +97,12 @@ pub fn in_order<T: Sync, R: Send>(
     mut take: impl FnMut(&T, R) -> bool,
 ) {
     let jobs = jobs.clamp(1, items.len().max(1));
-    let state = State { next: 0, first: 0, done: VecDeque::new(), stopped: false };
-    let shared = Shared { state: Mutex::new(state), changed: Condvar::new() };
+    let state = Schedule { next: 0, first: 0, done: VecDeque::new(), stopped: false };
+    let shared = SharedSchedule { state: Mutex::new(state), changed: Condvar::new() };
     thread::scope(|scope| {
         for _ in 0..jobs {
             scope.spawn(|| {
-                let _guard = Guard(&shared);
+                let _guard = PanicGuard(&shared);
                 while let Some(index) = shared.begin(items.len(), AHEAD * jobs) {
                     shared.put(index, work(&items[index]));
                 }
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_runs_far_ahead_of_a_slow_item() {
+    fn no_thread_runs_far_ahead_of_a_slow_item() {
         let items: Vec<usize> = (0..1000).collect();
         let begun = AtomicUsize::new(0);
         let furthest = AtomicUsize::new(0);
@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_more_is_begun_once_nobody_wants_it() {
+    fn nothing_more_is_begun_once_no_result_is_wanted() {
         let items: Vec<usize> = (0..1000).collect();
         let (begun, mut taken) = (AtomicUsize::new(0), 0);
         in_order(
@@ -181,7 +181,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "a scoped thread panicked")]
-    fn a_panic_is_passed_on_and_hangs_nobody() {
+    fn a_panic_is_passed_on_and_hangs_no_thread() {
         in_order(&[1, 2, 3, 4], 2, |item| assert!(*item != 2), |_, ()| true);
     }
 }

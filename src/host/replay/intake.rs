@@ -1,4 +1,4 @@
-//! What became of frames before they were read: end-to-end checks and dropped frames, for the summary of a replay.
+//! Checks of frames before they are read, for the summary of a replay: end-to-end protection and dropped frames.
 
 use std::collections::BTreeMap;
 
@@ -18,7 +18,7 @@ pub struct ProtectedSummary {
     pub counts: BTreeMap<&'static str, u64>,
 }
 
-/// A message of which frames were dropped because more came than are taken in.
+/// A message of which frames were dropped because they exceed the configured rate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct DroppedSummary {
     /// Interface.
@@ -29,7 +29,7 @@ pub struct DroppedSummary {
     pub dropped: u64,
 }
 
-/// Both, of a monitor at its end.
+/// The protected messages and the dropped frames of a monitor.
 pub(super) fn summaries(monitor: &Monitor, interfaces: &[String]) -> (Vec<ProtectedSummary>, Vec<DroppedSummary>) {
     let name = |bus: BusIndex| interfaces.get(bus.index()).map_or("unknown", String::as_str).to_owned();
     let protected = monitor.protected().map(|of| ProtectedSummary {

@@ -1,4 +1,4 @@
-//! What a replay came to: counts, alarms, the cells at the end.
+//! Summary of a replay: counts, alarms, the cells at the end.
 
 use std::collections::BTreeMap;
 
@@ -13,10 +13,10 @@ use crate::quantity::CellIndex;
 /// Raised alarms listed one by one; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
 
-/// What a replay came to.
+/// Summary of a replay.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Summary {
-    /// What was read.
+pub struct ReplaySummary {
+    /// Counts of the logs.
     #[serde(flatten)]
     pub log: LogCounts,
     /// Records outside `from` and `until`.
@@ -27,11 +27,11 @@ pub struct Summary {
     pub estimates: u64,
     /// Frames that would be sent.
     pub frames_out: u64,
-    /// Bad readings of signals that came back to good.
+    /// Bad readings of signals that became good again.
     pub bad_readings: u64,
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
-    /// Messages that came too often.
+    /// Messages with more frames than the configured rate.
     pub dropped: Vec<DroppedSummary>,
     /// Events by kind.
     pub events: BTreeMap<&'static str, u64>,
@@ -51,17 +51,17 @@ pub struct Summary {
     pub times_real_time: f64,
     /// Frames read, over wall time.
     pub frames_per_s: f64,
-    /// Voltage readings that came to an estimator, over wall time.
+    /// Voltage readings that reached an estimator, over wall time.
     pub cell_steps_per_s: f64,
-    /// Peak resident memory, KiB, where the system tells.
+    /// Peak resident memory, KiB, where the system reports it.
     pub peak_memory_kib: Option<u64>,
-    /// What the user should know.
+    /// Remarks for the user.
     pub notes: Vec<String>,
 }
 
 /// Counts an event; lists it if it is an alarm raised, and keeps the usable capacities.
 pub(super) fn note_event(
-    summary: &mut Summary,
+    summary: &mut ReplaySummary,
     usable: &mut BTreeMap<CellIndex, (Option<f64>, Option<f64>)>,
     event: &Event,
 ) {

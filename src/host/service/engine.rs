@@ -9,18 +9,18 @@ use tokio::time::Instant;
 use super::readiness::{Readiness, restored_words};
 use super::{Service, ServiceError};
 use crate::io::background_file::BackgroundFile;
+use crate::io::candump::{self, StampDigits};
+use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
+use crate::io::journal::JournalWriter;
 use crate::io::snapshot_file;
+use crate::io::socket::LinkOutput;
+use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
+use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::Store as StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
 use crate::store::{Candidate, DATABASE_SOURCE, Progress, Store, with_suffix};
-use crate::io::candump::{self, StampDigits};
-use crate::io::clock::MappedClock;
-use crate::io::journal::JournalWriter;
-use crate::io::socket::LinkOutput;
-use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
-use crate::quantity::Timestamp;
 
 /// The core, its journal and its log.
 #[derive(Debug)]
@@ -273,7 +273,11 @@ fn send(links: &[LinkOutput], transmit: &Transmit) {
 
 /// Takes up the first of the stored states that fits; how old it is, and why the database's was not, if it does not fit.
 /// Beside a journal goes what it began from.
-fn restore_first_valid(monitor: &mut Monitor, states: Vec<Candidate>, journal: Option<&Path>) -> (Option<Downtime>, Option<String>) {
+fn restore_first_valid(
+    monitor: &mut Monitor,
+    states: Vec<Candidate>,
+    journal: Option<&Path>,
+) -> (Option<Downtime>, Option<String>) {
     let mut unfit = None;
     for Candidate { snapshot, away, source } in states {
         let beside = journal.map(|path| with_suffix(path, ".state.json"));

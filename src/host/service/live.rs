@@ -13,15 +13,16 @@ use super::reload::Reload;
 use super::status_publisher::StatusPublisher;
 use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
+
 use crate::control::protocol::{Answer, Request};
 use crate::control::{Asked, answer};
-use crate::store::Progress;
-use crate::io::snapshot_file;
-use crate::logging;
 use crate::io::clock::MappedClock;
-use crate::io::socket::{LinkOutput, Received, LinkEvent};
+use crate::io::snapshot_file;
+use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::logging;
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
+use crate::store::Progress;
 
 /// Of these, handed over between two looks at the timer: under one tick's time of a full bus.
 const BATCH: usize = 256;
@@ -36,12 +37,12 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct Loop {
     pub(super) engine: Engine,
-    pub(super) inbox: mpsc::Receiver<Received>,
+    pub(super) inbox: mpsc::Receiver<LinkMessage>,
     pub(super) requests: mpsc::Receiver<Asked>,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
-    pub(super) batch: Vec<Received>,
+    pub(super) batch: Vec<LinkMessage>,
     pub(super) left_out_told: Instant,
     pub(super) status_publisher: StatusPublisher,
 }
@@ -160,7 +161,7 @@ impl Loop {
         self.batch.sort_by_key(|received| received.time);
         let mut has_frame = false;
         for received in &self.batch {
-            let Received { time, bus, what } = *received;
+            let LinkMessage { time, bus, what } = *received;
             let input = match &what {
                 LinkEvent::Frame(frame) => Input::Frame { time, bus, frame },
                 LinkEvent::Event(event) => Input::Bus { time, bus, event: *event },

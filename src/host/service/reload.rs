@@ -19,8 +19,8 @@ use tokio::time::{Instant, sleep_until};
 use super::live::Loop;
 use super::{Engine, notify};
 use crate::config::{self, Config, InterfaceConfig, StoreConfig};
-use crate::status::document::ConfigFile;
 use crate::monitor::{MonitorConfig, Reconfigured};
+use crate::status::document::ConfigFile;
 
 /// Readings of the file begin at least this far apart.
 const MIN_PERIOD: Duration = Duration::from_secs(1);
@@ -216,7 +216,8 @@ mod tests {
     use std::path::Path;
 
     fn example() -> Config {
-        config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml")).expect("the example is good")
+        config::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/paper.toml"))
+            .expect("the example is good")
     }
 
     #[test]

@@ -3,14 +3,14 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::status::PERIOD;
-use crate::status::StatusServer;
+
+use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::monitor::TICK_PERIOD_MS;
+use crate::quantity::Timestamp;
 use crate::status::collect::{Before, Identity, Sources};
 use crate::status::counters::LoopCounters;
 use crate::status::document::ConfigFile;
-use crate::io::socket::{LinkOutput, Received, LinkEvent};
-use crate::monitor::TICK_PERIOD_MS;
-use crate::quantity::Timestamp;
+use crate::status::{PERIOD, StatusServer};
 
 /// What the loop tells of itself.
 #[derive(Debug)]
@@ -34,7 +34,7 @@ impl StatusPublisher {
     }
 
     /// The frames among these have their estimates now.
-    pub(super) fn note_frames(&mut self, batch: &[Received], now: Timestamp) {
+    pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
         let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
         frames.for_each(|received| self.counters.latency.record(now.since(received.time)));
     }

@@ -1,16 +1,16 @@
 //! A document for tests: every value told, of a few nothing is known.
 
-use super::counters::LoopCounters;
-use super::document::{
-    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
-    StatusCount, Store, VERSION,
-};
-use crate::alarm::{Alarm, Rule, Severity, State};
+use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::LinkState;
 use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
+use crate::status::counters::LoopCounters;
+use crate::status::document::{
+    Alarms, Cell, Clients, ConfigFile, Counters, Document, Flooded, Interface, Pack, Protected, ServiceCounters,
+    StatusCount, Store, VERSION,
+};
 
 /// Of a pack with so many cells; the last one is silent and the one before it not trusted, when there are several.
 pub fn sample(cells: u16) -> Document {
@@ -146,7 +146,7 @@ fn alarms() -> Alarms {
         rule: Rule::CapacityLow,
         severity: Severity::Severe,
         cell: Some(CellIndex(0)),
-        state: State::Active,
+        state: AlarmState::Active,
         value: Some(2.412),
         probability: Some(0.973),
         threshold: 2.5,
@@ -156,7 +156,8 @@ fn alarms() -> Alarms {
         raised_value: Some(2.42),
         is_acknowledged: false,
     };
-    let past = Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: State::Cleared, ..raised };
+    let past =
+        Alarm { rule: Rule::SocLow, severity: Severity::Warning, cell: None, state: AlarmState::Cleared, ..raised };
     let past = Alarm { value: Some(0.632), threshold: 0.1, probability: None, is_acknowledged: true, ..past };
     Alarms {
         thresholds: 4,

@@ -16,7 +16,7 @@ use tokio::time::{Instant, timeout};
 
 use super::document::{Clients, Document};
 use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, standard_path, stream_path};
-use crate::io::unix_socket::{BindError, Bound, SocketSetting, bind};
+use crate::io::unix_socket::{BindError, BoundSocket, SocketSetting, bind};
 use crate::monitor::Event;
 
 /// Pause after a connection could not be taken (no descriptor left): trying at once would find the same.
@@ -181,7 +181,7 @@ fn run(path: PathBuf, desk: Desk, drafts: mpsc::Receiver<Box<Draft>>, ready: &Sy
 }
 
 /// Until the loop has gone.
-async fn serve([once, stream]: [Bound; 2], desk: &Desk, mut drafts: mpsc::Receiver<Box<Draft>>) {
+async fn serve([once, stream]: [BoundSocket; 2], desk: &Desk, mut drafts: mpsc::Receiver<Box<Draft>>) {
     let (published, latest) = watch::channel(None);
     let mut clients = JoinSet::new();
     let mut refusals = Refusals::default();

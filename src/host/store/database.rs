@@ -12,11 +12,11 @@ use rusqlite::types::Value;
 use rusqlite::{Connection, ErrorCode, OpenFlags, OptionalExtension, Transaction, TransactionBehavior, params};
 
 use super::chain::Head;
+use super::delta_encoder::DeltaEncoder;
 use super::document::Document;
 use super::parts::Parts;
 use super::rows::{Batch, Row, Table};
 use super::schema::{self, MIGRATIONS};
-use super::delta_encoder::DeltaEncoder;
 use super::stamp::{BootId, Stamp};
 use super::{packed, retention};
 use crate::monitor::EventKind;
@@ -167,8 +167,12 @@ impl Database {
         }
         schema::migrate(&mut connection, version, migrations)?;
         let meta = open_pack(&connection, now)?;
-        let mut database =
-            Self { connection, meta, delta_encoder: DeltaEncoder::default(), max_half_cycles: i64::from(max_half_cycles) };
+        let mut database = Self {
+            connection,
+            meta,
+            delta_encoder: DeltaEncoder::default(),
+            max_half_cycles: i64::from(max_half_cycles),
+        };
         database.fill_shelf()?;
         Ok(database)
     }
@@ -483,9 +487,7 @@ fn replace_pack(connection: &Connection, meta: &mut Meta, stamp: &Stamp) -> rusq
     meta.pack += 1;
     // A state of the pack that has gone must not come back.
     connection.execute("DELETE FROM state WHERE slot >= ?1", [ASIDE])?;
-    connection
-        .execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns])
-        .map(drop)
+    connection.execute("INSERT INTO pack (id, opened_ns) VALUES (?1, ?2)", params![meta.pack, stamp.wall_ns]).map(drop)
 }
 
 fn write_state(transaction: &Transaction<'_>, packed: &super::delta_encoder::Packed) -> rusqlite::Result<()> {

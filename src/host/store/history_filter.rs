@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
-use super::token_bucket::{TokenBucket, Limit};
 use super::rows::{Row, Subject};
+use super::token_bucket::{Limit, TokenBucket};
 use crate::alarm::Change;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::{CellIndex, Timestamp};

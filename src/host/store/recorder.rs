@@ -5,7 +5,7 @@ use std::path::Path;
 use super::database::{Database, StateRecord};
 use super::document::Document;
 use super::folder::{self, DATABASE, Folder};
-use super::history_filter::{HistoryFilter, CommitDecision};
+use super::history_filter::{CommitDecision, HistoryFilter};
 use super::parts::Parts;
 use super::rows::Batch;
 use super::stamp::Stamp;

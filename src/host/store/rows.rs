@@ -4,7 +4,7 @@ use rusqlite::types::Value;
 use serde::Serialize;
 
 use super::stamp::Stamp;
-use crate::alarm::{Rule, Severity, State};
+use crate::alarm::{AlarmState, Rule, Severity};
 use crate::monitor::EventKind;
 use crate::quantity::CellIndex;
 
@@ -296,7 +296,7 @@ fn dropped_values(rule: Rule, severity: Severity, cell: Option<CellIndex>, occur
         Value::Text(rule.name().to_owned()),
         word(&severity),
         word(&"dropped"),
-        word(&State::Inactive),
+        word(&AlarmState::Inactive),
         whole(0),
         Value::Null,
         Value::Null,
@@ -381,7 +381,7 @@ pub(super) mod tests {
             rule: Rule::SocLow,
             cell: None,
             change,
-            state: State::Active,
+            state: AlarmState::Active,
             active: true,
             severity: Severity::Warning,
             value: Some(0.05),

@@ -10,13 +10,14 @@ use super::database::Database;
 use super::folder::DATABASE;
 use super::parts::Parts;
 use super::*;
+
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
-use crate::replay::{self, Settings, Sinks, When};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogOptions, LogSource};
 use crate::monitor::{Input, Outputs};
 use crate::quantity::CellIndex;
+use crate::replay::{self, LogTime, ReplaySettings, Sinks};
 
 fn config() -> Config {
     config::load(&PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../config/measured.toml")).unwrap()
@@ -53,12 +54,12 @@ fn snapshot(seconds: Option<i64>, store: Option<Recorder>) -> Snapshot {
     let folder = tempfile::tempdir().unwrap();
     let config = config();
     let mut source = log(&config, folder.path());
-    let settings = Settings {
+    let settings = ReplaySettings {
         snapshot: true,
-        snapshot_at: seconds.map(|seconds| When::After(seconds * 1_000_000_000)),
+        snapshot_at: seconds.map(|seconds| LogTime::After(seconds * 1_000_000_000)),
         away: Some(Downtime::AsStamped),
         store,
-        ..Settings::plain(30.0, config.interface_names())
+        ..ReplaySettings::plain(30.0, config.interface_names())
     };
     let monitor = Monitor::new(config.monitor);
     replay::run(&mut source, monitor, Sinks::default(), settings, &mut |_| {}).unwrap().1.unwrap()

@@ -1,4 +1,4 @@
-//! Axes: which part of the world they show, where their ticks are, and what is written at them.
+//! Axes: their range, ticks and labels.
 
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
@@ -35,7 +35,7 @@ const MONTH_S: f64 = 30.44 * DAY;
 /// Room above and below the data, parts of their range.
 const MARGIN: f64 = 0.06;
 
-/// What the numbers of an axis are.
+/// Scale of an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Scale {
     #[default]
@@ -97,7 +97,7 @@ fn opened((low, high): (f64, f64), margin: f64) -> (f64, f64) {
         return (0.0, 1.0);
     }
     let width = high - low;
-    // Too narrow for ticks that can be told apart: some room round the value.
+    // Too narrow for distinct ticks: some room around the value.
     let room = if width <= 1e-9 * low.abs().max(1e-3) { 0.5 * low.abs().clamp(1.0, 3600.0) } else { margin * width };
     (low - room, high + room)
 }
@@ -152,7 +152,7 @@ fn month_ticks((low, high): (f64, f64), raw: f64) -> Vec<(f64, String)> {
         .collect()
 }
 
-/// A moment as precise as the step asks for.
+/// Formats a time with the precision of the step.
 fn moment(time_s: f64, step: f64) -> String {
     let text = format_utc(Timestamp::from_secs(time_s));
     let part = if step >= DAY {

@@ -1,6 +1,5 @@
-//! Pictures as files: SVG that stands alone, light or dark as its reader likes, and PNG.
+//! Writes pictures as files: self-contained SVG, light or dark as the viewer prefers, and PNG.
 
-use std::io::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -9,16 +8,15 @@ use resvg::usvg::{Options, Tree, fontdb};
 
 use super::style::{fixed, variables};
 use super::{Picture, Size, escape};
-use crate::io::result_file::ResultFile;
 
-/// Space round a picture in a file, pixels.
+/// Space around a picture in a file, pixels.
 const MARGIN: f64 = 14.0;
 /// Pixels of a PNG per pixel of the picture: sharp on paper.
 const DENSITY: f32 = 2.0;
-/// Fonts that look well, tried in this order.
+/// Preferred fonts, tried in this order.
 const FAMILIES: [&str; 5] = ["DejaVu Sans", "Noto Sans", "Liberation Sans", "Arial", "Roboto"];
 
-/// What a picture is written as.
+/// File format of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     Svg,
@@ -51,11 +49,7 @@ pub fn write_stack(path: &Path, pictures: &[Picture], format: Format) -> Result<
         Format::Svg => document(pictures, &variables()).into_bytes(),
         Format::Png => png(&document(pictures, &fixed())).map_err(failed)?,
     };
-    let written = ResultFile::create(path).and_then(|mut file| {
-        file.write_all(&bytes)?;
-        file.finish()
-    });
-    written.map_err(|error| failed(error.to_string()))
+    crate::write_file(path, &bytes).map_err(|error| failed(error.to_string()))
 }
 
 /// An SVG document.
@@ -105,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_stands_alone_and_a_bad_path_is_told() {
+    fn a_file_stands_alone_and_a_bad_path_is_reported() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("plot.svg");
         write(&path, &picture(), Format::Svg).expect("drawn");
@@ -124,7 +118,7 @@ mod tests {
                 let is_blue = |p: &resvg::tiny_skia::PremultipliedColorU8| p.blue() > p.red().saturating_add(20);
                 assert!(pixels.pixels().iter().filter(|p| is_blue(p)).count() > 1000, "no band in it");
             }
-            Err(told) => assert!(told.contains("no font is installed"), "{told}"),
+            Err(error) => assert!(error.contains("no font is installed"), "{error}"),
         }
     }
 

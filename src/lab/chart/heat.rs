@@ -42,7 +42,8 @@ impl Heat {
         let x = self.x.ends(std::iter::empty(), false);
         let area = Area { left, top, width: size.width - left - 22.0, height, x, y: (0.0, 1.0) };
         area.draw_x(&mut svg, &self.x);
-        let every = [1, 2, 5, 10, 20, 50, 100, 200].into_iter().find(|n| f64::from(*n) * row >= 13.0).unwrap_or(500);
+        let every =
+            [1_u32, 2, 5, 10, 20, 50, 100, 200].into_iter().find(|n| f64::from(*n) * row >= 13.0).unwrap_or(500);
         for cell in (1..=self.rows.len()).filter(|cell| *cell == 1 || cell % every as usize == 0) {
             svg.text(left - 6.0, top + (cell as f64 - 0.5) * row + 4.0, "t e", &cell.to_string());
         }
@@ -82,8 +83,8 @@ impl Heat {
         let decimals = self.decimals;
         let (low, high) = (format!("{low:.decimals$}"), format!("{high:.decimals$}"));
         let needs = text_width(&low, 11.5) + text_width(&high, 11.5) + 18.0 * 9.0 + 110.0;
-        let beside = text_width(&self.label, 11.5) + 130.0;
-        let (mut x, y) = if beside + needs < width { (beside, top) } else { (0.0, top + 18.0) };
+        let label_end = text_width(&self.label, 11.5) + 130.0;
+        let (mut x, y) = if label_end + needs < width { (label_end, top) } else { (0.0, top + 18.0) };
         svg.text(x, y + 12.0, "l", &low);
         x += text_width(&low, 11.5) + 6.0;
         for step in 0..STEPS.len() {

@@ -2,14 +2,14 @@
 
 use super::axis::Axis;
 use super::style::Ink;
-use super::svg::{Svg, Trail, short, text_width};
+use super::svg::{PathBuilder, Svg, short, text_width};
 use super::{Size, thin};
 
 /// Font size of ticks and legend, pixels, as the style sheet has it.
 const SMALL: f64 = 11.5;
-/// Most points of a layer that get a tool tip each; more are dots alone.
+/// Most points of a layer with a tool tip each; more are dots without.
 const MAX_TIPS: usize = 400;
-/// Height of the title, of a row of the legend, and of what stands below the axis, pixels.
+/// Height of the title, of a row of the legend, and of the labels below the axis, pixels.
 const TITLE: f64 = 24.0;
 const ROW: f64 = 18.0;
 const FOOT: f64 = 38.0;
@@ -30,7 +30,7 @@ pub struct Point {
     pub tip: String,
 }
 
-/// What is drawn; x does not fall.
+/// Shape of a layer; x does not fall.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Shape {
     /// (x, y).
@@ -42,11 +42,11 @@ pub enum Shape {
     Points(Vec<Point>),
     /// A threshold: the whole width at this y.
     Level(f64),
-    /// Something that happened: the whole height at these x, with tool tips in the points' `tip`.
+    /// Events: lines of the whole height at these x, with tool tips in the points' `tip`.
     Moments(Vec<Point>),
 }
 
-/// One of the things drawn, later ones above earlier ones.
+/// One layer of a chart; later ones are drawn above earlier ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Layer {
     /// For the legend; empty = not in it.
@@ -65,7 +65,7 @@ impl Layer {
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Chart {
     pub title: String,
-    /// For those who cannot see it.
+    /// For readers who cannot see the picture.
     pub description: String,
     pub x: Axis,
     pub y: Axis,
@@ -142,7 +142,7 @@ impl Chart {
         (svg.0, top + height + FOOT)
     }
 
-    /// Label of the y axis and what is what, in rows; gives where they end.
+    /// Draws the label of the y axis and the legend in rows; returns where they end.
     fn legend(&self, svg: &mut Svg, width: f64, top: f64) -> f64 {
         svg.text(0.0, top + 12.0, "t", &self.y.label);
         let (mut x, mut y) = (text_width(&self.y.label, SMALL) + 18.0, top);
@@ -159,7 +159,7 @@ impl Chart {
     }
 }
 
-/// The title in as many lines as it needs; gives where it ends.
+/// Draws the title in as many lines as it needs; returns where it ends.
 pub(super) fn title(svg: &mut Svg, text: &str, width: f64) -> f64 {
     let mut y = 0.0;
     for line in wrapped(text, width, 14.5) {
@@ -258,39 +258,39 @@ impl Layer {
             });
         }
         let places: Vec<(f64, f64)> = finite().map(|point| (point.x, point.y)).collect();
-        let mut trail = Trail::default();
+        let mut path = PathBuilder::default();
         let bins = area.width.max(1.0) as usize;
-        thin::line(&places, bins).into_iter().for_each(|(x, y)| trail.dot(area.px(x), area.py(y)));
-        svg.path(&format!("o {}", self.ink.stroke()), &trail.d, &self.label);
+        thin::line(&places, bins).into_iter().for_each(|(x, y)| path.dot(area.px(x), area.py(y)));
+        svg.path(&format!("o {}", self.ink.stroke()), &path.d, &self.label);
     }
 }
 
 fn line_path(points: &[(f64, f64)], area: &Area, bins: usize) -> String {
-    let mut trail = Trail::default();
+    let mut path = PathBuilder::default();
     for run in points.split(|p| !(p.0.is_finite() && p.1.is_finite())).filter(|run| !run.is_empty()) {
-        trail.lift();
+        path.lift();
         let kept = thin::line(run, bins);
-        // A value alone is seen as well.
+        // A single value is drawn as a short line.
         if let [only] = kept[..] {
-            trail.to(area.px(only.0) - 1.0, area.py(only.1));
-            trail.to(area.px(only.0) + 1.0, area.py(only.1));
+            path.to(area.px(only.0) - 1.0, area.py(only.1));
+            path.to(area.px(only.0) + 1.0, area.py(only.1));
         }
-        kept.into_iter().for_each(|(x, y)| trail.to(area.px(x), area.py(y)));
+        kept.into_iter().for_each(|(x, y)| path.to(area.px(x), area.py(y)));
     }
-    trail.d
+    path.d
 }
 
 fn band_path(points: &[(f64, f64, f64)], area: &Area, bins: usize) -> String {
-    let mut trail = Trail::default();
+    let mut path = PathBuilder::default();
     for run in points.split(|p| !(p.0.is_finite() && p.1.is_finite() && p.2.is_finite())).filter(|run| !run.is_empty())
     {
-        trail.lift();
+        path.lift();
         let kept = thin::band(run, bins);
-        kept.iter().for_each(|p| trail.to(area.px(p.0), area.py(p.2)));
-        kept.iter().rev().for_each(|p| trail.to(area.px(p.0), area.py(p.1)));
-        trail.d.push('z');
+        kept.iter().for_each(|p| path.to(area.px(p.0), area.py(p.2)));
+        kept.iter().rev().for_each(|p| path.to(area.px(p.0), area.py(p.1)));
+        path.d.push('z');
     }
-    trail.d
+    path.d
 }
 
 #[cfg(test)]
@@ -330,11 +330,11 @@ mod tests {
     }
 
     #[test]
-    fn a_legend_too_long_for_a_row_goes_on_in_the_next() {
+    fn a_legend_too_long_for_a_row_continues_in_the_next() {
         let layers = (0..6).map(|i| Layer::new(&format!("a rather long label {i}"), Ink::Blue, Shape::Level(1.0)));
         let chart = chart(layers.collect());
         let more = chart.draw(Size::NARROW).1 - chart.draw(Size { width: 2000.0, ..Size::NARROW }).1;
-        // One beside the axis' name, then two in a row.
+        // One next to the axis' name, then two per row.
         assert!((more - 3.0 * ROW).abs() < 0.1, "{more} pixels");
     }
 }

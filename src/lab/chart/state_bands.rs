@@ -1,4 +1,4 @@
-//! Spans of time in lanes: which alarm was raised from when to when.
+//! Bands of states over time: when each alarm was raised.
 
 use super::Size;
 use super::axis::Axis;
@@ -6,13 +6,13 @@ use super::plot::{Area, title};
 use super::style::Ink;
 use super::svg::{Svg, text_width};
 
-/// Height of a lane's name and of its spans, pixels.
+/// Height of a band's name and of its spans, pixels.
 const NAME: f64 = 16.0;
 const BAR: f64 = 12.0;
 /// Narrowest span, pixels: the shortest alarm is still seen.
 const LEAST: f64 = 3.0;
 
-/// Something that lasted.
+/// A state with its beginning and end.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Span {
     pub from: f64,
@@ -22,25 +22,25 @@ pub struct Span {
     pub tip: String,
 }
 
-/// What belongs together.
+/// The spans of one state.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Lane {
+pub struct StateBand {
     pub name: String,
     pub spans: Vec<Span>,
 }
 
-/// Lanes one below the other.
+/// Bands one below the other.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Lanes {
+pub struct StateBands {
     pub title: String,
     pub description: String,
     pub x: Axis,
-    pub lanes: Vec<Lane>,
-    /// What the inks mean.
+    pub bands: Vec<StateBand>,
+    /// Meaning of the inks.
     pub keys: Vec<(Ink, String)>,
 }
 
-impl Lanes {
+impl StateBands {
     /// The elements, and the height they take.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();
@@ -52,16 +52,16 @@ impl Lanes {
             x += 38.0 + text_width(word, 11.5);
         }
         top += 26.0;
-        let spans = self.lanes.iter().flat_map(|lane| &lane.spans);
+        let spans = self.bands.iter().flat_map(|band| &band.spans);
         let ends = self.x.ends(spans.flat_map(|span| [span.from, span.to]), false);
-        let height = self.lanes.len() as f64 * (NAME + BAR + 6.0);
+        let height = self.bands.len() as f64 * (NAME + BAR + 6.0);
         let area = Area { left: 8.0, top, width: size.width - 30.0, height, x: ends, y: (0.0, 1.0) };
         area.draw_x(&mut svg, &self.x);
-        for (index, lane) in self.lanes.iter().enumerate() {
+        for (index, band) in self.bands.iter().enumerate() {
             let y = top + index as f64 * (NAME + BAR + 6.0);
-            svg.text(area.left, y + 12.0, "l", &lane.name);
+            svg.text(area.left, y + 12.0, "l", &band.name);
             svg.open_area((area.left, y + NAME), (area.width, BAR));
-            for span in &lane.spans {
+            for span in &band.spans {
                 let (from, to) = (area.px(span.from), area.px(span.to));
                 svg.rect(
                     (from.min(area.width - LEAST), 0.0),
@@ -83,9 +83,9 @@ mod tests {
     #[test]
     fn the_shortest_alarm_at_the_very_end_is_still_seen() {
         let span = Span { from: 100.0, to: 100.0, ink: Ink::Red, tip: "severe".into() };
-        let lane = Lane { name: "capacity_low".into(), spans: vec![span] };
-        let lanes = Lanes { x: Axis::number("d").within(0.0, 100.0), lanes: vec![lane], ..Lanes::default() };
-        let (text, _) = lanes.draw(Size { width: 330.0, height: 0.0 });
+        let band = StateBand { name: "capacity_low".into(), spans: vec![span] };
+        let bands = StateBands { x: Axis::number("d").within(0.0, 100.0), bands: vec![band], ..StateBands::default() };
+        let (text, _) = bands.draw(Size { width: 330.0, height: 0.0 });
         assert!(text.contains("<rect x=\"297\" y=\"0\" width=\"3\""), "{text}");
     }
 }

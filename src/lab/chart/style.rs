@@ -1,11 +1,11 @@
 //! Colours: classes for strokes, fills and words, and their values in light and dark.
 //!
-//! The inks are those of Okabe and Ito, which people with any colour vision can tell apart, lighter on a dark page;
+//! The inks are those of Okabe and Ito, which people with any colour vision can distinguish, lighter on a dark page;
 //! the steps of heat maps are those of cividis (Nuñez, Anderton, Renslow 2018), made for the same readers.
 
 use std::fmt::Write as _;
 
-/// What something is drawn with.
+/// Colour of a drawn element.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ink {
     /// As words: truth, measurement.
@@ -72,7 +72,7 @@ pub(super) fn step_class(step: usize) -> String {
     format!("h-{step}")
 }
 
-/// The colours as variables of a page or a file: light, and dark on a screen that asks for it.
+/// The colours as variables of a page or a file: light, and dark on a screen that prefers it.
 pub fn variables() -> String {
     let list = |pick: fn(&(&str, &'static str, &'static str)) -> &'static str| {
         COLOURS.iter().fold(String::new(), |text, colour| text + &format!("--{}:{};", colour.0, pick(colour)))
@@ -84,7 +84,7 @@ pub fn variables() -> String {
     ) + &classes()
 }
 
-/// The classes alone, light, without variables, for programs that read no such style sheets.
+/// The classes alone, light, without variables, for programs without support for variables.
 pub(super) fn fixed() -> String {
     COLOURS.iter().fold(classes(), |text, (name, light, _)| text.replace(&format!("var(--{name})"), light))
 }

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 /// Average width of a character, parts of the font size.
 const CHARACTER: f64 = 0.56;
 
-/// Text as it may stand in an element or an attribute.
+/// Escapes text for an element or an attribute.
 pub fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for character in text.chars() {
@@ -30,7 +30,7 @@ pub(super) fn text_width(text: &str, size: f64) -> f64 {
 /// A coordinate with one decimal, as short as it goes.
 pub(super) fn short(value: f64) -> String {
     let tenths = (value * 10.0).round();
-    // Beyond any picture; keeps the text short whatever comes in.
+    // Larger than any picture: keeps the text short for any input.
     let tenths = tenths.clamp(-1e6, 1e6) as i64;
     match (tenths / 10, tenths.abs() % 10) {
         (whole, 0) => whole.to_string(),
@@ -99,12 +99,12 @@ impl Svg {
 
 /// A path through points: absolute at its beginning, then steps, so that it is short and rounding does not add up.
 #[derive(Debug, Default)]
-pub(super) struct Trail {
+pub(super) struct PathBuilder {
     pub(super) d: String,
     last: Option<(f64, f64)>,
 }
 
-impl Trail {
+impl PathBuilder {
     pub(super) fn lift(&mut self) {
         self.last = None;
     }
@@ -147,9 +147,9 @@ mod tests {
 
     #[test]
     fn steps_of_a_path_do_not_drift() {
-        let mut trail = Trail::default();
-        (0..=1000).for_each(|i| trail.to(f64::from(i) * 0.333, 0.0));
-        let sum: f64 = trail.d[1..].split(['l', ' ']).step_by(2).map(|x| x.parse::<f64>().unwrap()).sum();
+        let mut path = PathBuilder::default();
+        (0..=1000).for_each(|i| path.to(f64::from(i) * 0.333, 0.0));
+        let sum: f64 = path.d[1..].split(['l', ' ']).step_by(2).map(|x| x.parse::<f64>().unwrap()).sum();
         assert!((sum - 333.0).abs() < 0.05, "{sum}");
     }
 

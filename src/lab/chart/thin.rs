@@ -1,4 +1,4 @@
-//! Long series cut down to what a picture can show.
+//! Reduces long series to the resolution of a picture.
 
 /// First, lowest, highest and last point of each of `bins` bins along x, in their order; a short series as it is.
 pub(super) fn line(points: &[(f64, f64)], bins: usize) -> Vec<(f64, f64)> {

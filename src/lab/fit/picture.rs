@@ -1,25 +1,27 @@
-//! The residual plot: one panel per file, measured less model over time.
+//! The residual plot: one panel per file, measured minus model voltage over time.
 
 use std::path::Path;
 
-use super::{FitFailure, Outcome};
-use crate::ident::pass::residuals;
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use super::FitOutcome;
 
-/// Most panels; a page of more is not looked at.
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use crate::error::LabError;
+use crate::ident::pass::residuals;
+
+/// Most panels: a longer page is not read.
 const MAX_PANELS: usize = 40;
 
 /// Writes the plot.
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, outcome: &Outcome) -> Result<(), FitFailure> {
+pub fn write(path: &Path, outcome: &FitOutcome) -> Result<(), LabError> {
     let panels: Vec<Picture> = (0..outcome.files.len()).take(MAX_PANELS).map(|number| panel(outcome, number)).collect();
-    chart::write_stack(path, &panels, Format::Svg).map_err(|error| FitFailure(error.to_string()))
+    Ok(chart::write_stack(path, &panels, Format::Svg)?)
 }
 
 /// One file; its stretches follow each other.
-fn panel(outcome: &Outcome, number: usize) -> Picture {
+fn panel(outcome: &FitOutcome, number: usize) -> Picture {
     let file = &outcome.files[number];
     let mut points = Vec::new();
     let mut begin_s = 0.0;

@@ -1,109 +1,88 @@
 //! From measured files to records: voltage limits, capacity, slow tests, SOC, temperature.
 
-use super::{FitFailure, Request};
-use crate::ident::Raw;
+use super::FitRequest;
+use crate::error::LabError;
+use crate::ident::RawRows;
 use crate::ident::ageing::{self, HalfCycle};
 use crate::ident::anchor::Stretch;
-use crate::ident::fit::{self, Fit, OcvCurve, Residual};
+use crate::ident::fit::{self, FittedTables, OcvCurve, Residual};
 use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
-use crate::measured::{MeasuredFile, Part};
+use crate::measured::{MeasuredFile, MeasuredPart};
 
-/// Temperature taken where a file has none, degrees C.
-const USUAL_C: f64 = 25.0;
+/// Temperature assumed where a file has none, degrees C.
+const DEFAULT_C: f64 = 25.0;
 /// Temperatures of files closer than this share a node, K.
 const NODE_GAP_K: f64 = 5.0;
-/// Voltages this far beyond the cell's limits are no cell's, V.
+/// Voltages further than this beyond the cell's limits are not credible, V.
 const CREDIBLE_BEYOND_V: (f64, f64) = (1.0, 0.3);
-/// Voltages below this are a sensor that hangs free, V.
+/// Voltages below this come from a disconnected sensor, V.
 const DISCONNECTED_V: f64 = 0.5;
-/// A charge counts less than a discharge of an ageing cell: its voltage carries slower relaxation.
+/// Weight of a charge relative to a discharge of an ageing cell: its voltage carries slower relaxation.
 const AGEING_CHARGE_SCALE: f64 = 0.6;
-/// Share of the capacity a slow test must have taken out.
+/// Least share of the capacity that a slow test must discharge.
 const SLOW_TEST_SHARE: f64 = 0.5;
 
-/// One stretch of a file, ready but for the grid.
-pub(super) struct Source<'a> {
+/// One stretch of a file with its SOC, not yet placed in the grid.
+pub(super) struct AnchoredPart {
     /// Number of its file.
     pub(super) file: usize,
-    part: Clean<'a>,
+    part: MeasuredPart,
     soc: Vec<f64>,
     judged: Vec<bool>,
-    /// What each second weighs; `None` = by the SOC it covers and by what it is.
+    /// Weight of each second; `None` = by the SOC it covers and the kind of test.
     scale: Option<f64>,
 }
 
-/// Everything that is known before the grid is.
-pub(super) struct Prepared<'a> {
-    pub(super) sources: Vec<Source<'a>>,
+/// Everything the fit needs before the grid is known.
+pub(super) struct FitInputs {
+    pub(super) sources: Vec<AnchoredPart>,
     pub(super) capacity_ah: f64,
     pub(super) voltage_v: (f64, f64),
     pub(super) ocv: Vec<OcvCurve>,
     pub(super) notes: Vec<String>,
 }
 
-/// A part without the rows that lack current or voltage or whose time runs backwards.
-struct Clean<'a> {
-    part: &'a Part,
-    time_s: Vec<f64>,
-    current_a: Vec<f64>,
-    voltage_v: Vec<f64>,
-    temperature_c: Vec<f64>,
-    discharged_ah: Vec<f64>,
+/// Returns a part without the rows that lack current or voltage or whose time runs backwards; a temperature holds until the
+/// next one.
+fn clean(part: &MeasuredPart) -> MeasuredPart {
+    let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
+    let mut temperature_c = known.unwrap_or(DEFAULT_C);
+    let mut clean = MeasuredPart { key: part.key.clone(), kind: part.kind.clone(), ..MeasuredPart::default() };
+    for k in 0..part.len() {
+        let backwards = clean.time_s.last().is_some_and(|&last| part.time_s[k] < last);
+        if backwards || part.current_a[k].is_nan() || part.voltage_v[k].is_nan() {
+            continue;
+        }
+        if part.temperature_c[k].is_finite() {
+            temperature_c = part.temperature_c[k];
+        }
+        clean.push(part.time_s[k], part.current_a[k], part.voltage_v[k], temperature_c, part.discharged_ah[k]);
+    }
+    clean
 }
 
-impl<'a> Clean<'a> {
-    fn new(part: &'a Part) -> Self {
-        let mut clean = Self {
-            part,
-            time_s: vec![],
-            current_a: vec![],
-            voltage_v: vec![],
-            temperature_c: vec![],
-            discharged_ah: vec![],
-        };
-        let known = part.temperature_c.iter().copied().find(|t| t.is_finite());
-        let mut temperature_c = known.unwrap_or(USUAL_C);
-        for k in 0..part.len() {
-            let backwards = clean.time_s.last().is_some_and(|&last| part.time_s[k] < last);
-            if backwards || part.current_a[k].is_nan() || part.voltage_v[k].is_nan() {
-                continue;
-            }
-            if part.temperature_c[k].is_finite() {
-                temperature_c = part.temperature_c[k];
-            }
-            clean.time_s.push(part.time_s[k]);
-            clean.current_a.push(part.current_a[k]);
-            clean.voltage_v.push(part.voltage_v[k]);
-            clean.temperature_c.push(temperature_c);
-            clean.discharged_ah.push(part.discharged_ah[k]);
-        }
-        clean
-    }
-
-    fn stretch(&self) -> Stretch<'_> {
-        Stretch {
-            time_s: &self.time_s,
-            current_a: &self.current_a,
-            voltage_v: &self.voltage_v,
-            discharged_ah: &self.discharged_ah,
-        }
+fn stretch(part: &MeasuredPart) -> Stretch<'_> {
+    Stretch {
+        time_s: &part.time_s,
+        current_a: &part.current_a,
+        voltage_v: &part.voltage_v,
+        discharged_ah: &part.discharged_ah,
     }
 }
 
-/// Finds out everything but the grid.
-pub(super) fn prepare<'a>(
-    request: &Request,
-    files: &'a [MeasuredFile],
-    slow: &'a [MeasuredFile],
-) -> Result<Prepared<'a>, FitFailure> {
+/// Determines everything but the grid.
+pub(super) fn prepare(
+    request: &FitRequest,
+    files: &[MeasuredFile],
+    slow: &[MeasuredFile],
+) -> Result<FitInputs, LabError> {
     if request.first_cycles.is_some() {
         need_cycles(files)?;
     }
     let voltage_v = voltage_limits(request, files)?;
     let mut notes = Vec::new();
-    let dropped: usize =
-        files.iter().map(|f| f.rows() - f.parts.iter().map(|p| Clean::new(p).time_s.len()).sum::<usize>()).sum();
+    let dropped: usize = files.iter().map(|f| f.rows() - f.parts.iter().map(|p| clean(p).len()).sum::<usize>()).sum();
     if dropped > 0 {
         notes.push(format!("{dropped} rows left out: without current or voltage, or back in time"));
     }
@@ -122,68 +101,65 @@ pub(super) fn prepare<'a>(
             test.out_ah[test.out_ah.len() - 1]
         }
         (None, None) => {
-            notes.push("capacity is the deepest discharge in the data, for want of --capacity".into());
+            notes.push("capacity is the deepest discharge in the data (no --capacity given)".into());
             deepest_ah
         }
     };
     if capacity_ah <= 0.0 {
-        return Err(FitFailure("no discharge in the data".into()));
+        return Err(LabError("no discharge in the data".into()));
     }
-    let sources = taken.drain(..).map(|(file, part, out_ah)| Source {
+    let sources = taken.drain(..).map(|(file, part, out_ah)| AnchoredPart {
         file,
         soc: out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect(),
         part,
         judged: vec![],
         scale: None,
     });
-    let mut sources: Vec<Source<'a>> = sources.collect();
+    let mut sources: Vec<AnchoredPart> = sources.collect();
     let slow_sources =
         slow.iter().enumerate().map(|(k, file)| slow_source(file, files.len() + k, voltage_v.1, capacity_ah));
     sources.extend(slow_sources.collect::<Result<Vec<_>, _>>()?);
     let ocv = tests.iter().map(|test| test.curve(capacity_ah)).collect();
-    Ok(Prepared { sources, capacity_ah, voltage_v, ocv, notes })
+    Ok(FitInputs { sources, capacity_ah, voltage_v, ocv, notes })
 }
 
-/// Charge taken out since full, of every part of every file; files that do not begin full are refused together.
-type TakenOut<'a> = (usize, Clean<'a>, Vec<f64>);
+/// Number of the file, a part of it, and the charge taken out since full at every row, Ah.
+type PartDischarge = (usize, MeasuredPart, Vec<f64>);
 
-fn taken_out<'a>(
-    request: &Request,
-    files: &'a [MeasuredFile],
-    voltage_max_v: f64,
-) -> Result<Vec<TakenOut<'a>>, FitFailure> {
+/// Returns the charge taken out of every part of every file; reports all files that do not begin full in one error.
+fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -> Result<Vec<PartDischarge>, LabError> {
     let (mut taken, mut refused) = (Vec::new(), Vec::new());
     for (number, file) in files.iter().enumerate() {
-        for part in file.parts.iter().map(Clean::new).filter(|part| !part.time_s.is_empty()) {
+        for part in file.parts.iter().map(clean).filter(|part| !part.time_s.is_empty()) {
             let hint_ah = request.capacity_ah.or(request.rated_ah).unwrap_or_else(|| rough_capacity(&part));
-            match part.stretch().taken_out_ah(voltage_max_v, hint_ah) {
+            match stretch(&part).taken_out_ah(voltage_max_v, hint_ah) {
                 Ok(out_ah) => taken.push((number, part, out_ah)),
-                Err(error) => refused.push(format!("{}{}: {error}", file.path.display(), key_text(part.part))),
+                Err(error) => refused.push(format!("{}{}: {error}", file.path.display(), key_text(&part))),
             }
         }
     }
-    if refused.is_empty() { Ok(taken) } else { Err(FitFailure(refused.join("\n"))) }
+    if refused.is_empty() { Ok(taken) } else { Err(LabError(refused.join("\n"))) }
 }
 
-fn key_text(part: &Part) -> String {
+fn key_text(part: &MeasuredPart) -> String {
     if part.key.is_empty() { String::new() } else { format!(" part {}", part.key) }
 }
 
-fn rough_capacity(part: &Clean<'_>) -> f64 {
+fn rough_capacity(part: &MeasuredPart) -> f64 {
     let out = crate::ident::charge_ah(&part.time_s, &part.current_a);
     out.iter().fold(0.0_f64, |most, ah| most.max(*ah))
 }
 
-/// Given limits, else those the data keep to but for a few stray rows.
-fn voltage_limits(request: &Request, files: &[MeasuredFile]) -> Result<(f64, f64), FitFailure> {
+/// Returns the given limits, else the limits of the data without a few stray rows.
+fn voltage_limits(request: &FitRequest, files: &[MeasuredFile]) -> Result<(f64, f64), LabError> {
     let (low, high) = match request.first_cycles {
         Some(first) => cycle_limits(files, first),
         None => seen_limits(files),
     }
-    .ok_or_else(|| FitFailure("no voltage in the data".into()))?;
+    .ok_or_else(|| LabError("no voltage in the data".into()))?;
     let (low, high) = (request.voltage_min_v.unwrap_or(low), request.voltage_max_v.unwrap_or(high));
     if low >= high {
-        return Err(FitFailure(format!("lowest voltage {low} V, highest {high} V: must be below it")));
+        return Err(LabError(format!("lowest voltage {low} V, highest {high} V: must be below it")));
     }
     Ok((low, high))
 }
@@ -197,12 +173,12 @@ fn seen_limits(files: &[MeasuredFile]) -> Option<(f64, f64)> {
     Some(((low * 100.0).floor() / 100.0, (high * 100.0).ceil() / 100.0))
 }
 
-/// Limits of whole cycles: every discharge ends with its first row below the cut-off, which comes in steps of 0.1 V, so
-/// the highest of these rows tells it; charges hold their voltage, of which the middle one counts.
+/// Returns the voltage limits of whole cycles. Every discharge ends with its first row below the cut-off, which comes in
+/// steps of 0.1 V, so the highest of these rows gives the lower limit. Charges hold their voltage: the median counts.
 fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(f64, f64)> {
     let early =
         || files.iter().flat_map(|f| &f.parts).filter(move |p| p.key.parse().is_ok_and(|cycle: usize| cycle <= first));
-    let extreme = |part: &Part, sign: f64| {
+    let extreme = |part: &MeasuredPart, sign: f64| {
         let most_a = part.current_a.iter().fold(0.0_f64, |most, i| most.max(i * sign));
         let rows = part.current_a.iter().zip(&part.voltage_v);
         let loaded = rows.filter(|(i, _)| *i * sign > 0.02 * most_a).map(|(_, v)| -v * sign);
@@ -237,13 +213,13 @@ impl SlowDischarge {
     }
 }
 
-fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, FitFailure> {
-    let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
-    let part = Clean::new(&file.parts[0]);
+fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, LabError> {
+    let fail = |what: String| LabError(format!("{}: {what}", file.path.display()));
+    let part = clean(&file.parts[0]);
     if part.time_s.is_empty() {
         return Err(fail("no row with current and voltage".into()));
     }
-    let out_ah = part.stretch().taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(|e| fail(e.to_string()))?;
+    let out_ah = stretch(&part).taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(|e| fail(e.to_string()))?;
     let begin = part.current_a.iter().position(|&i| i > 0.0).ok_or_else(|| fail("no discharge".into()))?;
     let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
     let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
@@ -263,55 +239,55 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, F
     Ok(test)
 }
 
-/// A slow test's discharge as data beside the drives.
+/// Returns a slow test's discharge as data in addition to the drives.
 fn slow_source(
     file: &MeasuredFile,
     number: usize,
     voltage_max_v: f64,
     capacity_ah: f64,
-) -> Result<Source<'_>, FitFailure> {
-    let part = Clean::new(&file.parts[0]);
-    let out_ah = part.stretch().taken_out_ah(voltage_max_v, capacity_ah);
-    let out_ah = out_ah.map_err(|e| FitFailure(format!("{}: {e}", file.path.display())))?;
+) -> Result<AnchoredPart, LabError> {
+    let part = clean(&file.parts[0]);
+    let out_ah = stretch(&part).taken_out_ah(voltage_max_v, capacity_ah);
+    let out_ah = out_ah.map_err(|e| LabError(format!("{}: {e}", file.path.display())))?;
     let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
-    // What follows the discharge is judged by nobody.
+    // Rows after the discharge are not judged.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
     let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
-    Ok(Source { file: number, part, soc, judged, scale: None })
+    Ok(AnchoredPart { file: number, part, soc, judged, scale: None })
 }
 
-fn need_cycles(files: &[MeasuredFile]) -> Result<(), FitFailure> {
+fn need_cycles(files: &[MeasuredFile]) -> Result<(), LabError> {
     let without = files.iter().find(|file| file.parts.iter().any(|part| part.key.is_empty() || part.kind.is_empty()));
     without.map_or(Ok(()), |file| {
-        Err(FitFailure(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
+        Err(LabError(format!("{}: --first-cycles needs the columns cycle and type", file.path.display())))
     })
 }
 
-fn ageing_sources<'a>(
-    files: &'a [MeasuredFile],
+fn ageing_sources(
+    files: &[MeasuredFile],
     first: usize,
     voltage_v: (f64, f64),
     notes: Vec<String>,
-) -> Result<Prepared<'a>, FitFailure> {
-    let mut prepared = Prepared { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
+) -> Result<FitInputs, LabError> {
+    let mut prepared = FitInputs { sources: vec![], capacity_ah: 0.0, voltage_v, ocv: vec![], notes };
     for (number, file) in files.iter().enumerate() {
-        let fail = |what: String| FitFailure(format!("{}: {what}", file.path.display()));
+        let fail = |what: String| LabError(format!("{}: {what}", file.path.display()));
         let mut early = Vec::new();
         for part in &file.parts {
             let cycle: usize = part.key.parse().map_err(|_| fail(format!("cycle {:?}: not a number", part.key)))?;
             if cycle <= first {
-                early.push(Clean::new(part));
+                early.push(clean(part));
             }
         }
         let cycles: Vec<HalfCycle<'_>> = early.iter().map(half_cycle).collect();
         let (capacity_ah, anchored) = ageing::anchor(&cycles, voltage_v).map_err(|e| fail(e.to_string()))?;
         prepared.capacity_ah += capacity_ah / files.len() as f64;
-        let mut early: Vec<Option<Clean<'a>>> = early.into_iter().map(Some).collect();
+        let mut early: Vec<Option<MeasuredPart>> = early.into_iter().map(Some).collect();
         for half in anchored {
             let Some(mut part) = early[half.index].take() else { continue };
-            let scale = if part.part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
+            let scale = if part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
             part.current_a = half.current_a;
-            prepared.sources.push(Source {
+            prepared.sources.push(AnchoredPart {
                 file: number,
                 part,
                 soc: half.soc,
@@ -323,25 +299,25 @@ fn ageing_sources<'a>(
     Ok(prepared)
 }
 
-fn half_cycle<'b>(part: &'b Clean<'_>) -> HalfCycle<'b> {
+fn half_cycle(part: &MeasuredPart) -> HalfCycle<'_> {
     HalfCycle {
-        discharge: part.part.kind == "discharge",
+        discharge: part.kind == "discharge",
         time_s: &part.time_s,
         current_a: &part.current_a,
         voltage_v: &part.voltage_v,
     }
 }
 
-impl Prepared<'_> {
-    /// The records with their places in `grid`, and the weight of each.
+impl FitInputs {
+    /// Returns the records placed in `grid`, and the weight of each.
     pub(super) fn records(&self, grid: &Grid) -> (Vec<Record>, Vec<f64>) {
         let limits = Limits {
             voltage_low_v: (self.voltage_v.0 - CREDIBLE_BEYOND_V.0).max(DISCONNECTED_V),
             voltage_high_v: self.voltage_v.1 + CREDIBLE_BEYOND_V.1,
             capacity_ah: self.capacity_ah,
         };
-        let record = |source: &Source<'_>| {
-            let raw = Raw {
+        let record = |source: &AnchoredPart| {
+            let raw = RawRows {
                 time_s: &source.part.time_s,
                 current_a: &source.part.current_a,
                 voltage_v: &source.part.voltage_v,
@@ -353,26 +329,25 @@ impl Prepared<'_> {
         let records: Vec<Record> = self.sources.iter().map(record).collect();
         // Where there are no drives, the tests count in full.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
-        let usual = |r: &Record| record::weight(r) * record::share(r) / most;
-        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| usual(r)));
+        let by_share = |r: &Record| record::weight(r) * record::share(r) / most;
+        let scale = self.sources.iter().zip(&records).map(|(s, r)| s.scale.unwrap_or_else(|| by_share(r)));
         let scale = scale.collect();
         (records, scale)
     }
 
     /// Residuals of the discharges and of the charges.
-    pub(super) fn by_kind(&self, records: &[Record], fitted: &Fit) -> (Residual, Residual) {
+    pub(super) fn by_kind(&self, records: &[Record], fitted: &FittedTables) -> (Residual, Residual) {
         let of_kind = |discharge: bool| {
-            let own = self.sources.iter().zip(records).filter(|(s, _)| (s.part.part.kind == "discharge") == discharge);
+            let own = self.sources.iter().zip(records).filter(|(s, _)| (s.part.kind == "discharge") == discharge);
             let own: Vec<Record> = own.map(|(_, record)| record.clone()).collect();
             fit::judge(&own, &fitted.tables).1
         };
         (of_kind(true), of_kind(false))
     }
 
-    /// Temperatures the files were taken at: the coldest decile of each (cells warm under load), those close
-    /// together as one.
+    /// Returns the temperatures of the files: the coldest decile of each (cells warm under load), close ones joined.
     pub(super) fn temperature_nodes(&self) -> Vec<f64> {
-        let coldest = |source: &Source<'_>| {
+        let coldest = |source: &AnchoredPart| {
             let mut seen = source.part.temperature_c.clone();
             seen.sort_by(f64::total_cmp);
             seen[seen.len() / 10]

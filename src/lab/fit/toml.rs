@@ -1,11 +1,11 @@
-//! The cell model file: tables, thermal parameters, provenance. Holds no date: the same data give the same bytes.
+//! Writes the cell model file: tables, thermal parameters, provenance. It holds no date: the same data give the same bytes.
 
 use std::fmt::Write as _;
 
-use super::{AGEING_SHIFT, Outcome, Request};
+use super::{AGEING_SHIFT, FitOutcome, FitRequest};
 
-/// The whole file.
-pub fn text(request: &Request, outcome: &Outcome) -> String {
+/// Returns the whole file.
+pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
     let mut out = String::new();
     head(&mut out, request, outcome);
     provenance(&mut out, request, outcome);
@@ -27,7 +27,7 @@ fn quoted(text: &str) -> String {
     toml::Value::String(text.to_owned()).to_string()
 }
 
-fn head(out: &mut String, request: &Request, outcome: &Outcome) {
+fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     line(out, "# Written by `packwatch fit`; fit again rather than edit.");
     line(out, "format = 1");
     line(out, &format!("name = {}", quoted(&request.name)));
@@ -40,7 +40,7 @@ fn head(out: &mut String, request: &Request, outcome: &Outcome) {
     line(out, &format!("voltage_max_v = {}", outcome.voltage_v.1));
 }
 
-fn provenance(out: &mut String, request: &Request, outcome: &Outcome) {
+fn provenance(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     let fit = &outcome.fit;
     line(out, "\n[provenance]");
     line(out, &format!("program = \"packwatch {}\"", env!("CARGO_PKG_VERSION")));
@@ -69,13 +69,13 @@ fn provenance(out: &mut String, request: &Request, outcome: &Outcome) {
     }
 }
 
-/// The file and the folder it lies in: enough to know it, nothing of the machine.
+/// Returns a file's name with its folder: enough to identify it, nothing of the machine.
 fn file_name(path: &std::path::Path) -> String {
     let parts: Vec<_> = path.components().map(|part| part.as_os_str().to_string_lossy().into_owned()).collect();
     parts[parts.len().saturating_sub(2)..].join("/")
 }
 
-fn tables(out: &mut String, outcome: &Outcome) {
+fn tables(out: &mut String, outcome: &FitOutcome) {
     let grid = &outcome.fit.grid;
     let (ocv_v, r0_ohm, branches) = outcome.fit.tables.model(grid.soc.len());
     let list = |values: &[f64]| values.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ");

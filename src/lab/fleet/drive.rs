@@ -1,12 +1,13 @@
-//! One log through one core: the loop of a replay without its files.
+//! Replays one log through one monitor: the loop of `packwatch replay` without its files.
 //!
-//! In: a log and a monitor that has had no input. Out: after each input what came out, to a closure. Promise: the same
-//! inputs and ticks as `packwatch replay` gives the core, so the same results.
+//! Input: a log and a monitor without earlier input. Output: the monitor's outputs after each input, passed to a closure.
+//! Promise: the monitor receives the same inputs and ticks as from `packwatch replay`, so the results are the same.
 
 use std::path::Path;
 use std::sync::atomic::Ordering;
 
 use crate::config::Config;
+use crate::error::LabError;
 use crate::io::log::{LogCounts, LogSource, Record};
 use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, Outputs, TICK_PERIOD_MS};
@@ -15,61 +16,62 @@ use crate::quantity::Timestamp;
 /// Records between two reports of progress.
 const REPORT_EVERY: u64 = 4096;
 
-/// A log to be read, and what the user should know of how.
-pub type Opened = (LogSource, Option<String>);
+/// An opened log, and a note for the user on how it is read.
+pub type OpenedLog = (LogSource, Option<String>);
 
-/// How logs are read.
+/// How to read logs.
 #[derive(Clone, Copy)]
-pub struct Reading<'a> {
+pub struct LogAccess<'a> {
     /// Opens a log as it is read with a configuration.
-    pub open: &'a (dyn Fn(&Config, &Path) -> Opened + Sync),
-    /// A hole longer than this means that the recorder was asleep, s.
+    pub open: &'a (dyn Fn(&Config, &Path) -> OpenedLog + Sync),
+    /// A gap longer than this means that the recorder was asleep, s.
     pub sleep_gap_s: f64,
 }
 
-/// What a log was.
+/// Summary of a replayed log.
 #[derive(Debug, Clone, Default)]
-pub struct Driven {
-    /// What was read.
+pub struct DriveSummary {
+    /// Counts of the records read.
     pub counts: LogCounts,
     /// First and last stamp.
     pub span: Option<(Timestamp, Timestamp)>,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-impl Driven {
-    /// From the first stamp to the last, days.
+impl DriveSummary {
+    /// Returns the time from the first stamp to the last, days.
     pub fn days(&self) -> f64 {
         self.span.map_or(0.0, |(first, last)| last.since(first) / 86_400.0)
     }
 }
 
-/// Replays a log. `each` sees what came of every input and empties it; `report` is told the bytes read since it was last told.
+/// Replays a log. `each` takes the outputs of every input and clears them; `report` receives the bytes read since its last
+/// call.
 ///
 /// # Errors
-/// When the log cannot be read, or what `each` says.
+/// The log cannot be read, or `each` fails.
 pub fn drive(
-    (mut source, note): Opened,
+    (mut source, note): OpenedLog,
     mut monitor: Monitor,
     mut out: Outputs,
     sleep_gap_s: f64,
-    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), String>,
+    each: &mut dyn FnMut(&Monitor, &mut Outputs) -> Result<(), LabError>,
     report: &dyn Fn(u64),
-) -> Result<Driven, String> {
+) -> Result<DriveSummary, LabError> {
     let mut ticks = Ticks::new(TICK_PERIOD_MS, sleep_gap_s);
-    let (mut driven, mut records, mut told) = (Driven::default(), 0_u64, 0);
+    let (mut driven, mut records, mut reported) = (DriveSummary::default(), 0_u64, 0);
     driven.notes.extend(note);
     let mut tick = |ticks: &mut Ticks, monitor: &mut Monitor, input: Option<Input<'_>>| {
         while let Some(time) = ticks.pop(monitor.next_due()) {
             monitor.handle(Input::Tick { time }, &mut out);
             each(monitor, &mut out)?;
         }
-        let Some(input) = input else { return Ok(()) };
+        let Some(input) = input else { return Ok::<(), LabError>(()) };
         monitor.handle(input, &mut out);
         each(monitor, &mut out)
     };
-    while let Some(record) = source.next_record().map_err(|error| error.to_string())? {
+    while let Some(record) = source.next_record()? {
         driven.note(&record);
         if matches!(record, Record::UnknownGap { .. }) || source.carries_ticks() {
             ticks.sleep();
@@ -80,27 +82,27 @@ pub fn drive(
         records += 1;
         if records.is_multiple_of(REPORT_EVERY) {
             let bytes = source.read_bytes().load(Ordering::Relaxed);
-            report(bytes - told);
-            told = bytes;
+            report(bytes - reported);
+            reported = bytes;
         }
     }
     ticks.sleep();
     tick(&mut ticks, &mut monitor, None)?;
     monitor.settle(&mut out);
     each(&monitor, &mut out)?;
-    report(source.read_bytes().load(Ordering::Relaxed) - told);
+    report(source.read_bytes().load(Ordering::Relaxed) - reported);
     driven.finish(source.counts());
     Ok(driven)
 }
 
-impl Driven {
+impl DriveSummary {
     /// First and last stamp of `log`.
     ///
     /// # Errors
-    /// Nothing of it was read: what is known of why.
-    pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), String> {
+    /// The log held no record; the error includes the notes.
+    pub fn span_of(&self, log: &Path) -> Result<(Timestamp, Timestamp), LabError> {
         let why = || self.notes.iter().map(|note| format!(": {note}")).collect::<String>();
-        self.span.ok_or_else(|| format!("{}: holds no record{}", log.display(), why()))
+        self.span.ok_or_else(|| LabError(format!("{}: holds no record{}", log.display(), why())))
     }
 
     fn note(&mut self, record: &Record) {
@@ -124,10 +126,8 @@ impl Driven {
             self.notes.push(format!("{} bad lines left out, the first: {first}", counts.bad_lines));
         }
         if counts.unknown_gaps > 0 {
-            self.notes.push(format!(
-                "{} gaps of unknown length: its days are fewer than those that passed",
-                counts.unknown_gaps
-            ));
+            self.notes
+                .push(format!("{} gaps of unknown length: fewer days are counted than passed", counts.unknown_gaps));
         }
         if counts.frames == 0 {
             let others: Vec<_> = counts.foreign.keys().map(String::as_str).collect();

@@ -1,9 +1,9 @@
-//! What came out of logs, as tables any engine reads: estimates, half-cycles and alarms, Parquet or CSV.
+//! Exports the results of logs as tables: estimates, half-cycles and alarms, in Parquet or CSV.
 //!
-//! In: a configuration and logs. Out: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
+//! Input: a configuration and logs. Output: per log a folder `NAME/` with `estimates`, `half_cycles` and `alarms` (`.parquet` or
 //! `.csv`; columns and units in [`columns`]) and `about.json`, which is written last: where it is, the others are whole.
 //! Promise: a file has its final name only when it is complete; memory is bounded by a row group per table and log,
-//! whatever the length of the log; a log that fails leaves no file of its own and the others go on.
+//! independent of the length of the log; a log that fails leaves no file and the others continue.
 
 mod columns;
 mod rows;
@@ -16,15 +16,17 @@ use std::sync::Arc;
 use serde::Serialize;
 use serde_json::json;
 
-use self::rows::{Alarm, AlarmRow, EstimateRow, HalfCycle, HalfCycleRow, Learned};
+use self::rows::{AlarmRow, EstimateRow, HalfCycleRow};
 use self::table::TableFile;
-use super::drive::{Driven, Reading, drive};
+use super::drive::{DriveSummary, LogAccess, drive};
+
 use crate::config::Config;
-use crate::status::document::ConfigFile;
-use crate::io::result_file::ResultFile;
+use crate::error::LabError;
+use crate::fields::Fields;
 use crate::io::stamp;
 use crate::monitor::{Event, EventKind, Monitor, Outputs};
 use crate::quantity::{CellIndex, Timestamp};
+use crate::status::document::ConfigFile;
 
 pub use columns::reference;
 
@@ -33,14 +35,14 @@ const VERSION: u32 = 1;
 
 /// Form of the tables.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum TableFormat {
     /// Apache Parquet, Snappy.
     Parquet,
     /// Comma-separated values with a heading.
     Csv,
 }
 
-impl Format {
+impl TableFormat {
     const fn ending(self) -> &'static str {
         match self {
             Self::Parquet => "parquet",
@@ -49,13 +51,13 @@ impl Format {
     }
 }
 
-/// What all logs have in common.
+/// Settings of all logs.
 #[derive(Clone)]
-pub struct Settings<'a> {
-    /// How they are read.
-    pub reading: Reading<'a>,
+pub struct ExportSettings<'a> {
+    /// How to read the logs.
+    pub access: LogAccess<'a>,
     /// Form of the tables.
-    pub format: Format,
+    pub format: TableFormat,
     /// Folder for the logs' folders.
     pub out: PathBuf,
     /// At most one estimate per cell in each period, s; 0 = every one.
@@ -66,7 +68,7 @@ pub struct Settings<'a> {
 
 /// A log's tables.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Exported {
+pub struct ExportResult {
     /// The log.
     pub log: PathBuf,
     /// Folder of its tables.
@@ -75,20 +77,20 @@ pub struct Exported {
     pub rows: BTreeMap<&'static str, u64>,
     /// From the first stamp to the last, days.
     pub days: f64,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Exports all logs; per log what was written, or why nothing was. `report` is told bytes read.
+/// Exports all logs; returns per log what was written, or the error. `report` receives the bytes read since its last call.
 ///
 /// # Errors
 /// When no threads can be started.
 pub fn run(
     config: &Config,
     logs: &[PathBuf],
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Vec<Result<Exported, String>>, String> {
+) -> Result<Vec<Result<ExportResult, LabError>>, LabError> {
     let names = names(logs);
     super::in_parallel(logs, settings.jobs, |index, log| export(config, log, &names[index], settings, report))
 }
@@ -97,48 +99,49 @@ fn export(
     config: &Config,
     log: &Path,
     name: &str,
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
     report: &dyn Fn(u64),
-) -> Result<Exported, String> {
+) -> Result<ExportResult, LabError> {
     let folder = settings.out.join(name);
-    std::fs::create_dir_all(&folder).map_err(|error| format!("{}: cannot be made: {error}", folder.display()))?;
-    let mut tables = Tables::create(config, name, &folder, settings)?;
+    std::fs::create_dir_all(&folder)
+        .map_err(|error| LabError(format!("{}: cannot be created: {error}", folder.display())))?;
+    let mut tables = LogTables::create(config, name, &folder, settings)?;
     let out = Outputs { want_estimates: true, ..Outputs::default() };
-    let source = (settings.reading.open)(config, log);
+    let source = (settings.access.open)(config, log);
     let mut each = |monitor: &Monitor, out: &mut Outputs| {
-        let taken = tables.take(monitor, out);
+        let result = tables.take(monitor, out);
         out.clear();
-        taken
+        result
     };
     let monitor = Monitor::new(config.monitor.clone());
-    let driven = drive(source, monitor, out, settings.reading.sleep_gap_s, &mut each, report)?;
+    let driven = drive(source, monitor, out, settings.access.sleep_gap_s, &mut each, report)?;
     let span = driven.span_of(log)?;
     let metadata = metadata(config, log, span, settings);
     let mut notes = driven.notes.clone();
-    notes.extend(forget_about(&folder, log)?);
+    notes.extend(remove_about(&folder, log)?);
     let rows = tables.finish(&metadata)?;
-    let exported = Exported { log: log.to_owned(), folder, rows, days: driven.days(), notes };
+    let exported = ExportResult { log: log.to_owned(), folder, rows, days: driven.days(), notes };
     write_about(&exported, &driven, metadata)?;
     Ok(exported)
 }
 
-/// Takes away what an earlier export said of itself, since its tables are replaced one by one; a note when they were those
-/// of another log.
-fn forget_about(folder: &Path, log: &Path) -> Result<Option<String>, String> {
+/// Removes the `about.json` of an earlier export, since its tables are replaced one by one; returns a note when they were
+/// those of another log.
+fn remove_about(folder: &Path, log: &Path) -> Result<Option<String>, LabError> {
     let path = folder.join("about.json");
     let Ok(text) = std::fs::read(&path) else { return Ok(None) };
-    std::fs::remove_file(&path).map_err(|error| format!("{}: cannot be removed: {error}", path.display()))?;
+    std::fs::remove_file(&path).map_err(|error| LabError(format!("{}: cannot be removed: {error}", path.display())))?;
     let about: serde_json::Value = serde_json::from_slice(&text).unwrap_or_default();
     let other = about["metadata"]["packwatch.log"].as_str().filter(|other| Path::new(other) != log);
     Ok(other.map(|other| format!("replaced the tables of {other}")))
 }
 
-/// What the files say of themselves.
+/// Metadata of the files.
 fn metadata(
     config: &Config,
     log: &Path,
     (first, last): (Timestamp, Timestamp),
-    settings: &Settings<'_>,
+    settings: &ExportSettings<'_>,
 ) -> Vec<(&'static str, String)> {
     let hash = ConfigFile::of(&config.path).map_or_else(|| "unknown".to_owned(), |file| file.sha256);
     vec![
@@ -152,7 +155,11 @@ fn metadata(
     ]
 }
 
-fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str, String)>) -> Result<(), String> {
+fn write_about(
+    exported: &ExportResult,
+    driven: &DriveSummary,
+    metadata: Vec<(&'static str, String)>,
+) -> Result<(), LabError> {
     let metadata: serde_json::Map<_, _> =
         metadata.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect();
     let document = json!({
@@ -162,13 +169,11 @@ fn write_about(exported: &Exported, driven: &Driven, metadata: Vec<(&'static str
         "log": driven.counts,
         "notes": exported.notes,
     });
-    let mut file = ResultFile::create(&exported.folder.join("about.json")).map_err(|error| error.to_string())?;
-    serde_json::to_writer_pretty(&mut file, &document).map_err(|error| error.to_string())?;
-    file.finish().map_err(|error| error.to_string())
+    Ok(crate::write_file(&exported.folder.join("about.json"), &serde_json::to_vec_pretty(&document)?)?)
 }
 
-/// A name per log that a folder can have: the file's without endings; with the folder's before it, or a number after it,
-/// where several are the same.
+/// Returns a folder name per log: the file's name without endings; where several are equal, with the folder's name before
+/// it or a number after it.
 fn names(logs: &[PathBuf]) -> Vec<String> {
     let text = |name: Option<&std::ffi::OsStr>| name.unwrap_or_default().to_string_lossy().into_owned();
     let short = |log: &PathBuf| {
@@ -193,7 +198,7 @@ fn names(logs: &[PathBuf]) -> Vec<String> {
     names
 }
 
-/// What is safe in a file's name everywhere.
+/// Replaces characters that are not safe in file names.
 fn clean(name: &str) -> String {
     let safe = |letter: char| if letter.is_ascii_alphanumeric() || "._-".contains(letter) { letter } else { '_' };
     let name: String = name.chars().map(safe).collect();
@@ -201,7 +206,7 @@ fn clean(name: &str) -> String {
 }
 
 /// The three tables of one log.
-struct Tables {
+struct LogTables {
     log: Arc<str>,
     estimates: TableFile<EstimateRow>,
     half_cycles: TableFile<HalfCycleRow>,
@@ -212,12 +217,12 @@ struct Tables {
     periods: Vec<Option<i64>>,
     rated_ah: f64,
     moved_ah: Vec<f64>,
-    /// A half-cycle whose capacity comes next.
-    half_cycle: Option<HalfCycle>,
+    /// A half-cycle whose capacity event follows.
+    half_cycle: Option<(CellIndex, Fields)>,
 }
 
-impl Tables {
-    fn create(config: &Config, name: &str, folder: &Path, settings: &Settings<'_>) -> Result<Self, String> {
+impl LogTables {
+    fn create(config: &Config, name: &str, folder: &Path, settings: &ExportSettings<'_>) -> Result<Self, LabError> {
         let cells = usize::from(config.monitor.sample.cells);
         let (form, ending) = (settings.format, settings.format.ending());
         let path = |table: &str| folder.join(format!("{table}.{ending}"));
@@ -235,7 +240,7 @@ impl Tables {
         })
     }
 
-    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), String> {
+    fn take(&mut self, monitor: &Monitor, out: &Outputs) -> Result<(), LabError> {
         for estimate in &out.estimates {
             let since_ns = self.since_ns(estimate.time);
             let Some(last) = self.periods.get_mut(estimate.cell.index()) else { continue };
@@ -252,23 +257,28 @@ impl Tables {
         out.events.iter().try_for_each(|event| self.take_event(monitor, event))
     }
 
-    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), String> {
+    fn take_event(&mut self, monitor: &Monitor, event: &Event) -> Result<(), LabError> {
         let (log, time) = (self.log.clone(), event.time);
         let since_s = self.since_ns(time) as f64 * 1e-9;
-        if let Some(half) = HalfCycle::of(&event.kind) {
-            if let Some(moved_ah) = self.moved_ah.get_mut(half.cell.index()) {
-                *moved_ah += half.charge_ah;
+        match event.kind {
+            EventKind::HalfCycle { cell, charge_ah, .. } => {
+                if let Some(moved_ah) = self.moved_ah.get_mut(cell.index()) {
+                    *moved_ah += charge_ah;
+                }
+                self.half_cycle = Some((cell, Fields::of_event(&event.kind)));
             }
-            self.half_cycle = Some(half);
-        } else if let Some((cell, learned)) = Learned::of(&event.kind) {
-            let half = self.half_cycle.take().filter(|half| half.cell == cell);
-            let half = half.ok_or("a capacity came without its half-cycle")?;
-            let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
-            self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, learned, remaining })?;
-        } else if matches!(event.kind, EventKind::PackReplaced { .. }) {
-            self.moved_ah.fill(0.0);
-        } else if let Some(alarm) = Alarm::of(&event.kind) {
-            self.alarms.push(&AlarmRow { log, time, since_s, alarm })?;
+            EventKind::Capacity { cell, .. } => {
+                let half = self.half_cycle.take().filter(|half| half.0 == cell);
+                let (_, half) = half.ok_or("a capacity came without its half-cycle")?;
+                let (full_cycles, remaining) = (self.full_cycles(cell), monitor.remaining_life(cell).ok());
+                let capacity = Fields::of_event(&event.kind);
+                self.half_cycles.push(&HalfCycleRow { log, time, since_s, full_cycles, half, capacity, remaining })?;
+            }
+            EventKind::PackReplaced { .. } => self.moved_ah.fill(0.0),
+            EventKind::Alarm { rule, .. } => {
+                self.alarms.push(&AlarmRow { log, time, since_s, rule, alarm: Fields::of_event(&event.kind) })?;
+            }
+            _ => {}
         }
         Ok(())
     }
@@ -277,14 +287,14 @@ impl Tables {
         self.moved_ah.get(cell.index()).map_or(f64::NAN, |moved_ah| moved_ah / (2.0 * self.rated_ah))
     }
 
-    /// Since the first thing that was told.
+    /// Time since the first result, ns.
     fn since_ns(&mut self, time: Timestamp) -> i64 {
         let first = *self.first.get_or_insert(time);
         time.nanos().saturating_sub(first.nanos())
     }
 
-    /// Completes the files, each with what it says of itself; rows of each.
-    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, String> {
+    /// Completes the files with their metadata; returns the rows of each.
+    fn finish(self, metadata: &[(&'static str, String)]) -> Result<BTreeMap<&'static str, u64>, LabError> {
         Ok(BTreeMap::from([
             ("estimates", self.estimates.finish(metadata)?),
             ("half_cycles", self.half_cycles.finish(metadata)?),

@@ -1,30 +1,31 @@
-//! One alarm in one log, judged: lead before the end of life, missed, false.
+//! Scores one threshold's alarms in one log: lead before the end of life, missed, false.
 //!
-//! The words are those of `tests/alarm_tradeoff.md`, for a record that may end before the life does:
+//! The terms are those of `tests/alarm_tradeoff.md`, for a record that may end before the life does:
 //!
 //! * **end of life**: by the truth, the first moment a cell's capacity is below the limit; without a truth, when the weakest
 //!   learned capacity went below it for good, as the end of the record shows it.
 //! * **true raise**: a raise before the end of life, with the end coming within the horizon (if one is given).
 //! * **false alarm**: a raise with which the end of life did not come within the horizon; without a horizon, one in a
 //!   record that has no end of life. Raises at or after the end are neither.
-//! * **open**: a raise less than the horizon before the end of a record that has no end of life: nobody can say.
+//! * **open**: a raise less than the horizon before the end of a record that has no end of life: it cannot be judged.
 //! * **lead**: from the first true raise to the end of life, in days and in equivalent full cycles.
 //! * **missed**: the end of life came without a true raise before it.
-//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; said only where
-//!   the truth has it.
+//! * **false raise**: a raise of `capacity_low` while the true capacity of its cell was above the threshold; only with a
+//!   truth.
 //! * **flickers**: clears before the end of life.
 //!
-//! Only rules about ageing (those whose values are learned) are judged so; of the others the raises are told.
+//! Only rules about ageing (those whose values are learned) are judged; for the others the raises are counted.
 
 use serde::Serialize;
 
-use super::variant_batch::{AlarmHistory, Raise};
 use super::track::Track;
 use super::truth::{Truth, TruthKind};
+use super::variant_batch::{AlarmHistory, Raise};
+
 use crate::alarm::{Rule, RuleConfig};
 use crate::quantity::Timestamp;
 
-/// How soon after a raise the end of life must come.
+/// Longest time from a true raise to the end of life.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Horizon {
     /// In equivalent full cycles.
@@ -33,24 +34,24 @@ pub enum Horizon {
     Days(f64),
 }
 
-/// A log's life, for the judgement.
+/// A log's use, truth and end of life, which its alarms are judged by.
 #[derive(Debug, Clone, Copy)]
-pub struct Life<'a> {
+pub struct LogLife<'a> {
     /// Charge moved.
     pub track: &'a Track,
-    /// What was true.
+    /// True capacities.
     pub truth: Option<&'a Truth>,
     /// First and last stamp.
     pub span: (Timestamp, Timestamp),
     /// End of life; `None` = not reached.
     pub end: Option<Timestamp>,
-    /// How soon it must come.
+    /// Longest time from a true raise to `end`.
     pub horizon: Option<Horizon>,
 }
 
-/// A raise, for people and machines.
+/// The first raise of a threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct First {
+pub struct FirstRaise {
     /// Stamp of the log, s.
     pub time_s: f64,
     /// Days after the log's first stamp.
@@ -63,11 +64,11 @@ pub struct First {
     pub value: Option<f64>,
 }
 
-/// What a threshold's alarms were worth in one log.
+/// Score of one threshold's alarms in one log.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Judged {
+pub struct AlarmScore {
     /// The first raise.
-    pub first: Option<First>,
+    pub first: Option<FirstRaise>,
     /// Raises, at any time.
     pub raises: usize,
     /// Lead, days.
@@ -78,18 +79,18 @@ pub struct Judged {
     pub missed: Option<bool>,
     /// False alarms; `None` = the rule is not about ageing.
     pub false_alarms: Option<usize>,
-    /// Raises that nobody can judge.
+    /// Raises that cannot be judged.
     pub open: Option<usize>,
-    /// Raises above the true threshold; `None` = nobody knows.
+    /// Raises while the true capacity was above the threshold; `None` = there is no truth.
     pub false_raises: Option<usize>,
     /// Clears before the end of life.
     pub flickers: usize,
-    /// Raises and clears that were only counted.
+    /// Raises and clears beyond those stored.
     pub not_kept: u64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Verdict {
+enum RaiseClass {
     True,
     False,
     Open,
@@ -97,29 +98,29 @@ enum Verdict {
 }
 
 /// Judges the alarms of one threshold.
-pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &Life<'_>) -> Judged {
-    let verdicts: Vec<(Verdict, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
+pub fn judge(config: &RuleConfig, history: &AlarmHistory, life: &LogLife<'_>) -> AlarmScore {
+    let verdicts: Vec<(RaiseClass, &Raise)> = history.raises.iter().map(|raise| (life.verdict(raise), raise)).collect();
     let count = |wanted| verdicts.iter().filter(|(verdict, _)| *verdict == wanted).count();
-    // Of a life that was over before there was a log nobody can tell what was missed.
-    let is_ageing = config.rule.row().is_learned && life.end.is_none_or(|end| end > life.span.0);
-    let first_true = verdicts.iter().find(|(verdict, _)| *verdict == Verdict::True).map(|(_, raise)| raise.time);
+    // Nothing can be missed in a log that began after the end of life.
+    let is_ageing = config.rule.spec().is_learned && life.end.is_none_or(|end| end > life.span.0);
+    let first_true = verdicts.iter().find(|(verdict, _)| *verdict == RaiseClass::True).map(|(_, raise)| raise.time);
     let lead = life.end.zip(first_true).filter(|_| is_ageing);
-    Judged {
+    AlarmScore {
         first: history.raises.first().map(|raise| life.first(raise)),
         raises: history.raises.len(),
         lead_days: lead.map(|(end, raised)| end.since(raised) / 86_400.0),
         lead_cycles: lead.map(|(end, raised)| life.track.cycles_at(end) - life.track.cycles_at(raised)),
         missed: life.end.filter(|_| is_ageing).map(|_| first_true.is_none()),
-        false_alarms: is_ageing.then(|| count(Verdict::False)),
-        open: is_ageing.then(|| count(Verdict::Open)),
+        false_alarms: is_ageing.then(|| count(RaiseClass::False)),
+        open: is_ageing.then(|| count(RaiseClass::Open)),
         false_raises: life.false_raises(config, history),
         flickers: history.clears.iter().filter(|time| life.end.is_none_or(|end| **time < end)).count(),
         not_kept: history.not_kept,
     }
 }
 
-impl Life<'_> {
-    fn verdict(&self, raise: &Raise) -> Verdict {
+impl LogLife<'_> {
+    fn verdict(&self, raise: &Raise) -> RaiseClass {
         let within = |until: Timestamp| match self.horizon {
             None => None,
             Some(Horizon::Days(days)) => Some(until.since(raise.time) / 86_400.0 <= days),
@@ -128,16 +129,16 @@ impl Life<'_> {
             }
         };
         match self.end {
-            Some(end) if raise.time >= end => Verdict::Late,
-            Some(end) if within(end).unwrap_or(true) => Verdict::True,
-            Some(_) => Verdict::False,
-            None if within(self.span.1).unwrap_or(false) => Verdict::Open,
-            None => Verdict::False,
+            Some(end) if raise.time >= end => RaiseClass::Late,
+            Some(end) if within(end).unwrap_or(true) => RaiseClass::True,
+            Some(_) => RaiseClass::False,
+            None if within(self.span.1).unwrap_or(false) => RaiseClass::Open,
+            None => RaiseClass::False,
         }
     }
 
-    fn first(&self, raise: &Raise) -> First {
-        First {
+    fn first(&self, raise: &Raise) -> FirstRaise {
+        FirstRaise {
             time_s: raise.time.secs(),
             days: raise.time.since(self.span.0) / 86_400.0,
             cycles: self.track.cycles_at(raise.time),
@@ -159,8 +160,8 @@ impl Life<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Severity, When};
-    use crate::fleet::track::Learned;
+    use crate::alarm::{Comparison, Severity};
+    use crate::fleet::track::CapacityKind;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};
 
@@ -172,7 +173,7 @@ mod tests {
 
     /// One equivalent full cycle a day.
     fn track() -> Track {
-        let mut track = Track::new(1.0, Learned::Capacity);
+        let mut track = Track::new(1.0, CapacityKind::Capacity);
         for end in 1..=100 {
             let kind = EventKind::HalfCycle {
                 cell: CellIndex(0),
@@ -195,7 +196,7 @@ mod tests {
             severity: Severity::Warning,
             threshold: 0.8,
             clear: 0.9,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,
@@ -211,9 +212,9 @@ mod tests {
         }
     }
 
-    fn judged(raised: &[f64], end: Option<f64>, horizon: Option<Horizon>) -> Judged {
+    fn judged(raised: &[f64], end: Option<f64>, horizon: Option<Horizon>) -> AlarmScore {
         let track = track();
-        let life = Life { track: &track, truth: None, span: (day(0.0), day(100.0)), end: end.map(day), horizon };
+        let life = LogLife { track: &track, truth: None, span: (day(0.0), day(100.0)), end: end.map(day), horizon };
         judge(&rule(Rule::CapacityLow), &history(raised, &[20.0, 95.0]), &life)
     }
 
@@ -247,10 +248,10 @@ mod tests {
     }
 
     #[test]
-    fn a_rule_that_is_not_about_ageing_is_only_told() {
+    fn a_rule_that_is_not_about_ageing_is_only_counted() {
         let track = track();
         let life =
-            Life { track: &track, truth: None, span: (day(0.0), day(100.0)), end: Some(day(90.0)), horizon: None };
+            LogLife { track: &track, truth: None, span: (day(0.0), day(100.0)), end: Some(day(90.0)), horizon: None };
         let found = judge(&rule(Rule::SocLow), &history(&[10.0], &[]), &life);
         assert_eq!((found.raises, found.lead_days, found.false_alarms, found.missed), (1, None, None, None));
         assert_eq!(found.first.map(|first| (first.days, first.cycles)), Some((10.0, 10.0)));

@@ -1,6 +1,6 @@
-//! What a life came to along the way: charge moved, and the weakest capacity learned.
+//! Use and wear over a log: charge moved, and the weakest capacity learned.
 //!
-//! In: the core's events. Out: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities,
+//! Input: the monitor's events. Output: equivalent full cycles (charge moved over twice the rated capacity) and learned capacities,
 //! both known at the ends of half-cycles and interpolated between them (charge) or held (capacity).
 
 use std::collections::BTreeMap;
@@ -8,20 +8,20 @@ use std::collections::BTreeMap;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Which of the capacities was learned.
+/// Which learned capacity is followed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Learned {
+pub enum CapacityKind {
     /// At the configured load.
     Usable,
     /// Between the open-circuit voltages.
     Capacity,
 }
 
-/// A life so far.
+/// Charge moved and capacities learned up to now.
 #[derive(Debug, Clone)]
 pub struct Track {
     rated_ah: f64,
-    learned: Learned,
+    learned: CapacityKind,
     moved_ah: BTreeMap<CellIndex, f64>,
     capacity_ah: BTreeMap<CellIndex, f64>,
     /// Ends of half-cycles: time and equivalent full cycles so far.
@@ -31,20 +31,20 @@ pub struct Track {
 }
 
 impl Track {
-    pub fn new(rated_ah: f64, learned: Learned) -> Self {
+    pub fn new(rated_ah: f64, learned: CapacityKind) -> Self {
         let none = BTreeMap::new();
         Self { rated_ah, learned, moved_ah: none.clone(), capacity_ah: none, cycles: Vec::new(), weakest: Vec::new() }
     }
 
-    /// Takes the events of one input.
+    /// Adds the events of one input.
     pub fn observe(&mut self, events: &[Event]) {
         for event in events {
             match event.kind {
                 EventKind::HalfCycle { cell, charge_ah, .. } => self.move_charge(event.time, cell, charge_ah),
                 EventKind::Capacity { cell, capacity_ah, usable_capacity_ah, .. } => {
                     let learned = match self.learned {
-                        Learned::Usable => usable_capacity_ah,
-                        Learned::Capacity => Some(capacity_ah),
+                        CapacityKind::Usable => usable_capacity_ah,
+                        CapacityKind::Capacity => Some(capacity_ah),
                     };
                     self.learn(event.time, cell, learned);
                 }
@@ -59,7 +59,7 @@ impl Track {
         *moved_ah += charge_ah;
         let cycles = *moved_ah / (2.0 * self.rated_ah);
         let most = self.cycles.last().map_or(0.0, |last| last.1);
-        // The cells of a string move the same charge; one that was not known for a while has counted less.
+        // The cells of a string move the same charge; a cell without estimates for a while has counted less.
         if cycles > most {
             self.cycles.pop_if(|last| last.0 == time);
             self.cycles.push((time, cycles));
@@ -92,12 +92,12 @@ impl Track {
     }
 
     /// Which capacity it follows.
-    pub fn learned(&self) -> Learned {
+    pub fn learned(&self) -> CapacityKind {
         self.learned
     }
 
-    /// From when on the weakest learned capacity stayed below `end_ah` up to the end of the log; `None` = at the end it
-    /// is not below, or nothing was learned.
+    /// Returns the time from which the weakest learned capacity stayed below `end_ah` until the end of the log; `None` = it
+    /// is not below at the end, or nothing was learned.
     pub fn stays_below(&self, end_ah: f64) -> Option<(Timestamp, CellIndex)> {
         let below = self.weakest.iter().rev().take_while(|(_, ah, _)| *ah < end_ah).last();
         below.map(|&(time, _, cell)| (time, cell))
@@ -145,7 +145,7 @@ mod tests {
 
     #[test]
     fn cycles_are_charge_over_twice_the_rated_capacity_and_run_between_ends() {
-        let mut track = Track::new(2.0, Learned::Capacity);
+        let mut track = Track::new(2.0, CapacityKind::Capacity);
         track.observe(&[half_cycle(100.0, 0, 2.0), half_cycle(100.0, 1, 1.0), half_cycle(200.0, 0, 1.0)]);
         let at = |time_s| track.cycles_at(Timestamp::from_secs(time_s));
         assert_eq!((at(99.0), at(100.0), at(150.0), at(300.0)), (0.0, 0.5, 0.625, 0.75));
@@ -153,8 +153,8 @@ mod tests {
     }
 
     #[test]
-    fn the_end_is_when_the_weakest_cell_goes_below_for_good() {
-        let mut track = Track::new(2.0, Learned::Usable);
+    fn the_end_is_when_the_weakest_cell_falls_below_for_good() {
+        let mut track = Track::new(2.0, CapacityKind::Usable);
         let lives = [(1.0, 0, 1.4), (1.0, 1, 1.6), (2.0, 0, 1.6), (3.0, 1, 1.45), (4.0, 0, 1.55), (5.0, 1, 1.4)];
         track.observe(&lives.map(|(time_s, cell, ah)| learned(time_s, cell, ah)));
         assert_eq!(track.stays_below(1.4), Some((Timestamp::from_secs(3.0), CellIndex(1))));

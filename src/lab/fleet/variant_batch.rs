@@ -1,14 +1,14 @@
-//! The alarms of many settings from one replay.
+//! Evaluates the alarms of many settings in one replay.
 //!
 //! Estimates do not depend on alarm thresholds, and the alarms of one threshold do not depend on those of another. So one
-//! monitor's inputs to its alarms are given to further engines, the *lanes*: the n-th different threshold of each rule
+//! monitor's alarm inputs go to further engines, the *lanes*: the n-th different threshold of each rule
 //! and severity is watched in lane n. A grid of five thresholds of one rule by five of another needs five lanes, not
 //! twenty-five, and every setting of the grid finds each of its thresholds in some lane.
 
 use crate::alarm::{AlarmChange, AlarmEngine, AlarmInput, Change, Rule, RuleConfig, Severity};
 use crate::quantity::{CellIndex, Timestamp};
 
-/// Raises, and clears, kept of one threshold in one log; more are counted only.
+/// Most raises, and most clears, stored of one threshold in one log; further ones are only counted.
 const MAX_KEPT: usize = 20_000;
 
 /// An alarm was raised.
@@ -22,7 +22,7 @@ pub struct Raise {
     pub value: Option<f64>,
 }
 
-/// What became of the alarms of one threshold in one log.
+/// Raises and clears of one threshold in one log.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct AlarmHistory {
     /// In the order of time.
@@ -35,47 +35,47 @@ pub struct AlarmHistory {
 
 /// One threshold in its lane.
 #[derive(Debug, Clone)]
-struct Watched {
+struct BatchThreshold {
     config: RuleConfig,
     lane: usize,
     history: AlarmHistory,
 }
 
-/// Which thresholds are watched in which lane.
+/// The thresholds of the settings that share a replay, and the lane of each.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Lanes {
-    watched: Vec<Watched>,
+pub(super) struct VariantBatch {
+    watched: Vec<BatchThreshold>,
 }
 
-impl Lanes {
-    /// Makes sure that a threshold is watched; its number.
+impl VariantBatch {
+    /// Adds a threshold unless it is there; returns its number.
     pub(super) fn watch(&mut self, config: &RuleConfig) -> usize {
         if let Some(known) = self.watched.iter().position(|watched| watched.config == *config) {
             return known;
         }
-        let same = |watched: &&Watched| is_of(watched, config.rule, config.severity);
+        let same = |watched: &&BatchThreshold| is_of(watched, config.rule, config.severity);
         let lane = self.watched.iter().filter(same).count();
-        self.watched.push(Watched { config: config.clone(), lane, history: AlarmHistory::default() });
+        self.watched.push(BatchThreshold { config: config.clone(), lane, history: AlarmHistory::default() });
         self.watched.len() - 1
     }
 
     /// The engines of all lanes.
-    pub(super) fn engines(&self, cells: u16) -> Engines {
-        let lanes = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
+    pub(super) fn engines(&self, cells: u16) -> LaneEngines {
+        let batch = self.watched.iter().map(|watched| watched.lane + 1).max().unwrap_or(0);
         let rules = |lane| self.watched.iter().filter(move |watched| watched.lane == lane);
         let engine = |lane| AlarmEngine::new(rules(lane).map(|watched| watched.config.clone()).collect(), cells);
         let watches = |lane| {
             let numbers: Vec<u32> = rules(lane).map(|watched| 1 << (watched.config.rule as u8)).collect();
             numbers.iter().fold(0, |mask, bit| mask | bit)
         };
-        Engines { engines: (0..lanes).map(|lane| (engine(lane), watches(lane))).collect(), changes: Vec::new() }
+        LaneEngines { engines: (0..batch).map(|lane| (engine(lane), watches(lane))).collect(), changes: Vec::new() }
     }
 
     fn note(&mut self, lane: usize, time: Timestamp, change: &AlarmChange) {
         let alarm = &change.alarm;
-        let place =
+        let found =
             self.watched.iter_mut().find(|watched| watched.lane == lane && is_of(watched, alarm.rule, alarm.severity));
-        let Some(Watched { history, .. }) = place else { return };
+        let Some(BatchThreshold { history, .. }) = found else { return };
         match change.change {
             Change::Raised if history.raises.len() < MAX_KEPT => {
                 history.raises.push(Raise { time, cell: alarm.cell, value: alarm.value });
@@ -86,39 +86,39 @@ impl Lanes {
         }
     }
 
-    /// What became of the alarms of the threshold with this number.
+    /// Returns the raises and clears of the threshold with this number.
     pub(super) fn history(&self, number: usize) -> Option<&AlarmHistory> {
         self.watched.get(number).map(|watched| &watched.history)
     }
 }
 
-fn is_of(watched: &Watched, rule: Rule, severity: Severity) -> bool {
+fn is_of(watched: &BatchThreshold, rule: Rule, severity: Severity) -> bool {
     (watched.config.rule, watched.config.severity) == (rule, severity)
 }
 
 /// The lanes' engines in one replay.
 #[derive(Debug)]
-pub(super) struct Engines {
+pub(super) struct LaneEngines {
     /// Each with the rules it watches, a bit per wire number.
     engines: Vec<(AlarmEngine, u32)>,
     changes: Vec<AlarmChange>,
 }
 
-impl Engines {
-    /// Gives what the monitor told its alarms to all lanes, and notes what became of theirs.
-    pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], lanes: &mut Lanes) {
+impl LaneEngines {
+    /// Applies the monitor's alarm inputs to all lanes, and records the changes of their alarms.
+    pub(super) fn take(&mut self, inputs: &[(Timestamp, AlarmInput)], batch: &mut VariantBatch) {
         for (time, input) in inputs {
             for (lane, (engine, watches)) in self.engines.iter_mut().enumerate() {
                 if concerns(input, *watches) {
                     engine.apply(*time, input, &mut self.changes);
                 }
-                self.changes.drain(..).for_each(|change| lanes.note(lane, *time, &change));
+                self.changes.drain(..).for_each(|change| batch.note(lane, *time, &change));
             }
         }
     }
 }
 
-/// Whether an engine that watches these rules cares for an input.
+/// Whether an input concerns an engine that watches these rules.
 fn concerns(input: &AlarmInput, watches: u32) -> bool {
     match input {
         AlarmInput::Observe { rule, .. } | AlarmInput::InputsValid { rule, .. } => watches & 1 << (*rule as u8) != 0,
@@ -133,7 +133,7 @@ fn concerns(input: &AlarmInput, watches: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::{Observation, When};
+    use crate::alarm::{Comparison, Observation};
 
     fn low(rule: Rule, threshold: f64) -> RuleConfig {
         RuleConfig {
@@ -141,7 +141,7 @@ mod tests {
             severity: Severity::Warning,
             threshold,
             clear: threshold * 1.02,
-            when: When::Mean,
+            when: Comparison::Mean,
             debounce_s: 0.0,
             debounce_events: 1,
             is_latching: false,
@@ -150,35 +150,35 @@ mod tests {
 
     #[test]
     fn a_grid_of_two_rules_needs_as_many_lanes_as_the_longer_list() {
-        let mut lanes = Lanes::default();
+        let mut batch = VariantBatch::default();
         for capacity in [1.5, 1.6, 1.7] {
             for soc in [0.1, 0.2] {
-                lanes.watch(&low(Rule::CapacityLow, capacity));
-                lanes.watch(&low(Rule::SocLow, soc));
+                batch.watch(&low(Rule::CapacityLow, capacity));
+                batch.watch(&low(Rule::SocLow, soc));
             }
         }
-        assert_eq!(lanes.watched.len(), 5);
-        assert_eq!(lanes.engines(1).engines.len(), 3);
+        assert_eq!(batch.watched.len(), 5);
+        assert_eq!(batch.engines(1).engines.len(), 3);
     }
 
     #[test]
     fn each_threshold_has_its_own_history() {
-        let mut lanes = Lanes::default();
-        let numbers = [1.5, 1.6].map(|threshold| lanes.watch(&low(Rule::CapacityLow, threshold)));
-        let mut engines = lanes.engines(1);
+        let mut batch = VariantBatch::default();
+        let numbers = [1.5, 1.6].map(|threshold| batch.watch(&low(Rule::CapacityLow, threshold)));
+        let mut engines = batch.engines(1);
         for (second, value) in [(1, 1.7), (2, 1.55), (3, 1.7), (4, 1.4)] {
             let (rule, cell) = (Rule::CapacityLow, Some(CellIndex(0)));
             let seen = Observation::new(Some(value)).with_std(0.1);
             let time = Timestamp::from_secs(f64::from(second));
-            engines.take(&[(time, AlarmInput::Observe { rule, cell, seen })], &mut lanes);
+            engines.take(&[(time, AlarmInput::Observe { rule, cell, observation: seen })], &mut batch);
         }
         let seconds = |number: usize| {
-            let history = lanes.history(number).expect("watched");
+            let history = batch.history(number).expect("watched");
             let raised: Vec<f64> = history.raises.iter().map(|raise| raise.time.secs()).collect();
             (raised, history.clears.len())
         };
         assert_eq!(seconds(numbers[0]), (vec![4.0], 0));
         assert_eq!(seconds(numbers[1]), (vec![2.0, 4.0], 1));
-        assert_eq!(lanes.watch(&low(Rule::CapacityLow, 1.5)), numbers[0]);
+        assert_eq!(batch.watch(&low(Rule::CapacityLow, 1.5)), numbers[0]);
     }
 }

@@ -3,7 +3,7 @@
 //! In: the configuration's text and choices. Out: one checked configuration per combination, the one as written first, and
 //! which of them can share a replay: those that differ in nothing but `[[alarm]]` tables (of `input_missing` aside: how
 //! long a silence counts is judged before the alarms see it). A combination that is no valid configuration is left out
-//! and told.
+//! and reported.
 //!
 //! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the gravest severity
 //! that the file has, `RULE.probability` for `when = { probability = ... }`, any other key of the rule's `[[alarm]]` tables;
@@ -19,9 +19,9 @@ use self::target::{Target, name_rules, rule_of, targets};
 use crate::alarm::Rule;
 use crate::config::{self, Config};
 
-/// Combinations at most: a table nobody reads to its end.
+/// Most combinations: a longer table is not readable.
 pub const MAX_COMBINATIONS: usize = 1000;
-/// Faults quoted of one combination.
+/// Most faults quoted of one combination.
 const MAX_QUOTED: usize = 3;
 /// One `--set`.
 #[derive(Debug, Clone, PartialEq)]
@@ -70,7 +70,7 @@ fn split(text: &str) -> Vec<&str> {
     parts
 }
 
-/// As TOML; what is no TOML value is a text (`80 %`, `mean`).
+/// Parses a value as TOML; anything else is a text (`80 %`, `mean`).
 fn value(text: &str) -> Value {
     let parsed = format!("value = {text}").parse::<Table>().ok();
     parsed.and_then(|mut table| table.remove("value")).unwrap_or_else(|| Value::String(text.to_owned()))
@@ -79,9 +79,9 @@ fn value(text: &str) -> Value {
 /// One combination.
 #[derive(Debug, Clone)]
 pub struct Variant {
-    /// What is set, as written, in the order of the choices; empty = the configuration as it is.
+    /// Values set, as written, in the order of the choices; empty = the configuration as it is.
     pub values: Vec<String>,
-    /// What it means.
+    /// The configuration with these values.
     pub config: Config,
     /// Combinations with the same number share a replay.
     pub replay: usize,
@@ -89,7 +89,7 @@ pub struct Variant {
 
 /// All combinations.
 #[derive(Debug, Clone)]
-pub struct Grid {
+pub struct VariantGrid {
     /// The keys, as written.
     pub keys: Vec<String>,
     /// The configuration as it is, then every combination.
@@ -100,18 +100,18 @@ pub struct Grid {
     pub rules: Vec<Rule>,
     /// Whether something else was set, too.
     pub other_keys: bool,
-    /// What the user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// Makes the grid.
+/// Builds the grid.
 ///
 /// # Errors
 /// When the configuration is faulty, a key names nothing, there are too many combinations, or none of them is valid.
-pub fn grid(path: &Path, choices: &[Choice]) -> Result<Grid, Vec<String>> {
+pub fn grid(path: &Path, choices: &[Choice]) -> Result<VariantGrid, Vec<String>> {
     let plain = config::load(path).map_err(|faults| faults.0)?;
     let root = read(path).map_err(|fault| vec![fault])?;
-    let mut grid = Grid {
+    let mut grid = VariantGrid {
         keys: choices.iter().map(|choice| choice.key.clone()).collect(),
         variants: Vec::new(),
         replays: 0,
@@ -153,7 +153,7 @@ pub fn grid(path: &Path, choices: &[Choice]) -> Result<Grid, Vec<String>> {
     Ok(grid)
 }
 
-/// The combination's configuration, and what its replay depends on.
+/// Returns the combination's configuration, and the key of its replay.
 fn variant(
     path: &Path,
     root: &Table,
@@ -167,7 +167,7 @@ fn variant(
     let text = toml::to_string(&root).map_err(|error| vec![error.to_string()])?;
     let read = |file: &Path| if file == path { Ok(text.clone().into_bytes()) } else { std::fs::read(file) };
     let config = config::load_with(path, &read).map_err(|faults| {
-        // The lines are those of a text that nobody wrote.
+        // The line numbers refer to a generated text.
         let file = format!("{}:", path.display());
         let without_line = |fault: &String| {
             let rest = fault.strip_prefix(&file).map(|rest| rest.trim_start_matches(|c: char| c.is_ascii_digit()));
@@ -183,13 +183,13 @@ fn read(path: &Path) -> Result<Table, String> {
     text.parse::<Table>().map_err(|error| format!("{}: {}", path.display(), error.message()))
 }
 
-/// Everything of a configuration that estimates, and the values of the rules, can depend on.
+/// Returns everything in a configuration that estimates and the values of rules can depend on.
 fn replay_key(root: &Table) -> String {
     let mut root = root.clone();
     if let Some(Value::Array(alarms)) = root.get_mut("alarm") {
         alarms.retain(|alarm| rule_of(alarm) == Some(Rule::InputMissing.name()));
     }
-    // A table that can be read can be written; were it not so, nothing would be shared.
+    // A table that was parsed can be written; if it could not, no replay would be shared.
     toml::to_string(&root).unwrap_or_else(|error| format!("{error} {root:?}"))
 }
 

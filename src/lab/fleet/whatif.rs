@@ -1,50 +1,52 @@
-//! What every combination of settings would have told, log by log.
+//! The alarms of every combination of settings, log by log.
 //!
-//! In: a [`Grid`], logs, their truths. Out: per log its life and per combination and threshold a [`Judged`]. One replay
-//! per log serves all combinations that differ in alarms only ([`Lanes`]); the life (charge moved, learned capacity) is
+//! Input: a [`VariantGrid`], logs, their truths. Output: per log its life and per combination and threshold a [`AlarmScore`]. One replay
+//! per log serves all combinations that differ in alarms only ([`VariantBatch`]); the life (charge moved, learned capacity) is
 //! that of the configuration as it is.
 
 use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::drive::{Driven, Reading, drive};
-use super::judge::{Horizon, Judged, Life, judge};
-use super::variant_batch::Lanes;
-use super::track::{Learned, Track};
+use super::drive::{DriveSummary, LogAccess, drive};
+use super::judge::{AlarmScore, Horizon, LogLife, judge};
+use super::track::{CapacityKind, Track};
 use super::truth::{Truth, TruthKind};
-use super::variants::Grid;
+use super::variant_batch::VariantBatch;
+use super::variants::VariantGrid;
+
 use crate::alarm::{Rule, Severity};
 use crate::config::Config;
+use crate::error::LabError;
 use crate::monitor::{Monitor, Outputs};
 
 /// A log and its truth.
 #[derive(Debug, Clone)]
-pub struct Job {
+pub struct WhatifJob {
     /// The log.
     pub log: PathBuf,
-    /// What was true of it.
+    /// CSV of its true capacities.
     pub truth: Option<PathBuf>,
 }
 
-/// What all logs have in common.
+/// Settings of all logs.
 #[derive(Clone, Copy)]
-pub struct Settings<'a> {
-    /// How they are read.
-    pub reading: Reading<'a>,
+pub struct WhatifSettings<'a> {
+    /// How to read the logs.
+    pub access: LogAccess<'a>,
     /// Capacity below which a cell's life is over, Ah.
     pub end_of_life_ah: f64,
     /// Whether the usable capacity is compared with it, where one is configured.
     pub judges_usable: bool,
-    /// How soon after a raise the end of life must come.
+    /// Longest time from a true raise to the end of life.
     pub horizon: Option<Horizon>,
     /// Threads; `None` = all cores.
     pub jobs: Option<usize>,
 }
 
-/// What the end of life was judged by.
+/// Source of the end of life.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub enum JudgedBy {
+pub enum EndOfLifeSource {
     /// The true capacity.
     #[serde(rename = "true_capacity")]
     Truth,
@@ -56,17 +58,17 @@ pub enum JudgedBy {
     LearnedUsable,
     /// The capacity learned.
     #[serde(rename = "learned_capacity")]
-    Learned,
+    CapacityKind,
 }
 
-impl JudgedBy {
-    /// For people.
+impl EndOfLifeSource {
+    /// Words for tables.
     pub const fn words(self) -> &'static str {
         match self {
             Self::Truth => "the true capacity",
             Self::Published => "published capacities",
             Self::LearnedUsable => "the learned usable capacity",
-            Self::Learned => "the learned capacity",
+            Self::CapacityKind => "the learned capacity",
         }
     }
 }
@@ -80,24 +82,24 @@ pub struct EndOfLife {
     pub days: f64,
     /// Equivalent full cycles so far.
     pub cycles: f64,
-    /// The cell whose it is, counted from 0.
+    /// The cell that reached it, counted from 0.
     pub cell: u16,
 }
 
 /// One threshold under one combination.
 #[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct AlarmRow {
+pub struct ThresholdScore {
     /// Index of the combination.
     pub setting: usize,
-    /// Which rule.
+    /// The rule.
     pub rule: Rule,
     /// Its severity.
     pub severity: Severity,
-    /// What is compared with, in the rule's unit.
+    /// The threshold, in the rule's unit.
     pub threshold: f64,
-    /// What it was worth.
+    /// Score of its alarms.
     #[serde(flatten)]
-    pub judged: Judged,
+    pub judged: AlarmScore,
 }
 
 /// One log.
@@ -107,8 +109,8 @@ pub struct LogResult {
     pub log: PathBuf,
     /// Its truth.
     pub truth: Option<PathBuf>,
-    /// What the end of life was judged by.
-    pub judged_by: JudgedBy,
+    /// Source of the end of life.
+    pub judged_by: EndOfLifeSource,
     /// From the first stamp to the last, days.
     pub days: f64,
     /// Equivalent full cycles.
@@ -118,111 +120,116 @@ pub struct LogResult {
     /// `None` = not reached.
     pub end_of_life: Option<EndOfLife>,
     /// Every threshold under every combination.
-    pub alarms: Vec<AlarmRow>,
-    /// What the user should know.
+    pub alarms: Vec<ThresholdScore>,
+    /// Notes for the user.
     pub notes: Vec<String>,
 }
 
-/// What one replay came to.
-struct Replayed {
-    driven: Driven,
+/// Result of one replay.
+struct ReplayResult {
+    driven: DriveSummary,
     track: Track,
-    lanes: Lanes,
+    batch: VariantBatch,
     /// Of the log's first replay only.
     truth: Option<Truth>,
 }
 
-/// Replays all logs; per log its result, or why there is none. `report` is told bytes read.
+/// Replays all logs; returns per log its result or error. `report` receives the bytes read since its last call.
 ///
 /// # Errors
 /// When no threads can be started.
 pub fn run(
-    grid: &Grid,
-    jobs: &[Job],
-    settings: &Settings<'_>,
+    grid: &VariantGrid,
+    jobs: &[WhatifJob],
+    settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Vec<Result<LogResult, String>>, String> {
+) -> Result<Vec<Result<LogResult, LabError>>, LabError> {
     // The replays of one log are independent too: a fleet of one log still uses all cores.
     let tasks: Vec<(usize, usize)> = (0..jobs.len()).flat_map(|job| (0..grid.replays).map(move |r| (job, r))).collect();
     let replays = super::in_parallel(&tasks, settings.jobs, |_, &(job, number)| {
         replay(grid, number, &jobs[job], settings, report)
     })?;
     let mut replays = replays.into_iter();
-    let of_job = |job: &Job| {
-        // All of them, also behind one that failed: the next job's begin after them.
-        let own: Vec<Result<Replayed, String>> = replays.by_ref().take(grid.replays).collect();
+    let of_job = |job: &WhatifJob| {
+        // Takes all of them, also after one that failed: the next job's results follow them.
+        let own: Vec<Result<ReplayResult, LabError>> = replays.by_ref().take(grid.replays).collect();
         judge_log(grid, job, own.into_iter().collect::<Result<_, _>>()?, settings)
     };
     Ok(jobs.iter().map(of_job).collect())
 }
 
-/// The number of each combination's thresholds in the lanes of their replay, for combination `index`.
-fn watch(grid: &Grid, number: usize) -> (Lanes, Vec<(usize, Vec<usize>)>) {
-    let mut lanes = Lanes::default();
+/// Returns the thresholds of replay `number`, and per combination the numbers of its thresholds among them.
+fn watch(grid: &VariantGrid, number: usize) -> (VariantBatch, Vec<(usize, Vec<usize>)>) {
+    let mut batch = VariantBatch::default();
     let own = grid.variants.iter().enumerate().filter(|(_, variant)| variant.replay == number);
     let places = own.map(|(index, variant)| {
         let rules = variant.config.monitor.rules.iter();
-        (index, rules.map(|rule| lanes.watch(rule)).collect())
+        (index, rules.map(|rule| batch.watch(rule)).collect())
     });
     let places = places.collect();
-    (lanes, places)
+    (batch, places)
 }
 
 fn replay(
-    grid: &Grid,
+    grid: &VariantGrid,
     number: usize,
-    job: &Job,
-    settings: &Settings<'_>,
+    job: &WhatifJob,
+    settings: &WhatifSettings<'_>,
     report: &(dyn Fn(u64) + Sync),
-) -> Result<Replayed, String> {
+) -> Result<ReplayResult, LabError> {
     let variant = grid.variants.iter().find(|variant| variant.replay == number);
     let config: &Config = &variant.ok_or("a replay without a setting")?.config;
-    // Before the replay, which may take hours: a table that cannot be read is told at once.
+    // Before the replay, which may take hours: a table that cannot be read is reported at once.
     let truth = job.truth.as_deref().filter(|_| number == 0).map(Truth::read).transpose()?;
     let monitor = &config.monitor;
-    let (mut lanes, _) = watch(grid, number);
-    let mut engines = lanes.engines(monitor.sample.cells);
+    let (mut batch, _) = watch(grid, number);
+    let mut engines = batch.engines(monitor.sample.cells);
     let is_usable = settings.judges_usable && monitor.health.usable.is_some();
-    let learned = if is_usable { Learned::Usable } else { Learned::Capacity };
+    let learned = if is_usable { CapacityKind::Usable } else { CapacityKind::Capacity };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
-    let source = (settings.reading.open)(config, &job.log);
+    let source = (settings.access.open)(config, &job.log);
     let mut each = |_: &Monitor, out: &mut Outputs| {
         track.observe(&out.events);
-        engines.take(&out.alarm_inputs, &mut lanes);
+        engines.take(&out.alarm_inputs, &mut batch);
         out.clear();
         Ok(())
     };
-    let driven = drive(source, Monitor::new(monitor.clone()), out, settings.reading.sleep_gap_s, &mut each, report)?;
-    Ok(Replayed { driven, track, lanes, truth })
+    let driven = drive(source, Monitor::new(monitor.clone()), out, settings.access.sleep_gap_s, &mut each, report)?;
+    Ok(ReplayResult { driven, track, batch, truth })
 }
 
-fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings<'_>) -> Result<LogResult, String> {
+fn judge_log(
+    grid: &VariantGrid,
+    job: &WhatifJob,
+    replays: Vec<ReplayResult>,
+    settings: &WhatifSettings<'_>,
+) -> Result<LogResult, LabError> {
     let plain = replays.first().ok_or("no replay")?;
     let truth = plain.truth.as_ref();
     let span = plain.driven.span_of(&job.log)?;
     if let Some((from, to)) = truth.map(Truth::span).filter(|(from, to)| *from > span.1 || *to < span.0) {
         let file = job.truth.as_deref().unwrap_or(&job.log).display();
         let ((a, b), (c, d)) = ((from.secs(), to.secs()), (span.0.secs(), span.1.secs()));
-        return Err(format!(
-            "{file}: tells of {a} to {b} s, must tell of the log's {c} to {d} s (--start-times dates a CSV)"
-        ));
+        return Err(LabError(format!(
+            "{file}: covers {a} to {b} s, must overlap the log's {c} to {d} s (--start-times dates a CSV)"
+        )));
     }
     let (judged_by, end) = end_of_life(&plain.track, truth, settings.end_of_life_ah);
     let mut notes = plain.driven.notes.clone();
     if end.is_some_and(|(time, _)| time <= span.0) {
-        notes.push("the life was over before the log began: nothing is judged by its end".to_owned());
+        notes.push("the end of life came before the log began: alarms are not judged by it".to_owned());
     }
     let end = end.filter(|(time, _)| *time <= span.1);
     let mut alarms = Vec::new();
     for (number, replayed) in replays.iter().enumerate() {
         let end = end.map(|(time, _)| time);
-        let life = Life { track: &plain.track, truth, span, end, horizon: settings.horizon };
+        let life = LogLife { track: &plain.track, truth, span, end, horizon: settings.horizon };
         for (setting, places) in watch(grid, number).1 {
             let rules = &grid.variants[setting].config.monitor.rules;
             let judged = rules.iter().zip(places).filter_map(|(config, place)| {
-                let judged = judge(config, replayed.lanes.history(place)?, &life);
-                Some(AlarmRow {
+                let judged = judge(config, replayed.batch.history(place)?, &life);
+                Some(ThresholdScore {
                     setting,
                     rule: config.rule,
                     severity: config.severity,
@@ -255,16 +262,16 @@ fn judge_log(grid: &Grid, job: &Job, replays: Vec<Replayed>, settings: &Settings
 
 type End = Option<(crate::quantity::Timestamp, crate::quantity::CellIndex)>;
 
-fn end_of_life(track: &Track, truth: Option<&Truth>, end_ah: f64) -> (JudgedBy, End) {
+fn end_of_life(track: &Track, truth: Option<&Truth>, end_ah: f64) -> (EndOfLifeSource, End) {
     match (truth, track.learned()) {
         (Some(truth), _) => {
             let by = match truth.kind {
-                TruthKind::Capacity => JudgedBy::Truth,
-                TruthKind::Published => JudgedBy::Published,
+                TruthKind::Capacity => EndOfLifeSource::Truth,
+                TruthKind::Published => EndOfLifeSource::Published,
             };
             (by, truth.falls_below(end_ah))
         }
-        (None, Learned::Usable) => (JudgedBy::LearnedUsable, track.stays_below(end_ah)),
-        (None, Learned::Capacity) => (JudgedBy::Learned, track.stays_below(end_ah)),
+        (None, CapacityKind::Usable) => (EndOfLifeSource::LearnedUsable, track.stays_below(end_ah)),
+        (None, CapacityKind::Capacity) => (EndOfLifeSource::CapacityKind, track.stays_below(end_ah)),
     }
 }

@@ -1,15 +1,15 @@
-//! Rows to come from rows that were: a forecast that needs nothing of the future.
+//! Forecasts future rows from past rows; needs no inputs of the future.
 //!
-//! In: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at row
-//! t is what is known then: for every column its value and its last differences ([`Plan::lags`] values in all). For every
+//! Input: a table of outputs, then other columns, in the order of time, in parts that do not belong together. A *window* at
+//! row t holds what is known then: for every column its value and its last differences ([`ForecastPlan::lags`] values in all). For every
 //! output and every horizon h there is a process of its own (a direct forecast) that predicts the change from t to t + h:
 //! errors of one step do not feed the next, and each horizon has its own noise. Without knowledge the forecast falls
 //! back to the mean change, so to persistence.
 //!
-//! The interval comes from forecasts that really were made: the process is fitted again to the beginning of the training
-//! rows and judged on the block that follows, block after block; how wide it is, and where, follows from |error| /
+//! The interval is calibrated on real forecasts: the process is fitted again to the beginning of the training
+//! rows and judged on the block that follows, block after block; its width at each place follows from |error| /
 //! standard deviation of these ([`spread`]). (Rows left out one by one would not do: windows overlap, and each row's
-//! neighbours give it away.) No row after the origin is looked at.
+//! neighbours reveal it.) No row after the origin is used.
 
 mod spread;
 mod windows;
@@ -17,17 +17,22 @@ mod windows;
 use std::path::Path;
 use std::time::Instant;
 
-pub use windows::{Steps, Windows};
-
-use super::{GprError, Table, create, finish};
-use crate::regress::{Jitter, Model, Prediction, Rows, Score, Settings, Watcher, fit, score};
 use spread::Spread;
+
+use super::{ColumnTable, interval, write_csv};
+
+use crate::error::LabError;
+use crate::regress::{
+    GprSettings, Jitter, Model, Prediction, PredictionScore, ProgressCallback, TrainingRows, fit, score,
+};
+
+pub use windows::{LagWindows, RowSpacing};
 
 /// Most lagged values of a column.
 pub const MAX_LAGS: usize = 200;
 /// Most rows ahead.
 pub const MAX_STEPS: usize = 10_000;
-/// Most horizons that get a process of their own; between them nothing is said.
+/// Most horizons with a process of their own; there are no forecasts between them.
 pub const MAX_HORIZONS: usize = 10;
 /// Fewest windows to train on.
 const FEWEST: usize = 20;
@@ -44,8 +49,8 @@ const GOLDEN: f64 = 0.618_033_988_749_894_9;
 
 /// What to forecast.
 #[derive(Debug, Clone)]
-pub struct Plan {
-    /// The first so many columns of the table are forecast.
+pub struct ForecastPlan {
+    /// Number of the table's first columns to forecast.
     pub outputs: usize,
     /// Values of each column that a window has, 1 or more.
     pub lags: usize,
@@ -56,12 +61,12 @@ pub struct Plan {
     /// Most windows a process is fitted to, taken evenly from all there are, at changing phases.
     pub rows: usize,
     /// Kernel and search.
-    pub settings: Settings,
+    pub settings: GprSettings,
 }
 
-/// What came of it.
+/// Forecasts of all outputs.
 #[derive(Debug, Clone)]
-pub struct Forecast {
+pub struct TableForecast {
     /// Rows that were known.
     pub origin: usize,
     /// Row from which the forecast at the origin is made: the last known one that has a window.
@@ -78,12 +83,12 @@ pub struct OutputForecast {
     /// Its place in the table.
     pub column: usize,
     /// By rows ahead, rising.
-    pub horizons: Vec<Horizon>,
+    pub horizons: Vec<HorizonForecast>,
 }
 
-/// Forecasts of one column so many rows ahead.
+/// Forecasts of one column, `steps` rows ahead.
 #[derive(Debug, Clone)]
-pub struct Horizon {
+pub struct HorizonForecast {
     /// Rows ahead.
     pub steps: usize,
     /// Windows it learned from.
@@ -94,20 +99,20 @@ pub struct Horizon {
     pub factor: f64,
     /// Time of fit and calibration, s.
     pub fit_s: f64,
-    /// What was added to diagonals.
+    /// Jitter added to diagonals.
     pub jitter: Jitter,
     /// The forecast made at the origin.
     pub at_origin: Prediction,
     /// Rows after the origin from which forecasts were made, and the forecasts.
     pub held_out: Vec<(usize, Prediction)>,
-    /// Their errors; `None` when nothing comes after the origin.
-    pub score: Option<Score>,
-    /// Root of the mean squared error of "it stays as it is" over the same rows.
+    /// Their errors; `None` when there are no rows after the origin.
+    pub score: Option<PredictionScore>,
+    /// Root of the mean squared error of persistence (the value stays as it is) over the same rows.
     pub persistence_rmse: Option<f64>,
 }
 
-/// Rows ahead that get a process: all up to [`MAX_HORIZONS`], else so many with even ratios, the first and the last
-/// included.
+/// Returns the horizons that get a process: all up to [`MAX_HORIZONS`], else that many with even ratios, including the first
+/// and the last.
 pub fn horizons(steps: usize) -> Vec<usize> {
     if steps <= MAX_HORIZONS {
         return (1..=steps).collect();
@@ -119,21 +124,21 @@ pub fn horizons(steps: usize) -> Vec<usize> {
     all
 }
 
-/// Makes the forecasts. `done` hears of every horizon that is finished: how many, of how many.
+/// Makes the forecasts. `done` receives the number of finished horizons, and of all.
 ///
 /// # Errors
 /// Numbers out of range, too few rows for the lags and steps, or no positive definite matrix.
 pub fn run(
-    table: &Table,
-    plan: &Plan,
-    watcher: &mut Watcher<'_>,
+    table: &ColumnTable,
+    plan: &ForecastPlan,
+    watcher: &mut ProgressCallback<'_>,
     done: &mut dyn FnMut(usize, usize),
-) -> Result<Forecast, GprError> {
+) -> Result<TableForecast, LabError> {
     check(plan)?;
-    let windows = Windows::new(table, plan.lags);
+    let windows = LagWindows::new(table, plan.lags);
     let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
     let from = windows.last_before(origin).ok_or_else(|| {
-        GprError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
+        LabError(format!("lags = {}, must be at most the rows of a part before the origin (row {origin})", plan.lags))
     })?;
     let list = horizons(plan.steps);
     let mut outputs = Vec::new();
@@ -141,7 +146,7 @@ pub fn run(
         let mut start = Vec::new();
         let mut horizons = Vec::new();
         for &steps in &list {
-            let task = Task { plan, windows: &windows, column, steps, origin };
+            let task = HorizonTask { plan, windows: &windows, column, steps, origin };
             let (horizon, model) = task.run(&start, from, watcher)?;
             start = model.hyperparameters().into_iter().map(|h| h.value).collect();
             horizons.push(horizon);
@@ -149,37 +154,42 @@ pub fn run(
         }
         outputs.push(OutputForecast { name: table.names[column].clone(), column, horizons });
     }
-    Ok(Forecast { origin, from, outputs })
+    Ok(TableForecast { origin, from, outputs })
 }
 
-fn check(plan: &Plan) -> Result<(), GprError> {
+fn check(plan: &ForecastPlan) -> Result<(), LabError> {
     let range = |what: &str, found: usize, most: usize| match (1..=most).contains(&found) {
         true => Ok(()),
-        false => Err(GprError(format!("{what} = {found}, must be 1 to {most}"))),
+        false => Err(LabError(format!("{what} = {found}, must be 1 to {most}"))),
     };
     range("lags", plan.lags, MAX_LAGS)?;
     range("steps", plan.steps, MAX_STEPS)?;
     if !(plan.origin > 0.0 && plan.origin <= 1.0) {
-        return Err(GprError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
+        return Err(LabError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
     }
     Ok(())
 }
 
-/// One column so many rows ahead.
-struct Task<'a> {
-    plan: &'a Plan,
-    windows: &'a Windows<'a>,
+/// Fit and forecasts of one column, `steps` rows ahead.
+struct HorizonTask<'a> {
+    plan: &'a ForecastPlan,
+    windows: &'a LagWindows<'a>,
     column: usize,
     steps: usize,
     origin: usize,
 }
 
-impl Task<'_> {
-    fn run(&self, start: &[f64], from: usize, watcher: &mut Watcher<'_>) -> Result<(Horizon, Model), GprError> {
+impl HorizonTask<'_> {
+    fn run(
+        &self,
+        start: &[f64],
+        from: usize,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<(HorizonForecast, Model), LabError> {
         let begin = Instant::now();
         let (model, trained) = self.fitted(self.origin, start, None, watcher)?.ok_or_else(|| {
             let (lags, steps, origin, fewest) = (self.plan.lags, self.steps, self.origin, self.fewest());
-            GprError(format!(
+            LabError(format!(
                 "fewer than {fewest} windows of {lags} lags and {steps} steps before the origin (row {origin}), must be at \
                  least as many: give fewer lags or steps, a later origin or more rows"
             ))
@@ -191,7 +201,7 @@ impl Task<'_> {
         let later = chosen(&self.windows.between(self.origin - 1, usize::MAX, self.steps), HELD_OUT);
         let held_out: Vec<(usize, Prediction)> = later.iter().copied().zip(predict(&later)?).collect();
         let (score, persistence_rmse) = self.judge(&held_out);
-        let horizon = Horizon {
+        let horizon = HorizonForecast {
             steps: self.steps,
             trained,
             calibrated: spread.count(),
@@ -218,8 +228,8 @@ impl Task<'_> {
         end: usize,
         start: &[f64],
         fixed: Option<&[f64]>,
-        watcher: &mut Watcher<'_>,
-    ) -> Result<Option<(Model, usize)>, GprError> {
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<Option<(Model, usize)>, LabError> {
         let known = self.windows.between(0, end, self.steps);
         if known.len() < self.fewest() {
             return Ok(None);
@@ -227,7 +237,7 @@ impl Task<'_> {
         let rows = chosen(&known, self.plan.rows);
         let inputs = self.windows.features(&rows);
         let targets: Vec<f64> = rows.iter().map(|row| self.windows.change(*row, self.column, self.steps)).collect();
-        let mut settings = Settings { calibrate: false, ..self.plan.settings.clone() };
+        let mut settings = GprSettings { calibrate: false, ..self.plan.settings.clone() };
         if let Some(fixed) = fixed {
             (settings.start, settings.max_iterations, settings.restarts) = (fixed.to_vec(), 0, 0);
         } else if !start.is_empty() {
@@ -235,18 +245,18 @@ impl Task<'_> {
             settings.max_iterations = settings.max_iterations.min(WARM_STEPS);
             settings.restarts = 0;
         }
-        let rows = Rows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
+        let rows = TrainingRows { inputs: &inputs, dimensions: self.windows.width(), targets: &targets, lines: &[] };
         Ok(Some((fit(&rows, &settings, watcher)?, targets.len())))
     }
 
     /// From forecasts of block after block by what came before it.
-    fn spread(&self, model: &Model, watcher: &mut Watcher<'_>) -> Result<Spread, GprError> {
+    fn spread(&self, model: &Model, watcher: &mut ProgressCallback<'_>) -> Result<Spread, LabError> {
         let fixed: Vec<f64> = model.hyperparameters().into_iter().map(|h| h.value).collect();
         let at = |part: f64| ((self.origin as f64) * part).round() as usize;
         let (mut judged, mut features, mut ratios) = (Vec::new(), Vec::new(), Vec::new());
         for ends in BLOCKS.windows(2) {
             let (begin, end) = (at(ends[0]).max(1), at(ends[1]));
-            // What came may lie beyond the block: a block may be shorter than the horizon.
+            // The forecast row may lie beyond the block: a block may be shorter than the horizon.
             let mut rows = self.windows.between(begin, self.origin, self.steps);
             rows.retain(|row| *row < end);
             let rows = chosen(&rows, BLOCK_WINDOWS);
@@ -266,7 +276,7 @@ impl Task<'_> {
     }
 
     /// Forecasts of the value itself from some rows.
-    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, GprError> {
+    fn predict(&self, model: &Model, rows: &[usize], spread: &Spread) -> Result<Vec<Prediction>, LabError> {
         if rows.is_empty() {
             return Ok(Vec::new());
         }
@@ -281,7 +291,7 @@ impl Task<'_> {
         Ok(rows.iter().zip(windows).zip(found).map(value).collect())
     }
 
-    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<Score>, Option<f64>) {
+    fn judge(&self, held_out: &[(usize, Prediction)]) -> (Option<PredictionScore>, Option<f64>) {
         if held_out.is_empty() {
             return (None, None);
         }
@@ -294,33 +304,30 @@ impl Task<'_> {
     }
 }
 
-/// Writes every forecast: that at the origin and those after it, with what came where that is known.
+/// Writes every forecast: that at the origin and those after it, with the measured value where it is known.
 ///
 /// # Errors
 /// The file cannot be written.
-pub fn write(path: &Path, data: &Table, forecast: &Forecast) -> Result<(), GprError> {
-    let mut out = csv::Writer::from_writer(create(path)?);
-    out.write_record(["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"])?;
-    for output in &forecast.outputs {
-        for horizon in &output.horizons {
-            let at_origin = (forecast.from, horizon.at_origin);
-            let later = horizon.held_out.iter().filter(|(row, _)| *row != forecast.from).copied();
-            for (row, p) in std::iter::once(at_origin).chain(later) {
-                let place = [data.file_of(row).display().to_string(), data.lines[row].to_string()];
-                let own = [output.name.clone(), horizon.steps.to_string()].into_iter().chain(place);
-                let value = data.row(row)[output.column];
-                let numbers = [value, p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
-                let truth = data.after(row, horizon.steps).map(|later| data.row(later)[output.column]);
-                let truth = truth.map(|truth| truth.to_string()).unwrap_or_default();
-                out.write_record(own.chain(numbers.map(|number| number.to_string())).chain([truth]))?;
-            }
-        }
-    }
-    finish(out)
+pub fn write(path: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), LabError> {
+    let heads = ["output", "ahead", "file", "line", "origin", "mean", "std", "low_95", "high_95", "measured"];
+    let horizons = forecast.outputs.iter().flat_map(|output| output.horizons.iter().map(move |h| (output, h)));
+    let rows = horizons.flat_map(|(output, horizon)| {
+        let later = horizon.held_out.iter().filter(|(row, _)| *row != forecast.from).copied();
+        let forecasts = std::iter::once((forecast.from, horizon.at_origin)).chain(later);
+        forecasts.map(move |(row, prediction)| {
+            let value = |row: usize| data.row(row)[output.column].to_string();
+            let file = data.file_of(row).display().to_string();
+            let (ahead, line) = (horizon.steps.to_string(), data.lines[row].to_string());
+            let truth = data.after(row, horizon.steps).map(value).unwrap_or_default();
+            let own = [output.name.clone(), ahead, file, line, value(row)];
+            own.into_iter().chain(interval(&prediction)).chain([truth]).collect()
+        })
+    });
+    write_csv(path, heads.map(str::to_owned).to_vec(), rows)
 }
 
-/// At most so many of them, one from each of so many equal stretches, at a place in it that differs from stretch to
-/// stretch: a fixed stride would meet rows that repeat, as those of cycles do, always at the same phase.
+/// Returns at most `most` rows, one from each of as many equal stretches, at a position that differs from stretch to
+/// stretch: a fixed stride would always meet repeating rows, such as those of cycles, at the same phase.
 fn chosen(all: &[usize], most: usize) -> Vec<usize> {
     let count = all.len().min(most);
     let place = |k: usize| if count == all.len() { 0.0 } else { (k as f64 * GOLDEN).fract() };

@@ -3,8 +3,8 @@
 
 use std::path::Path;
 
-use super::forecast::{Forecast, Horizon, OutputForecast};
-use super::{Table, Validated, table};
+use super::forecast::{HorizonForecast, OutputForecast, TableForecast};
+use super::{ColumnTable, CrossValidation, table};
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Point, Shape};
 
 /// Rows of the stretch that is drawn with its interval: each can be seen.
@@ -18,7 +18,7 @@ const BEFORE: usize = 60;
 ///
 /// # Errors
 /// A file cannot be written, or there is no font for the words of a PNG.
-pub fn write_cross_validation(folder: &Path, data: &Table, all: &[Validated]) -> Result<(), PlotError> {
+pub fn write_cross_validation(folder: &Path, data: &ColumnTable, all: &[CrossValidation]) -> Result<(), PlotError> {
     let output = data.names.last().map_or("", String::as_str);
     let truth: Vec<f64> = data.column(data.width() - 1).collect();
     for validated in all {
@@ -33,7 +33,7 @@ pub fn write_cross_validation(folder: &Path, data: &Table, all: &[Validated]) ->
 ///
 /// # Errors
 /// As [`write_cross_validation`].
-pub fn write_forecast(folder: &Path, data: &Table, forecast: &Forecast) -> Result<(), PlotError> {
+pub fn write_forecast(folder: &Path, data: &ColumnTable, forecast: &TableForecast) -> Result<(), PlotError> {
     for output in &forecast.outputs {
         let mut charts = vec![fan(data, forecast, output)];
         if output.horizons.iter().any(|horizon| horizon.score.is_some()) {
@@ -73,7 +73,7 @@ fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
     Layer::new("95 % interval", Ink::Blue, Shape::Band(all.collect()))
 }
 
-fn scatter(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let every = truth.len().div_ceil(SCATTER).max(1);
     let pairs = truth.iter().zip(&validated.folds.predictions).step_by(every);
     let mut pairs: Vec<(f64, f64)> = pairs.map(|(y, p)| (*y, p.mean)).collect();
@@ -101,7 +101,7 @@ fn stem(output: &str) -> String {
     table::label(output).split(',').next().unwrap_or_default().to_owned()
 }
 
-fn stretch(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+fn stretch(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let begin = (truth.len() / 2).saturating_sub(STRETCH / 2);
     let rows = begin..(begin + STRETCH).min(truth.len());
     let at = |row: usize| &validated.folds.predictions[row];
@@ -118,17 +118,17 @@ fn stretch(validated: &Validated, truth: &[f64], output: &str) -> Chart {
     }
 }
 
-fn errors(validated: &Validated, truth: &[f64], output: &str) -> Chart {
+fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let all = || truth.iter().zip(&validated.folds.predictions).enumerate();
     let half = |p: &crate::regress::Prediction| (p.high_95 - p.low_95) / 2.0;
-    // The interval's width wobbles from row to row: its mean over a hundredth of the rows says how wide it is.
+    // The interval's width wobbles from row to row: its mean over a hundredth of the rows shows its width.
     let width = (truth.len() / 100).max(1);
     let halves = validated.folds.predictions.chunks(width).enumerate().map(|(k, chunk)| {
         let mean = chunk.iter().map(half).sum::<f64>() / chunk.len() as f64;
         ((k * width) as f64 + chunk.len() as f64 / 2.0, -mean, mean)
     });
     Chart {
-        title: "Error of every row (outermost ones of many at one place), and how wide the interval is".to_owned(),
+        title: "Error of every row (the outermost of many at one place), and the width of the interval".to_owned(),
         x: Axis::number("row"),
         y: Axis::number(&format!("predicted - measured, {}", table::label(output).split(", ").nth(1).unwrap_or(""))),
         layers: vec![
@@ -139,22 +139,18 @@ fn errors(validated: &Validated, truth: &[f64], output: &str) -> Chart {
     }
 }
 
-fn fan(data: &Table, forecast: &Forecast, output: &OutputForecast) -> Chart {
+fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) -> Chart {
     let most = output.horizons.last().map_or(1, |horizon| horizon.steps);
     let from = forecast.from;
     let value = |row: usize| data.row(row)[output.column];
     let rows = from.saturating_sub(BEFORE.max(2 * most))..(from + most + 1).min(data.len());
     let x = |row: usize| row as f64 - from as f64;
-    let at = |horizon: &Horizon| horizon.steps as f64;
+    let at = |horizon: &HorizonForecast| horizon.steps as f64;
     let now = [(0.0, value(from), value(from))];
     let fan = output.horizons.iter().map(|h| (at(h), h.at_origin.low_95, h.at_origin.high_95));
     let mean = output.horizons.iter().map(|h| (at(h), h.at_origin.mean));
     Chart {
-        title: format!(
-            "{}: forecast from row {} on, which knows nothing of what follows",
-            stem(&output.name),
-            from + 1
-        ),
+        title: format!("{}: forecast from row {} without any later data", stem(&output.name), from + 1),
         x: Axis::number("rows from the origin"),
         y: Axis::number(&table::label(&output.name)),
         layers: vec![
@@ -167,7 +163,7 @@ fn fan(data: &Table, forecast: &Forecast, output: &OutputForecast) -> Chart {
 }
 
 fn growth(output: &OutputForecast) -> Chart {
-    let over = |value: &dyn Fn(&Horizon) -> Option<f64>| -> Vec<(f64, f64)> {
+    let over = |value: &dyn Fn(&HorizonForecast) -> Option<f64>| -> Vec<(f64, f64)> {
         output.horizons.iter().filter_map(|h| Some((h.steps as f64, value(h)?))).collect()
     };
     Chart {
@@ -175,7 +171,7 @@ fn growth(output: &OutputForecast) -> Chart {
         x: Axis::number("rows ahead"),
         y: Axis::number(&format!("RMSE, {}", table::label(&output.name).split(", ").nth(1).unwrap_or(""))),
         layers: vec![
-            line("it stays as it is", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
+            line("persistence", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
             line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
             line(
                 "half of the mean 95 % interval",
@@ -188,7 +184,7 @@ fn growth(output: &OutputForecast) -> Chart {
 }
 
 fn coverage(output: &OutputForecast) -> Chart {
-    let inside = |h: &Horizon| h.score.map(|s| (h.steps as f64, 100.0 * s.coverage_95));
+    let inside = |h: &HorizonForecast| h.score.map(|s| (h.steps as f64, 100.0 * s.coverage_95));
     Chart {
         title: "Part of the measured values inside the 95 % interval".to_owned(),
         x: Axis::number("rows ahead"),
@@ -202,7 +198,7 @@ fn coverage(output: &OutputForecast) -> Chart {
 }
 
 /// Forecasts of the last horizon against what came, over the rows they are for.
-fn held_out(data: &Table, output: &OutputForecast) -> Chart {
+fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;
     let all = || horizon.held_out.iter();

@@ -1,46 +1,45 @@
 //! Columns of CSV files by name, for regressions: any column may be an output or an input.
 //!
-//! In: CSV, plain, gzip or zstd, one heading line; numbers in the columns asked for. Out: those columns, row after row,
-//! with the file and line of each row. An empty field or NaN is a missing value: refused with its place, or its row left
-//! out and counted. Anything else that is no finite number is always refused.
+//! Input: CSV, plain, gzip or zstd, one heading line; numbers in the requested columns. Output: those columns, row after row,
+//! with the file and line of each row. An empty field or NaN is a missing value: an error with its place, or its row is left
+//! out and counted. Anything else that is no finite number is always an error.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use super::GprError;
-use crate::io::lines;
+use crate::error::LabError;
+use crate::io::table::{PART_COLUMNS, Row, Table as CsvTable, TableError};
 
 /// Endings of column names that are units: `voltage` finds `voltage_v`.
 const UNITS: [&str; 36] = [
     "a", "ma", "ah", "mah", "v", "mv", "w", "kw", "wh", "kwh", "c", "k", "f", "s", "ms", "us", "ns", "min", "h", "d",
     "days", "cycles", "hz", "ohm", "mohm", "percent", "pct", "ppm", "kg", "m", "mm", "pa", "bar", "n", "nm", "rpm",
 ];
-/// Most rows of a regression: its numbers then take some gigabytes.
+/// Most rows of a regression: their numbers take some gigabytes.
 const MAX_ROWS: usize = 5_000_000;
-/// Most columns told in an error.
-const MAX_TOLD: usize = 40;
+/// Most columns listed in an error.
+const MAX_LISTED: usize = 40;
 
-/// What is to be done with a row that lacks a value.
+/// Treatment of a row without a required value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Missing {
-    /// The whole work is refused, with file and line.
-    Refused,
+pub enum MissingPolicy {
+    /// Reading fails, with file and line.
+    Rejected,
     /// The row is left out and counted.
     Skipped,
 }
 
-/// What to read.
+/// Columns to read.
 #[derive(Debug, Clone)]
-pub struct Wanted<'a> {
-    /// Columns that every row must have, as their reader calls them.
+pub struct ColumnSelection<'a> {
+    /// Columns that every row must have, by name, or by name without unit.
     pub columns: &'a [String],
     /// Columns that need not be there, nor have a value in every row (NaN then).
     pub optional: &'a [String],
-    /// Rows that lack a value.
-    pub missing: Missing,
+    /// Treatment of rows without a required value.
+    pub missing: MissingPolicy,
 }
 
-/// Which column says what belongs together.
+/// The column whose values separate parts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PartColumn {
     /// None: every file is one run of rows.
@@ -48,26 +47,23 @@ pub enum PartColumn {
     /// This one.
     Named(String),
     /// The first of `cycle`, `segment` and `ref` that is there.
-    Usual,
+    Default,
 }
-
-/// Columns at whose values time usually starts again.
-const USUAL_PARTS: [&str; 3] = ["cycle", "segment", "ref"];
 
 impl PartColumn {
     fn find(&self, header: &[String]) -> Result<Option<usize>, String> {
         match self {
             Self::None => Ok(None),
             Self::Named(name) => find(header, name).map(Some),
-            Self::Usual => Ok(USUAL_PARTS.iter().find_map(|name| header.iter().position(|column| column == name))),
+            Self::Default => Ok(PART_COLUMNS.iter().find_map(|name| header.iter().position(|column| column == name))),
         }
     }
 }
 
 /// Columns of one or more files, one after the other.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Table {
-    /// Full names of the columns, in the order asked for; an optional one that is not there has the name asked for.
+pub struct ColumnTable {
+    /// Full names of the columns in the requested order; a missing optional column has its requested name.
     pub names: Vec<String>,
     /// Values, row after row.
     pub values: Vec<f64>,
@@ -83,25 +79,25 @@ pub struct Table {
     pub parts: Vec<usize>,
 }
 
-impl Table {
+impl ColumnTable {
     /// Reads files one after the other.
     ///
     /// # Errors
     /// A file cannot be read, a column is unknown or ambiguous, a value is missing or no number, there are too many rows:
     /// with file, line, column, what was found and what is allowed.
-    pub fn read(paths: &[PathBuf], wanted: &Wanted<'_>, part: &PartColumn) -> Result<Self, GprError> {
+    pub fn read(paths: &[PathBuf], wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<Self, LabError> {
         let mut table = Self { has: vec![true; wanted.optional.len()], ..Self::default() };
         for path in paths {
-            table.read_file(path, wanted, part).map_err(|what| GprError(format!("{}{what}", path.display())))?;
+            table.read_file(path, wanted, part)?;
             table.files.push((path.clone(), table.lines.len()));
         }
-        table.mend_parts(part);
+        table.ignore_row_counter(part);
         Ok(table)
     }
 
-    /// A usual part column that differs from row to row counts the rows: it cuts nothing.
-    fn mend_parts(&mut self, part: &PartColumn) {
-        if *part == PartColumn::Usual && self.parts.len() == self.len() {
+    /// Ignores a default part column that differs from row to row: it counts the rows.
+    fn ignore_row_counter(&mut self, part: &PartColumn) {
+        if *part == PartColumn::Default && self.parts.len() == self.len() {
             let begins = [0].into_iter().chain(self.files.iter().map(|(_, end)| *end));
             self.parts = begins.filter(|begin| *begin < self.lines.len()).collect();
             self.parts.dedup();
@@ -139,12 +135,12 @@ impl Table {
         self.files.get(at).map_or(Path::new(""), |(path, _)| path)
     }
 
-    /// Place of a row, for people.
+    /// File and line of a row, for messages.
     pub fn place(&self, row: usize) -> String {
         format!("{}:{}", self.file_of(row).display(), self.lines[row])
     }
 
-    /// The row so many after this one, in the same part.
+    /// Returns the row `steps` after this one in the same part.
     pub fn after(&self, row: usize, steps: usize) -> Option<usize> {
         let at = self.parts.partition_point(|begin| *begin <= row);
         let end = self.parts.get(at).copied().unwrap_or(self.len());
@@ -171,40 +167,33 @@ impl Table {
         thin
     }
 
-    /// One file; errors begin with the colon after its name.
-    fn read_file(&mut self, path: &Path, wanted: &Wanted<'_>, part: &PartColumn) -> Result<(), String> {
-        let source = lines::open(path, &Arc::default()).map_err(|error| format!(": {error}"))?;
-        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
-        let fail = |error: csv::Error| format!(": {error}");
-        let header = reader.headers().map_err(fail)?;
-        let header: Vec<String> = header.iter().map(|name| name.trim_start_matches('\u{feff}').to_owned()).collect();
-        let columns = self.columns(&header, wanted).map_err(|what| format!(":1: {what}"))?;
-        let part = part.find(&header).map_err(|what| format!(":1: {what}"))?;
-        let mut record = csv::ByteRecord::new();
+    fn read_file(&mut self, path: &Path, wanted: &ColumnSelection<'_>, part: &PartColumn) -> Result<(), TableError> {
+        let mut file = CsvTable::open(path)?;
+        let header = file.header();
+        let columns = self.columns(header.names(), wanted).map_err(|what| header.fault(what))?;
+        let part = part.find(header.names()).map_err(|what| header.fault(what))?;
         let mut key: Option<Vec<u8>> = None;
-        while reader.read_byte_record(&mut record).map_err(fail)? {
-            let line = record.position().map_or(0, csv::Position::line);
-            let values = row(&header, &columns, wanted.columns.len(), &record);
-            let Some(values) = values.map_err(|bad| bad.told(line, wanted.missing)).or_else(Bad::skipped)? else {
+        while let Some(row) = file.next_row()? {
+            let Some(values) = row_values(&row, &columns, wanted)? else {
                 self.skipped += 1;
                 continue;
             };
-            let new_key = part.and_then(|column| record.get(column)).map(<[u8]>::to_vec).unwrap_or_default();
+            let new_key = part.and_then(|column| row.bytes(column)).map(<[u8]>::to_vec).unwrap_or_default();
             if key.as_ref() != Some(&new_key) {
                 self.parts.push(self.lines.len());
                 key = Some(new_key);
             }
             self.values.extend(values);
-            self.lines.push(line);
+            self.lines.push(row.line);
             if self.lines.len() > MAX_ROWS {
-                return Err(format!(":{line}: more than {MAX_ROWS} rows in all, must be at most as many"));
+                return Err(row.row_fault(format_args!("more than {MAX_ROWS} rows in all, must be at most as many")));
             }
         }
         Ok(())
     }
 
     /// Where the columns are; those of later files must have the names that the first one has.
-    fn columns(&mut self, header: &[String], wanted: &Wanted<'_>) -> Result<Vec<Option<usize>>, String> {
+    fn columns(&mut self, header: &[String], wanted: &ColumnSelection<'_>) -> Result<Vec<Option<usize>>, String> {
         let first = self.names.is_empty();
         let mut columns = Vec::new();
         for (k, name) in wanted.columns.iter().chain(wanted.optional).enumerate() {
@@ -219,67 +208,43 @@ impl Table {
             columns.push(found);
         }
         if first {
-            let asked = wanted.columns.iter().chain(wanted.optional);
-            let name = |(found, asked): (&Option<usize>, &String)| found.map_or(asked, |at| &header[at]).clone();
-            self.names = columns.iter().zip(asked).map(name).collect();
+            let requested = wanted.columns.iter().chain(wanted.optional);
+            let name =
+                |(found, requested): (&Option<usize>, &String)| found.map_or(requested, |at| &header[at]).clone();
+            self.names = columns.iter().zip(requested).map(name).collect();
         }
         Ok(columns)
     }
 }
 
-/// A row that cannot be used.
-enum Bad {
-    Missing(String),
-    Wrong(String),
-}
-
-impl Bad {
-    /// As an error that begins with the line; a missing value that may be skipped stays one.
-    fn told(self, line: u64, missing: Missing) -> Self {
-        match (self, missing) {
-            (Self::Missing(what), Missing::Skipped) => Self::Missing(what),
-            (Self::Missing(what), Missing::Refused) => {
-                Self::Wrong(format!(":{line}: {what}; --skip-missing leaves such rows out"))
-            }
-            (Self::Wrong(what), _) => Self::Wrong(format!(":{line}: {what}")),
-        }
-    }
-
-    /// A row that may be skipped is no row, anything else an error.
-    fn skipped(self) -> Result<Option<Vec<f64>>, String> {
-        match self {
-            Self::Missing(_) => Ok(None),
-            Self::Wrong(what) => Err(what),
-        }
-    }
-}
-
-/// Values of one row; the first `needed` must be there.
-fn row(
-    header: &[String],
+/// Returns the values of one row; `None` = it lacks a required value and such rows are skipped.
+fn row_values(
+    row: &Row<'_>,
     columns: &[Option<usize>],
-    needed: usize,
-    record: &csv::ByteRecord,
-) -> Result<Option<Vec<f64>>, Bad> {
+    wanted: &ColumnSelection<'_>,
+) -> Result<Option<Vec<f64>>, TableError> {
     let mut values = Vec::with_capacity(columns.len());
-    for (k, column) in columns.iter().enumerate() {
-        let text = column.and_then(|column| record.get(column)).unwrap_or_default();
-        let name = column.map_or("", |column| &header[column]);
-        let shown = || String::from_utf8_lossy(text).into_owned();
-        let value = if text.is_empty() {
-            f64::NAN
-        } else {
-            let number = std::str::from_utf8(text).ok().and_then(|text| text.parse::<f64>().ok());
-            let number = number.filter(|value| !value.is_infinite());
-            let wrong = || Bad::Wrong(format!("column {name}: found {:?}, must be a finite number", shown()));
-            number.ok_or_else(wrong)?
-        };
-        if value.is_nan() && k < needed {
-            return Err(Bad::Missing(format!("column {name}: found {:?}, must be a finite number", shown())));
+    for (k, &column) in columns.iter().enumerate() {
+        let value = column.map_or(Ok(f64::NAN), |column| number(row, column))?;
+        match (column, wanted.missing) {
+            (Some(column), MissingPolicy::Rejected) if value.is_nan() && k < wanted.columns.len() => {
+                return Err(row.fault(column, "a finite number; --skip-missing leaves such rows out"));
+            }
+            (Some(_), MissingPolicy::Skipped) if value.is_nan() && k < wanted.columns.len() => return Ok(None),
+            _ => values.push(value),
         }
-        values.push(value);
     }
     Ok(Some(values))
+}
+
+/// A number; NaN where it is missing.
+fn number(row: &Row<'_>, column: usize) -> Result<f64, TableError> {
+    let text = row.text(column);
+    if text.is_empty() {
+        return Ok(f64::NAN);
+    }
+    let number = text.parse::<f64>().ok().filter(|value| !value.is_infinite());
+    number.ok_or_else(|| row.fault(column, "a finite number"))
 }
 
 /// A column by its name, or by its name without the unit.
@@ -289,18 +254,18 @@ fn find(header: &[String], name: &str) -> Result<usize, String> {
     };
     let exact = all(&|column| column == name);
     let found = if exact.is_empty() { all(&|column| stem(column) == Some(name)) } else { exact };
-    let told = |columns: &mut dyn Iterator<Item = &String>| {
+    let list = |columns: &mut dyn Iterator<Item = &String>| {
         let names: Vec<&str> = columns.map(String::as_str).collect();
-        let more = names.len().saturating_sub(MAX_TOLD);
-        let list = names[..names.len() - more].join(", ");
-        if more > 0 { format!("{list} and {more} more") } else { list }
+        let more = names.len().saturating_sub(MAX_LISTED);
+        let shown = names[..names.len() - more].join(", ");
+        if more > 0 { format!("{shown} and {more} more") } else { shown }
     };
     match found[..] {
         [only] => Ok(only),
-        [] => Err(format!("no column {name:?}, must be one of {}", told(&mut header.iter()))),
+        [] => Err(format!("no column {name:?}, must be one of {}", list(&mut header.iter()))),
         _ => Err(format!(
             "column {name:?} is ambiguous, found {}, must be one of them by its whole name",
-            told(&mut found.iter().map(|at| &header[*at]))
+            list(&mut found.iter().map(|at| &header[*at]))
         )),
     }
 }
@@ -319,7 +284,7 @@ pub(super) fn derived(column: &str, word: &str) -> String {
     split(column).map_or_else(|| format!("{column}_{word}"), |(stem, unit)| format!("{stem}_{word}_{unit}"))
 }
 
-/// Name and unit for people: `voltage, V`.
+/// Formats a column's name and unit: `voltage, V`.
 pub(super) fn label(column: &str) -> String {
     let Some((stem, unit)) = split(column) else { return column.replace('_', " ") };
     let unit = match unit {
@@ -343,13 +308,13 @@ pub(super) fn label(column: &str) -> String {
 mod tests {
     use super::*;
 
-    fn read(text: &str, columns: &[&str], missing: Missing) -> Result<Table, String> {
+    fn read(text: &str, columns: &[&str], missing: MissingPolicy) -> Result<ColumnTable, String> {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("cell.csv");
         std::fs::write(&path, text).expect("written");
         let columns: Vec<String> = columns.iter().map(|name| (*name).to_owned()).collect();
-        let wanted = Wanted { columns: &columns, optional: &[], missing };
-        let found = Table::read(std::slice::from_ref(&path), &wanted, &PartColumn::None);
+        let wanted = ColumnSelection { columns: &columns, optional: &[], missing };
+        let found = ColumnTable::read(std::slice::from_ref(&path), &wanted, &PartColumn::None);
         found.map_err(|e| e.0.replace(&format!("{}/", folder.path().display()), ""))
     }
 
@@ -357,29 +322,29 @@ mod tests {
 
     #[test]
     fn columns_are_found_with_and_without_their_unit() {
-        let table = read(TEXT, &["voltage_mv", "time"], Missing::Refused).expect("reads");
+        let table = read(TEXT, &["voltage_mv", "time"], MissingPolicy::Rejected).expect("reads");
         assert_eq!(table.names, ["voltage_mv", "time_s"]);
         assert_eq!((table.row(3), table.lines[3], table.parts.clone()), (&[3200.0, 3.0][..], 5, vec![0]));
-        let ambiguous = read(TEXT, &["voltage"], Missing::Refused).expect_err("two");
+        let ambiguous = read(TEXT, &["voltage"], MissingPolicy::Rejected).expect_err("two");
         assert_eq!(
             ambiguous,
             "cell.csv:1: column \"voltage\" is ambiguous, found voltage_v, voltage_mv, must be one of them by its whole name"
         );
-        let unknown = read(TEXT, &["current"], Missing::Refused).expect_err("none");
+        let unknown = read(TEXT, &["current"], MissingPolicy::Rejected).expect_err("none");
         assert_eq!(unknown, "cell.csv:1: no column \"current\", must be one of time_s, voltage_v, voltage_mv");
     }
 
     #[test]
     fn missing_values_are_refused_with_their_line_or_skipped_and_counted() {
-        let refused = read(TEXT, &["voltage_v"], Missing::Refused).expect_err("a hole");
+        let refused = read(TEXT, &["voltage_v"], MissingPolicy::Rejected).expect_err("a hole");
         let expected =
             "cell.csv:3: column voltage_v: found \"\", must be a finite number; --skip-missing leaves such rows out";
         assert_eq!(refused, expected);
-        let table = read(TEXT, &["voltage_v"], Missing::Skipped).expect("reads");
+        let table = read(TEXT, &["voltage_v"], MissingPolicy::Skipped).expect("reads");
         assert_eq!((table.len(), table.skipped, table.lines.clone()), (2, 2, vec![2, 5]));
         for wrong in ["x", "inf", "1e999"] {
             let text = format!("a\n1\n{wrong}\n");
-            let refused = read(&text, &["a"], Missing::Skipped).expect_err(wrong);
+            let refused = read(&text, &["a"], MissingPolicy::Skipped).expect_err(wrong);
             assert_eq!(refused, format!("cell.csv:3: column a: found {wrong:?}, must be a finite number"));
         }
     }
@@ -391,15 +356,15 @@ mod tests {
         let parts = |text: &str, part: &PartColumn| {
             std::fs::write(&path, text).expect("written");
             let columns = ["a".to_owned()];
-            let wanted = Wanted { columns: &columns, optional: &[], missing: Missing::Refused };
-            let table = Table::read(&[path.clone(), path.clone()], &wanted, part).expect("reads");
+            let wanted = ColumnSelection { columns: &columns, optional: &[], missing: MissingPolicy::Rejected };
+            let table = ColumnTable::read(&[path.clone(), path.clone()], &wanted, part).expect("reads");
             assert_eq!((table.after(0, 1).is_some(), table.file_of(3)), (table.parts.len() < 6, path.as_path()));
             (table.every(2).lines, table.parts)
         };
         let counted = "ref,a\n1,1\n2,1\n3,1\n";
-        assert_eq!(parts(counted, &PartColumn::Usual), (vec![2, 4, 2, 4], vec![0, 3]));
+        assert_eq!(parts(counted, &PartColumn::Default), (vec![2, 4, 2, 4], vec![0, 3]));
         assert_eq!(parts(counted, &PartColumn::Named("ref".into())).1, [0, 1, 2, 3, 4, 5]);
-        assert_eq!(parts("ref,a\n1,1\n1,1\n2,1\n", &PartColumn::Usual), (vec![2, 4, 2, 4], vec![0, 2, 3, 5]));
+        assert_eq!(parts("ref,a\n1,1\n1,1\n2,1\n", &PartColumn::Default), (vec![2, 4, 2, 4], vec![0, 2, 3, 5]));
     }
 
     #[test]

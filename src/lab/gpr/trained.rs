@@ -1,4 +1,4 @@
-//! A model with the names of its columns: trained from a table, saved, loaded, put to other files.
+//! A model with the names of its columns: trained from a table, saved, loaded, applied to other files.
 //!
 //! The file is one line of JSON that names the columns, then the two lines of the model itself (see the arithmetic), which
 //! have a checksum.
@@ -7,19 +7,21 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::{GprError, Table, create, finish, split, table, write_text};
-use crate::regress::{Model, Prediction, Rows, Settings, Watcher, fit};
+use super::{ColumnTable, interval, split, table, write_csv};
 
-/// What the first line says it is.
+use crate::error::LabError;
+use crate::regress::{GprSettings, Model, Prediction, ProgressCallback, TrainingRows, fit};
+
+/// Format name in the first line.
 const FORMAT: &str = "packwatch gpr";
-/// Version written; others are refused.
+/// Version written; other versions are rejected.
 const VERSION: u32 = 1;
-/// Largest file read: rows enough for the most a model may have.
+/// Largest file read, bytes: enough for the largest model.
 const MAX_BYTES: u64 = 1 << 32;
 
-/// A fitted model and what its numbers are.
+/// A fitted model and the names of its columns.
 #[derive(Debug)]
-pub struct Trained {
+pub struct TrainedModel {
     /// Column that is predicted.
     pub output: String,
     /// Columns it is predicted from, in the model's order.
@@ -30,22 +32,26 @@ pub struct Trained {
 
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct Names {
+struct ModelHeader {
     format: String,
     version: u32,
     output: String,
     inputs: Vec<String>,
 }
 
-impl Trained {
+impl TrainedModel {
     /// Fits a model to a table whose last column is the output.
     ///
     /// # Errors
-    /// Too few rows, settings out of range, no positive definite matrix, or the watcher gave up.
-    pub fn fit(table: &Table, settings: &Settings, watcher: &mut Watcher<'_>) -> Result<Self, GprError> {
+    /// Too few rows, settings out of range, no positive definite matrix, or the watcher stopped it.
+    pub fn fit(
+        table: &ColumnTable,
+        settings: &GprSettings,
+        watcher: &mut ProgressCallback<'_>,
+    ) -> Result<Self, LabError> {
         let (inputs, targets) = split(table);
         let width = table.width();
-        let rows = Rows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
+        let rows = TrainingRows { inputs: &inputs, dimensions: width - 1, targets: &targets, lines: &table.lines };
         let model = fit(&rows, settings, watcher)?;
         Ok(Self { output: table.names[width - 1].clone(), inputs: table.names[..width - 1].to_vec(), model })
     }
@@ -54,23 +60,23 @@ impl Trained {
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn save(&self, path: &Path) -> Result<(), GprError> {
-        let names = Names {
+    pub fn save(&self, path: &Path) -> Result<(), LabError> {
+        let names = ModelHeader {
             format: FORMAT.to_owned(),
             version: VERSION,
             output: self.output.clone(),
             inputs: self.inputs.clone(),
         };
-        let names = serde_json::to_string(&names).map_err(|error| GprError(error.to_string()))?;
-        write_text(path, &format!("{names}\n{}", self.model.save()?))
+        let names = serde_json::to_string(&names)?;
+        Ok(crate::write_file(path, format!("{names}\n{}", self.model.save()?).as_bytes())?)
     }
 
-    /// Reads one, to work with so many threads.
+    /// Reads a model that works with `threads` threads.
     ///
     /// # Errors
     /// The file cannot be read, is no such model, is damaged, or is of another version.
-    pub fn load(path: &Path, threads: usize) -> Result<Self, GprError> {
-        let fail = |what: String| GprError(format!("{}: {what}", path.display()));
+    pub fn load(path: &Path, threads: usize) -> Result<Self, LabError> {
+        let fail = |what: String| LabError(format!("{}: {what}", path.display()));
         let size = std::fs::metadata(path).map_err(|error| fail(error.to_string()))?.len();
         if size > MAX_BYTES {
             return Err(fail(format!("{size} bytes, must be at most {MAX_BYTES}")));
@@ -78,7 +84,7 @@ impl Trained {
         let text = std::fs::read_to_string(path).map_err(|error| fail(error.to_string()))?;
         let (first, rest) =
             text.split_once('\n').ok_or_else(|| fail("one line only, must be three: no model".into()))?;
-        let names: Names =
+        let names: ModelHeader =
             serde_json::from_str(first).map_err(|error| fail(format!("line 1: no model of gpr: {error}")))?;
         if names.format != FORMAT || names.version != VERSION {
             let found = (&names.format, names.version);
@@ -96,33 +102,30 @@ impl Trained {
     ///
     /// # Errors
     /// A covariance matrix that is not positive definite.
-    pub fn predict(&self, table: &Table) -> Result<Vec<Prediction>, GprError> {
+    pub fn predict(&self, table: &ColumnTable) -> Result<Vec<Prediction>, LabError> {
         let d = self.inputs.len();
         let inputs: Vec<f64> = table.values.chunks_exact(table.width()).flat_map(|row| &row[..d]).copied().collect();
         Ok(self.model.predict(&inputs)?)
     }
 }
 
-/// Writes predictions of a table's rows; its last column is the output, NaN where it is not known.
+/// Writes predictions of a table's rows; its last column is the output, NaN where it is unknown.
 ///
 /// # Errors
 /// The file cannot be written.
 pub fn write_predictions(
     path: &Path,
-    trained: &Trained,
-    table: &Table,
+    trained: &TrainedModel,
+    table: &ColumnTable,
     predictions: &[Prediction],
-) -> Result<(), GprError> {
-    let mut out = csv::Writer::from_writer(create(path)?);
+) -> Result<(), LabError> {
     let output = &trained.output;
     let named = ["mean", "std", "low_95", "high_95"].map(|word| table::derived(output, word));
-    let own = ["file".to_owned(), "line".to_owned()];
-    out.write_record(own.iter().chain(&trained.inputs).chain([output]).chain(&named))?;
-    for (row, p) in predictions.iter().enumerate() {
+    let heads = ["file".to_owned(), "line".to_owned()].into_iter().chain(trained.inputs.clone());
+    let rows = predictions.iter().enumerate().map(|(row, prediction)| {
         let own = [table.file_of(row).display().to_string(), table.lines[row].to_string()];
         let known = table.row(row).iter().map(|value| if value.is_nan() { String::new() } else { value.to_string() });
-        let found = [p.mean, p.measurement_variance.sqrt(), p.low_95, p.high_95];
-        out.write_record(own.into_iter().chain(known).chain(found.map(|number| number.to_string())))?;
-    }
-    finish(out)
+        own.into_iter().chain(known).chain(interval(prediction)).collect()
+    });
+    write_csv(path, heads.chain([output.clone()]).chain(named).collect(), rows)
 }

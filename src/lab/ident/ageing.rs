@@ -1,9 +1,9 @@
-//! SOC for the first cycles of an ageing cell: full charges and discharges one after the other, no counter.
+//! Determines the SOC of the first cycles of an ageing cell: full charges and discharges one after the other, no counter.
 //!
 //! Anchors: SOC 1 at the end of every full charge (the state this charger leaves), and the knee of each discharge (where the voltage
 //! falls fastest comes with so little charge left that the knee is a mark on the SOC axis) at one common SOC. That takes the fade
 //! from cycle to cycle and the charger's own gain error out of the curves. Charge left below the cut-off under load is
-//! taken to be [`SOC_LEFT`]. What comes before the first discharge has no known beginning and is left out.
+//! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge have no known beginning and are left out.
 
 use super::charge_ah;
 
@@ -33,14 +33,14 @@ pub struct HalfCycle<'a> {
 
 /// A half-cycle with its SOC.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Anchored {
-    /// Which of the half-cycles given.
+pub struct AnchoredHalfCycle {
+    /// Index of the half-cycle.
     pub index: usize,
     /// Current without a charger's load pulses, A.
     pub current_a: Vec<f64>,
     /// SOC of every row.
     pub soc: Vec<f64>,
-    /// Whether the row's voltage is to be judged.
+    /// Whether the row's voltage is judged.
     pub judged: Vec<bool>,
 }
 
@@ -73,7 +73,7 @@ struct Marks {
 ///
 /// # Errors
 /// No discharge, or one without a knee.
-pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, Vec<Anchored>), AgeingError> {
+pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, Vec<AnchoredHalfCycle>), AgeingError> {
     let first = cycles.iter().position(|cycle| cycle.discharge).ok_or(AgeingError::NoDischarge)?;
     let knee_v = voltage_v.0 + KNEE_SHARE * (voltage_v.1 - voltage_v.0);
     let discharges = cycles.iter().filter(|cycle| cycle.discharge);
@@ -106,7 +106,7 @@ pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, V
         };
         left = soc[soc.len() - 1];
         let judged = judged(cycle.discharge, &current_a, &soc, capacity_ah);
-        anchored.push(Anchored { index, current_a, soc, judged });
+        anchored.push(AnchoredHalfCycle { index, current_a, soc, judged });
     }
     Ok((capacity_ah, anchored))
 }
@@ -177,7 +177,7 @@ mod tests {
         let whole = anchor(&[discharge, charge, discharge], (2.7, 4.2)).expect("anchored");
         let found = anchor(&[discharge, one_row, aborted, charge, discharge], (2.7, 4.2)).expect("anchored");
         assert_eq!(found.0, whole.0);
-        let socs = |anchored: &[Anchored]| anchored.iter().map(|a| a.soc.clone()).collect::<Vec<_>>();
+        let socs = |anchored: &[AnchoredHalfCycle]| anchored.iter().map(|a| a.soc.clone()).collect::<Vec<_>>();
         assert_eq!(socs(&found.1), socs(&whole.1));
         assert_eq!(found.1.iter().map(|a| a.index).collect::<Vec<_>>(), [0, 3, 4]);
     }

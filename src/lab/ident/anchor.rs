@@ -1,10 +1,10 @@
-//! SOC of every raw row, by explicit rules; a file whose beginning is unknown is refused.
+//! Determines the SOC of every raw row by explicit rules; rejects a file whose beginning is unknown.
 //!
 //! 1. A stretch must begin with a full cell: its first voltage is within [`REST_SAG_V`] of the highest, or within
 //!    [`LOAD_SAG_V`] of it when current flows already.
-//! 2. With the cycler's counter, SOC = 1 - counter / capacity when the counter begins within [`COUNTER_NEAR`] of 0: what
-//!    little it shows was really taken out. A counter that begins lower was reset before the charge: differences count.
-//!    One that begins higher was reset at full and says that the cell is not full any more: refused.
+//! 2. With the cycler's counter, SOC = 1 - counter / capacity when the counter begins within [`COUNTER_NEAR`] of 0: the
+//!    small value was really taken out. A counter that begins lower was reset before the charge: differences count.
+//!    A counter that begins higher was reset at full, so the cell is no longer full: rejected.
 //! 3. Without a counter the current is integrated from 1.
 
 use super::charge_ah;
@@ -29,7 +29,7 @@ pub enum AnchorError {
         /// Least voltage of a full cell, V.
         needed_v: f64,
     },
-    /// Its counter says that charge was taken out before.
+    /// Its counter shows that charge was taken out before.
     #[error("discharged_ah begins at {counter_ah} Ah, expected 0 or below: charge was taken out before the first row")]
     TakenBefore {
         /// First value, Ah.
@@ -37,7 +37,7 @@ pub enum AnchorError {
     },
 }
 
-/// What is known of a stretch: slices of equal length, not empty.
+/// The rows of a stretch: slices of equal length, not empty.
 #[derive(Debug, Clone, Copy)]
 pub struct Stretch<'a> {
     /// Seconds.
@@ -54,7 +54,7 @@ impl Stretch<'_> {
     /// Charge taken out since full at every row, Ah.
     ///
     /// # Errors
-    /// When it does not begin full, or so that it cannot be told.
+    /// The stretch does not begin full, or its beginning is unknown.
     pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, AnchorError> {
         self.begins_full(voltage_max_v, capacity_hint_ah)?;
         if self.discharged_ah[0].is_nan() {

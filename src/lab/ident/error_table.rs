@@ -1,22 +1,22 @@
-//! How wrong the fitted model is, over SOC and temperature: the standard deviation of its voltage error averaged over [`BLOCK_S`].
+//! Error of the fitted model over SOC and temperature: the standard deviation of its voltage error averaged over [`BLOCK_S`].
 //!
 //! Model error repeats itself within minutes, so blocks of 100 s are what counts. A block weighs by the charge that moved in
-//! it, spread over the nodes round it; a node with little of it leans on the mean of its temperature. A fit's own residuals understate
+//! it, spread over the nodes around it; a node with little charge follows the mean of its temperature. A fit's own residuals understate
 //! the error on a new drive: the variance grows by 1 + 3 / (files that visit the node, a pulse or slow test counting
-//! as 0.3 of one: it says little about a drive); an ageing cell's life is one file however
+//! as 0.3 of one: it holds little information about a drive); an ageing cell's life is one file however
 //! many cycles it has. A temperature without
 //! data takes the nearest one's, scaled by a power of Arrhenius' factor.
 
 use std::collections::BTreeMap;
 
-use super::fit::Fit;
+use super::fit::FittedTables;
 use super::grid::{Grid, arrhenius};
 use super::pass::residuals;
 use super::record::Record;
 
 /// Length of a block, s.
 const BLOCK_S: f64 = 100.0;
-/// Error beyond which a block counts no more, V.
+/// Errors are limited to this, V.
 const MOST_V: f64 = 0.1;
 /// Charge, as SOC, with which the mean of a temperature counts at each of its nodes.
 const LEAN_SOC: f64 = 1.0;
@@ -26,11 +26,11 @@ const UNSEEN: f64 = 3.0;
 const VISIT_SOC: f64 = 0.005;
 /// Power of Arrhenius' factor by which error grows with cold.
 const COLD_POWER: f64 = 0.7;
-/// Least error a model is believed to have, V.
+/// Least error assumed of a model, V.
 const LEAST_V: f64 = 0.001;
 
 /// Sums per node.
-struct Sums {
+struct NodeSums {
     square: Vec<f64>,
     weight: Vec<f64>,
     files: Vec<f64>,
@@ -38,19 +38,19 @@ struct Sums {
 
 /// A record and where it comes from.
 #[derive(Debug, Clone, Copy)]
-pub struct Judged<'a> {
+pub struct WeightedRecord<'a> {
     /// The rows.
     pub record: &'a Record,
-    /// Number of its file: records of one file tell of one cell on one day.
+    /// Number of its file: records of one file describe one cell on one day.
     pub file: usize,
-    /// What it counts.
+    /// Its weight: 1 for a drive.
     pub share: f64,
 }
 
 /// The table in node order, V.
-pub fn table(fit: &Fit, records: &[Judged<'_>], capacity_ah: f64) -> Vec<f64> {
+pub fn table(fit: &FittedTables, records: &[WeightedRecord<'_>], capacity_ah: f64) -> Vec<f64> {
     let nodes = fit.grid.nodes();
-    let mut sums = Sums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
+    let mut sums = NodeSums { square: vec![0.0; nodes], weight: vec![0.0; nodes], files: vec![0.0; nodes] };
     let mut moved: BTreeMap<usize, (f64, Vec<f64>)> = BTreeMap::new();
     for judged in records {
         let before = sums.weight.clone();
@@ -71,9 +71,9 @@ pub fn table(fit: &Fit, records: &[Judged<'_>], capacity_ah: f64) -> Vec<f64> {
     fill(&fit.grid, &rows)
 }
 
-fn add_record(sums: &mut Sums, fit: &Fit, record: &Record, share: f64, capacity_ah: f64) {
+fn add_record(sums: &mut NodeSums, fit: &FittedTables, record: &Record, share: f64, capacity_ah: f64) {
     let errors = residuals(record, &fit.tables);
-    let mut block = Block::default();
+    let mut block = ErrorBlock::default();
     for (row, error) in record.rows.iter().zip(errors) {
         if block.seconds + row.weight_s > BLOCK_S {
             block.close(sums, &fit.grid, share);
@@ -91,7 +91,7 @@ fn add_record(sums: &mut Sums, fit: &Fit, record: &Record, share: f64, capacity_
 
 /// Weighted sums over a block.
 #[derive(Default)]
-struct Block {
+struct ErrorBlock {
     error: f64,
     soc: f64,
     temperature: f64,
@@ -99,8 +99,8 @@ struct Block {
     moved_soc: f64,
 }
 
-impl Block {
-    fn close(&mut self, sums: &mut Sums, grid: &Grid, share: f64) {
+impl ErrorBlock {
+    fn close(&mut self, sums: &mut NodeSums, grid: &Grid, share: f64) {
         let block = std::mem::take(self);
         if block.seconds <= 0.0 {
             return;
@@ -116,7 +116,7 @@ impl Block {
 }
 
 /// One temperature's errors; `None` = no data.
-fn row(sums: &Sums, t: usize, columns: usize) -> Option<Vec<f64>> {
+fn row(sums: &NodeSums, t: usize, columns: usize) -> Option<Vec<f64>> {
     let range = t * columns..(t + 1) * columns;
     let weight: f64 = sums.weight[range.clone()].iter().sum();
     let most_files = sums.files[range.clone()].iter().fold(0.0_f64, |most, n| most.max(*n));
@@ -148,9 +148,9 @@ fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ident::Raw;
+    use crate::ident::RawRows;
     use crate::ident::fit::Residual;
-    use crate::ident::parameters::Tables;
+    use crate::ident::parameters::ParameterTables;
     use crate::ident::record::Limits;
 
     #[test]
@@ -164,10 +164,10 @@ mod tests {
     #[test]
     fn files_count_and_not_their_records() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
-        let tables = Tables { ocv_v: vec![3.6; 2], r0_ohm: vec![0.0; 2], r_ohm: vec![], tau_s: vec![] };
+        let tables = ParameterTables { ocv_v: vec![3.6; 2], r0_ohm: vec![0.0; 2], r_ohm: vec![], tau_s: vec![] };
         let time_s: Vec<f64> = (0..=3600).map(f64::from).collect();
         let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
-        let raw = Raw {
+        let raw = RawRows {
             time_s: &time_s,
             current_a: &[2.0; 3601],
             voltage_v: &[3.61; 3601],
@@ -176,7 +176,7 @@ mod tests {
         };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = Record::prepare(&raw, &[], &grid, &limits);
-        let fit = Fit {
+        let fit = FittedTables {
             grid,
             tables,
             residuals: vec![],
@@ -186,7 +186,7 @@ mod tests {
             converged: true,
         };
         let error_v = |files: [usize; 4], share: f64| {
-            let judged = files.map(|file| Judged { record: &record, file, share });
+            let judged = files.map(|file| WeightedRecord { record: &record, file, share });
             table(&fit, &judged, 2.0)
         };
         // 10 mV everywhere: variance times four for one drive, times 1.75 for four, times 11 for one pulse test.
@@ -199,7 +199,7 @@ mod tests {
 
     #[test]
     fn few_files_and_little_charge_make_a_node_less_certain() {
-        let sums = Sums { square: vec![4e-4, 0.0], weight: vec![4.0, 0.0], files: vec![4.0, 0.0] };
+        let sums = NodeSums { square: vec![4e-4, 0.0], weight: vec![4.0, 0.0], files: vec![4.0, 0.0] };
         let row = row(&sums, 0, 2).expect("data");
         assert!((row[0] - 0.01 * 1.75_f64.sqrt()).abs() < 1e-12, "{row:?}");
         assert_eq!(row[0], row[1]);

@@ -1,13 +1,16 @@
-//! The fit as a whole: starting values, prior, passes over all records in parallel, residuals, nodes without data.
+//! Runs the whole fit: starting values, prior, passes over all records in parallel, residuals, nodes without data.
 
-use super::grid::{Grid, Place, arrhenius, interpolate};
-use super::parameters::{Layout, Tables};
-use super::pass::{Normal, accumulate, residuals, visits};
-use super::prior::{Beliefs, Prior, per_node};
+use rayon::prelude::*;
+
+use super::grid::{Grid, GridPoint, arrhenius, interpolate};
+use super::parameters::{Layout, ParameterTables};
+use super::pass::{NormalEquations, accumulate, residuals, visits};
+use super::prior::{Prior, PriorDeviations, per_node};
 use super::record::Record;
 use super::solve::{Space, minimise};
 
-/// Groups of records that are summed apart and then in order: the result does not depend on the number of cores.
+/// Number of groups of records. Groups are summed separately, then in order: the result does not depend on the number of
+/// cores.
 const GROUPS: usize = 4;
 /// Fewest judged rows a fit may rest on.
 pub const MIN_ROWS: usize = 50;
@@ -33,9 +36,9 @@ pub struct OcvCurve {
     pub voltage_v: Vec<f64>,
 }
 
-/// What is to be fitted.
+/// Settings of a fit.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct FitSettings {
     /// Breakpoints.
     pub grid: Grid,
     /// Starting time constants, s, one per branch, rising.
@@ -49,10 +52,10 @@ pub struct Settings {
     /// OCV at SOC 0 held here, where no data reach it.
     pub empty_ocv_v: Option<f64>,
     /// Smoothness.
-    pub beliefs: Beliefs,
+    pub deviations: PriorDeviations,
 }
 
-/// How well one record is met.
+/// Error statistics of one record.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Residual {
     /// Judged seconds.
@@ -67,11 +70,11 @@ pub struct Residual {
 
 /// A fitted set of tables.
 #[derive(Debug, Clone)]
-pub struct Fit {
+pub struct FittedTables {
     /// Breakpoints.
     pub grid: Grid,
     /// Values in node order.
-    pub tables: Tables,
+    pub tables: ParameterTables,
     /// Per record, in their order.
     pub residuals: Vec<Residual>,
     /// Over all records.
@@ -98,21 +101,21 @@ pub enum FitError {
         "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number"
     )]
     NotFinite,
-    /// The current never changes enough to tell a resistance.
-    #[error("the current does not change: no resistance can be told from the open-circuit voltage")]
+    /// The current never changes enough to determine a resistance.
+    #[error("the current does not change: no resistance can be separated from the open-circuit voltage")]
     NoExcitation,
 }
 
-/// Fits tables to `records` with weights `scale` per record; `progress` is told pass and RMS-like cost.
+/// Fits tables to `records` with weights `scale` per record; `progress` receives the pass number and the cost.
 ///
 /// # Errors
-/// Too few rows, or a current that tells nothing.
+/// Too few rows, or a current that never changes.
 pub fn fit(
-    settings: &Settings,
+    settings: &FitSettings,
     records: &[Record],
     scale: &[f64],
     progress: impl FnMut(usize, f64),
-) -> Result<Fit, FitError> {
+) -> Result<FittedTables, FitError> {
     let judged = records.iter().flat_map(|r| &r.rows).filter(|row| row.weight_s > 0.0).count();
     if judged < MIN_ROWS {
         return Err(FitError::TooFewRows { found: judged });
@@ -121,7 +124,7 @@ pub fn fit(
     let start = start(settings, &layout, records)?;
     let space = space(settings, &layout, &start);
     let start = space.inside(&start);
-    let prior = Prior::new(&settings.grid, &layout, &start, !settings.ocv.is_empty(), &settings.beliefs);
+    let prior = Prior::new(&settings.grid, &layout, &start, !settings.ocv.is_empty(), &settings.deviations);
     let groups = groups(records, scale);
     let evaluate = |theta: &[f64]| {
         let mut normal = sum_of_groups(&groups, &layout, theta);
@@ -132,10 +135,10 @@ pub fn fit(
         return Err(FitError::NotFinite);
     }
     let solution = minimise(&space, &start, evaluate, progress);
-    let tables = Tables::new(&layout, &solution.theta);
+    let tables = ParameterTables::new(&layout, &solution.theta);
     let (each, total) = judge(records, &tables);
     let all: Vec<&Record> = records.iter().collect();
-    Ok(Fit {
+    Ok(FittedTables {
         grid: settings.grid.clone(),
         residuals: each,
         total,
@@ -148,7 +151,7 @@ pub fn fit(
 
 type Group<'a> = Vec<(&'a Record, f64)>;
 
-/// Records dealt out to [`GROUPS`], the longest first to the emptiest, so that all take about as long.
+/// Distributes records over [`GROUPS`], the longest first to the emptiest, so that all groups take about equally long.
 fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     let mut order: Vec<usize> = (0..records.len()).collect();
     order.sort_by_key(|&i| std::cmp::Reverse(records[i].rows.len()));
@@ -162,30 +165,25 @@ fn groups<'a>(records: &'a [Record], scale: &[f64]) -> Vec<Group<'a>> {
     groups
 }
 
-fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal {
-    let tables = &Tables::new(layout, theta);
+fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> NormalEquations {
+    let tables = &ParameterTables::new(layout, theta);
     let of_group = |group: &Group<'_>| {
-        let mut normal = Normal::new(layout.len());
+        let mut normal = NormalEquations::new(layout.len());
         for (record, scale) in group {
             accumulate(record, *scale, layout, tables, &mut normal);
         }
         normal
     };
-    std::thread::scope(|scope| {
-        let workers: Vec<_> = groups.iter().map(|group| scope.spawn(move || of_group(group))).collect();
-        let mut sum = Normal::new(layout.len());
-        for worker in workers {
-            match worker.join() {
-                Ok(normal) => sum.add_all(&normal),
-                Err(panic) => std::panic::resume_unwind(panic),
-            }
-        }
+    // Added in the order of the groups: the sum does not depend on the threads.
+    let sums: Vec<NormalEquations> = groups.par_iter().map(of_group).collect();
+    sums.iter().fold(NormalEquations::new(layout.len()), |mut sum, group| {
+        sum.add_all(group);
         sum
     })
 }
 
 /// Starting values: OCV of the slow test or a straight line, resistances from steps of current.
-fn start(settings: &Settings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, FitError> {
+fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, FitError> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
         true => grid.temperature_c.iter().flat_map(|_| straight_ocv(settings)).collect(),
@@ -201,7 +199,7 @@ fn start(settings: &Settings, layout: &Layout, records: &[Record]) -> Result<Vec
     Ok(theta)
 }
 
-fn straight_ocv(settings: &Settings) -> Vec<f64> {
+fn straight_ocv(settings: &FitSettings) -> Vec<f64> {
     let (low, high) = settings.voltage_v;
     settings.grid.soc.iter().map(|s| low + s * (high - low)).collect()
 }
@@ -220,7 +218,7 @@ pub fn ocv_nodes(grid: &Grid, curves: &[OcvCurve]) -> Vec<f64> {
         .collect()
 }
 
-/// A curve's voltage; below the SOC at which a cold test ended, the shape of the next warmer one hangs on to it.
+/// A curve's voltage; below the SOC at which a cold test ended, the shape of the next warmer curve continues it.
 fn curve_at(curves: &[OcvCurve], which: usize, soc: f64) -> f64 {
     let curve = &curves[which];
     let end = curve.soc[0];
@@ -247,7 +245,7 @@ fn resistance_of_steps(records: &[Record]) -> Option<f64> {
     found.get(found.len() / 2).copied()
 }
 
-fn space(settings: &Settings, layout: &Layout, start: &[f64]) -> Space {
+fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
     let grid = &settings.grid;
     let (mut low, mut high) = (start.to_vec(), start.to_vec());
     let (least_v, most_v) = settings.voltage_v;
@@ -276,10 +274,10 @@ fn space(settings: &Settings, layout: &Layout, start: &[f64]) -> Space {
 }
 
 /// Residuals of every record and of all together.
-pub fn judge(records: &[Record], tables: &Tables) -> (Vec<Residual>, Residual) {
-    let mut total = Sums::default();
+pub fn judge(records: &[Record], tables: &ParameterTables) -> (Vec<Residual>, Residual) {
+    let mut total = ResidualSums::default();
     let each = records.iter().map(|record| {
-        let mut sums = Sums::default();
+        let mut sums = ResidualSums::default();
         for (row, e) in record.rows.iter().zip(residuals(record, tables)) {
             sums.add(row.weight_s, e);
         }
@@ -292,15 +290,15 @@ pub fn judge(records: &[Record], tables: &Tables) -> (Vec<Residual>, Residual) {
 
 /// Running sums of weighted residuals.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Sums {
+pub struct ResidualSums {
     weight: f64,
     first: f64,
     second: f64,
     worst: f64,
 }
 
-impl Sums {
-    /// One residual and the seconds it stands for.
+impl ResidualSums {
+    /// Adds one residual and the seconds it represents.
     pub fn add(&mut self, weight_s: f64, e: f64) {
         if weight_s > 0.0 {
             self.weight += weight_s;
@@ -310,7 +308,7 @@ impl Sums {
         }
     }
 
-    /// Those of another stretch.
+    /// Adds the sums of another stretch.
     pub fn join(&mut self, other: &Self) {
         self.weight += other.weight;
         self.first += other.first;
@@ -318,7 +316,7 @@ impl Sums {
         self.worst = if other.worst.abs() > self.worst.abs() { other.worst } else { self.worst };
     }
 
-    /// What they say.
+    /// Returns the statistics.
     pub fn residual(&self) -> Residual {
         if self.weight == 0.0 {
             return Residual::default();
@@ -332,8 +330,8 @@ impl Sums {
     }
 }
 
-impl Fit {
-    /// Nodes no data support: temperature and SOC.
+impl FittedTables {
+    /// Returns the nodes that no data support: temperature and SOC.
     pub fn unsupported(&self) -> Vec<(f64, f64)> {
         let columns = self.grid.soc.len();
         let weak = self.visits_s.iter().enumerate().filter(|(_, seconds)| **seconds < SUPPORTED_S);
@@ -351,7 +349,7 @@ impl Fit {
     }
 
     /// The model's resistance once all branches have settled, ohm, at a place.
-    pub fn settled_ohm(&self, place: &Place) -> f64 {
+    pub fn settled_ohm(&self, place: &GridPoint) -> f64 {
         let corners = self.grid.resistance_corners(place);
         let branches: f64 = self.tables.r_ohm.iter().map(|r| corners.at(r)).sum();
         corners.at(&self.tables.r0_ohm) + branches

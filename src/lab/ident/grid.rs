@@ -1,8 +1,8 @@
 //! The grid of the tables and the place of a SOC and a temperature in it.
 //!
-//! The same rules as [`CellModel::place`](crate::cell::CellModel::place): along SOC linear (the OCV goes on beyond 0 and 1, all else
-//! holds its edge); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
-//! temperatures the nearest edge holds.
+//! The same rules as [`CellModel::place`](crate::cell::CellModel::place): along SOC linear (the OCV continues beyond 0 and 1, everything else
+//! holds its edge value); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
+//! temperature range the nearest edge holds.
 
 pub use crate::cell::arrhenius;
 
@@ -15,9 +15,9 @@ pub struct Grid {
     pub temperature_c: Vec<f64>,
 }
 
-/// The two SOC columns and two temperature rows round one place, with the weights of the upper ones.
+/// The two SOC columns and two temperature rows around one point, with the weights of the upper ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
+pub struct GridPoint {
     /// Lower SOC column.
     pub s: usize,
     /// Lower temperature row.
@@ -62,7 +62,7 @@ impl Grid {
     }
 
     /// The place of a SOC and a temperature.
-    pub fn place(&self, soc: f64, temperature_c: f64) -> Place {
+    pub fn place(&self, soc: f64, temperature_c: f64) -> GridPoint {
         let (s, beyond_s) = locate(&self.soc, soc);
         let temperatures = &self.temperature_c;
         let (t, along_t, warped_t) = if temperatures.len() == 1 {
@@ -74,25 +74,25 @@ impl Grid {
             let inside = temperature_c.clamp(temperatures[t], temperatures[t + 1]);
             (t, along, (arrhenius(inside) - low) / (high - low))
         };
-        Place { s, t, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, along_t, warped_t }
+        GridPoint { s, t, along_s: beyond_s.clamp(0.0, 1.0), beyond_s, along_t, warped_t }
     }
 
     /// Corners for the OCV.
-    pub fn ocv_corners(&self, place: &Place) -> Corners {
+    pub fn ocv_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.beyond_s, place.along_t)
     }
 
     /// Corners for time constants.
-    pub fn tau_corners(&self, place: &Place) -> Corners {
+    pub fn tau_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.along_s, place.along_t)
     }
 
     /// Corners for resistances.
-    pub fn resistance_corners(&self, place: &Place) -> Corners {
+    pub fn resistance_corners(&self, place: &GridPoint) -> Corners {
         self.corners(place, place.along_s, place.warped_t)
     }
 
-    fn corners(&self, place: &Place, along_s: f64, along_t: f64) -> Corners {
+    fn corners(&self, place: &GridPoint, along_s: f64, along_t: f64) -> Corners {
         let columns = self.soc.len();
         let first = place.t * columns + place.s;
         let mut corners = Corners::default();
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_grid_only_the_ocv_goes_on() {
+    fn outside_the_grid_only_the_ocv_continues() {
         let grid = Grid { soc: vec![0.0, 0.5, 1.0], temperature_c: vec![25.0] };
         let place = grid.place(1.1, 60.0);
         assert!((grid.ocv_corners(&place).at(&[3.0, 3.6, 4.2]) - 4.32).abs() < 1e-12);

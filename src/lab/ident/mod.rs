@@ -1,9 +1,9 @@
 //! Fits cell models to measured data (paper, section 3.3.2): pure arithmetic, no files, no printing.
 //!
-//! The way of the numbers: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, places in
+//! Data flow: raw rows of one file -> [`anchor`] (SOC of every row) -> [`record`] (coarser rows, places in
 //! the tables, weights) -> [`pass`] (residuals and the exact Jacobian by sensitivity recursion) with [`prior`]
 //! (smoothness) -> [`solve`] (projected Levenberg-Marquardt) -> [`fit`] (the whole, residuals per file, nodes without data).
-//! [`error_table`] says how wrong the result is, [`thermal`] fits heat capacity and thermal resistance afterwards.
+//! [`error_table`] estimates the model's error, [`thermal`] fits heat capacity and thermal resistance afterwards.
 
 pub mod ageing;
 pub mod anchor;
@@ -19,7 +19,7 @@ pub mod thermal;
 
 /// Rows of one stretch of one file as measured, time rising or equal, no holes. Slices of equal length.
 #[derive(Debug, Clone, Copy)]
-pub struct Raw<'a> {
+pub struct RawRows<'a> {
     /// Seconds since its beginning.
     pub time_s: &'a [f64],
     /// Current, A, positive = discharge.

@@ -51,7 +51,7 @@ impl Layout {
 
 /// The tables a parameter vector stands for, in node order.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Tables {
+pub struct ParameterTables {
     /// Open-circuit voltage, V.
     pub ocv_v: Vec<f64>,
     /// Series resistance, ohm.
@@ -62,7 +62,7 @@ pub struct Tables {
     pub tau_s: Vec<Vec<f64>>,
 }
 
-impl Tables {
+impl ParameterTables {
     /// The tables of `theta`.
     pub fn new(layout: &Layout, theta: &[f64]) -> Self {
         let exp = |first: usize| theta[first..first + layout.nodes].iter().map(|&x| libm::exp(x)).collect::<Vec<_>>();

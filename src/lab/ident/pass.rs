@@ -7,8 +7,8 @@
 //! Residuals beyond [`HUBER_V`] count linearly (Huber), so that what no circuit explains does not bend the tables.
 
 use super::grid::Corners;
-use super::parameters::{Layout, Tables};
-use super::record::{Record, Row};
+use super::parameters::{Layout, ParameterTables};
+use super::record::{FitRow, Record};
 
 /// Derivative, V per unit of a log parameter, below which it is dropped: a thousandth of the voltage's resolution.
 const FADED_V: f64 = 1e-6;
@@ -21,9 +21,9 @@ const REPEATS_S: f64 = 50.0;
 
 /// Normal equations in the nodes' own parameters.
 #[derive(Debug, Clone)]
-pub struct Normal {
+pub struct NormalEquations {
     n: usize,
-    /// Row-major; a pair's product lies at either of its two places until [`Normal::symmetric`].
+    /// Row-major; a pair's product lies at either of its two places until [`NormalEquations::symmetric`].
     h: Vec<f64>,
     /// Gradient of the cost.
     pub g: Vec<f64>,
@@ -31,7 +31,7 @@ pub struct Normal {
     pub cost: f64,
 }
 
-impl Normal {
+impl NormalEquations {
     /// Empty equations for `n` parameters.
     pub fn new(n: usize) -> Self {
         Self { n, h: vec![0.0; n * n], g: vec![0.0; n], cost: 0.0 }
@@ -93,7 +93,7 @@ impl BranchRun {
     }
 
     /// Over a row's step, without derivatives. Returns the decay and dU'/dtau.
-    fn step_voltage(&mut self, row: &Row, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
+    fn step_voltage(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) -> (f64, f64) {
         let (r, tau) = (row.resistance.at(r_ohm), row.tau.at(tau_s));
         let settled = r * row.mean_current_a;
         let decay = libm::exp(-row.dt_s / tau);
@@ -102,7 +102,7 @@ impl BranchRun {
         (decay, above * decay * row.dt_s / (tau * tau))
     }
 
-    fn step(&mut self, row: &Row, r_ohm: &[f64], tau_s: &[f64]) {
+    fn step(&mut self, row: &FitRow, r_ohm: &[f64], tau_s: &[f64]) {
         let (decay, by_tau) = self.step_voltage(row, r_ohm, tau_s);
         self.fade(decay);
         let by_r = (1.0 - decay) * row.mean_current_a;
@@ -138,9 +138,9 @@ impl BranchRun {
 }
 
 /// Residuals of a record, V, one per row (also of rows that are not judged).
-pub fn residuals(record: &Record, tables: &Tables) -> Vec<f64> {
+pub fn residuals(record: &Record, tables: &ParameterTables) -> Vec<f64> {
     let mut branches: Vec<_> = tables.r_ohm.iter().map(|_| BranchRun::new(0)).collect();
-    let of_row = |row: &Row| {
+    let of_row = |row: &FitRow| {
         let mut model_v = row.ocv.at(&tables.ocv_v) - row.resistance.at(&tables.r0_ohm) * row.current_a;
         for (i, branch) in branches.iter_mut().enumerate() {
             if row.relaxed {
@@ -156,7 +156,13 @@ pub fn residuals(record: &Record, tables: &Tables) -> Vec<f64> {
 }
 
 /// Adds a record's residuals and derivatives to `normal`, `scale` times its rows' weights.
-pub fn accumulate(record: &Record, scale: f64, layout: &Layout, tables: &Tables, normal: &mut Normal) {
+pub fn accumulate(
+    record: &Record,
+    scale: f64,
+    layout: &Layout,
+    tables: &ParameterTables,
+    normal: &mut NormalEquations,
+) {
     let mut branches: Vec<_> = (0..layout.branches).map(|_| BranchRun::new(layout.nodes)).collect();
     let (mut index, mut j) = (Vec::with_capacity(128), Vec::with_capacity(128));
     for row in &record.rows {
@@ -182,9 +188,9 @@ pub fn accumulate(record: &Record, scale: f64, layout: &Layout, tables: &Tables,
 
 /// Derivatives of the residual by every parameter the row feels.
 fn derivatives(
-    row: &Row,
+    row: &FitRow,
     layout: &Layout,
-    tables: &Tables,
+    tables: &ParameterTables,
     branches: &[BranchRun],
     index: &mut Vec<usize>,
     j: &mut Vec<f64>,

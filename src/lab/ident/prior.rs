@@ -1,15 +1,15 @@
-//! What is believed before the data: smooth tables, Arrhenius' law between temperatures, an OCV near the slow test's.
+//! The prior: smooth tables, Arrhenius' law between temperatures, an OCV near that of the slow test.
 //!
-//! Each belief is a linear combination of node parameters with a target and a standard deviation. Curvature is the
+//! Each term is a linear combination of node parameters with a target and a standard deviation. Curvature is the
 //! change of slope at a node times the mean of its two spacings.
 
 use super::grid::{Grid, arrhenius};
 use super::parameters::Layout;
-use super::pass::Normal;
+use super::pass::NormalEquations;
 
-/// Standard deviations of the beliefs.
+/// Standard deviations of the prior's terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Beliefs {
+pub struct PriorDeviations {
     /// Second difference of the OCV over SOC at the nodes' own spacing, V: of the curve itself without a slow test, of
     /// the correction with one.
     pub ocv_curvature_v: f64,
@@ -19,9 +19,9 @@ pub struct Beliefs {
     pub ocv_pull_v: f64,
     /// Second difference of ln R0 over SOC at the nodes' own spacing.
     pub r0_curvature: f64,
-    /// The same of each ln R.
+    /// Second difference of each ln R.
     pub r_curvature: f64,
-    /// The same of each ln tau.
+    /// Second difference of each ln tau.
     pub tau_curvature: f64,
     /// Difference of ln R from Arrhenius' law between neighbouring temperatures.
     pub r_by_temperature: f64,
@@ -33,8 +33,8 @@ pub struct Beliefs {
     pub tau_level: f64,
 }
 
-impl Beliefs {
-    /// Without a slow test: the OCV is whatever the data say.
+impl PriorDeviations {
+    /// Without a slow test: the data alone determine the OCV.
     pub const FREE_OCV: Self = Self {
         ocv_curvature_v: 0.2,
         ocv_by_temperature_v: 0.01,
@@ -61,9 +61,9 @@ impl Beliefs {
         ..Self::FREE_OCV
     };
 
-    /// Discharges and charges at one current each tell R0 from the branch only at their beginnings: R0 hardly bends,
-    /// the time constant stays where it is. Nor do they tell the branch from the OCV at the empty end, where both turn
-    /// steeply: the branch bends as little as drives allow ([`Beliefs::SLOW_TEST`]), so that the OCV takes the knee.
+    /// For an ageing cell. Discharges and charges at one current each separate R0 from the branch only at their beginnings:
+    /// R0 hardly bends, the time constant stays. They do not separate the branch from the OCV at the empty end either, where
+    /// both turn steeply: the branch bends as little as drives allow ([`PriorDeviations::SLOW_TEST`]), so that the OCV takes the knee.
     pub const AGEING: Self = Self {
         ocv_curvature_v: 0.5,
         r0_curvature: 0.005,
@@ -74,7 +74,7 @@ impl Beliefs {
     };
 }
 
-/// One belief: sum of factor x parameter = target, within sigma.
+/// One term: sum of factor x parameter = target, within sigma.
 #[derive(Debug, Clone, PartialEq)]
 struct PriorDensity {
     terms: Vec<(usize, f64)>,
@@ -82,51 +82,51 @@ struct PriorDensity {
     sigma: f64,
 }
 
-/// All beliefs of one fit.
+/// All prior terms of one fit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prior(Vec<PriorDensity>);
 
 impl Prior {
-    /// Beliefs round the starting values `start`; `slow_test` = the OCV of `start` is a measured one.
-    pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, beliefs: &Beliefs) -> Self {
+    /// Creates the prior around the starting values `start`; `slow_test` = the OCV of `start` is a measured one.
+    pub fn new(grid: &Grid, layout: &Layout, start: &[f64], slow_test: bool, deviations: &PriorDeviations) -> Self {
         let mut prior = Self(Vec::new());
         let reference = if slow_test { &start[..layout.nodes] } else { &vec![0.0; layout.nodes] };
-        prior.curvature(grid, 0, reference, beliefs.ocv_curvature_v);
-        prior.by_temperature(grid, 0, reference, beliefs.ocv_by_temperature_v);
+        prior.curvature(grid, 0, reference, deviations.ocv_curvature_v);
+        prior.by_temperature(grid, 0, reference, deviations.ocv_by_temperature_v);
         if slow_test {
-            prior.level(0, reference, beliefs.ocv_pull_v);
+            prior.level(0, reference, deviations.ocv_pull_v);
         }
         let arrhenius_ln = per_node(grid, |t| libm::log(arrhenius(t)));
         let flat = vec![0.0; layout.nodes];
         let level = |first: usize| &start[first..first + layout.nodes];
-        prior.curvature(grid, layout.r0(), &flat, beliefs.r0_curvature);
-        prior.by_temperature(grid, layout.r0(), &arrhenius_ln, beliefs.r_by_temperature);
-        prior.level(layout.r0(), level(layout.r0()), beliefs.r_level);
+        prior.curvature(grid, layout.r0(), &flat, deviations.r0_curvature);
+        prior.by_temperature(grid, layout.r0(), &arrhenius_ln, deviations.r_by_temperature);
+        prior.level(layout.r0(), level(layout.r0()), deviations.r_level);
         for i in 0..layout.branches {
             let (r, tau) = (layout.branch_r(i), layout.branch_tau(i));
-            prior.curvature(grid, r, &flat, beliefs.r_curvature);
-            prior.by_temperature(grid, r, &arrhenius_ln, beliefs.r_by_temperature);
-            prior.level(r, level(r), beliefs.r_level);
-            prior.curvature(grid, tau, &flat, beliefs.tau_curvature);
-            prior.by_temperature(grid, tau, &flat, beliefs.tau_by_temperature);
-            prior.level(tau, level(tau), beliefs.tau_level);
+            prior.curvature(grid, r, &flat, deviations.r_curvature);
+            prior.by_temperature(grid, r, &arrhenius_ln, deviations.r_by_temperature);
+            prior.level(r, level(r), deviations.r_level);
+            prior.curvature(grid, tau, &flat, deviations.tau_curvature);
+            prior.by_temperature(grid, tau, &flat, deviations.tau_by_temperature);
+            prior.level(tau, level(tau), deviations.tau_level);
         }
         prior
     }
 
-    /// Adds the beliefs' cost and derivatives at `theta`.
-    pub fn accumulate(&self, theta: &[f64], normal: &mut Normal) {
+    /// Adds the prior's cost and derivatives at `theta`.
+    pub fn accumulate(&self, theta: &[f64], normal: &mut NormalEquations) {
         let (mut index, mut j) = (Vec::new(), Vec::new());
-        for belief in &self.0 {
+        for term in &self.0 {
             index.clear();
             j.clear();
-            let mut residual = -belief.target;
-            for &(at, factor) in &belief.terms {
+            let mut residual = -term.target;
+            for &(at, factor) in &term.terms {
                 residual += factor * theta[at];
                 index.push(at);
                 j.push(factor);
             }
-            let weight = 1.0 / (belief.sigma * belief.sigma);
+            let weight = 1.0 / (term.sigma * term.sigma);
             normal.cost += 0.5 * weight * residual * residual;
             normal.add(&index, &j, residual, weight);
         }

@@ -1,4 +1,4 @@
-//! Measured rows made ready for the fit: coarser, placed in the tables, weighted by the time they stand for.
+//! Prepares measured rows for the fit: joins them to blocks, places them in the tables, weights them by time.
 //!
 //! A block collects raw rows until it is [`BLOCK_S`] long. Its last row is kept as it was measured (voltage, current,
 //! temperature, SOC at that instant: the series resistance acts at once); the branches see the mean current of the
@@ -6,16 +6,16 @@
 //! pulse's edge are kept, and at gaps. Over a gap in which charge was moved that the rows do not show, the branches
 //! start again relaxed.
 
-use super::Raw;
+use super::RawRows;
 use super::grid::{Corners, Grid};
 
 /// Longest block, s: time constants of interest are several times longer, drives change about once a second.
 const BLOCK_S: f64 = 1.0;
-/// Step of current that ends a block early, as a share of the largest current, when the block before it was steady.
+/// Current step that ends a block early, as a share of the largest current, when the block before it was steady.
 const EDGE_SHARE: f64 = 0.1;
 /// A step is an edge to be kept when the current was steady for this long before it, s; in drives it seldom is.
 const STEADY_S: f64 = 3.0;
-/// Most seconds one row stands for: rests at one row a minute must not outweigh what moves.
+/// Most seconds that one row represents: rests logged once a minute must not outweigh drives.
 const MAX_WEIGHT_S: f64 = 20.0;
 /// A gap this long may hide charge the rows do not show, s.
 const GAP_S: f64 = 60.0;
@@ -28,12 +28,12 @@ const REST_SHARE: f64 = 0.02;
 
 /// One row of the fit.
 #[derive(Debug, Clone, Copy)]
-pub struct Row {
+pub struct FitRow {
     /// Seconds since the file's beginning.
     pub time_s: f64,
     /// Seconds since the row before it.
     pub dt_s: f64,
-    /// Branches are relaxed at this row whatever came before.
+    /// Branches are relaxed at this row, regardless of the rows before.
     pub relaxed: bool,
     /// Mean current since the row before it, A.
     pub mean_current_a: f64,
@@ -45,7 +45,7 @@ pub struct Row {
     pub temperature_c: f64,
     /// State of charge.
     pub soc: f64,
-    /// Seconds it stands for; 0 = carries the branches on and is not judged.
+    /// Seconds it represents; 0 = it updates the branches but is not judged.
     pub weight_s: f64,
     /// Nodes of the OCV.
     pub ocv: Corners,
@@ -59,14 +59,14 @@ pub struct Row {
 #[derive(Debug, Clone, Default)]
 pub struct Record {
     /// In time order.
-    pub rows: Vec<Row>,
+    pub rows: Vec<FitRow>,
     /// Rows as measured.
     pub raw_rows: usize,
     /// Rows whose voltage no cell of this type can have (sensor disconnected), left out.
     pub outliers: usize,
 }
 
-/// What a record is cut by.
+/// Limits that a record's rows must keep.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Lowest credible voltage, V.
@@ -79,7 +79,7 @@ pub struct Limits {
 
 impl Record {
     /// Prepares a stretch. `judged[k]` = false keeps raw row k's current but not its voltage; empty = all are judged.
-    pub fn prepare(raw: &Raw<'_>, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
+    pub fn prepare(raw: &RawRows<'_>, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
         let mut record = Self { raw_rows: raw.time_s.len(), ..Self::default() };
@@ -111,9 +111,9 @@ impl Record {
     }
 }
 
-/// Time for which a whole discharge counts, s: a drive's. What takes longer says no more about the tables.
+/// Time that a whole discharge counts for, s: the length of a drive. A longer test holds no more information.
 const WHOLE_S: f64 = 8000.0;
-/// What slow and pulse tests count next to drives: the model is to follow drives.
+/// Weight of slow and pulse tests relative to drives: the model is made to follow drives.
 const TEST_SHARE: f64 = 0.3;
 /// Share of the time in which current flows, and variation of its size relative to its mean, of a drive.
 const DRIVE: (f64, f64) = (0.5, 0.3);
@@ -135,7 +135,7 @@ pub fn share(record: &Record) -> f64 {
     if flowing > DRIVE.0 * all && variation > DRIVE.1 { 1.0 } else { TEST_SHARE }
 }
 
-/// What a second of a record weighs: by the SOC it covers, not by how long it takes.
+/// Returns the weight of a record's second: by the SOC that the record covers, not by its length.
 pub fn weight(record: &Record) -> f64 {
     let judged = record.rows.iter().filter(|row| row.weight_s > 0.0);
     let (low, high, seconds) = judged.fold((f64::INFINITY, f64::NEG_INFINITY, 0.0), |(low, high, sum), row| {
@@ -145,7 +145,7 @@ pub fn weight(record: &Record) -> f64 {
 }
 
 /// The raw rows at which blocks end; the first row is a block of its own.
-fn block_ends(raw: &Raw<'_>, largest_a: f64) -> Vec<usize> {
+fn block_ends(raw: &RawRows<'_>, largest_a: f64) -> Vec<usize> {
     let (time_s, current_a) = (raw.time_s, raw.current_a);
     let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
     for k in 1..time_s.len() {
@@ -166,13 +166,13 @@ fn block_ends(raw: &Raw<'_>, largest_a: f64) -> Vec<usize> {
     ends
 }
 
-fn block_row(raw: &Raw<'_>, before: usize, end: usize, grid: &Grid) -> Row {
+fn block_row(raw: &RawRows<'_>, before: usize, end: usize, grid: &Grid) -> FitRow {
     let dt_s = raw.time_s[end] - raw.time_s[before];
     let charge_as: f64 = (before + 1..=end)
         .map(|k| 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * (raw.time_s[k] - raw.time_s[k - 1]))
         .sum();
     let place = grid.place(raw.soc[end], raw.temperature_c[end]);
-    Row {
+    FitRow {
         time_s: raw.time_s[end],
         dt_s,
         relaxed: end == 0,
@@ -188,8 +188,8 @@ fn block_row(raw: &Raw<'_>, before: usize, end: usize, grid: &Grid) -> Row {
     }
 }
 
-/// Whether SOC moved over a gap otherwise than the current of its two ends says.
-fn hides_charge(raw: &Raw<'_>, before: usize, end: usize, capacity_ah: f64) -> bool {
+/// Whether the SOC change over a gap differs from the charge that the current at its ends implies.
+fn hides_charge(raw: &RawRows<'_>, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];
         let shown = 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * dt_s / 3600.0 / capacity_ah;
@@ -198,7 +198,7 @@ fn hides_charge(raw: &Raw<'_>, before: usize, end: usize, capacity_ah: f64) -> b
 }
 
 /// Half the time to both neighbours, at most [`MAX_WEIGHT_S`]; rows marked by a negative weight get none.
-fn weigh(rows: &mut [Row]) {
+fn weigh(rows: &mut [FitRow]) {
     for k in 0..rows.len() {
         let after_s = rows.get(k + 1).map_or(0.0, |row| row.dt_s);
         let row = &mut rows[k];
@@ -218,7 +218,7 @@ mod tests {
 
     fn prepare(time_s: &[f64], current_a: &[f64], voltage_v: &[f64], soc: &[f64]) -> Record {
         let temperature_c = vec![25.0; time_s.len()];
-        let raw = Raw { time_s, current_a, voltage_v, temperature_c: &temperature_c, soc };
+        let raw = RawRows { time_s, current_a, voltage_v, temperature_c: &temperature_c, soc };
         Record::prepare(&raw, &[], &grid(), &LIMITS)
     }
 

@@ -7,7 +7,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::pass::Normal;
+use super::pass::NormalEquations;
 
 /// Most passes over the data.
 const MAX_PASSES: usize = 60;
@@ -24,7 +24,7 @@ const DAMPING_GROWTH: f64 = 8.0;
 const DAMPING_WEAK: f64 = 0.02;
 /// Damping at which no step helps any more.
 const DAMPING_MAX: f64 = 1e8;
-/// Most exchanges of the held set in one step; what is left then is cut off at the bounds.
+/// Most exchanges of the held set in one step; the rest is clamped to the bounds.
 const MAX_EXCHANGES: usize = 30;
 
 /// Bounds and structure of the parameters.
@@ -50,7 +50,7 @@ impl Space {
         y
     }
 
-    /// And back.
+    /// First value and rises to node values.
     fn to_nodes(&self, y: &[f64]) -> Vec<f64> {
         let mut theta = y.to_vec();
         for &(first, len) in &self.rising {
@@ -71,7 +71,7 @@ impl Space {
     }
 
     /// Gradient and matrix by first values and rises: every node feels all rises below it.
-    fn pull_back(&self, normal: &Normal) -> (DMatrix<f64>, DVector<f64>) {
+    fn pull_back(&self, normal: &NormalEquations) -> (DMatrix<f64>, DVector<f64>) {
         let n = normal.g.len();
         let mut h = DMatrix::from_vec(n, n, normal.symmetric());
         let mut g = DVector::from_column_slice(&normal.g);
@@ -105,11 +105,11 @@ pub struct Solution {
     pub converged: bool,
 }
 
-/// Minimises the cost that `evaluate` gives, from `start`; `progress` is told pass and cost.
+/// Minimises the cost that `evaluate` gives, from `start`; `progress` receives the pass number and the cost.
 pub fn minimise(
     space: &Space,
     start: &[f64],
-    evaluate: impl Fn(&[f64]) -> Normal,
+    evaluate: impl Fn(&[f64]) -> NormalEquations,
     mut progress: impl FnMut(usize, f64),
 ) -> Solution {
     let mut theta = space.inside(start);
@@ -130,7 +130,7 @@ pub fn minimise(
             passes += 1;
             if let Some((better, trial)) = evaluated.filter(|(trial, _)| trial.cost < normal.cost) {
                 let fall = (normal.cost - better.cost) / normal.cost;
-                // Under strong damping a small fall says nothing.
+                // Under strong damping a small fall does not show convergence.
                 still = if fall < CONVERGED && damping <= DAMPING_WEAK { still + 1 } else { 0 };
                 (theta, normal) = (trial, better);
                 damping = (damping * fall_by).max(DAMPING_MIN);
@@ -151,9 +151,9 @@ pub fn minimise(
     Solution { theta, cost: normal.cost, passes, converged: still >= 2 }
 }
 
-/// Where a parameter is in the bounded step.
+/// State of a parameter in the bounded step.
 #[derive(Clone, Copy, PartialEq)]
-enum Held {
+enum BoundState {
     Free,
     Low,
     High,
@@ -166,12 +166,12 @@ fn bounded_step(h: &DMatrix<f64>, g: &DVector<f64>, damping: f64, y: &[f64], spa
     for k in 0..n {
         damped[(k, k)] += damping * h[(k, k)] + f64::MIN_POSITIVE;
     }
-    let mut held = vec![Held::Free; n];
+    let mut held = vec![BoundState::Free; n];
     for k in 0..n {
         if y[k] <= space.low[k] && g[k] > 0.0 {
-            held[k] = Held::Low;
+            held[k] = BoundState::Low;
         } else if y[k] >= space.high[k] && g[k] < 0.0 {
-            held[k] = Held::High;
+            held[k] = BoundState::High;
         }
     }
     let mut d = DVector::zeros(n);
@@ -193,15 +193,15 @@ fn solve_free(
     g: &DVector<f64>,
     y: &[f64],
     space: &Space,
-    held: &[Held],
+    held: &[BoundState],
     d: &mut DVector<f64>,
 ) -> Option<()> {
-    let free: Vec<usize> = (0..y.len()).filter(|&k| held[k] == Held::Free).collect();
+    let free: Vec<usize> = (0..y.len()).filter(|&k| held[k] == BoundState::Free).collect();
     for k in 0..y.len() {
         d[k] = match held[k] {
-            Held::Free => 0.0,
-            Held::Low => space.low[k] - y[k],
-            Held::High => space.high[k] - y[k],
+            BoundState::Free => 0.0,
+            BoundState::Low => space.low[k] - y[k],
+            BoundState::High => space.high[k] - y[k],
         };
     }
     let pushed = damped * &*d + g;
@@ -216,13 +216,13 @@ fn solve_free(
     d.iter().all(|d| d.is_finite()).then_some(())
 }
 
-/// Holds what left its bounds, frees what is pushed inwards; whether anything changed.
+/// Holds parameters that left their bounds, frees those pushed inwards; returns whether anything changed.
 fn exchange(
     damped: &DMatrix<f64>,
     g: &DVector<f64>,
     y: &[f64],
     space: &Space,
-    held: &mut [Held],
+    held: &mut [BoundState],
     d: &DVector<f64>,
 ) -> bool {
     let gradient = damped * d + g;
@@ -230,10 +230,10 @@ fn exchange(
     for k in 0..y.len() {
         let tolerance = 1e-12 * (1.0 + y[k].abs());
         let now = match held[k] {
-            Held::Free if y[k] + d[k] < space.low[k] - tolerance => Held::Low,
-            Held::Free if y[k] + d[k] > space.high[k] + tolerance => Held::High,
-            Held::Low if gradient[k] < 0.0 => Held::Free,
-            Held::High if gradient[k] > 0.0 => Held::Free,
+            BoundState::Free if y[k] + d[k] < space.low[k] - tolerance => BoundState::Low,
+            BoundState::Free if y[k] + d[k] > space.high[k] + tolerance => BoundState::High,
+            BoundState::Low if gradient[k] < 0.0 => BoundState::Free,
+            BoundState::High if gradient[k] > 0.0 => BoundState::Free,
             same => same,
         };
         changed |= now != held[k];
@@ -251,7 +251,7 @@ mod tests {
     fn a_rising_block_stays_rising_and_meets_the_bounded_optimum() {
         let points = [0.0, 2.0, 1.9, 4.0];
         let evaluate = |theta: &[f64]| {
-            let mut normal = Normal::new(4);
+            let mut normal = NormalEquations::new(4);
             for (k, point) in points.iter().enumerate() {
                 let residual = theta[k] - point;
                 normal.cost += 0.5 * residual * residual;

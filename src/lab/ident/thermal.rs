@@ -4,27 +4,27 @@
 //! (some begin in a cell still warm or cold), so each discharge is fitted alone and the medians of what is credible are
 //! taken. Reversible heat is left out: the values are effective ones of the duty in the data.
 
-use super::parameters::Tables;
+use super::parameters::ParameterTables;
 use super::record::Record;
 use crate::cell::Thermal;
 
-/// Least warming of a record that tells anything, K.
+/// Least warming of a usable record, K.
 const MIN_RISE_K: f64 = 2.0;
 /// Most a record may cool below its beginning, K: else it began warmer than its surroundings.
 const MAX_FALL_K: f64 = 1.0;
-/// Values outside are no cell's: J/K, K/W.
+/// Ranges of credible values: J/K, K/W.
 const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 
 /// Heat capacity per stored energy of a cell, J/K per Wh: 300 Wh/kg with 0.8 kJ/(kg K) to 80 Wh/kg with 1 kJ/(kg K). A sensor that
 /// sees a share of the warming only (between cell and moving air) gives a capacity too large and a resistance too small by
-/// that share, without a trace in the residuals; this is what tells it.
+/// that share, without a trace in the residuals; this range detects it.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
 /// Why there are no thermal parameters.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum Untold {
+pub enum ThermalFitError {
     /// Too little warming, or no answer.
-    #[error("no thermal parameters: no file's temperature tells them")]
+    #[error("no thermal parameters: no file warms enough to determine them")]
     NoWarming,
     /// The sensor does not show the cell's own temperature.
     #[error(
@@ -45,18 +45,18 @@ pub enum Untold {
 ///
 /// # Errors
 /// No discharge warms enough, or the answer is no cell's.
-pub fn fit(records: &[Record], tables: &Tables, energy_wh: f64) -> Result<Thermal, Untold> {
-    let thermal = medians(records, tables).ok_or(Untold::NoWarming)?;
+pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, ThermalFitError> {
+    let thermal = medians(records, tables).ok_or(ThermalFitError::NoWarming)?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;
     let (least, most) = CELL_J_PER_K_WH;
     let a_cell = (least..=most).contains(&(found_j_per_k / energy_wh));
-    if a_cell { Ok(thermal) } else { Err(Untold::NoCell { found_j_per_k, energy_wh }) }
+    if a_cell { Ok(thermal) } else { Err(ThermalFitError::NoCell { found_j_per_k, energy_wh }) }
 }
 
-fn medians(records: &[Record], tables: &Tables) -> Option<Thermal> {
-    let told = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
+fn medians(records: &[Record], tables: &ParameterTables) -> Option<Thermal> {
+    let fitted = records.iter().filter(|record| warms(record)).filter_map(|record| of_record(record, tables));
     let (mut capacities, mut resistances): (Vec<f64>, Vec<f64>) =
-        told.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
+        fitted.map(|thermal| (thermal.heat_capacity_j_per_k, thermal.resistance_k_per_w)).unzip();
     Some(Thermal { heat_capacity_j_per_k: median(&mut capacities)?, resistance_k_per_w: median(&mut resistances)? })
 }
 
@@ -66,7 +66,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 }
 
 /// T - T0 = heat / C + (-above) / (R C): normal equations of two unknowns.
-fn of_record(record: &Record, tables: &Tables) -> Option<Thermal> {
+fn of_record(record: &Record, tables: &ParameterTables) -> Option<Thermal> {
     let (mut hh, mut ha, mut aa, mut ht, mut at) = (0.0, 0.0, 0.0, 0.0, 0.0);
     let start_c = record.rows[0].temperature_c;
     let (mut heat, mut above) = (0.0, 0.0);
@@ -102,14 +102,14 @@ fn warms(record: &Record) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ident::Raw;
+    use crate::ident::RawRows;
     use crate::ident::grid::Grid;
     use crate::ident::record::Limits;
 
     #[test]
     fn known_parameters_are_found_again_in_spite_of_a_record_that_began_cold() {
         let grid = Grid { soc: vec![0.0, 1.0], temperature_c: vec![25.0] };
-        let tables = Tables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], tau_s: vec![] };
+        let tables = ParameterTables { ocv_v: vec![3.6, 3.6], r0_ohm: vec![0.1; 2], r_ohm: vec![], tau_s: vec![] };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = |start_c: f64| {
             let time_s: Vec<f64> = (0..3000).map(f64::from).collect();
@@ -117,7 +117,7 @@ mod tests {
             let warm = |t: f64| 25.0 + 4.0 + (start_c - 29.0) * libm::exp(-t / 400.0);
             let temperature_c: Vec<f64> = time_s.iter().map(|&t| warm(t)).collect();
             // 0.4 W through 10 K/W with 40 J/K.
-            let raw = Raw {
+            let raw = RawRows {
                 time_s: &time_s,
                 current_a: &[2.0; 3000],
                 voltage_v: &[3.4; 3000],

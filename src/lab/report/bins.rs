@@ -1,11 +1,11 @@
-//! A record of any length in a bounded number of bins: when it outgrows them, neighbours are joined.
+//! Stores a record of any length in a bounded number of bins: when they are full, neighbours are joined.
 
-/// Bins at most: about two per pixel column of a wide picture.
+/// Most bins: about two per pixel column of a wide picture.
 const MOST: usize = 2048;
 
-/// What a bin holds.
+/// Content of a bin.
 pub(super) trait Bin: Clone + Default {
-    /// Takes a later neighbour in.
+    /// Joins a later neighbour to this bin.
     fn join(&mut self, later: &Self);
 }
 
@@ -22,7 +22,7 @@ impl<B: Bin> Bins<B> {
         Self { begin_s, width_s: 1.0, bins: Vec::new() }
     }
 
-    /// The bin of a moment; one before the first (a clock that was set back) falls into the first.
+    /// Returns the bin of a time; a time before the first (after a clock was set back) belongs to the first.
     pub(super) fn at(&mut self, time_s: f64) -> &mut B {
         let after_s = (time_s - self.begin_s).max(0.0);
         while after_s / self.width_s >= MOST as f64 {

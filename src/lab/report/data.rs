@@ -1,16 +1,18 @@
-//! What a report is about, gathered from a store's rows or from a replay's events and estimates.
+//! Data of a report, collected from a store's rows or from a replay's events and estimates.
 //!
 //! Times are seconds on the wall clock (a replay: on the log's clock). Cells count from 0.
 
 use super::trace::Trace;
-use crate::store::{Entry, Filter, Kind, Reader};
+
+use crate::fields::Fields;
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode};
+use crate::store::{Entry, Filter, Kind, Reader};
 
 /// Stamps from here on are dates, s since 1970; a log that begins earlier counts from its own start.
 const FIRST_DATE_S: f64 = 3.0e8;
 
-/// Where data come from.
+/// Origin of the data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// A store's history: what was learned and alarms, no samples.
@@ -21,7 +23,7 @@ pub enum Origin {
 
 /// A charge or discharge of a cell.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Half {
+pub(super) struct HalfCycleRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
     pub(super) is_charge: bool,
@@ -30,12 +32,12 @@ pub(super) struct Half {
     pub(super) mean_temperature_c: Option<f64>,
 }
 
-/// What was learned at a transition.
+/// Estimates of a cell after a half-cycle.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Learned {
+pub(super) struct CapacityRecord {
     pub(super) time_s: f64,
     pub(super) cell: usize,
-    /// What this half-cycle alone said, Ah.
+    /// Capacity by this half-cycle alone, Ah.
     pub(super) measured_ah: Option<f64>,
     /// Its standard deviation, Ah.
     pub(super) measured_std_ah: Option<f64>,
@@ -48,16 +50,16 @@ pub(super) struct Learned {
 
 /// A charge that covered the window.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Recharge {
+pub(super) struct RechargeRecord {
     pub(super) time_s: f64,
     pub(super) raw_s: Option<f64>,
     /// Mean and standard deviation.
     pub(super) normalised_s: Option<(f64, f64)>,
 }
 
-/// Something that became of an alarm.
+/// A change of an alarm.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct AlarmRow {
+pub(super) struct AlarmRecord {
     pub(super) time_s: f64,
     pub(super) rule: String,
     pub(super) severity: String,
@@ -68,26 +70,26 @@ pub(super) struct AlarmRow {
     pub(super) threshold: Option<f64>,
 }
 
-/// Where the data come from and how they are.
+/// Origin and quality of the data.
 #[derive(Debug, Clone)]
-pub struct Source {
+pub struct DataSource {
     /// Which kind.
     pub origin: Origin,
     /// Pack of the store, from 1, and packs before it.
     pub pack: Option<i64>,
-    /// Why it may not be believed: a sentence without its full stop.
+    /// Why the data may be wrong: a sentence without its full stop.
     pub doubt: Option<String>,
 }
 
 /// Everything a report shows.
 #[derive(Debug)]
 pub struct Data {
-    pub(super) source: Source,
-    pub(super) halves: Vec<Half>,
-    pub(super) learned: Vec<Learned>,
-    pub(super) recharges: Vec<Recharge>,
-    pub(super) alarms: Vec<AlarmRow>,
-    /// Resets, damages, lost trust: when and what.
+    pub(super) source: DataSource,
+    pub(super) halves: Vec<HalfCycleRecord>,
+    pub(super) learned: Vec<CapacityRecord>,
+    pub(super) recharges: Vec<RechargeRecord>,
+    pub(super) alarms: Vec<AlarmRecord>,
+    /// Resets, damages, lost trust: time and text.
     pub(super) incidents: Vec<(f64, String)>,
     pub(super) trace: Trace,
     first_s: f64,
@@ -95,10 +97,10 @@ pub struct Data {
 }
 
 impl Data {
-    /// Nothing yet.
+    /// Creates data without any record.
     pub fn new(origin: Origin) -> Self {
         Self {
-            source: Source { origin, pack: None, doubt: None },
+            source: DataSource { origin, pack: None, doubt: None },
             halves: Vec::new(),
             learned: Vec::new(),
             recharges: Vec::new(),
@@ -123,111 +125,86 @@ impl Data {
         Ok(data)
     }
 
-    /// The record may not be believed: a sentence without its full stop.
+    /// Sets why the data may be wrong: a sentence without its full stop.
     pub fn doubt(&mut self, why: String) {
         self.source.doubt = Some(why);
     }
 
-    /// Takes a row of a store.
+    /// Adds a row of a store.
     fn take_entry(&mut self, entry: &Entry) {
         let time_s = entry.wall_ns as f64 * 1e-9;
         self.span(time_s);
-        let row = Values(entry);
-        let cell = row.number("cell").map(|cell| cell as usize);
-        match (entry.kind, cell) {
-            (Kind::HalfCycle, Some(cell)) => self.halves.push(Half {
-                time_s,
-                cell,
-                is_charge: row.text("mode") == "charge",
-                charge_ah: row.number("charge_ah").unwrap_or(f64::NAN),
-                duration_s: row.number("duration_s").unwrap_or(f64::NAN),
-                mean_temperature_c: row.number("mean_temperature_c"),
-            }),
-            (Kind::Capacity, Some(cell)) => self.learned.push(Learned {
-                time_s,
-                cell,
-                measured_ah: row.number("measured_ah"),
-                measured_std_ah: row.number("measured_std_ah"),
-                capacity_ah: row.pair("capacity_ah", "capacity_std_ah").unwrap_or((f64::NAN, f64::NAN)),
-                usable_ah: row.pair("usable_capacity_ah", "usable_capacity_std_ah"),
-                resistance: row.pair("resistance_ratio", "resistance_ratio_std").unwrap_or((f64::NAN, f64::NAN)),
-            }),
-            (Kind::Alarm, cell) => self.alarms.push(AlarmRow {
-                time_s,
-                rule: row.text("rule"),
-                severity: row.text("severity"),
-                cell,
-                change: row.text("change"),
-                is_active: row.number("active").is_some_and(|active| active != 0.0),
-                value: row.number("value"),
-                threshold: row.number("threshold"),
-            }),
-            (Kind::Reset, cell) => {
-                let of = cell.map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
-                let detail = row.text("detail");
+        let fields = Fields::of_entry(entry);
+        match entry.kind {
+            Kind::HalfCycle => self.take_half_cycle(time_s, &fields),
+            Kind::Capacity => self.take_capacity(time_s, &fields),
+            Kind::Alarm => self.take_alarm(time_s, &fields),
+            Kind::Reset => {
+                let of = cell_of(&fields).map_or(String::new(), |cell| format!(" (cell {})", cell + 1));
+                let (reason, detail) = (fields.text("reason").replace('_', " "), fields.text("detail"));
                 let colon = if detail.is_empty() { "" } else { ": " };
-                self.incidents.push((time_s, format!("{}{of}{colon}{detail}", row.text("reason").replace('_', " "))));
+                self.incidents.push((time_s, format!("{reason}{of}{colon}{detail}")));
             }
-            // A row of a cell without its number: the store writes none. And the forecast is made anew here.
-            (Kind::HalfCycle | Kind::Capacity, None) | (Kind::RemainingLife, _) => {}
+            // The forecast is computed again here.
+            Kind::RemainingLife => {}
         }
     }
 
-    /// Takes an event of a replay.
+    /// Adds an event of a replay.
     pub fn take_event(&mut self, event: &Event) {
         let time_s = event.time.secs();
         self.span(time_s);
         match event.kind {
-            EventKind::HalfCycle { cell, mode, charge_ah, duration_s, mean_temperature_c, .. } => {
-                let (cell, is_charge) = (cell.index(), mode == Mode::Charge);
-                self.halves.push(Half { time_s, cell, is_charge, charge_ah, duration_s, mean_temperature_c });
-            }
+            EventKind::HalfCycle { .. } => self.take_half_cycle(time_s, &Fields::of_event(&event.kind)),
+            EventKind::Capacity { .. } => self.take_capacity(time_s, &Fields::of_event(&event.kind)),
+            EventKind::Alarm { .. } => self.take_alarm(time_s, &Fields::of_event(&event.kind)),
             EventKind::RechargePeriod { seconds, normalised_s, normalised_std_s } => {
                 let normalised_s = normalised_s.zip(normalised_std_s);
-                self.recharges.push(Recharge { time_s, raw_s: seconds, normalised_s });
+                self.recharges.push(RechargeRecord { time_s, raw_s: seconds, normalised_s });
             }
             EventKind::Mode { to: Mode::Charge | Mode::Discharge, .. } => self.trace.turn(time_s),
-            EventKind::Capacity { .. } | EventKind::Alarm { .. } => self.take_learned(time_s, &event.kind),
             _ => self.take_incident(time_s, &event.kind),
         }
     }
 
-    fn take_learned(&mut self, time_s: f64, kind: &EventKind) {
-        match *kind {
-            EventKind::Capacity {
-                cell,
-                measured_ah,
-                measured_std_ah,
-                capacity_ah,
-                capacity_std_ah,
-                usable_capacity_ah,
-                usable_capacity_std_ah,
-                resistance_ratio,
-                resistance_ratio_std,
-                ..
-            } => self.learned.push(Learned {
-                time_s,
-                cell: cell.index(),
-                measured_ah,
-                measured_std_ah,
-                capacity_ah: (capacity_ah, capacity_std_ah),
-                usable_ah: usable_capacity_ah.zip(usable_capacity_std_ah),
-                resistance: (resistance_ratio, resistance_ratio_std),
-            }),
-            EventKind::Alarm { rule, cell, change, active, severity, value, threshold, .. } => {
-                self.alarms.push(AlarmRow {
-                    time_s,
-                    rule: rule.name().to_owned(),
-                    severity: severity.name().to_owned(),
-                    cell: cell.map(CellIndex::index),
-                    change: word(&change),
-                    is_active: active,
-                    value,
-                    threshold: Some(threshold),
-                });
-            }
-            _ => {}
-        }
+    fn take_half_cycle(&mut self, time_s: f64, fields: &Fields) {
+        // The store writes no row of a cell without its number.
+        let Some(cell) = cell_of(fields) else { return };
+        self.halves.push(HalfCycleRecord {
+            time_s,
+            cell,
+            is_charge: fields.text("mode") == "charge",
+            charge_ah: fields.number("charge_ah").unwrap_or(f64::NAN),
+            duration_s: fields.number("duration_s").unwrap_or(f64::NAN),
+            mean_temperature_c: fields.number("mean_temperature_c"),
+        });
+    }
+
+    fn take_capacity(&mut self, time_s: f64, fields: &Fields) {
+        const UNKNOWN: (f64, f64) = (f64::NAN, f64::NAN);
+        let Some(cell) = cell_of(fields) else { return };
+        self.learned.push(CapacityRecord {
+            time_s,
+            cell,
+            measured_ah: fields.number("measured_ah"),
+            measured_std_ah: fields.number("measured_std_ah"),
+            capacity_ah: fields.pair("capacity_ah", "capacity_std_ah").unwrap_or(UNKNOWN),
+            usable_ah: fields.pair("usable_capacity_ah", "usable_capacity_std_ah"),
+            resistance: fields.pair("resistance_ratio", "resistance_ratio_std").unwrap_or(UNKNOWN),
+        });
+    }
+
+    fn take_alarm(&mut self, time_s: f64, fields: &Fields) {
+        self.alarms.push(AlarmRecord {
+            time_s,
+            rule: fields.text("rule").to_owned(),
+            severity: fields.text("severity").to_owned(),
+            cell: cell_of(fields),
+            change: fields.text("change").to_owned(),
+            is_active: fields.flag("active"),
+            value: fields.number("value"),
+            threshold: fields.number("threshold"),
+        });
     }
 
     fn take_incident(&mut self, time_s: f64, kind: &EventKind) {
@@ -258,7 +235,7 @@ impl Data {
         self.recharges.clear();
     }
 
-    /// Takes an estimate of a replay.
+    /// Adds an estimate of a replay.
     pub fn take_estimate(&mut self, estimate: &Estimate) {
         self.span(estimate.time.secs());
         self.trace.take(estimate);
@@ -269,17 +246,17 @@ impl Data {
         self.last_s = self.last_s.max(time_s);
     }
 
-    /// First and last moment; `None` = there is nothing.
+    /// First and last time, s; `None` = there are no data.
     pub(super) fn ends_s(&self) -> Option<(f64, f64)> {
         (self.first_s <= self.last_s).then_some((self.first_s, self.last_s))
     }
 
-    /// Whether moments are dates.
+    /// Whether times are dates.
     pub(super) fn is_dated(&self) -> bool {
         self.first_s >= FIRST_DATE_S
     }
 
-    /// Cells that anything is known of.
+    /// Number of cells with data.
     pub(super) fn cells(&self) -> usize {
         let learned = self.learned.iter().map(|row| row.cell + 1);
         let halves = self.halves.iter().map(|row| row.cell + 1);
@@ -287,29 +264,7 @@ impl Data {
     }
 }
 
-/// A word of the core as it is written everywhere.
-fn word(value: &impl serde::Serialize) -> String {
-    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
-}
-
-/// The values of a row by name.
-struct Values<'a>(&'a Entry);
-
-impl Values<'_> {
-    fn value(&self, name: &str) -> Option<&serde_json::Value> {
-        let column = self.0.kind.columns().iter().position(|column| *column == name)?;
-        self.0.values.get(column)
-    }
-
-    fn number(&self, name: &str) -> Option<f64> {
-        self.value(name)?.as_f64()
-    }
-
-    fn pair(&self, mean: &str, std: &str) -> Option<(f64, f64)> {
-        self.number(mean).zip(self.number(std))
-    }
-
-    fn text(&self, name: &str) -> String {
-        self.value(name).and_then(|value| value.as_str()).unwrap_or_default().to_owned()
-    }
+/// Index of the cell, from 0.
+fn cell_of(fields: &Fields) -> Option<usize> {
+    fields.whole("cell").map(|cell| cell as usize)
 }

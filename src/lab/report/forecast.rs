@@ -1,29 +1,30 @@
-//! The remaining life, told from the record by the same filter as on board (`health::Forecast`), and its fan.
+//! The remaining life, computed from the record by the same filter as on board (`health::Forecast`), and its fan.
 //!
-//! A store's rows and a replay's events both hold what the filter is fed, so both give what the core itself says. A
-//! record that has lost its beginning gives a wider interval.
+//! A store's rows and a replay's events both hold the filter's inputs, so both give the same result as the monitor. A
+//! record without its beginning gives a wider interval.
 
 use std::collections::BTreeMap;
 
-use super::data::{Data, Learned};
-use super::{Setting, pictures};
+use super::data::{CapacityRecord, Data};
+use super::{PageContext, pictures};
+
 use crate::alarm::Rule;
-use crate::health::{Axis, Forecast, Usage, Reading, Remaining, RemainingLife, InsufficientData};
+use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
 const DAY_S: f64 = 86_400.0;
-/// Deviation of the current sensor's gain where no configuration tells one: what `capacity.current_gain_std` is by default.
-const USUAL_GAIN_STD: f64 = 0.005;
+/// Deviation of the current sensor's gain without a configuration: the default of `capacity.current_gain_std`.
+const DEFAULT_GAIN_STD: f64 = 0.005;
 /// Points of a fan.
 const POINTS: usize = 60;
-/// How far a fan goes at most: medians until the end of life, and lengths of the record.
+/// Longest fan: medians until the end of life, and lengths of the record.
 const MAX_MEDIANS: f64 = 2.5;
 const MAX_RECORDS: f64 = 2.0;
-/// And how far it goes even where the median is near, if the end may come that late.
+/// Fan length even where the median is near, if the end may come that late, lengths of the record.
 const LEAST_RECORDS: f64 = 0.2;
 
-/// Capacity to come, at a moment.
+/// Forecast of the capacity at a time.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct FanPoint {
+pub(super) struct DatedFanPoint {
     pub(super) time_s: f64,
     /// 5 %, 50 % and 95 % quantile, Ah.
     pub(super) low_ah: f64,
@@ -31,13 +32,13 @@ pub(super) struct FanPoint {
     pub(super) high_ah: f64,
 }
 
-/// What is to come for the cell whose life ends first of those whose life is known.
+/// Forecast for the cell whose life ends first of those whose life is known.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Outlook {
     /// Counts from 0.
     pub(super) cell: usize,
     /// For the capacity chart; empty = already at its end, or how fast it is used is not known.
-    pub(super) fan: Vec<FanPoint>,
+    pub(super) fan: Vec<DatedFanPoint>,
     /// Capacity at the end of life, Ah.
     pub(super) end_ah: f64,
     pub(super) life: RemainingLife,
@@ -45,20 +46,20 @@ pub(super) struct Outlook {
     pub(super) unknown: Option<String>,
 }
 
-/// Capacity at the end of life, Ah: as configured, else the mildest limit that the record's alarms tell.
-pub(super) fn end_of_life_ah(data: &Data, setting: &Setting<'_>) -> Option<f64> {
-    let configured = setting.config.map(|config| config.monitor.health.end_of_life_ah);
-    configured.or_else(|| pictures::threshold(data, setting, Rule::CapacityLow))
+/// Capacity at the end of life, Ah: as configured, else the mildest limit of the record's alarms.
+pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
+    let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
+    configured.or_else(|| pictures::threshold(data, context, Rule::CapacityLow))
 }
 
 /// The outlook of the cell whose life ends first, or why there is none.
-pub(super) fn outlook(data: &Data, setting: &Setting<'_>) -> Result<Outlook, String> {
-    let end_ah = end_of_life_ah(data, setting)
+pub(super) fn outlook(data: &Data, context: &PageContext<'_>) -> Result<Outlook, String> {
+    let end_ah = end_of_life_ah(data, context)
         .ok_or("the record does not say which capacity is the end of life; a configuration (-c) does")?;
-    let cells = cells(data, setting);
+    let cells = cells(data, context);
     let lives: Vec<Result<RemainingLife, InsufficientData>> = cells.iter().map(|cell| cell.remaining(end_ah)).collect();
     let refused = lives.iter().enumerate().find_map(|(cell, life)| Some((cell, life.err()?)));
-    let unknown = refused.map(|(cell, why)| too_thin(&lives, cell, why));
+    let unknown = refused.map(|(cell, why)| unknown_lives(&lives, cell, why));
     let median = |life: &RemainingLife| life.cycles.or(life.days).map_or(f64::INFINITY, |left| left.median);
     let known = lives.into_iter().enumerate().filter_map(|(cell, life)| Some((cell, life.ok()?)));
     match known.min_by(|a, b| median(&a.1).total_cmp(&median(&b.1))) {
@@ -76,24 +77,25 @@ fn is_over(life: &RemainingLife) -> bool {
     life.cycles.or(life.days).is_some_and(|left| left.high <= 0.0)
 }
 
-fn too_thin(lives: &[Result<RemainingLife, InsufficientData>], cell: usize, why: InsufficientData) -> String {
+fn unknown_lives(lives: &[Result<RemainingLife, InsufficientData>], cell: usize, why: InsufficientData) -> String {
     if lives.len() == 1 {
-        return told(why);
+        return display(why);
     }
     let unknown = lives.iter().filter(|life| life.is_err()).count();
-    format!("not known of {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, told(why))
+    format!("not known of {unknown} of {} cells (cell {}: {})", lives.len(), cell + 1, display(why))
 }
 
-fn told(why: InsufficientData) -> String {
+fn display(why: InsufficientData) -> String {
     why.to_string().replace("+-", "\u{b1}")
 }
 
 /// Every cell's forecast at the end of the record, fed as `monitor::life` feeds it.
-pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
-    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
-    let gain_std = setting.config.map_or(USUAL_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
+pub(super) fn cells(data: &Data, context: &PageContext<'_>) -> Vec<Forecast> {
+    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let gain_std = context.config.map_or(DEFAULT_GAIN_STD, |config| config.monitor.health.capacity.current_gain_std);
     let key = |time_s: f64, cell: usize| (time_s.to_bits(), cell);
-    let learned: BTreeMap<_, &Learned> = data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
+    let learned: BTreeMap<_, &CapacityRecord> =
+        data.learned.iter().map(|row| (key(row.time_s, row.cell), row)).collect();
     let rated_ah = rated_ah.or_else(|| data.learned.first().map(|row| row.capacity_ah.0)).unwrap_or(1.0);
     let mut cells = vec![Forecast::new(Axis::Cycles, rated_ah); data.cells()];
     let mut before_s: Option<f64> = None;
@@ -101,24 +103,24 @@ pub(super) fn cells(data: &Data, setting: &Setting<'_>) -> Vec<Forecast> {
         let now_s = halves[0].time_s;
         let since_before_s = before_s.map(|before_s| now_s - before_s);
         for half in halves {
-            let passed = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
-            // Use without a reading is use all the same: a store leaves out capacities that say nothing new.
+            let usage = Usage::in_half_cycle(half.charge_ah, half.duration_s, since_before_s, rated_ah);
+            // Use without a reading counts too: a store leaves out capacities without new information.
             let row = learned.get(&key(half.time_s, half.cell));
-            cells[half.cell].update(passed, row.and_then(|row| reading(row, gain_std)));
+            cells[half.cell].update(usage, row.and_then(|row| reading(row, gain_std)));
         }
         before_s = Some(now_s);
     }
     cells
 }
 
-fn reading(row: &Learned, gain_std: f64) -> Option<Reading> {
+fn reading(row: &CapacityRecord, gain_std: f64) -> Option<CapacityReading> {
     let (capacity_ah, std_ah) = row.measured_ah.zip(row.measured_std_ah)?;
     let gain_ah = gain_std * row.capacity_ah.0;
-    Some(Reading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
+    Some(CapacityReading { capacity_ah, variance_ah2: std_ah * std_ah, shared_variance_ah2: gain_ah * gain_ah })
 }
 
 /// From the last half-cycle until the last moment the end of life may come, within reason.
-fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<FanPoint> {
+fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<DatedFanPoint> {
     let (Some(cycles), Some(days)) = (life.cycles, life.days) else { return Vec::new() };
     let (Some(first), Some(last)) = (data.halves.first(), data.halves.last()) else { return Vec::new() };
     if is_over(life) {
@@ -128,7 +130,7 @@ fn fan(data: &Data, forecast: &Forecast, life: &RemainingLife) -> Vec<FanPoint> 
     let recorded = (last.time_s - first.time_s) / DAY_S / days_per_cycle;
     let long = (MAX_MEDIANS * cycles.median).max(LEAST_RECORDS * recorded);
     let ahead = cycles.high.min(long).min((MAX_RECORDS * recorded).max(cycles.median));
-    let at = |point: crate::health::forecast::FanPoint| FanPoint {
+    let at = |point: crate::health::forecast::FanPoint| DatedFanPoint {
         time_s: last.time_s + point.ahead * days_per_cycle * DAY_S,
         low_ah: point.low_ah,
         median_ah: point.median_ah,
@@ -142,7 +144,7 @@ impl Outlook {
         is_over(&self.life)
     }
 
-    /// "14 cycles"; as in the core itself, a pack's life is not known before every cell's is.
+    /// Returns "14 cycles"; as in the monitor, a pack's life is unknown until every cell's is known.
     pub(super) fn value(&self) -> String {
         match self.life.cycles {
             Some(left) if self.unknown.is_none() => median(left),
@@ -150,7 +152,7 @@ impl Outlook {
         }
     }
 
-    /// What it means, with the interval and the days.
+    /// Explains it, with the interval and the days.
     pub(super) fn note(&self, cells: usize) -> String {
         let cycles = self.life.cycles.map_or_else(String::new, interval);
         if let Some(why) = &self.unknown {
@@ -162,7 +164,7 @@ impl Outlook {
             return format!("the capacity{of_cell} is below {:.3} Ah, the end of life", self.end_ah);
         }
         let days = self.life.days.map_or_else(String::new, |days| {
-            format!("; if used as of late {} days, {}", digits(days.median), interval(days))
+            format!("; at the recent rate of use {} days, {}", digits(days.median), interval(days))
         });
         format!("{cycles}, until the capacity{of_cell} is {:.3} Ah{days}", self.end_ah)
     }
@@ -176,7 +178,7 @@ fn interval(left: Remaining) -> String {
     format!("{} to {} in nine of ten cases", digits(left.low), digits(left.high))
 }
 
-/// Below ten a decimal is worth its room.
+/// Formats with one decimal below ten, else none.
 fn digits(value: f64) -> String {
     if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
 }
@@ -185,7 +187,7 @@ fn digits(value: f64) -> String {
 mod tests {
     use super::*;
     use crate::report::Origin;
-    use crate::report::data::Half;
+    use crate::report::data::HalfCycleRecord;
 
     /// Full cycles of three hours each, twice a day, each cell losing its own share of 2 Ah per half-cycle.
     fn worn(halves: u32, losses: &[f64]) -> Data {
@@ -195,7 +197,7 @@ mod tests {
             for (cell, loss) in losses.iter().enumerate() {
                 let capacity_ah = 2.0 * (1.0 - loss * f64::from(half));
                 let (is_charge, duration_s) = (half % 2 == 1, 10_800.0);
-                data.halves.push(Half {
+                data.halves.push(HalfCycleRecord {
                     time_s,
                     cell,
                     is_charge,
@@ -203,7 +205,7 @@ mod tests {
                     duration_s,
                     mean_temperature_c: None,
                 });
-                data.learned.push(Learned {
+                data.learned.push(CapacityRecord {
                     time_s,
                     cell,
                     measured_ah: Some(capacity_ah),
@@ -218,7 +220,7 @@ mod tests {
     }
 
     fn alarm_at(data: &mut Data, threshold: f64) {
-        data.alarms.push(crate::report::data::AlarmRow {
+        data.alarms.push(crate::report::data::AlarmRecord {
             time_s: 1.7e9,
             rule: "capacity_low".to_owned(),
             severity: "warning".to_owned(),
@@ -231,10 +233,10 @@ mod tests {
     }
 
     #[test]
-    fn the_cell_that_fades_fastest_is_told_with_a_fan_to_its_end() {
+    fn the_cell_that_fades_fastest_is_reported_with_a_fan_to_its_end() {
         let mut data = worn(100, &[0.001, 0.0015, 0.001]);
         alarm_at(&mut data, 1.6);
-        let outlook = outlook(&data, &Setting::default()).expect("enough readings");
+        let outlook = outlook(&data, &PageContext::default()).expect("enough readings");
         assert_eq!((outlook.cell, outlook.end_ah), (1, 1.6));
         let left = outlook.life.cycles.expect("cycles");
         // 1.7 Ah now, 0.006 Ah a cycle: 17 full cycles, a little more as a cycle moves less and less.
@@ -249,27 +251,27 @@ mod tests {
     }
 
     #[test]
-    fn what_is_too_thin_is_refused_with_the_reason() {
-        let mut thin = worn(4, &[0.001, 0.001]);
-        assert!(outlook(&thin, &Setting::default()).unwrap_err().contains("a configuration (-c) does"));
-        alarm_at(&mut thin, 1.6);
-        let why = outlook(&thin, &Setting::default()).unwrap_err();
+    fn too_little_data_is_rejected_with_the_reason() {
+        let mut short = worn(4, &[0.001, 0.001]);
+        assert!(outlook(&short, &PageContext::default()).unwrap_err().contains("a configuration (-c) does"));
+        alarm_at(&mut short, 1.6);
+        let why = outlook(&short, &PageContext::default()).unwrap_err();
         assert_eq!(why, "not known of 2 of 2 cells (cell 1: 4 capacity readings, needs 6)");
         let mut mixed = worn(100, &[0.001, 0.0]);
         alarm_at(&mut mixed, 1.6);
-        let outlook_of_one = outlook(&mixed, &Setting::default()).expect("of one cell");
+        let outlook_of_one = outlook(&mixed, &PageContext::default()).expect("of one cell");
         assert_eq!((outlook_of_one.cell, outlook_of_one.value().as_str()), (0, "unknown"));
         assert!(outlook_of_one.note(2).starts_with("not known of 1 of 2 cells (cell 2: capacity lost is"));
         let mut flat = worn(100, &[0.0]);
         alarm_at(&mut flat, 1.6);
-        assert!(outlook(&flat, &Setting::default()).unwrap_err().starts_with("capacity lost is"));
+        assert!(outlook(&flat, &PageContext::default()).unwrap_err().starts_with("capacity lost is"));
     }
 
     #[test]
     fn a_cell_past_its_end_has_no_life_and_no_fan() {
         let mut data = worn(100, &[0.0015]);
         alarm_at(&mut data, 1.9);
-        let outlook = outlook(&data, &Setting::default()).expect("known");
+        let outlook = outlook(&data, &PageContext::default()).expect("known");
         assert_eq!((outlook.value().as_str(), outlook.fan.len()), ("none", 0));
         assert_eq!(outlook.note(1), "the capacity is below 1.900 Ah, the end of life");
     }

@@ -2,36 +2,36 @@
 
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
-use super::series::{self, Step};
-use super::trace::{Moment, OF_95};
-use super::{Setting, summary};
+use super::series::{self, CellStep};
+use super::trace::{OF_95, TraceBin};
+use super::{PageContext, summary};
 use crate::alarm::Rule;
-use crate::chart::{Axis, Chart, Heat, Ink, Lane, Lanes, Layer, Picture, Point, Scale, Shape, Span};
+use crate::chart::{Axis, Chart, Heat, Ink, Layer, Picture, Point, Scale, Shape, Span, StateBand, StateBands};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
     "unknown: the history keeps what was learned, not every sample; a report of a replay shows it";
 
-/// A hole of this part of the whole interrupts a line, if it is this long as well: some sensors are slow.
+/// A gap of this part of the whole interrupts a line, if it is also this long: some sensors are slow.
 const MAX_HOLE_PART: usize = 100;
 const MAX_HOLE_S: f64 = 100.0;
-/// And of at least this many bins.
+/// Fewest bins of such a gap.
 const MAX_HOLE_BINS: usize = 3;
-/// The last half-cycles have a picture of their own when they are at most this part of the record.
+/// The last half-cycles get their own picture when they are at most this part of the record.
 const MAX_RECENT: f64 = 0.9;
 
-/// Every picture that there are data for, with the name of its file.
-pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> {
-    let outlook = forecast::outlook(data, setting);
+/// Returns every picture that has data, with the name of its file.
+pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Picture)> {
+    let outlook = forecast::outlook(data, context);
     let named = |name: &str, picture: Option<Picture>| picture.map(|picture| (name.to_owned(), picture));
     [
-        named("soc", soc(data, setting)),
-        named("soc_recent", soc_recent(data, setting)),
-        named("capacity", capacity(data, setting, outlook.as_ref().ok())),
-        named("usable_capacity", usable(data, setting)),
-        named("recharge_period", recharge(data, setting)),
-        named("resistance", resistance(data, setting)),
-        named("temperature", temperature(data, setting)),
+        named("soc", soc(data, context)),
+        named("soc_recent", soc_recent(data, context)),
+        named("capacity", capacity(data, context, outlook.as_ref().ok())),
+        named("usable_capacity", usable(data, context)),
+        named("recharge_period", recharge(data, context)),
+        named("resistance", resistance(data, context)),
+        named("temperature", temperature(data, context)),
         named("alarms", alarms(data)),
         named("cells_capacity", heat(data, "Capacity of every cell", "capacity, Ah", series::capacity)),
         named("cells_resistance", heat(data, "Resistance of every cell", "resistance, times new", series::resistance)),
@@ -43,14 +43,14 @@ pub(super) fn all(data: &Data, setting: &Setting<'_>) -> Vec<(String, Picture)> 
     .collect()
 }
 
-/// The x axis: dates, or time since the start in a unit that fits.
-struct Clock {
+/// The x axis: dates, or time since the start in a suitable unit.
+struct TimeAxis {
     axis: Axis,
     zero_s: f64,
     unit_s: f64,
 }
 
-impl Clock {
+impl TimeAxis {
     fn of(data: &Data) -> Self {
         let (first_s, last_s) = data.ends_s().unwrap_or((0.0, 0.0));
         Self::between(data, first_s, last_s)
@@ -77,13 +77,13 @@ impl Clock {
 }
 
 /// The mildest threshold of a rule, as configured, else as its alarms say.
-pub(super) fn threshold(data: &Data, setting: &Setting<'_>, rule: Rule) -> Option<f64> {
-    thresholds(data, setting, rule).first().map(|(value, _)| *value)
+pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
+    thresholds(data, context, rule).first().map(|(value, _)| *value)
 }
 
 /// Every threshold of a rule with its severity, the mildest first.
-fn thresholds(data: &Data, setting: &Setting<'_>, rule: Rule) -> Vec<(f64, String)> {
-    let mut all: Vec<(f64, String)> = match setting.config {
+fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
+    let mut all: Vec<(f64, String)> = match context.config {
         Some(config) => {
             let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
             rules.map(|row| (row.threshold, row.severity.name().to_owned())).collect()
@@ -99,8 +99,8 @@ fn thresholds(data: &Data, setting: &Setting<'_>, rule: Rule) -> Vec<(f64, Strin
     all
 }
 
-fn levels(data: &Data, setting: &Setting<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
-    thresholds(data, setting, rule).into_iter().map(|(value, severity)| {
+fn levels(data: &Data, context: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
+    thresholds(data, context, rule).into_iter().map(|(value, severity)| {
         let ink = ink_of(&severity);
         Layer::new(&format!("limit ({severity})"), ink, Shape::Level(value))
     })
@@ -115,7 +115,7 @@ fn ink_of(severity: &str) -> Ink {
 }
 
 /// The moments at which alarms of a rule were raised.
-fn raised(data: &Data, clock: &Clock, rule: Rule) -> Option<Layer> {
+fn raised(data: &Data, clock: &TimeAxis, rule: Rule) -> Option<Layer> {
     let rows = data.alarms.iter().filter(|row| row.rule == rule.name() && row.change == "raised");
     let points: Vec<Point> = rows
         .map(|row| Point {
@@ -132,7 +132,12 @@ fn moment(data: &Data, time_s: f64) -> String {
 }
 
 /// Bins of a trace as a band and, where cells differ or bins are long, the range within.
-fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64), factor: f64) -> Vec<(f64, f64, f64)> {
+fn range(
+    bins: &[(f64, &TraceBin)],
+    clock: &TimeAxis,
+    pick: fn(&TraceBin) -> (f64, f64),
+    factor: f64,
+) -> Vec<(f64, f64, f64)> {
     let band = bins.iter().map(|(time_s, bin)| {
         let (low, high) = pick(bin);
         (clock.x(*time_s), factor * low, factor * high)
@@ -141,8 +146,8 @@ fn range(bins: &[(f64, &Moment)], clock: &Clock, pick: fn(&Moment) -> (f64, f64)
 }
 
 /// Bins with something in them; of a stretch without anything that can be seen, one empty bin, which interrupts a line.
-fn filled<'a>(bins: impl Iterator<Item = (f64, &'a Moment)>) -> Vec<(f64, &'a Moment)> {
-    let all: Vec<(f64, &Moment)> = bins.collect();
+fn filled<'a>(bins: impl Iterator<Item = (f64, &'a TraceBin)>) -> Vec<(f64, &'a TraceBin)> {
+    let all: Vec<(f64, &TraceBin)> = bins.collect();
     let width_s = all.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(f64::INFINITY, f64::min).max(1.0);
     let hole = (all.len() / MAX_HOLE_PART).max((MAX_HOLE_S / width_s) as usize).max(MAX_HOLE_BINS);
     let mut empty = 0;
@@ -159,14 +164,14 @@ fn zigzag(band: &[(f64, f64, f64)]) -> Vec<(f64, f64)> {
     band.iter().flat_map(|(x, low, high)| [(*x, *low), (*x, *high)]).collect()
 }
 
-fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let bins = filled(life.iter());
     let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0)))];
-    layers.extend(true_soc(setting, &clock, data.ends_s()?));
+    layers.extend(true_soc(context, &clock, data.ends_s()?));
     layers.push(Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))));
     Some(Picture::Chart(Chart {
         title: "State of charge over the whole record".to_owned(),
@@ -177,18 +182,18 @@ fn soc(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let moments: Vec<(f64, &Moment)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
+fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
+    let moments: Vec<(f64, &TraceBin)> = filled(data.trace.recent.iter().flat_map(|bins| bins.iter()));
     let (first_s, last_s) = data.ends_s()?;
-    // As good as the whole record: the picture before shows it.
+    // Almost the whole record: the picture before shows it.
     if moments.last()?.0 - moments.first()?.0 > MAX_RECENT * (last_s - first_s) {
         return None;
     }
-    let clock = Clock::between(data, moments.first()?.0, moments.last()?.0);
+    let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
     let mut layers =
         vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
-    layers.extend(true_soc(setting, &clock, (moments.first()?.0, moments.last()?.0)));
+    layers.extend(true_soc(context, &clock, (moments.first()?.0, moments.last()?.0)));
     if data.cells() > 1 {
         layers.push(Layer::new("highest cell", Ink::Green, Shape::Line(soc.iter().map(|p| (p.0, p.2)).collect())));
         layers.push(Layer::new("lowest cell", Ink::Blue, Shape::Line(soc.iter().map(|p| (p.0, p.1)).collect())));
@@ -205,7 +210,7 @@ fn soc_recent(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
 }
 
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.
-fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Vec<Layer> {
+fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str) -> Vec<Layer> {
     let interval =
         steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
     let mut layers = vec![Layer::new("95 % interval", ink, Shape::Band(interval.collect()))];
@@ -218,20 +223,20 @@ fn worst(data: &Data, clock: &Clock, steps: &[Step], ink: Ink, name: &str) -> Ve
     layers
 }
 
-fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
+fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -> Option<Picture> {
     let steps = series::steps(data, series::capacity, false);
     let (first_s, mut last_s) = data.ends_s().filter(|_| !steps.is_empty())?;
     let fan = outlook.map_or(&[][..], |outlook| &outlook.fan);
     last_s = fan.iter().map(|point| point.time_s).fold(last_s, f64::max);
-    let clock = Clock::between(data, first_s, last_s);
+    let clock = TimeAxis::between(data, first_s, last_s);
     let mut layers = vec![];
     if data.cells() == 1 {
-        let said = data.learned.iter().filter_map(|row| {
+        let single = data.learned.iter().filter_map(|row| {
             let y = row.measured_ah?;
             let tip = format!("{}: this half-cycle alone {y:.3} Ah", moment(data, row.time_s));
             Some(Point { x: clock.x(row.time_s), y, tip })
         });
-        layers.push(Layer::new("one half-cycle alone", Ink::Grey, Shape::Points(said.collect())));
+        layers.push(Layer::new("one half-cycle alone", Ink::Grey, Shape::Points(single.collect())));
     }
     layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
     if !fan.is_empty() {
@@ -240,13 +245,13 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
-    // Measured capacities are under load, unless there is no such estimate to set them beside.
-    if !setting.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
-        layers.extend(references(data, &clock, setting));
+    // Measured capacities are under load and belong to the usable capacity, unless there is none.
+    if !context.reference.is_loaded || series::steps(data, series::usable, false).is_empty() {
+        layers.extend(references(data, &clock, context));
     }
-    let limits: Vec<Layer> = levels(data, setting, Rule::CapacityLow).collect();
-    let end = forecast::end_of_life_ah(data, setting).map(Shape::Level);
-    // A limit at the same height would hide it, or it the limit.
+    let limits: Vec<Layer> = levels(data, context, Rule::CapacityLow).collect();
+    let end = forecast::end_of_life_ah(data, context).map(Shape::Level);
+    // A limit at the same height would be hidden.
     let end = end.filter(|end| limits.iter().all(|limit| limit.shape != *end));
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
@@ -260,8 +265,8 @@ fn capacity(data: &Data, setting: &Setting<'_>, outlook: Option<&Outlook>) -> Op
     }))
 }
 
-/// Single half-cycles may say anything: the axis follows what they add up to, with its interval.
-fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
+/// Returns an axis over the filtered values with their interval: single half-cycles may lie far outside.
+fn within_reason(steps: &[CellStep], layers: &[Layer], label: &str) -> Axis {
     let mut low = steps.iter().map(|s| s.range.0.min(s.worst.0 - OF_95 * s.worst.1)).fold(f64::INFINITY, f64::min);
     let mut high = steps.iter().map(|s| s.range.1.max(s.worst.0 + OF_95 * s.worst.1)).fold(0.0, f64::max);
     for layer in layers {
@@ -277,15 +282,15 @@ fn within_reason(steps: &[Step], layers: &[Layer], label: &str) -> Axis {
     Axis::number(label).within((low - room).max(0.0), high + room)
 }
 
-fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer> {
-    let capacities = &setting.reference.capacities;
+fn references(data: &Data, clock: &TimeAxis, context: &PageContext<'_>) -> Option<Layer> {
+    let capacities = &context.reference.capacities;
     let points = capacities.iter().map(|&(time_s, capacity_ah)| Point {
         x: clock.x(time_s),
         y: capacity_ah,
         tip: format!("{}: reference {capacity_ah:.3} Ah", moment(data, time_s)),
     });
     let points: Vec<Point> = points.collect();
-    let words = match (setting.reference.is_loaded, data.cells() > 1) {
+    let words = match (context.reference.is_loaded, data.cells() > 1) {
         (true, _) => "measured (reference)",
         (false, true) => "true, weakest cell (reference)",
         (false, false) => "true (reference)",
@@ -294,8 +299,8 @@ fn references(data: &Data, clock: &Clock, setting: &Setting<'_>) -> Option<Layer
 }
 
 /// The true SOC between two moments: of one cell a line, of several the lowest and the highest.
-fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
-    let within = setting.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
+fn true_soc(context: &PageContext<'_>, clock: &TimeAxis, (first_s, last_s): (f64, f64)) -> Vec<Layer> {
+    let within = context.reference.socs.iter().filter(|row| row.0 >= first_s && row.0 <= last_s);
     let rows: Vec<(f64, f64, f64)> =
         within.map(|&(time_s, low, high)| (clock.x(time_s), 100.0 * low, 100.0 * high)).collect();
     let line = |pick: fn(&(f64, f64, f64)) -> f64| Shape::Line(rows.iter().map(|row| (row.0, pick(row))).collect());
@@ -309,19 +314,19 @@ fn true_soc(setting: &Setting<'_>, clock: &Clock, (first_s, last_s): (f64, f64))
     }
 }
 
-fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn usable(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::usable, false);
     if steps.is_empty() {
         return None;
     }
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Orange, "weakest");
-    if setting.reference.is_loaded {
-        layers.extend(references(data, &clock, setting));
+    if context.reference.is_loaded {
+        layers.extend(references(data, &clock, context));
     }
-    layers.extend(levels(data, setting, Rule::UsableCapacityLow));
+    layers.extend(levels(data, context, Rule::UsableCapacityLow));
     layers.extend(raised(data, &clock, Rule::UsableCapacityLow));
-    let load = setting.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
+    let load = context.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
         format!(" at {} A, {} \u{b0}C, down to {} V", usable.current_a, usable.temperature_c, usable.cutoff_v)
     });
     Some(Picture::Chart(Chart {
@@ -333,8 +338,8 @@ fn usable(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let clock = Clock::of(data);
+fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
+    let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     let minutes = |seconds: f64| seconds / 60.0;
     let normalised = || data.recharges.iter().filter_map(|row| Some((clock.x(row.time_s), row.normalised_s?)));
@@ -364,7 +369,7 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
         return None;
     }
     if !is_stored {
-        let limits = levels(data, setting, Rule::RechargePeriodLow).map(|mut layer| {
+        let limits = levels(data, context, Rule::RechargePeriodLow).map(|mut layer| {
             if let Shape::Level(seconds) = &mut layer.shape {
                 *seconds = minutes(*seconds);
             }
@@ -373,7 +378,7 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
         layers.extend(limits);
         layers.extend(raised(data, &clock, Rule::RechargePeriodLow));
     }
-    let window = setting.config.map(|config| &config.monitor.health.recharge);
+    let window = context.config.map(|config| &config.monitor.health.recharge);
     let window =
         window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
     let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
@@ -381,14 +386,14 @@ fn recharge(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
 }
 
-fn resistance(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
+fn resistance(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let steps = series::steps(data, series::resistance, true);
     if steps.is_empty() {
         return None;
     }
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let mut layers = worst(data, &clock, &steps, Ink::Purple, "highest");
-    layers.extend(levels(data, setting, Rule::ResistanceHigh));
+    layers.extend(levels(data, context, Rule::ResistanceHigh));
     layers.extend(raised(data, &clock, Rule::ResistanceHigh));
     Some(Picture::Chart(Chart {
         title: "Resistance over life".to_owned(),
@@ -399,8 +404,8 @@ fn resistance(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     }))
 }
 
-fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
-    let clock = Clock::of(data);
+fn temperature(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
+    let clock = TimeAxis::of(data);
     let mut layers = Vec::new();
     if let Some(life) = &data.trace.life {
         let bins = filled(life.iter());
@@ -416,7 +421,7 @@ fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
     if layers.is_empty() {
         return None;
     }
-    layers.extend(levels(data, setting, Rule::TemperatureHigh));
+    layers.extend(levels(data, context, Rule::TemperatureHigh));
     layers.extend(raised(data, &clock, Rule::TemperatureHigh));
     Some(Picture::Chart(Chart {
         title: "Temperature".to_owned(),
@@ -429,42 +434,42 @@ fn temperature(data: &Data, setting: &Setting<'_>) -> Option<Picture> {
 
 fn alarms(data: &Data) -> Option<Picture> {
     let (_, last_s) = data.ends_s().filter(|_| !data.alarms.is_empty())?;
-    let clock = Clock::of(data);
-    let mut lanes: Vec<Lane> = Vec::new();
-    let mut open: Vec<(usize, &super::data::AlarmRow)> = Vec::new();
+    let clock = TimeAxis::of(data);
+    let mut bands: Vec<StateBand> = Vec::new();
+    let mut open: Vec<(usize, &super::data::AlarmRecord)> = Vec::new();
     for row in &data.alarms {
         let name = format!("{} ({})", row.rule, row.severity);
-        let lane = lanes.iter().position(|lane| lane.name == name).unwrap_or_else(|| {
-            lanes.push(Lane { name, spans: Vec::new() });
-            lanes.len() - 1
+        let band = bands.iter().position(|band| band.name == name).unwrap_or_else(|| {
+            bands.push(StateBand { name, spans: Vec::new() });
+            bands.len() - 1
         });
-        let known = open.iter().position(|(at, before)| *at == lane && before.cell == row.cell);
+        let known = open.iter().position(|(at, before)| *at == band && before.cell == row.cell);
         match (row.is_active, known) {
-            (true, None) => open.push((lane, row)),
+            (true, None) => open.push((band, row)),
             (false, Some(index)) => {
-                let (lane, from) = open.remove(index);
-                lanes[lane].spans.push(span(data, &clock, from, row.time_s, "until"));
+                let (band, from) = open.remove(index);
+                bands[band].spans.push(span(data, &clock, from, row.time_s, "until"));
             }
             (true, Some(_)) | (false, None) => {}
         }
     }
-    for (lane, from) in open {
-        lanes[lane].spans.push(span(data, &clock, from, last_s, "still raised at"));
+    for (band, from) in open {
+        bands[band].spans.push(span(data, &clock, from, last_s, "still raised at"));
     }
     let keys = [(Ink::Red, "severe"), (Ink::Amber, "warning"), (Ink::Grey, "info")];
-    Some(Picture::Lanes(Lanes {
+    Some(Picture::StateBands(StateBands {
         title: "Alarms".to_owned(),
         description: format!(
             "{} changes of alarms; each bar is an alarm from when it was raised until it ended",
             data.alarms.len()
         ),
         x: clock.axis,
-        lanes,
+        bands,
         keys: keys.map(|(ink, word)| (ink, word.to_owned())).to_vec(),
     }))
 }
 
-fn span(data: &Data, clock: &Clock, from: &super::data::AlarmRow, to_s: f64, end: &str) -> Span {
+fn span(data: &Data, clock: &TimeAxis, from: &super::data::AlarmRecord, to_s: f64, end: &str) -> Span {
     Span {
         from: clock.x(from.time_s),
         to: clock.x(to_s),
@@ -473,7 +478,7 @@ fn span(data: &Data, clock: &Clock, from: &super::data::AlarmRow, to_s: f64, end
     }
 }
 
-fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Picture> {
+fn heat(data: &Data, title: &str, label: &str, pick: series::ValueSelector) -> Option<Picture> {
     if data.cells() < 2 || data.learned.is_empty() {
         return None;
     }
@@ -488,7 +493,7 @@ fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Pic
     Some(Picture::Heat(Heat {
         title: title.to_owned(),
         description: format!("{label} of every cell, from the start to the end of the record"),
-        x: Clock::of(data).axis,
+        x: TimeAxis::of(data).axis,
         label: label.to_owned(),
         rows,
         tips,
@@ -498,7 +503,7 @@ fn heat(data: &Data, title: &str, label: &str, pick: series::Pick) -> Option<Pic
 
 fn innovation(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let band = range(&filled(life.iter()), &clock, |bin| bin.innovation_v, 1e3);
     Some(Picture::Chart(Chart {
         title: "Innovation: measured minus expected voltage".to_owned(),
@@ -511,7 +516,7 @@ fn innovation(data: &Data) -> Option<Picture> {
 
 fn coverage(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
-    let clock = Clock::of(data);
+    let clock = TimeAxis::of(data);
     let line = life.iter().filter_map(|(time_s, bin)| Some((clock.x(time_s), 100.0 * bin.health.coverage()?)));
     let line: Vec<(f64, f64)> = line.collect();
     // From 80 % where nothing lies lower.
@@ -521,7 +526,7 @@ fn coverage(data: &Data) -> Option<Picture> {
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
     Some(Picture::Chart(Chart {
-        title: "How sure the estimator is, and rightly".to_owned(),
+        title: "Coverage of the estimator's 95 % interval".to_owned(),
         description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
         x: clock.axis,
         y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),

@@ -1,10 +1,9 @@
-//! Measured or true capacities and SOC from a CSV, to be drawn beside the estimates.
+//! Measured or true capacities and SOC from a CSV, to be drawn next to the estimates.
 
-use std::io::Read;
+use std::ops::RangeInclusive;
 use std::path::Path;
-use std::sync::Arc;
 
-use crate::io::{lines, stamp};
+use crate::io::table::{Header, Row, Table, TableError};
 
 /// Names a column of capacities may have, Ah.
 const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
@@ -12,21 +11,21 @@ const CAPACITY: [&str; 2] = ["capacity_ah", "capacity_ah_source"];
 const SOC: [&str; 1] = ["soc"];
 /// Names a column of moments may have.
 const TIME: [&str; 4] = ["time_s", "start", "date", "time"];
-/// A smaller change of the capacity, part of it, is not worth a point of its own.
+/// Smallest relative change of the capacity that gets a point of its own.
 const KEPT_CHANGE: f64 = 2e-4;
 
-/// What was measured; times in s on the data's clock.
+/// Measured or true values; times in s on the data's clock.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Reference {
-    /// Moment and Ah; where a row tells its cell, of the weakest cell.
+    /// Moment and Ah; where rows name their cell, of the weakest cell.
     pub capacities: Vec<(f64, f64)>,
-    /// They were measured under load; else they are those between full and empty.
+    /// Whether they were measured under load; else they are those between full and empty.
     pub is_loaded: bool,
     /// Moment, SOC of the lowest and the highest cell, fraction.
     pub socs: Vec<(f64, f64, f64)>,
 }
 
-/// Where a table has what.
+/// Numbers of the columns.
 struct Columns {
     time: usize,
     capacity: Option<usize>,
@@ -35,20 +34,17 @@ struct Columns {
 }
 
 /// Reads a table with a capacity (`capacity_ah` or `capacity_ah_source`, Ah), an SOC (`soc`, fraction), or both, and a
-/// moment (`time_s`, s; `start`, `date` or `time`, s or like 2008-04-02T13:08:17). An empty field is passed over. With a
+/// moment (`time_s`, s; `start`, `date` or `time`, s or like 2008-04-02T13:08:17). An empty field is skipped. With a
 /// column `cell`, rows of one moment are joined to the weakest cell's capacity and the lowest and highest SOC.
 ///
 /// # Errors
 /// The file cannot be read, a column is missing, or a value is no number or out of range; names file and line.
-pub fn read(path: &Path) -> Result<Reference, String> {
-    let at = |line: usize, what: String| format!("{}:{line}: {what}", path.display());
-    let file = lines::open(path, &Arc::default()).map_err(|error| format!("{}: {error}", path.display()))?;
-    let mut table = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
-    let columns = Columns::of(&mut table).map_err(|what| at(1, what))?;
+pub fn read(path: &Path) -> Result<Reference, TableError> {
+    let mut table = Table::open(path)?;
+    let columns = Columns::find(table.header())?;
     let mut reference = Reference { is_loaded: !columns.has_cells, ..Reference::default() };
-    for (index, row) in table.records().enumerate() {
-        let row = row.map_err(|error| at(index + 2, error.to_string()))?;
-        reference.take(&row, &columns).map_err(|what| at(index + 2, what))?;
+    while let Some(row) = table.next_row()? {
+        reference.add_row(&row, &columns)?;
     }
     reference.capacities.sort_by(|a, b| a.0.total_cmp(&b.0));
     reference.socs.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -59,40 +55,32 @@ pub fn read(path: &Path) -> Result<Reference, String> {
 }
 
 impl Columns {
-    fn of(table: &mut csv::Reader<impl Read>) -> Result<Self, String> {
-        let header = table.headers().map_err(|error| error.to_string())?;
-        let name = |column: &str| column.trim_start_matches('\u{feff}').to_owned();
-        let names: Vec<String> = header.iter().map(name).collect();
-        let find = |known: &[&str]| known.iter().find_map(|known| names.iter().position(|name| name == known));
-        let missing = |known: &[&str]| format!("no column {}, has {}", known.join(" or "), names.join(", "));
-        let (capacity, soc) = (find(&CAPACITY), find(&SOC));
-        if capacity.is_none() && soc.is_none() {
-            return Err(missing(&[&CAPACITY[..], &SOC].concat()));
-        }
-        let time = find(&TIME).ok_or_else(|| missing(&TIME))?;
-        Ok(Self { time, capacity, soc, has_cells: find(&["cell"]).is_some() })
+    fn find(header: &Header) -> Result<Self, TableError> {
+        header.required(&[&CAPACITY[..], &SOC].concat())?;
+        let (capacity, soc) = (header.find_any(&CAPACITY), header.find_any(&SOC));
+        Ok(Self { time: header.required(&TIME)?, capacity, soc, has_cells: header.find("cell").is_some() })
     }
 }
 
 impl Reference {
-    fn take(&mut self, row: &csv::StringRecord, columns: &Columns) -> Result<(), String> {
-        let text = |column: Option<usize>| column.and_then(|column| row.get(column)).unwrap_or_default();
-        let (capacity, soc) = (text(columns.capacity), text(columns.soc));
-        if capacity.is_empty() && soc.is_empty() {
+    fn add_row(&mut self, row: &Row<'_>, columns: &Columns) -> Result<(), TableError> {
+        let number = |column: Option<usize>, range: RangeInclusive<f64>, allowed: &str| {
+            column.map_or(Ok(None), |column| row.number_in(column, range, allowed))
+        };
+        let capacity = number(columns.capacity, 0.0..=f64::MAX, "a number, 0 or more")?;
+        // A little beyond full and empty an SOC may be; 0 to 100 would be percent.
+        let soc = number(columns.soc, -0.5..=1.5, "a fraction, 0 to 1")?;
+        if capacity.is_none() && soc.is_none() {
             return Ok(());
         }
-        let time = text(Some(columns.time));
-        let time_s =
-            stamp::parse_stamp(time).ok_or_else(|| format!("time {time:?}, must be seconds or a date"))?.secs();
-        if !capacity.is_empty() {
-            let ah = number("capacity", capacity, f64::INFINITY)?;
+        let time_s = row.stamp(columns.time)?.secs();
+        if let Some(ah) = capacity {
             match self.capacities.last_mut().filter(|last| columns.has_cells && last.0 == time_s) {
                 Some(last) => last.1 = last.1.min(ah),
                 None => self.capacities.push((time_s, ah)),
             }
         }
-        if !soc.is_empty() {
-            let soc = number("soc", soc, 1.5)?;
+        if let Some(soc) = soc {
             match self.socs.last_mut().filter(|last| columns.has_cells && last.0 == time_s) {
                 Some(last) => (last.1, last.2) = (last.1.min(soc), last.2.max(soc)),
                 None => self.socs.push((time_s, soc, soc)),
@@ -102,15 +90,7 @@ impl Reference {
     }
 }
 
-/// A little beyond full and empty an SOC may be; 0 to 100 would be percent.
-fn number(name: &str, text: &str, most: f64) -> Result<f64, String> {
-    let least = if most.is_finite() { 1.0 - most } else { 0.0 };
-    let value = text.parse().ok().filter(|value: &f64| value.is_finite() && (least..=most).contains(value));
-    let allowed = if most.is_finite() { "a fraction, 0 to 1" } else { "a number, 0 or more" };
-    value.ok_or_else(|| format!("{name} {text:?}, must be {allowed}"))
-}
-
-/// Leaves the points at which the capacity has changed, and the last.
+/// Keeps the points at which the capacity has changed, and the last.
 fn thin(points: &mut Vec<(f64, f64)>) {
     let last = points.last().copied();
     let mut kept_ah = f64::INFINITY;
@@ -133,11 +113,11 @@ mod tests {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("r.csv");
         std::fs::write(&path, text).expect("written");
-        read(&path)
+        read(&path).map_err(|error| error.0)
     }
 
     #[test]
-    fn dates_and_seconds_are_read_and_rows_without_a_capacity_passed_over() {
+    fn dates_and_seconds_are_read_and_rows_without_a_capacity_skipped() {
         let rows = of("cycle,start,capacity_ah_source\n0,2008-04-02T13:08:17,\n1,2008-04-02T15:25:41,1.856\n").unwrap();
         assert_eq!((rows.capacities, rows.is_loaded), (vec![(1_207_149_941.0, 1.856)], true));
         assert_eq!(of("time_s,capacity_ah\n20,2\n10,1\n").unwrap().capacities[0].1, 1.0);
@@ -153,10 +133,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_told_with_its_line() {
+    fn a_fault_names_its_line() {
         assert!(of("a,b\n1,2\n").unwrap_err().contains("r.csv:1: no column capacity_ah or capacity_ah_source or soc"));
-        assert!(of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: capacity \"NaN\""));
-        assert!(of("time_s,capacity_ah\nsoon,2\n").unwrap_err().contains("r.csv:2: time \"soon\""));
-        assert!(of("time_s,soc\n1,57\n").unwrap_err().contains("r.csv:2: soc \"57\", must be a fraction"));
+        assert!(
+            of("time_s,capacity_ah\n1,2\n2,NaN\n").unwrap_err().contains("r.csv:3: column capacity_ah: found \"NaN\"")
+        );
+        assert!(of("time_s,capacity_ah\nsoon,2\n").unwrap_err().contains("r.csv:2: column time_s: found \"soon\""));
+        assert!(
+            of("time_s,soc\n1,57\n").unwrap_err().contains("r.csv:2: column soc: found \"57\", must be a fraction")
+        );
     }
 }

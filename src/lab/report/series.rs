@@ -1,13 +1,13 @@
 //! Series over the life of a pack: its worst cell, the range over its cells, every cell in columns of time.
 
-use super::data::{Data, Learned};
+use super::data::{CapacityRecord, Data};
 
 /// Columns of a heat map.
 pub(super) const COLUMNS: usize = 120;
 
-/// The cells after a transition.
+/// State of the cells after a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Step {
+pub(super) struct CellStep {
     pub(super) time_s: f64,
     /// The worst cell, its mean and standard deviation.
     pub(super) cell: usize,
@@ -16,24 +16,24 @@ pub(super) struct Step {
     pub(super) range: (f64, f64),
 }
 
-/// What is picked of a row: mean and standard deviation.
-pub(super) type Pick = fn(&Learned) -> Option<(f64, f64)>;
+/// Selects a value of a row: mean and standard deviation.
+pub(super) type ValueSelector = fn(&CapacityRecord) -> Option<(f64, f64)>;
 
-pub(super) fn capacity(row: &Learned) -> Option<(f64, f64)> {
+pub(super) fn capacity(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.capacity_ah).filter(|value| value.0.is_finite())
 }
 
-pub(super) fn usable(row: &Learned) -> Option<(f64, f64)> {
+pub(super) fn usable(row: &CapacityRecord) -> Option<(f64, f64)> {
     row.usable_ah.filter(|value| value.0.is_finite())
 }
 
-pub(super) fn resistance(row: &Learned) -> Option<(f64, f64)> {
+pub(super) fn resistance(row: &CapacityRecord) -> Option<(f64, f64)> {
     Some(row.resistance).filter(|value| value.0.is_finite())
 }
 
 /// The worst cell after every transition: the lowest value, or the highest where `high_is_bad`. A cell keeps its value
 /// until it has another.
-pub(super) fn steps(data: &Data, pick: Pick, high_is_bad: bool) -> Vec<Step> {
+pub(super) fn steps(data: &Data, pick: ValueSelector, high_is_bad: bool) -> Vec<CellStep> {
     let mut cells: Vec<Option<(f64, f64)>> = vec![None; data.cells()];
     let mut steps = Vec::new();
     for rows in data.learned.chunk_by(|a, b| a.time_s == b.time_s) {
@@ -46,14 +46,14 @@ pub(super) fn steps(data: &Data, pick: Pick, high_is_bad: bool) -> Vec<Step> {
         let by_mean = |a: &(usize, (f64, f64)), b: &(usize, (f64, f64))| a.1.0.total_cmp(&b.1.0);
         if let (Some(low), Some(high)) = (known().min_by(by_mean), known().max_by(by_mean)) {
             let (cell, worst) = if high_is_bad { high } else { low };
-            steps.push(Step { time_s: rows[0].time_s, cell, worst, range: (low.1.0, high.1.0) });
+            steps.push(CellStep { time_s: rows[0].time_s, cell, worst, range: (low.1.0, high.1.0) });
         }
     }
     steps
 }
 
 /// The value of every cell at the end of each column.
-pub(super) fn columns(data: &Data, pick: Pick) -> Vec<Vec<Option<f64>>> {
+pub(super) fn columns(data: &Data, pick: ValueSelector) -> Vec<Vec<Option<f64>>> {
     let mut rows = vec![vec![None; COLUMNS]; data.cells()];
     let Some((first_s, last_s)) = data.ends_s() else { return rows };
     let width_s = (last_s - first_s).max(1e-9) / COLUMNS as f64;
@@ -102,7 +102,7 @@ mod tests {
     fn pack() -> Data {
         let mut data = Data::new(Origin::Store);
         for (time_s, cell, ah) in [(10.0, 0, 2.0), (10.0, 1, 1.9), (20.0, 1, 2.1), (30.0, 0, 1.5)] {
-            data.learned.push(Learned {
+            data.learned.push(CapacityRecord {
                 time_s,
                 cell,
                 measured_ah: None,

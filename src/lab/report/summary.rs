@@ -1,17 +1,17 @@
-//! The summary at the top: how the battery is, since when, what to do; "unknown" where nothing is known.
+//! The summary at the top: the battery's condition, since when, what to do; "unknown" where nothing is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::data::{AlarmRow, Data, Origin};
+use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
-use super::{Setting, forecast, series};
+use super::{PageContext, forecast, series};
 use crate::alarm::{Rule, Severity};
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;
 
-/// How the battery is.
+/// Condition of the battery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
+pub(super) enum Condition {
     Good,
     Watch,
     Plan,
@@ -19,8 +19,8 @@ pub(super) enum Verdict {
     Unknown,
 }
 
-impl Verdict {
-    /// A word for its colour.
+impl Condition {
+    /// Class of its colour.
     pub(super) const fn class(self) -> &'static str {
         match self {
             Self::Good => "good",
@@ -31,7 +31,7 @@ impl Verdict {
         }
     }
 
-    /// A sign that needs no colour.
+    /// Sign that does not depend on colour.
     pub(super) const fn sign(self) -> &'static str {
         match self {
             Self::Good => "\u{2713}",
@@ -51,10 +51,10 @@ pub(super) struct Tile {
     pub(super) note: String,
 }
 
-/// All of it.
+/// Content of the summary.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Summary {
-    pub(super) verdict: Verdict,
+    pub(super) verdict: Condition,
     pub(super) how: String,
     pub(super) since: String,
     pub(super) what: String,
@@ -62,50 +62,50 @@ pub(super) struct Summary {
 }
 
 /// An alarm that is raised at the end of the data.
-struct Raised<'a> {
-    row: &'a AlarmRow,
+struct ActiveAlarm<'a> {
+    row: &'a AlarmRecord,
     since_s: f64,
 }
 
 /// Makes the summary.
-pub(super) fn of(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>) -> Summary {
+pub(super) fn of(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> Summary {
     let raised = raised(data);
     let (battery, measuring): (Vec<_>, Vec<_>) = raised.iter().partition(|raised| is_of_battery(&raised.row.rule));
     let worst = battery.iter().max_by_key(|raised| rank(&raised.row.severity)).copied();
-    let unknown = unknown(data, setting);
+    let unknown = unknown(data, context);
     let verdict = match worst.map(|raised| raised.row.severity.as_str()) {
-        Some("severe") => Verdict::Act,
-        Some("warning") => Verdict::Plan,
-        Some(_) => Verdict::Watch,
-        None if is_over(data, setting, outlook) => Verdict::Watch,
-        None if unknown.is_some() => Verdict::Unknown,
-        None if !measuring.is_empty() => Verdict::Watch,
-        None => Verdict::Good,
+        Some("severe") => Condition::Act,
+        Some("warning") => Condition::Plan,
+        Some(_) => Condition::Watch,
+        None if is_over(data, context, outlook) => Condition::Watch,
+        None if unknown.is_some() => Condition::Unknown,
+        None if !measuring.is_empty() => Condition::Watch,
+        None => Condition::Good,
     };
     Summary {
         verdict,
         how: how(verdict, worst, &measuring, data, unknown),
         since: since(data, &battery, &measuring),
-        what: what(verdict, worst, &measuring, knows_limits(data, setting)),
-        tiles: tiles(data, setting, outlook, &raised),
+        what: what(verdict, worst, &measuring, knows_limits(data, context)),
+        tiles: tiles(data, context, outlook, &raised),
     }
 }
 
-/// Whether the capacity has passed the end of life, whatever the alarms say.
-fn is_over(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>) -> bool {
+/// Whether the capacity is below the end of life, independent of the alarms.
+fn is_over(data: &Data, context: &PageContext<'_>, outlook: &Result<Outlook, String>) -> bool {
     let least = series::steps(data, series::capacity, false).last().map(|step| step.worst.0);
-    let is_below = least.zip(forecast::end_of_life_ah(data, setting)).is_some_and(|(least, end)| least < end);
+    let is_below = least.zip(forecast::end_of_life_ah(data, context)).is_some_and(|(least, end)| least < end);
     is_below || outlook.as_ref().is_ok_and(Outlook::is_over)
 }
 
-/// Whether the record or a configuration says what is too little.
-fn knows_limits(data: &Data, setting: &Setting<'_>) -> bool {
-    setting.config.is_some() || !data.alarms.is_empty()
+/// Whether the record or a configuration defines limits.
+fn knows_limits(data: &Data, context: &PageContext<'_>) -> bool {
+    context.config.is_some() || !data.alarms.is_empty()
 }
 
-/// Why this battery cannot be called good, whatever is raised; `None` = nothing stands against it.
-fn unknown(data: &Data, setting: &Setting<'_>) -> Option<String> {
-    let cells = setting.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
+/// Returns why this battery cannot be called good, independent of alarms; `None` = it can.
+fn unknown(data: &Data, context: &PageContext<'_>) -> Option<String> {
+    let cells = context.config.map_or(0, |config| usize::from(config.monitor.sample.cells)).max(data.cells());
     let measured: BTreeSet<usize> =
         data.learned.iter().filter(|row| row.measured_ah.is_some()).map(|row| row.cell).collect();
     if let Some(doubt) = &data.source.doubt {
@@ -120,16 +120,16 @@ fn unknown(data: &Data, setting: &Setting<'_>) -> Option<String> {
             cells - measured.len()
         ));
     }
-    (!knows_limits(data, setting)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
+    (!knows_limits(data, context)).then(|| "Unknown: no alarm is raised, but this record names no limit.".to_owned())
 }
 
-fn raised(data: &Data) -> Vec<Raised<'_>> {
-    let mut last: BTreeMap<(&str, &str, Option<usize>), Raised<'_>> = BTreeMap::new();
+fn raised(data: &Data) -> Vec<ActiveAlarm<'_>> {
+    let mut last: BTreeMap<(&str, &str, Option<usize>), ActiveAlarm<'_>> = BTreeMap::new();
     for row in &data.alarms {
         let key = (row.rule.as_str(), row.severity.as_str(), row.cell);
-        // The row that raised it has the value that did; later ones may not know one any more.
+        // The row that raised it holds the value; later rows may hold none.
         if row.is_active {
-            last.entry(key).or_insert(Raised { row, since_s: row.time_s });
+            last.entry(key).or_insert(ActiveAlarm { row, since_s: row.time_s });
         } else {
             last.remove(&key);
         }
@@ -145,7 +145,7 @@ fn rule(name: &str) -> Option<Rule> {
     Rule::ALL.into_iter().find(|rule| rule.name() == name)
 }
 
-/// Whether a rule speaks of the battery, not of the measuring of it.
+/// Whether a rule is about the battery, not about its measurement.
 fn is_of_battery(name: &str) -> bool {
     !matches!(
         rule(name),
@@ -161,14 +161,14 @@ fn is_of_battery(name: &str) -> bool {
 }
 
 fn about(name: &str) -> &str {
-    rule(name).map_or(name, |rule| rule.row().about)
+    rule(name).map_or(name, |rule| rule.spec().about)
 }
 
 fn unit(name: &str) -> &'static str {
-    rule(name).map_or("", |rule| rule.row().unit.symbol())
+    rule(name).map_or("", |rule| rule.spec().unit.symbol())
 }
 
-/// A rule's value with its unit, without digits that say nothing.
+/// Formats a rule's value with its unit, without trailing zeros.
 pub(super) fn amount(value: f64, rule: &str) -> String {
     let digits = format!("{value:.3}");
     let digits = digits.trim_end_matches('0').trim_end_matches('.');
@@ -176,7 +176,7 @@ pub(super) fn amount(value: f64, rule: &str) -> String {
 }
 
 /// "a cell's usable capacity is 1.38 Ah, limit 1.4 Ah (cell 3)".
-pub(super) fn words(row: &AlarmRow) -> String {
+pub(super) fn words(row: &AlarmRecord) -> String {
     let amount = |value: f64| amount(value, &row.rule);
     let value = row.value.map_or_else(|| "unknown".to_owned(), amount);
     let limit = row.threshold.map_or_else(|| "unknown".to_owned(), amount);
@@ -185,36 +185,36 @@ pub(super) fn words(row: &AlarmRow) -> String {
 }
 
 fn how(
-    verdict: Verdict,
-    worst: Option<&Raised<'_>>,
-    measuring: &[&Raised<'_>],
+    verdict: Condition,
+    worst: Option<&ActiveAlarm<'_>>,
+    measuring: &[&ActiveAlarm<'_>],
     data: &Data,
     unknown: Option<String>,
 ) -> String {
     let head = match verdict {
-        Verdict::Good => "Good: no limit is passed.",
-        Verdict::Watch if worst.is_none() && measuring.is_empty() => {
+        Condition::Good => "Good: no limit is passed.",
+        Condition::Watch if worst.is_none() && measuring.is_empty() => {
             "No limit is passed, but the capacity is below that of the end of life."
         }
-        Verdict::Watch if worst.is_none() => "The battery passes no limit, but its measuring is not in order.",
-        Verdict::Watch => "Worth watching.",
-        Verdict::Plan => "Worn: plan a visit to the workshop.",
-        Verdict::Act => "Past its limit: act now.",
-        Verdict::Unknown => unknown.as_deref().unwrap_or("Unknown."),
+        Condition::Watch if worst.is_none() => "The battery passes no limit, but its measurements are faulty.",
+        Condition::Watch => "Worth watching.",
+        Condition::Plan => "Worn: plan a visit to the workshop.",
+        Condition::Act => "Past its limit: act now.",
+        Condition::Unknown => unknown.as_deref().unwrap_or("Unknown."),
     };
     let why = worst
         .or(measuring.first().copied())
         .map_or(String::new(), |raised| format!(" When the alarm came, {}.", words(raised.row)));
     let lost = data.trace.health().coverage().filter(|share| *share < 0.8);
     let doubt = lost.map_or(String::new(), |_| {
-        " The estimator is less sure than it says (see its health below): take the figures with care.".to_owned()
+        " The estimator's intervals are too narrow (see its health below): use the figures with care.".to_owned()
     });
-    let changed = data.source.doubt.iter().filter(|_| verdict != Verdict::Unknown);
+    let changed = data.source.doubt.iter().filter(|_| verdict != Condition::Unknown);
     let changed: String = changed.map(|changed| format!(" But {changed}.")).collect();
     format!("{head}{why}{doubt}{changed}")
 }
 
-/// A moment for people.
+/// Formats a time: a date, or hours after the start.
 pub(super) fn moment(data: &Data, time_s: f64) -> String {
     if data.is_dated() {
         format_utc(Timestamp::from_secs(time_s)).replace('T', " ").replace('Z', " UTC")
@@ -224,7 +224,7 @@ pub(super) fn moment(data: &Data, time_s: f64) -> String {
     }
 }
 
-fn since(data: &Data, battery: &[&Raised<'_>], measuring: &[&Raised<'_>]) -> String {
+fn since(data: &Data, battery: &[&ActiveAlarm<'_>], measuring: &[&ActiveAlarm<'_>]) -> String {
     let first = battery.iter().chain(if battery.is_empty() { measuring } else { &[] }).map(|raised| raised.since_s);
     match (first.reduce(f64::min), data.ends_s()) {
         (Some(time_s), _) => format!("The first alarm that is still raised came {}.", moment(data, time_s)),
@@ -236,14 +236,19 @@ fn since(data: &Data, battery: &[&Raised<'_>], measuring: &[&Raised<'_>]) -> Str
     }
 }
 
-fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>], knows_limits: bool) -> String {
+fn what(
+    verdict: Condition,
+    worst: Option<&ActiveAlarm<'_>>,
+    measuring: &[&ActiveAlarm<'_>],
+    knows_limits: bool,
+) -> String {
     let advice = worst.and_then(|raised| rule(&raised.row.rule)).map(|rule| match rule {
         Rule::TemperatureHigh => "Check cooling and load before the next use.",
         Rule::SocLow => "Charge it.",
         Rule::CellImbalance => {
             "Have the cells balanced; if that does not hold, the weakest cell is the one to look at."
         }
-        _ if verdict == Verdict::Act => "Replace the battery or the named cell, or take it out of service.",
+        _ if verdict == Condition::Act => "Replace the battery or the named cell, or take it out of service.",
         _ => "Order a replacement, and have its capacity measured at the next visit.",
     });
     let measure = measuring.first().map(|raised| match rule(&raised.row.rule) {
@@ -254,13 +259,13 @@ fn what(verdict: Verdict, worst: Option<&Raised<'_>>, measuring: &[&Raised<'_>],
         _ => "Check sensors, wiring and bus: some inputs did not come or made no sense.",
     });
     match (advice, measure) {
-        (None, None) if verdict == Verdict::Unknown && !knows_limits => {
-            "Make this report again with the configuration (-c), which says what is too little.".to_owned()
+        (None, None) if verdict == Condition::Unknown && !knows_limits => {
+            "Make this report again with the configuration (-c), which defines the limits.".to_owned()
         }
-        (None, None) if verdict == Verdict::Unknown => {
+        (None, None) if verdict == Condition::Unknown => {
             "Use it through a deep discharge and a full charge, then make this report again.".to_owned()
         }
-        (None, None) if verdict == Verdict::Watch => "Plan its replacement.".to_owned(),
+        (None, None) if verdict == Condition::Watch => "Plan its replacement.".to_owned(),
         (None, None) => "Nothing.".to_owned(),
         (advice, measure) => advice.into_iter().chain(measure).collect::<Vec<_>>().join(" "),
     }
@@ -270,22 +275,28 @@ fn tile(name: &'static str, value: Option<String>, note: impl Into<String>) -> T
     Tile { name, value: value.unwrap_or_else(|| "unknown".to_owned()), note: note.into() }
 }
 
-fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, raised: &[Raised<'_>]) -> Vec<Tile> {
+fn tiles(
+    data: &Data,
+    context: &PageContext<'_>,
+    outlook: &Result<Outlook, String>,
+    raised: &[ActiveAlarm<'_>],
+) -> Vec<Tile> {
     let last = |pick, high_is_bad| series::steps(data, pick, high_is_bad).last().copied();
-    let rated_ah = setting.config.map(|config| config.monitor.model.rated_capacity_ah);
+    let rated_ah = context.config.map(|config| config.monitor.model.rated_capacity_ah);
     let of_cell =
-        |step: &series::Step| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
+        |step: &series::CellStep| if data.cells() > 1 { format!(", cell {}", step.cell + 1) } else { String::new() };
     let (capacity, usable) = (last(series::capacity, false), last(series::usable, false));
     let resistance = last(series::resistance, true);
-    let figure = |step: &series::Step| format!("{:.3} Ah", step.worst.0);
+    let figure = |step: &series::CellStep| format!("{:.3} Ah", step.worst.0);
     let health = capacity.zip(rated_ah).map(|(step, rated)| format!("{:.0} %", 100.0 * step.worst.0 / rated));
     let health_note = match (rated_ah, capacity) {
         (None, _) => "rated capacity not known without -c".to_owned(),
         (Some(_), None) => "no capacity learned yet".to_owned(),
         (Some(rated), Some(step)) => format!("of {rated} Ah rated{}", of_cell(&step)),
     };
-    let note = |step: Option<series::Step>, none: &str| {
-        let std = |step: series::Step| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
+    let note = |step: Option<series::CellStep>, none: &str| {
+        let std =
+            |step: series::CellStep| format!("\u{b1} {:.3}, one standard deviation{}", step.worst.1, of_cell(&step));
         step.map_or_else(|| none.to_owned(), std)
     };
     vec![
@@ -312,7 +323,7 @@ fn tiles(data: &Data, setting: &Setting<'_>, outlook: &Result<Outlook, String>, 
     ]
 }
 
-/// The latest recharge period, normalised where it is known, beside the first.
+/// Returns the tile of the latest recharge period, normalised where it is known, with the first for comparison.
 fn recharge_tile(data: &Data) -> Tile {
     let normalised = || data.recharges.iter().filter_map(|row| row.normalised_s.map(|(mean, _)| mean));
     let raw = || data.recharges.iter().filter_map(|row| row.raw_s);
@@ -332,23 +343,32 @@ fn recharge_tile(data: &Data) -> Tile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::data::Learned;
+    use crate::report::data::CapacityRecord;
 
-    fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRow {
+    fn alarm(time_s: f64, rule: &str, severity: &str, is_active: bool) -> AlarmRecord {
         let (rule, severity, change) = (rule.to_owned(), severity.to_owned(), "raised".to_owned());
-        AlarmRow { time_s, rule, severity, cell: Some(2), change, is_active, value: Some(1.38), threshold: Some(1.4) }
+        AlarmRecord {
+            time_s,
+            rule,
+            severity,
+            cell: Some(2),
+            change,
+            is_active,
+            value: Some(1.38),
+            threshold: Some(1.4),
+        }
     }
 
-    fn summary(alarms: Vec<AlarmRow>) -> Summary {
+    fn summary(alarms: Vec<AlarmRecord>) -> Summary {
         let mut data = Data::new(Origin::Store);
         data.alarms = alarms;
-        of(&data, &Setting::default(), &Err("too little".into()))
+        of(&data, &PageContext::default(), &Err("too little".into()))
     }
 
     #[test]
     fn nothing_known_is_unknown_and_neither_good_nor_bad() {
         let summary = summary(Vec::new());
-        assert_eq!(summary.verdict, Verdict::Unknown);
+        assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.tiles.iter().filter(|tile| tile.value == "unknown").count() >= 5, "{:?}", summary.tiles);
         assert!(summary.since.starts_with("Unknown"));
     }
@@ -356,49 +376,49 @@ mod tests {
     #[test]
     fn the_worst_raised_alarm_decides_and_one_that_is_over_does_not() {
         let over = vec![alarm(1.0, "capacity_low", "severe", true), alarm(2.0, "capacity_low", "severe", false)];
-        assert_eq!(summary(over.clone()).verdict, Verdict::Unknown);
+        assert_eq!(summary(over.clone()).verdict, Condition::Unknown);
         let mut both = over;
         both.push(alarm(3.0e8, "usable_capacity_low", "warning", true));
         let plan = summary(both.clone());
-        assert_eq!(plan.verdict, Verdict::Plan);
+        assert_eq!(plan.verdict, Condition::Plan);
         assert!(plan.how.contains("a cell's usable capacity was 1.38 Ah, limit 1.4 Ah (cell 3)"), "{}", plan.how);
         both.push(alarm(4.0e8, "resistance_high", "severe", true));
-        assert_eq!(summary(both).verdict, Verdict::Act);
+        assert_eq!(summary(both).verdict, Condition::Act);
     }
 
-    fn learned(time_s: f64, cell: usize, measured_ah: Option<f64>) -> Learned {
+    fn learned(time_s: f64, cell: usize, measured_ah: Option<f64>) -> CapacityRecord {
         let (measured_std_ah, usable_ah, resistance) = (measured_ah.map(|_| 0.01), None, (1.0, 0.1));
-        Learned { time_s, cell, measured_ah, measured_std_ah, capacity_ah: (1.2, 0.01), usable_ah, resistance }
+        CapacityRecord { time_s, cell, measured_ah, measured_std_ah, capacity_ah: (1.2, 0.01), usable_ah, resistance }
     }
 
     #[test]
-    fn good_is_only_said_where_every_cell_and_a_limit_is_known() {
-        let verdict = |rows: &[Learned], alarms: Vec<AlarmRow>, doubt: Option<&str>| {
+    fn good_needs_every_cell_and_a_limit_to_be_known() {
+        let verdict = |rows: &[CapacityRecord], alarms: Vec<AlarmRecord>, doubt: Option<&str>| {
             let mut data = Data::new(Origin::Store);
             (data.learned, data.alarms) = (rows.to_vec(), alarms);
             doubt.into_iter().for_each(|doubt| data.doubt(doubt.to_owned()));
-            of(&data, &Setting::default(), &Err("too little".into()))
+            of(&data, &PageContext::default(), &Err("too little".into()))
         };
         let cell = |cell: usize| learned(3.0, cell, Some(1.2));
         let limit =
-            |threshold: f64| AlarmRow { threshold: Some(threshold), ..alarm(4.0, "capacity_low", "severe", false) };
-        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.0)], None).verdict, Verdict::Good);
+            |threshold: f64| AlarmRecord { threshold: Some(threshold), ..alarm(4.0, "capacity_low", "severe", false) };
+        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.0)], None).verdict, Condition::Good);
         let no_limit = verdict(&[cell(0), cell(1)], Vec::new(), None);
-        assert_eq!(no_limit.verdict, Verdict::Unknown);
+        assert_eq!(no_limit.verdict, Condition::Unknown);
         assert!(no_limit.how.contains("names no limit") && no_limit.what.contains("-c"), "{no_limit:?}");
         let one_missing = verdict(&[cell(1)], vec![limit(1.0)], None);
         assert_eq!(one_missing.how, "Unknown: nothing has been learned yet about 1 of 2 cells.");
-        assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Verdict::Unknown);
-        // Below the end of life, whatever no alarm has said so far.
-        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Verdict::Watch);
+        assert_eq!(verdict(&[cell(0), learned(3.0, 1, None)], vec![limit(1.0)], None).verdict, Condition::Unknown);
+        // Below the end of life, though no alarm was raised so far.
+        assert_eq!(verdict(&[cell(0), cell(1)], vec![limit(1.6)], None).verdict, Condition::Watch);
         let changed = verdict(&[cell(0), cell(1)], vec![limit(1.0)], Some("the history was changed"));
         assert_eq!(changed.how, "Unknown: the history was changed.");
     }
 
     #[test]
-    fn a_missing_input_says_nothing_bad_of_the_battery() {
+    fn a_missing_input_does_not_make_the_battery_bad() {
         let summary = summary(vec![alarm(1.0, "input_missing", "severe", true)]);
-        assert_eq!(summary.verdict, Verdict::Unknown);
+        assert_eq!(summary.verdict, Condition::Unknown);
         assert!(summary.what.contains("Check sensors"), "{}", summary.what);
     }
 }

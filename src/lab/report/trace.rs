@@ -1,4 +1,4 @@
-//! What a replay's estimates come to: SOC, temperature and the estimator's own consistency, in bins.
+//! Summary of a replay's estimates in bins: SOC, temperature and the estimator's consistency.
 
 use std::collections::VecDeque;
 
@@ -12,7 +12,7 @@ const DETAILED: usize = 6;
 
 /// The estimates of a stretch of time, of all cells.
 #[derive(Debug, Clone)]
-pub(super) struct Moment {
+pub(super) struct TraceBin {
     /// Lowest and highest SOC, fraction.
     pub(super) soc: (f64, f64),
     /// Lowest and highest end of a 95 % interval.
@@ -21,16 +21,16 @@ pub(super) struct Moment {
     pub(super) temperature_c: (f64, f64),
     /// V.
     pub(super) innovation_v: (f64, f64),
-    pub(super) health: Health,
+    pub(super) health: Consistency,
 }
 
-/// How the innovations compare with what the filter expected.
+/// Consistency of the innovations with the filter's own variance.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Health {
+pub(super) struct Consistency {
     pub(super) count: u64,
     /// Within their own 95 % interval.
     pub(super) inside: u64,
-    /// Beyond the gate: they moved nothing.
+    /// Beyond the gate: not used.
     pub(super) gated: u64,
     /// Sum of squares of innovation over its standard deviation.
     pub(super) squares: f64,
@@ -38,9 +38,9 @@ pub(super) struct Health {
 
 const NOTHING: (f64, f64) = (f64::INFINITY, f64::NEG_INFINITY);
 
-impl Default for Moment {
+impl Default for TraceBin {
     fn default() -> Self {
-        let health = Health::default();
+        let health = Consistency::default();
         Self { soc: NOTHING, soc_band: NOTHING, temperature_c: NOTHING, innovation_v: NOTHING, health }
     }
 }
@@ -49,7 +49,7 @@ fn grow(range: &mut (f64, f64), (low, high): (f64, f64)) {
     *range = (range.0.min(low), range.1.max(high));
 }
 
-impl Moment {
+impl TraceBin {
     fn take(&mut self, e: &Estimate) {
         grow(&mut self.soc, (e.soc, e.soc));
         grow(&mut self.soc_band, (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std));
@@ -59,7 +59,7 @@ impl Moment {
     }
 }
 
-impl Bin for Moment {
+impl Bin for TraceBin {
     fn join(&mut self, later: &Self) {
         grow(&mut self.soc, later.soc);
         grow(&mut self.soc_band, later.soc_band);
@@ -69,7 +69,7 @@ impl Bin for Moment {
     }
 }
 
-impl Health {
+impl Consistency {
     fn take(&mut self, e: &Estimate) {
         let parts = e.innovation_v / e.innovation_std_v;
         if !parts.is_finite() {
@@ -99,13 +99,13 @@ impl Health {
     }
 }
 
-/// All of it.
+/// Binned estimates of a replay.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Trace {
-    pub(super) life: Option<Bins<Moment>>,
+    pub(super) life: Option<Bins<TraceBin>>,
     /// The last half-cycles, each in its own bins.
-    pub(super) recent: VecDeque<Bins<Moment>>,
-    pub(super) cells: Vec<Health>,
+    pub(super) recent: VecDeque<Bins<TraceBin>>,
+    pub(super) cells: Vec<Consistency>,
 }
 
 impl Trace {
@@ -120,12 +120,12 @@ impl Trace {
         }
         let cell = estimate.cell.index();
         if self.cells.len() <= cell {
-            self.cells.resize(cell + 1, Health::default());
+            self.cells.resize(cell + 1, Consistency::default());
         }
         self.cells[cell].take(estimate);
     }
 
-    /// A charge or discharge begins.
+    /// Starts the bins of a charge or discharge.
     pub(super) fn turn(&mut self, time_s: f64) {
         self.recent.push_back(Bins::new(time_s));
         while self.recent.len() > DETAILED {
@@ -133,9 +133,9 @@ impl Trace {
         }
     }
 
-    /// Of all cells over all time.
-    pub(super) fn health(&self) -> Health {
-        self.cells.iter().fold(Health::default(), |mut all, cell| {
+    /// Returns the consistency of all cells over all time.
+    pub(super) fn health(&self) -> Consistency {
+        self.cells.iter().fold(Consistency::default(), |mut all, cell| {
             all.add(cell);
             all
         })

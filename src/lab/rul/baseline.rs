@@ -1,24 +1,25 @@
-//! What forecasts are compared with: a straight line through the last points, and a double exponential of least squares.
+//! Baselines that forecasts are compared with: a straight line through the last points, and a double exponential of least
+//! squares.
 //!
-//! Points are [use, capacity]. Both answer with the use at which their curve first passes the threshold.
+//! Input: points of [use, capacity]. Output: the use at which the curve first passes the threshold.
 
 /// The straight line goes through this part of the points, the last ones.
 const LAST_PART: f64 = 0.3;
-/// And through no fewer than this, if there are as many.
+/// Fewest points of the straight line, where the history has as many.
 const LAST_POINTS: usize = 5;
 /// A curve is followed until this many times the use so far.
 const FOLLOWED: f64 = 20.0;
 /// Steps it is followed in.
 const STEPS: u32 = 20_000;
-/// Where the search for the exponents starts, e-folds over the use so far: both falling, one rising, nearly straight.
+/// Starts of the search for the exponents, e-folds over the use so far: both falling, one rising, nearly straight.
 const STARTS: [[f64; 2]; 4] = [[-0.1, 0.5], [-0.2, -2.0], [-0.05, 3.0], [-0.5, 0.05]];
-/// First step of that search, and when it is done.
+/// First step of that search, and the step at which it ends.
 const SEARCH: (f64, f64) = (0.5, 1e-4);
-/// Moves of that search at most: those that need more creep along a valley in which nothing changes.
+/// Most moves of that search: a search that needs more creeps along a flat valley.
 const MAX_MOVES: u32 = 400;
 /// Exponents beyond this are not tried: e-folds over the use so far.
 const STEEPEST: f64 = 50.0;
-/// A determinant less than this part of its terms: both exponentials are one.
+/// A determinant below this share of its terms: both exponentials coincide.
 const SINGULAR: f64 = 1e-12;
 
 /// Straight line of least squares through the last points; `None` = it does not fall.
@@ -51,10 +52,10 @@ pub(super) fn double_exponential(points: &[[f64; 2]], threshold: f64) -> Option<
 }
 
 /// Sum of squares, factors, exponents.
-type Fit = (f64, [f64; 2], [f64; 2]);
+type ExponentialFit = (f64, [f64; 2], [f64; 2]);
 
-/// Pattern search: a better neighbour is taken and the step doubled, without one it is halved.
-fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<Fit>) -> Option<Fit> {
+/// Pattern search: takes a better neighbour and doubles the step, else halves the step.
+fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<ExponentialFit>) -> Option<ExponentialFit> {
     const NEIGHBOURS: [[f64; 2]; 8] =
         [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0], [-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]];
     let (mut best, mut step) = (fit(start)?, SEARCH.0);
@@ -71,8 +72,8 @@ fn search(start: [f64; 2], fit: &dyn Fn([f64; 2]) -> Option<Fit>) -> Option<Fit>
     Some(best)
 }
 
-/// The factors that fit best with these exponents; `None` = they cannot be told apart.
-fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<Fit> {
+/// The factors that fit best with these exponents; `None` = they cannot be distinguished.
+fn linear(points: &[[f64; 2]], scale: f64, exponents: [f64; 2]) -> Option<ExponentialFit> {
     let at = |used: f64| exponents.map(|exponent| (exponent * used / scale).exp());
     let (mut xx, mut xy, mut yy, mut xc, mut yc) = (0.0, 0.0, 0.0, 0.0, 0.0);
     for &[used, capacity] in points {

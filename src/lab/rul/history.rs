@@ -3,27 +3,21 @@
 //! * `date` or `start`: when the reading began, ISO 8601 or seconds, in order of time.
 //! * `capacity_ah` or `capacity_ah_source`: Ah above 0; empty = not measured.
 //! * `type`, where it exists: only `discharge` rows are readings, and each of them counts as a full cycle. Without it the
-//!   file says nothing of use, and days count.
-//! * `duration_s`, where it exists beside `type`: what of the time between two readings was use; the rest was rest.
+//!   file holds no use, and days count.
+//! * `duration_s`, where it exists in addition to `type`: time of use between two readings; the remaining time was rest.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use crate::health::{Axis, Usage};
-use crate::io::{lines, stamp};
+use crate::io::table::{Header, Row, Table, TableError};
 use crate::quantity::Timestamp;
 
 /// Seconds in a day.
 const DAY_S: f64 = 86_400.0;
 
-/// What is wrong with a file, with its place.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct HistoryError(pub String);
-
 /// A reading.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Row {
+pub struct MeasuredCapacity {
     /// Line of the file.
     pub line: u64,
     /// Units of the history's axis since the first reading.
@@ -44,7 +38,7 @@ pub struct History {
     /// What counts as use.
     pub axis: Axis,
     /// In order of time, at least one.
-    pub rows: Vec<Row>,
+    pub rows: Vec<MeasuredCapacity>,
 }
 
 struct Columns {
@@ -54,9 +48,9 @@ struct Columns {
     duration: Option<usize>,
 }
 
-/// What is counted over the lines read so far.
+/// Use counted over the lines read so far.
 #[derive(Default)]
-struct Counted {
+struct UseCounter {
     first: Option<Timestamp>,
     last: Option<Timestamp>,
     discharges: f64,
@@ -66,7 +60,7 @@ struct Counted {
     rest_days: f64,
 }
 
-impl Row {
+impl MeasuredCapacity {
     /// What passed since another.
     pub fn since(&self, before: &Self) -> Usage {
         Usage {
@@ -81,26 +75,17 @@ impl History {
     /// Reads a file.
     ///
     /// # Errors
-    /// See [`super::read`].
-    pub(super) fn read(path: &Path) -> Result<Self, HistoryError> {
-        let name = path.display();
-        let source =
-            lines::open(path, &Arc::default()).map_err(|e| HistoryError(format!("{name}: cannot be read: {e}")))?;
-        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(source);
-        let fail = |e: csv::Error| HistoryError(format!("{name}: {e}"));
-        let headers = reader.headers().map_err(fail)?.clone();
-        let columns = Columns::find(&headers).map_err(|what| HistoryError(format!("{name}:1: {what}")))?;
-        let (mut counted, mut rows) = (Counted::default(), Vec::new());
-        for record in reader.records() {
-            let record = record.map_err(fail)?;
-            let line = record.position().map_or(0, csv::Position::line);
-            let row = counted.take(&columns, &headers, &record);
-            let row = row.map_err(|what| HistoryError(format!("{name}:{line}: {what}")))?;
-            rows.extend(row.map(|row| Row { line, ..row }));
+    /// It cannot be read or a field is wrong, with file, line, column, what was found and what is allowed.
+    pub fn read(path: &Path) -> Result<Self, TableError> {
+        let mut table = Table::open(path)?;
+        let columns = Columns::find(table.header())?;
+        let (mut counter, mut rows) = (UseCounter::default(), Vec::new());
+        while let Some(row) = table.next_row()? {
+            rows.extend(counter.add_row(&columns, &row)?);
         }
         if rows.is_empty() {
-            let column = &headers[columns.capacity];
-            return Err(HistoryError(format!("{name}: no row with a {column}, needs at least one")));
+            let column = &table.header().names()[columns.capacity];
+            return Err(table.header().file_fault(format_args!("no row with a {column}, needs at least one")));
         }
         let axis = if columns.kind.is_some() { Axis::Cycles } else { Axis::Days };
         Ok(Self { axis, rows })
@@ -113,59 +98,39 @@ impl History {
 }
 
 impl Columns {
-    fn find(headers: &csv::StringRecord) -> Result<Self, String> {
-        let find = |name: &str| headers.iter().position(|h| h.trim_start_matches('\u{feff}') == name);
-        let needed = |names: [&str; 2]| {
-            let found = headers.iter().collect::<Vec<_>>().join(",");
-            let place = names.into_iter().find_map(find);
-            place.ok_or_else(|| format!("no column {} or {}, found {found}", names[0], names[1]))
-        };
+    fn find(header: &Header) -> Result<Self, TableError> {
         Ok(Self {
-            time: needed(["date", "start"])?,
-            capacity: needed(["capacity_ah", "capacity_ah_source"])?,
-            kind: find("type"),
-            duration: find("duration_s"),
+            time: header.required(&["date", "start"])?,
+            capacity: header.required(&["capacity_ah", "capacity_ah_source"])?,
+            kind: header.find("type"),
+            duration: header.find("duration_s"),
         })
     }
 }
 
-impl Counted {
-    /// Takes a line; a reading when it is one.
-    fn take(
-        &mut self,
-        columns: &Columns,
-        headers: &csv::StringRecord,
-        record: &csv::StringRecord,
-    ) -> Result<Option<Row>, String> {
-        let field = |column: usize| record.get(column).unwrap_or_default();
-        let fault = |column: usize, allowed: &str| {
-            format!("column {}: found {:?}, must be {allowed}", &headers[column], field(column))
-        };
-        let number = |column: usize, allowed: &str, least: f64| match field(column) {
-            "" => Ok(None),
-            text => {
-                let value = text.parse::<f64>().ok().filter(|value| value.is_finite() && *value >= least);
-                value.map(Some).ok_or_else(|| fault(column, allowed))
-            }
-        };
-        let time = stamp::parse_stamp(field(columns.time))
-            .ok_or_else(|| fault(columns.time, "like 2008-04-02T13:08:17.921 or seconds"))?;
+impl UseCounter {
+    /// Counts a line; returns its reading, if it has one.
+    fn add_row(&mut self, columns: &Columns, row: &Row<'_>) -> Result<Option<MeasuredCapacity>, TableError> {
+        let time = row.stamp(columns.time)?;
         if self.last.is_some_and(|last| time < last) {
-            return Err(fault(columns.time, "no earlier than the line before"));
+            return Err(row.fault(columns.time, "no earlier than the line before"));
         }
-        let capacity = number(columns.capacity, "Ah above 0 or nothing", f64::MIN_POSITIVE)?;
-        let duration_s = columns.duration.map_or(Ok(None), |c| number(c, "seconds of 0 or more, or nothing", 0.0))?;
+        let capacity = row.number_in(columns.capacity, f64::MIN_POSITIVE..=f64::MAX, "Ah above 0 or nothing")?;
+        let duration = |column| row.number_in(column, 0.0..=f64::MAX, "seconds of 0 or more, or nothing");
+        let duration_s = columns.duration.map_or(Ok(None), duration)?;
         self.pass(time);
-        let is_discharge = columns.kind.is_none_or(|kind| field(kind) == "discharge");
-        let row = capacity.filter(|_| is_discharge).map(|capacity_ah| self.row(columns, time, capacity_ah));
+        let is_discharge = columns.kind.is_none_or(|kind| row.text(kind) == "discharge");
+        let counts_cycles = columns.kind.is_some();
+        let reading = capacity.filter(|_| is_discharge);
+        let reading = reading.map(|ah| MeasuredCapacity { line: row.line, ..self.reading(counts_cycles, time, ah) });
         if is_discharge {
             self.discharges += 1.0;
         }
         self.used_days = duration_s.unwrap_or(0.0) / DAY_S;
-        Ok(row)
+        Ok(reading)
     }
 
-    /// The time until the next line: what the line before did not use of it was rest.
+    /// Counts the time since the line before: time that the line before did not use was rest.
     fn pass(&mut self, time: Timestamp) {
         if let Some(last) = self.last {
             self.rest_days += (time.since(last) / DAY_S - self.used_days).max(0.0);
@@ -173,14 +138,14 @@ impl Counted {
         self.last = Some(time);
     }
 
-    fn row(&mut self, columns: &Columns, time: Timestamp, capacity_ah: f64) -> Row {
+    fn reading(&mut self, counts_cycles: bool, time: Timestamp, capacity_ah: f64) -> MeasuredCapacity {
         if self.first.is_none() {
             (self.first, self.before, self.rest_days) = (Some(time), self.discharges, 0.0);
         }
         let days = self.first.map_or(0.0, |first| time.since(first) / DAY_S);
-        let cycles = if columns.kind.is_some() { self.discharges - self.before } else { 0.0 };
-        let used = if columns.kind.is_some() { cycles } else { days };
-        Row { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
+        let cycles = if counts_cycles { self.discharges - self.before } else { 0.0 };
+        let used = if counts_cycles { cycles } else { days };
+        MeasuredCapacity { line: 0, used, cycles, days, rest_days: self.rest_days, capacity_ah }
     }
 }
 
@@ -196,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn discharges_are_cycles_and_what_no_line_used_is_rest() {
+    fn discharges_are_cycles_and_unused_time_is_rest() {
         let history = read(
             "cycle,type,start,capacity_ah_source,duration_s\n0,charge,0,,\n1,discharge,86400,2.0,43200\n\
              2,charge,129600,,43200\n3,discharge,259200,,43200\n4,discharge,345600,1.9,100\n",

@@ -1,4 +1,4 @@
-//! When a life ended: where the non-increasing line of least squares through its capacities passes the threshold.
+//! End of a life: where the non-increasing line of least squares through its capacities passes the threshold.
 
 use super::History;
 
@@ -34,12 +34,16 @@ fn non_increasing(values: &[f64]) -> Vec<f64> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::Row;
+    use super::super::MeasuredCapacity;
     use super::*;
     use crate::health::Axis;
 
     fn history(capacities: &[f64]) -> History {
-        let row = |(index, &capacity_ah): (u32, &f64)| Row { used: f64::from(index), capacity_ah, ..Row::default() };
+        let row = |(index, &capacity_ah): (u32, &f64)| MeasuredCapacity {
+            used: f64::from(index),
+            capacity_ah,
+            ..MeasuredCapacity::default()
+        };
         History { axis: Axis::Cycles, rows: (0..).zip(capacities).map(row).collect() }
     }
 
@@ -51,7 +55,7 @@ mod tests {
     }
 
     #[test]
-    fn a_dip_that_heals_is_no_end_and_a_recovery_that_goes_again_does_not_undo_one() {
+    fn a_dip_that_recovers_is_no_end_and_a_passing_recovery_does_not_undo_one() {
         assert_eq!(end_of_life(&history(&[2.0, 1.45, 1.8, 1.7, 1.6, 1.4]), 1.5), Some(4.5));
         assert_eq!(end_of_life(&history(&[2.0, 1.6, 1.4, 1.3, 1.52, 1.2]), 1.5), Some(1.5));
     }

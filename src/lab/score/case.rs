@@ -1,4 +1,4 @@
-//! One file in one case: the run through the core and what it came to.
+//! Runs one file in one case through the monitor and scores it.
 
 use std::ops::Range;
 use std::path::PathBuf;
@@ -6,19 +6,20 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::feed::Feeder;
-use super::life::{Life, LifeScore};
-use super::soc::{self, Sample, SocScore};
-use super::{Job, ScoreError, Settings, picture, window};
-use crate::measured::{MeasuredFile, Part};
+use super::life::{LifeRecorder, LifeScore};
+use super::soc::{self, SocSample, SocScore};
+use super::{ScoreJob, ScoreSettings, picture, window};
+use crate::error::LabError;
+use crate::measured::{MeasuredFile, MeasuredPart};
 use crate::monitor::{EventKind, MonitorConfig};
 use crate::quantity::Timestamp;
 
-/// A part whose beginning nobody knows is put this long after the record so far.
+/// A part whose beginning is unknown is placed this long after the record so far.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
 /// Rows between two reports of progress.
 const REPORT_EVERY: usize = 4096;
-/// A told SOC beyond 0 or 1 by no more than this is taken as that end (a counter that does not start at 0).
-const TOLD_SLACK: f64 = 0.005;
+/// An initial SOC beyond 0 or 1 by no more than this is limited to that end (a counter that does not start at 0).
+const SOC_SLACK: f64 = 0.005;
 
 /// Where in a file the estimator starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -26,7 +27,7 @@ const TOLD_SLACK: f64 = 0.005;
 pub enum Start {
     /// At its first row.
     Full,
-    /// Where a part of the charge has been taken out; the rows before are not there.
+    /// Where a part of the charge has been taken out; the rows before are dropped.
     Middle,
 }
 
@@ -35,8 +36,9 @@ pub enum Start {
 pub struct Case {
     /// Where.
     pub start: Start,
-    /// Error of the SOC it is told, points; `None` = it is told nothing and starts from the first voltage.
-    pub told_points: Option<f64>,
+    /// Error of the initial SOC, points; `None` = none is given: the estimator starts from the first voltage.
+    #[serde(rename = "told_points")]
+    pub soc_error_points: Option<f64>,
     /// Error of the capacity it starts with, percent of the model's.
     pub capacity_error_percent: f64,
     /// Offset of the sensor: added to every measured current before the core sees it, A.
@@ -55,15 +57,15 @@ pub struct CaseScore {
     /// The case.
     #[serde(flatten)]
     pub case: Case,
-    /// Rows handed to the core.
+    /// Rows fed to the monitor.
     pub rows: usize,
-    /// Values that no frame could carry.
+    /// Values that no frame can carry.
     pub uncarried_values: usize,
-    /// Times the filter lost its cell and started again.
+    /// Number of filter resets.
     pub resets: usize,
-    /// Capacity believed at the end, Ah, and its standard deviation; `None` = no estimate.
+    /// Capacity estimated at the end, Ah; `None` = no estimate.
     pub final_capacity_ah: Option<f64>,
-    /// Standard deviation, Ah.
+    /// Its standard deviation, Ah.
     pub final_capacity_std_ah: Option<f64>,
     /// Resistance at the end relative to new; `None` = no estimate.
     pub final_resistance_ratio: Option<f64>,
@@ -80,17 +82,17 @@ pub struct CaseScore {
 /// Runs `file` through the core.
 ///
 /// # Errors
-/// The file has no truth, never comes to the start asked for, or the SOC to be told is none; a plot cannot be written.
+/// The file has no truth, never reaches the start of the case, or the initial SOC is out of range; a plot cannot be written.
 pub(super) fn run(
-    job: &Job,
+    job: &ScoreJob,
     file: &MeasuredFile,
     case: &Case,
-    settings: &Settings,
+    settings: &ScoreSettings,
     progress: &dyn Fn(f64),
-) -> Result<CaseScore, ScoreError> {
-    let begin = Beginning::find(job, file, case, settings)?;
+) -> Result<CaseScore, LabError> {
+    let begin = CaseStart::find(job, file, case, settings)?;
     let config = configure(job, case, settings, begin.truth)?;
-    let mut run = Run::new(job, settings, config, case.current_offset_a);
+    let mut run = CaseRun::new(job, settings, config, case.current_offset_a);
     let (mut done, rows) = (0, file.rows().max(1));
     for (index, part) in file.parts.iter().enumerate().skip(begin.part) {
         let mut seen = case.seed.zip(settings.window).map_or(0..part.len(), |(s, w)| window::rows(part, index, s, w));
@@ -107,16 +109,16 @@ pub(super) fn run(
 }
 
 /// Where a case begins.
-struct Beginning {
+struct CaseStart {
     part: usize,
     row: usize,
     /// SOC there, fraction; NaN where there is no counter.
     truth: f64,
 }
 
-impl Beginning {
-    fn find(job: &Job, file: &MeasuredFile, case: &Case, settings: &Settings) -> Result<Self, ScoreError> {
-        let unfit = |what: String| Err(ScoreError::Unfit(format!("{}: {what}", job.path.display())));
+impl CaseStart {
+    fn find(job: &ScoreJob, file: &MeasuredFile, case: &Case, settings: &ScoreSettings) -> Result<Self, LabError> {
+        let unfit = |what: String| Err(LabError(format!("{}: {what}", job.path.display())));
         let truths = || {
             let rows =
                 file.parts.iter().enumerate().flat_map(|(p, part)| (0..part.len()).map(move |row| (p, row, part)));
@@ -128,11 +130,13 @@ impl Beginning {
                     "no column discharged_ah with values, and no table with --cycles: nothing to score against".into(),
                 );
             }
-            return match (case.start, case.told_points) {
+            return match (case.start, case.soc_error_points) {
                 (Start::Middle, _) => {
                     unfit("no column discharged_ah with values: a start in the middle cannot be found".into())
                 }
-                (_, Some(_)) => unfit("no column discharged_ah with values: no SOC to tell a wrong one from".into()),
+                (_, Some(_)) => {
+                    unfit("no column discharged_ah with values: an initial SOC with an error cannot be derived".into())
+                }
                 _ => Ok(Self { part: 0, row: 0, truth: f64::NAN }),
             };
         };
@@ -151,25 +155,25 @@ impl Beginning {
 }
 
 /// SOC by the counter, fraction; NaN where it has no value.
-fn truth(part: &Part, row: usize, settings: &Settings) -> f64 {
+fn truth(part: &MeasuredPart, row: usize, settings: &ScoreSettings) -> f64 {
     1.0 - part.discharged_ah[row] / settings.truth_capacity_ah
 }
 
-/// The core as the case wants it.
-fn configure(job: &Job, case: &Case, settings: &Settings, truth: f64) -> Result<MonitorConfig, ScoreError> {
+/// Returns the monitor's configuration for the case.
+fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) -> Result<MonitorConfig, LabError> {
     let mut config = settings.monitor.clone();
     let estimator = &mut config.estimator;
-    if let Some(points) = case.told_points {
-        let told = truth + points / 100.0;
-        if !(-TOLD_SLACK..=1.0 + TOLD_SLACK).contains(&told) {
+    if let Some(points) = case.soc_error_points {
+        let initial = truth + points / 100.0;
+        if !(-SOC_SLACK..=1.0 + SOC_SLACK).contains(&initial) {
             let (path, truth) = (job.path.display(), 100.0 * truth);
-            return Err(ScoreError::Unfit(format!(
-                "{path}: started at {truth:.1} % and told {points:+} points: {:.1} %, must be 0 to 100 %",
-                100.0 * told
+            return Err(LabError(format!(
+                "{path}: initial SOC is {truth:.1} % and {points:+} points: {:.1} %, must be 0 to 100 %",
+                100.0 * initial
             )));
         }
-        estimator.initial_soc = Some(told.clamp(0.0, 1.0));
-        estimator.initial_soc_std = settings.told_std(points);
+        estimator.initial_soc = Some(initial.clamp(0.0, 1.0));
+        estimator.initial_soc_std = settings.initial_soc_std(points);
     }
     if case.capacity_error_percent != 0.0 {
         estimator.initial_capacity_ah = config.model.capacity_ah * (1.0 + case.capacity_error_percent / 100.0);
@@ -180,10 +184,10 @@ fn configure(job: &Job, case: &Case, settings: &Settings, truth: f64) -> Result<
     Ok(config)
 }
 
-/// A run under way.
-struct Run<'a> {
-    job: &'a Job,
-    settings: &'a Settings,
+/// State of a run.
+struct CaseRun<'a> {
+    job: &'a ScoreJob,
+    settings: &'a ScoreSettings,
     feeder: Feeder,
     current_offset_a: f64,
     /// First and latest stamp fed.
@@ -191,13 +195,13 @@ struct Run<'a> {
     rows: usize,
     left_out: usize,
     resets: usize,
-    samples: Vec<Sample>,
-    life: Life,
+    samples: Vec<SocSample>,
+    life: LifeRecorder,
     last: Option<crate::monitor::Estimate>,
 }
 
-impl<'a> Run<'a> {
-    fn new(job: &'a Job, settings: &'a Settings, config: MonitorConfig, current_offset_a: f64) -> Self {
+impl<'a> CaseRun<'a> {
+    fn new(job: &'a ScoreJob, settings: &'a ScoreSettings, config: MonitorConfig, current_offset_a: f64) -> Self {
         Self {
             job,
             settings,
@@ -208,13 +212,13 @@ impl<'a> Run<'a> {
             left_out: 0,
             resets: 0,
             samples: Vec::new(),
-            life: Life::default(),
+            life: LifeRecorder::default(),
             last: None,
         }
     }
 
-    /// The rows `seen` of one part; `report` is told how many were fed.
-    fn part(&mut self, part: &Part, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
+    /// Feeds the rows `seen` of one part; `report` receives the number of rows fed.
+    fn part(&mut self, part: &MeasuredPart, seen: Range<usize>, report: &mut dyn FnMut(usize)) {
         let Some(&first_s) = part.time_s.get(seen.start).filter(|_| !seen.is_empty()) else { return };
         let known = self.job.cycles.as_ref().and_then(|table| table.start(&part.key));
         let base = match (known, self.span) {
@@ -235,7 +239,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn row(&mut self, part: &Part, row: usize, time: Timestamp) {
+    fn row(&mut self, part: &MeasuredPart, row: usize, time: Timestamp) {
         let (began, latest) = self.span.unwrap_or((time, time));
         self.span = Some((began, latest.max(time)));
         self.rows += 1;
@@ -251,13 +255,15 @@ impl<'a> Run<'a> {
         self.feeder.out.clear();
         self.last = estimate.or(self.last);
         match estimate {
-            Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => self.samples.push(Sample {
-                time_s: time.since(began),
-                truth,
-                soc: e.soc,
-                soc_std: e.soc_std,
-                nis: (e.innovation_v / e.innovation_std_v).powi(2),
-            }),
+            Some(e) if truth.is_finite() && e.soc.is_finite() && e.soc_std.is_finite() => {
+                self.samples.push(SocSample {
+                    time_s: time.since(began),
+                    truth,
+                    soc: e.soc,
+                    soc_std: e.soc_std,
+                    nis: (e.innovation_v / e.innovation_std_v).powi(2),
+                })
+            }
             _ => self.left_out += 1,
         }
     }
@@ -271,7 +277,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    fn finish(mut self, case: &Case) -> Result<CaseScore, ScoreError> {
+    fn finish(mut self, case: &Case) -> Result<CaseScore, LabError> {
         if let Some((_, latest)) = self.span {
             self.feeder.finish(latest);
             self.take_events();

@@ -3,8 +3,7 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use super::ScoreError;
-use crate::io::stamp;
+use crate::io::table::{Table, TableError};
 use crate::quantity::Timestamp;
 
 /// A discharge of the table.
@@ -29,39 +28,23 @@ impl CycleTable {
     ///
     /// # Errors
     /// It cannot be read, a column is missing or a field is wrong, with file and line; it names no discharge.
-    pub fn read(path: &Path) -> Result<Self, ScoreError> {
-        let name = path.display();
-        let fail = |line: u64, what: String| ScoreError::Unfit(format!("{name}:{line}: {what}"));
-        let text = std::fs::read(path).map_err(|e| ScoreError::Unfit(format!("{name}: cannot be read: {e}")))?;
-        let mut reader = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(text.as_slice());
-        let headers = reader.headers().map_err(|e| fail(1, e.to_string()))?.clone();
-        let column = |wanted: &str| {
-            let found = || headers.iter().collect::<Vec<_>>().join(",");
-            let index = headers.iter().position(|header| header.trim_start_matches('\u{feff}') == wanted);
-            index.ok_or_else(|| fail(1, format!("no column {wanted}, found {}", found())))
-        };
+    pub fn read(path: &Path) -> Result<Self, TableError> {
+        let mut file = Table::open(path)?;
+        let column = |name: &str| file.header().required(&[name]);
         let [cycle, kind, start, capacity] =
             [column("cycle")?, column("type")?, column("start")?, column("capacity_ah_source")?];
         let mut table = Self { starts: HashMap::new(), discharges: Vec::new() };
-        for record in reader.records() {
-            let record = record.map_err(|e| ScoreError::Unfit(format!("{name}: {e}")))?;
-            let line = record.position().map_or(0, csv::Position::line);
-            let field = |column: usize| record.get(column).unwrap_or_default();
-            let (found_start, found_capacity) = (field(start), field(capacity));
-            let start = stamp::parse_stamp(found_start).ok_or_else(|| {
-                fail(line, format!("start = {found_start:?}, must be like 2008-04-02T13:08:17.921 or seconds"))
-            })?;
-            let capacity_ah = parse_capacity(found_capacity).ok_or_else(|| {
-                fail(line, format!("capacity_ah_source = {found_capacity:?}, must be a number above 0 or nothing"))
-            })?;
-            table.starts.insert(field(cycle).to_owned(), start);
-            if field(kind) == "discharge" {
+        while let Some(row) = file.next_row()? {
+            let start = row.stamp(start)?;
+            let capacity_ah = row.number_in(capacity, f64::MIN_POSITIVE..=f64::MAX, "a number above 0 or nothing")?;
+            table.starts.insert(row.text(cycle).into_owned(), start);
+            if row.text(kind) == "discharge" {
                 table.discharges.push(Discharge { start, capacity_ah });
             }
         }
         table.discharges.sort_by_key(|discharge| discharge.start);
         if table.discharges.iter().all(|discharge| discharge.capacity_ah.is_none()) {
-            return Err(ScoreError::Unfit(format!("{name}: no discharge with a capacity_ah_source")));
+            return Err(file.header().file_fault("no discharge with a capacity_ah_source"));
         }
         Ok(table)
     }
@@ -75,14 +58,6 @@ impl CycleTable {
     pub(super) fn number_at(&self, time: Timestamp) -> usize {
         self.discharges.partition_point(|discharge| discharge.start <= time)
     }
-}
-
-/// Nothing is `Some(None)`, no capacity is `None`.
-fn parse_capacity(text: &str) -> Option<Option<f64>> {
-    if text.is_empty() {
-        return Some(None);
-    }
-    text.parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0).map(Some)
 }
 
 #[cfg(test)]
@@ -113,10 +88,13 @@ mod tests {
         let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,soon,1.9\n");
         assert_eq!(
             fault,
-            Err("cycles.csv:2: start = \"soon\", must be like 2008-04-02T13:08:17.921 or seconds".into())
+            Err("cycles.csv:2: column start: found \"soon\", must be like 2008-04-02T13:08:17.921 or seconds".into())
         );
         let fault = read("cycle,type,start,capacity_ah_source\n1,discharge,1,-1\n");
-        assert_eq!(fault, Err("cycles.csv:2: capacity_ah_source = \"-1\", must be a number above 0 or nothing".into()));
+        assert_eq!(
+            fault,
+            Err("cycles.csv:2: column capacity_ah_source: found \"-1\", must be a number above 0 or nothing".into())
+        );
         let fault = read("cycle,type,start\n1,discharge,1\n");
         assert_eq!(fault, Err("cycles.csv:1: no column capacity_ah_source, found cycle,type,start".into()));
         let fault = read("cycle,type,start,capacity_ah_source\n1,charge,1,\n");

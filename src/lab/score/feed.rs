@@ -1,4 +1,4 @@
-//! Rows of a measured file into the core: frames as they would have come over a bus, and the driver's ticks between them.
+//! Feeds rows of a measured file to the monitor: frames as a bus would carry them, and the driver's ticks between them.
 
 use crate::can::Frame;
 use crate::can::decode::SensorIndex;
@@ -7,16 +7,16 @@ use crate::io::ticks::Ticks;
 use crate::monitor::{Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 
-/// A core and what stands round it in a replay.
+/// A monitor with the encoder and ticks of a replay.
 pub(super) struct Feeder {
     monitor: Monitor,
     encoder: InputEncoder,
     protector: InputProtector,
     ticks: Ticks,
     frames: Vec<(BusIndex, Frame)>,
-    /// What came out since the caller last emptied it.
+    /// Outputs since the caller last cleared them.
     pub(super) out: Outputs,
-    /// Values that no frame could carry.
+    /// Values that no frame can carry.
     pub(super) uncarried: usize,
 }
 
@@ -33,10 +33,10 @@ impl Feeder {
         }
     }
 
-    /// One row: A (positive = discharge), V, degrees C; NaN = no value.
+    /// Feeds one row: A (positive = discharge), V, degrees C; NaN = no value.
     pub(super) fn row(&mut self, time: Timestamp, current_a: f64, voltage_v: f64, temperature_c: f64) {
         self.ticks.advance(time);
-        self.make_ticks();
+        self.send_ticks();
         let values = [
             (Channel::Current, Some(current_a)),
             (Channel::CellVoltage(CellIndex(0)), Some(voltage_v)),
@@ -51,19 +51,19 @@ impl Feeder {
         self.frames = frames;
     }
 
-    /// The record goes on at `time` after a gap that nobody knows.
+    /// The record continues at `time` after a gap of unknown length.
     pub(super) fn unknown_gap(&mut self, time: Timestamp) {
         self.ticks.sleep();
-        self.make_ticks();
+        self.send_ticks();
         self.monitor.handle(Input::UnknownGap { time }, &mut self.out);
     }
 
-    /// The record ends: what is due up to its last row, and a gap, which completes the half-cycle at hand.
+    /// Ends the record at its last row with a gap, which completes the current half-cycle.
     pub(super) fn finish(&mut self, latest: Timestamp) {
         self.unknown_gap(latest);
     }
 
-    fn make_ticks(&mut self) {
+    fn send_ticks(&mut self) {
         while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
             self.monitor.handle(Input::Tick { time }, &mut self.out);
         }

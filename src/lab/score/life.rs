@@ -4,11 +4,11 @@ use serde::Serialize;
 
 use super::cycles::CycleTable;
 use super::soc::{largest, mean};
-use super::{STD_OF_95, Settings};
+use super::{STD_OF_95, ScoreSettings};
 use crate::monitor::{Event, EventKind};
 use crate::quantity::Mode;
 
-/// What was believed after one discharge.
+/// Estimates after one discharge.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct DischargeScore {
     /// Counted from 1.
@@ -29,7 +29,7 @@ pub struct DischargeScore {
     pub resistance_ratio_std: f64,
 }
 
-/// What a life's usable capacities were worth. Statistics are over the discharges after those skipped.
+/// Errors of a life's usable capacities. Statistics are over the discharges after those skipped.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LifeScore {
     /// Discharges of the table.
@@ -48,7 +48,7 @@ pub struct LifeScore {
     pub coverage: f64,
     /// Mean half-width of that interval, Ah.
     pub mean_half_width_ah: f64,
-    /// What is looked for, Ah.
+    /// Threshold of the first fall, Ah.
     pub threshold_ah: f64,
     /// First discharge (after those skipped) whose estimate is below the threshold.
     pub first_below_estimate: Option<usize>,
@@ -58,15 +58,15 @@ pub struct LifeScore {
     pub each: Vec<DischargeScore>,
 }
 
-/// Collects beliefs as the core tells them.
+/// Collects the estimates after each discharge from the monitor's events.
 #[derive(Debug, Default)]
-pub(super) struct Life {
-    /// Mode of the half-cycle just told of; its capacity event follows.
+pub(super) struct LifeRecorder {
+    /// Mode of the latest half-cycle; its capacity event follows.
     mode: Option<Mode>,
     each: Vec<DischargeScore>,
 }
 
-impl Life {
+impl LifeRecorder {
     pub(super) fn observe(&mut self, event: &Event, table: &CycleTable) {
         match event.kind {
             EventKind::HalfCycle { mode, .. } => self.mode = Some(mode),
@@ -83,7 +83,7 @@ impl Life {
                 let Some(discharge) = number.checked_sub(1).and_then(|index| table.discharges.get(index)) else {
                     return;
                 };
-                // A discharge that comes in pieces: its last word counts.
+                // Of a discharge in pieces the last estimate counts.
                 self.each.pop_if(|before| before.number == number);
                 self.each.push(DischargeScore {
                     number,
@@ -100,7 +100,7 @@ impl Life {
         }
     }
 
-    pub(super) fn score(self, table: &CycleTable, settings: &Settings) -> LifeScore {
+    pub(super) fn score(self, table: &CycleTable, settings: &ScoreSettings) -> LifeScore {
         score(self.each, table, settings.threshold_ah, settings.skip_cycles)
     }
 }
@@ -129,8 +129,8 @@ fn score(each: Vec<DischargeScore>, table: &CycleTable, threshold_ah: f64, skip:
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::score::cycles::CycleTable;
     use crate::quantity::{CellIndex, Timestamp};
+    use crate::score::cycles::CycleTable;
 
     fn table() -> CycleTable {
         let folder = tempfile::tempdir().expect("a folder");
@@ -171,15 +171,15 @@ mod tests {
     }
 
     #[test]
-    fn capacities_are_held_against_the_discharge_that_told_them() {
+    fn capacities_are_compared_with_the_discharge_that_taught_them() {
         let table = table();
-        let mut life = Life::default();
+        let mut life = LifeRecorder::default();
         let discharges = [(150.0, 1.3), (250.0, 9.0), (260.0, 1.46), (350.0, 1.39), (450.0, 1.36), (550.0, 1.3)];
         for (time_s, usable_ah) in discharges {
             life.observe(&half_cycle(time_s, Mode::Discharge), &table);
             life.observe(&capacity_event(time_s, usable_ah), &table);
             life.observe(&half_cycle(time_s + 1.0, Mode::Charge), &table);
-            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // a charge says nothing about a discharge
+            life.observe(&capacity_event(time_s + 1.0, 7.0), &table); // a charge does not measure a discharge
         }
         let score = score(life.each, &table, 1.4, 1);
         assert_eq!((score.discharges, score.scored, score.left_out, score.each.len()), (5, 3, 1, 5));

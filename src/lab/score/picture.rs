@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::life::{DischargeScore, LifeScore};
-use super::soc::Sample;
+use super::soc::SocSample;
 use super::{Case, STD_OF_95, Start};
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Shape};
 
@@ -12,7 +12,7 @@ pub(super) fn draw(
     folder: &Path,
     name: &str,
     case: &Case,
-    samples: &[Sample],
+    samples: &[SocSample],
     life: Option<&LifeScore>,
 ) -> Result<PathBuf, PlotError> {
     let title = format!("{name}, {}", describe(case, ", "));
@@ -27,13 +27,13 @@ pub(super) fn draw(
     Ok(path)
 }
 
-/// A case in words.
+/// Describes a case in words.
 pub(super) fn describe(case: &Case, separator: &str) -> String {
     let mut words = vec![match case.start {
         Start::Full => "full".to_owned(),
         Start::Middle => "middle".to_owned(),
     }];
-    words.extend(case.told_points.map(|points| format!("told {points:+}")));
+    words.extend(case.soc_error_points.map(|points| format!("told {points:+}")));
     words.extend((case.capacity_error_percent != 0.0).then(|| format!("capacity {:+} %", case.capacity_error_percent)));
     words.extend((case.current_offset_a != 0.0).then(|| format!("current {:+} A", case.current_offset_a)));
     words.extend(case.seed.map(|seed| format!("windows {seed}")));
@@ -50,8 +50,8 @@ fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
     Layer::new("95 % interval", Ink::Orange, Shape::Band(points))
 }
 
-fn soc_panel(title: &str, samples: &[Sample]) -> Chart {
-    let over = |value: fn(&Sample) -> f64| samples.iter().map(move |s| (s.time_s / 3600.0, value(s)));
+fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
+    let over = |value: fn(&SocSample) -> f64| samples.iter().map(move |s| (s.time_s / 3600.0, value(s)));
     Chart {
         title: title.to_owned(),
         x: Axis::number("time since the start, h"),
@@ -65,8 +65,8 @@ fn soc_panel(title: &str, samples: &[Sample]) -> Chart {
     }
 }
 
-fn error_panel(samples: &[Sample]) -> Chart {
-    // What came before settling would dwarf the rest: the axis follows the second half of the run.
+fn error_panel(samples: &[SocSample]) -> Chart {
+    // Errors before settling would dwarf the rest: the axis follows the second half of the run.
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);

@@ -1,4 +1,4 @@
-//! Errors of the SOC, and whether the interval that came with it held.
+//! Errors of the SOC, and the coverage of its interval.
 
 use serde::Serialize;
 
@@ -9,9 +9,9 @@ pub const CONVERGED_POINTS: f64 = 2.0;
 /// It must stay so near for this long, s: a wrong estimate that only crosses the truth has not converged.
 pub const CONVERGED_HOLD_S: f64 = 600.0;
 
-/// One estimate beside its truth.
+/// One estimate with its truth.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Sample {
+pub(super) struct SocSample {
     /// Since the start, s.
     pub(super) time_s: f64,
     /// Fraction.
@@ -24,7 +24,7 @@ pub(super) struct Sample {
     pub(super) nis: f64,
 }
 
-impl Sample {
+impl SocSample {
     /// Points.
     pub(super) fn error_points(&self) -> f64 {
         100.0 * (self.soc - self.truth)
@@ -36,7 +36,7 @@ impl Sample {
     }
 }
 
-/// What a run's SOC was worth. Statistics are over the samples after settling; NaN (JSON: null) where there are none.
+/// Errors of a run's SOC. Statistics are over the samples after settling; NaN (JSON: null) where there are none.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SocScore {
     /// Samples in the statistics.
@@ -76,28 +76,28 @@ pub(super) fn largest(values: impl Iterator<Item = f64>) -> f64 {
 }
 
 /// Judges a run whose samples are in order of time.
-pub(super) fn score(samples: &[Sample], settle_s: f64, left_out_rows: usize) -> SocScore {
+pub(super) fn score(samples: &[SocSample], settle_s: f64, left_out_rows: usize) -> SocScore {
     let settled = &samples[samples.partition_point(|sample| sample.time_s < settle_s)..];
-    let errors = || settled.iter().map(Sample::error_points);
-    let held = |sample: &Sample| f64::from(sample.error_points().abs() <= sample.half_width_points());
+    let errors = || settled.iter().map(SocSample::error_points);
+    let held = |sample: &SocSample| f64::from(sample.error_points().abs() <= sample.half_width_points());
     SocScore {
         samples: settled.len(),
         left_out_rows,
-        first_error_points: samples.first().map_or(f64::NAN, Sample::error_points),
+        first_error_points: samples.first().map_or(f64::NAN, SocSample::error_points),
         rmse_points: mean(errors().map(|e| e * e)).sqrt(),
         mean_error_points: mean(errors()),
         mean_abs_error_points: mean(errors().map(f64::abs)),
         max_abs_error_points: largest(errors().map(f64::abs)),
         converge_s: converged_at(samples),
         coverage: mean(settled.iter().map(held)),
-        mean_half_width_points: mean(settled.iter().map(Sample::half_width_points)),
+        mean_half_width_points: mean(settled.iter().map(SocSample::half_width_points)),
         mean_normalised_innovation_squared: mean(settled.iter().map(|s| s.nis).filter(|nis| nis.is_finite())),
     }
 }
 
 /// Start of the first stretch of [`CONVERGED_HOLD_S`] within [`CONVERGED_POINTS`].
-fn converged_at(samples: &[Sample]) -> Option<f64> {
-    let near = |sample: &Sample| sample.error_points().abs() <= CONVERGED_POINTS;
+fn converged_at(samples: &[SocSample]) -> Option<f64> {
+    let near = |sample: &SocSample| sample.error_points().abs() <= CONVERGED_POINTS;
     let stretches = samples.chunk_by(|a, b| near(a) == near(b)).filter(|stretch| near(&stretch[0]));
     let ends = stretches.filter_map(|stretch| Some((stretch.first()?.time_s, stretch.last()?.time_s)));
     ends.into_iter().find(|(begin, end)| end - begin >= CONVERGED_HOLD_S).map(|(begin, _)| begin)
@@ -108,8 +108,8 @@ mod tests {
     use super::*;
 
     /// Samples every 10 s with these errors, points, and a standard deviation of 1 point.
-    fn samples(errors: &[f64]) -> Vec<Sample> {
-        let of = |(index, error): (usize, &f64)| Sample {
+    fn samples(errors: &[f64]) -> Vec<SocSample> {
+        let of = |(index, error): (usize, &f64)| SocSample {
             time_s: 10.0 * index as f64,
             truth: 0.5,
             soc: 0.5 + error / 100.0,

@@ -1,18 +1,18 @@
-//! Random windows: each half-cycle seen only in part, as a vehicle that starts and stops anywhere sees it.
+//! Random windows: each half-cycle is seen only in part, as by a vehicle that starts and stops anywhere.
 //!
 //! The window is a share of the charge that the part moves (|current| times time; a charger's long taper would dominate
-//! a share of time), uniform between two bounds, at a uniform place. Rows outside are not there at all: the core finds a
-//! hole in its record.
+//! a share of time), uniform between two bounds, at a uniform place. Rows outside are dropped: the monitor sees a
+//! gap in its record.
 
 use std::ops::Range;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::measured::Part;
+use crate::measured::MeasuredPart;
 
 /// The rows of part number `index` that are seen: never none of a part that has rows.
-pub(super) fn rows(part: &Part, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
+pub(super) fn rows(part: &MeasuredPart, index: usize, seed: u64, (least, most): (f64, f64)) -> Range<usize> {
     let moved = moved_as(part);
     let total = moved.last().copied().unwrap_or(0.0);
     if total <= 0.0 {
@@ -29,7 +29,7 @@ pub(super) fn rows(part: &Part, index: usize, seed: u64, (least, most): (f64, f6
 }
 
 /// Charge moved up to each row, A s, either way.
-fn moved_as(part: &Part) -> Vec<f64> {
+fn moved_as(part: &MeasuredPart) -> Vec<f64> {
     let mut total = 0.0;
     let mut before_s = part.time_s.first().copied().unwrap_or(0.0);
     let mut step = |(&time_s, &current_a): (&f64, &f64)| {
@@ -53,10 +53,10 @@ mod tests {
     use super::*;
 
     /// 1000 s at 2 A, then 1000 s of rest.
-    fn part() -> Part {
+    fn part() -> MeasuredPart {
         let time_s: Vec<f64> = (0..=2000).map(f64::from).collect();
         let current_a = time_s.iter().map(|&t| if t <= 1000.0 { 2.0 } else { 0.0 }).collect();
-        Part { time_s, current_a, ..Part::default() }
+        MeasuredPart { time_s, current_a, ..MeasuredPart::default() }
     }
 
     #[test]
@@ -80,8 +80,8 @@ mod tests {
 
     #[test]
     fn a_part_without_current_is_seen_whole() {
-        let rest = Part { time_s: vec![0.0, 1.0], current_a: vec![0.0, f64::NAN], ..Part::default() };
+        let rest = MeasuredPart { time_s: vec![0.0, 1.0], current_a: vec![0.0, f64::NAN], ..MeasuredPart::default() };
         assert_eq!(rows(&rest, 0, 1, (0.4, 0.7)), 0..2);
-        assert_eq!(rows(&Part::default(), 0, 1, (0.4, 0.7)), 0..0);
+        assert_eq!(rows(&MeasuredPart::default(), 0, 1, (0.4, 0.7)), 0..0);
     }
 }

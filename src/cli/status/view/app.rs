@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
+use crate::quantity::Timestamp;
 use crate::status::STALE;
 use crate::status::document::Document;
-use crate::quantity::Timestamp;
 
 /// Documents remembered for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;

@@ -10,10 +10,10 @@ use super::app::{App, Page};
 use super::{pages, plot};
 use crate::alarm::Severity;
 use crate::cli::status::{config, duration, number, percent, shown, store, with_std, word};
-use crate::status::document::Document;
 use crate::io::stamp;
 use crate::monitor::Validity;
 use crate::quantity::Timestamp;
+use crate::status::document::Document;
 
 /// Least size that shows anything sensible.
 const LEAST: (u16, u16) = (40, 12);

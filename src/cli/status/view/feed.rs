@@ -10,9 +10,9 @@ use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
 
 use super::app::News;
-use crate::status::client::{check_length, explain, parse};
 use crate::io::clock::Reading;
 use crate::quantity::Timestamp;
+use crate::status::client::{check_length, explain, parse};
 
 /// Pause before a daemon that is not there is looked for again.
 const RETRY: Duration = Duration::from_secs(1);

@@ -12,8 +12,8 @@ use super::draw::{Theme, clock};
 use super::plot::{Scale, bar, sparkline};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{number, shown, with_std, word};
-use crate::status::document::{Cell, Document};
 use crate::quantity::Timestamp;
+use crate::status::document::{Cell, Document};
 
 /// Width of a row's first cell number in the map.
 const LABEL: usize = 5;

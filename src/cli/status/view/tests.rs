@@ -9,9 +9,9 @@ use ratatui::style::Color;
 
 use super::app::{HISTORY, News, Page};
 use super::*;
-use crate::status::document::Document;
 use crate::cli::status::sample::sample;
 use crate::quantity::Timestamp;
+use crate::status::document::Document;
 
 fn app() -> App {
     App::new(PathBuf::from("/run/packwatch/status-stream.sock"), true)

@@ -1,17 +1,17 @@
-//! Scenarios over the whole engine; the single machine's table is tested beside it.
+//! Scenarios over the whole engine; the table of a single machine is tested next to it.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::super::{Direction, When};
+use super::super::{Comparison, Direction};
 use super::*;
 
 fn rule(rule: Rule, threshold: f64, hysteresis: f64, debounce_s: f64, debounce_events: u32) -> RuleConfig {
-    let clear = match rule.row().direction {
+    let clear = match rule.spec().direction {
         Direction::Below => threshold + hysteresis,
         Direction::Above => threshold - hysteresis,
     };
-    let (severity, when) = (Severity::Warning, When::Mean);
+    let (severity, when) = (Severity::Warning, Comparison::Mean);
     RuleConfig { rule, severity, threshold, clear, when, debounce_s, debounce_events, is_latching: false }
 }
 
@@ -65,7 +65,7 @@ fn input_lost_while_active_keeps_the_alarm_without_a_value() {
     assert_eq!(heard, [Change::Raised, Change::Suppressed], "neither cleared nor raised again");
     let alarms: Vec<_> = engine.raised().collect();
     assert_eq!((alarms.len(), alarms[0].value, alarms[0].last_raised), (1, None, Some(at(0.0))));
-    assert_eq!((alarms[0].state, alarms[0].raised_value), (State::Suppressed, Some(1.3)));
+    assert_eq!((alarms[0].state, alarms[0].raised_value), (AlarmState::Suppressed, Some(1.3)));
 }
 
 #[test]
@@ -158,7 +158,7 @@ fn values_of_rules_and_cells_not_watched_are_passed_over() {
     see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(2)), Some(0.0), &mut changes);
     see(&mut engine, at(0.0), Rule::RechargePeriodLow, None, Some(0.0), &mut changes);
     assert_eq!(changes, []);
-    assert_eq!(engine.get(Rule::CapacityLow, Some(CellIndex(1))).map(|alarm| alarm.state), Some(State::Unknown));
+    assert_eq!(engine.get(Rule::CapacityLow, Some(CellIndex(1))).map(|alarm| alarm.state), Some(AlarmState::Unknown));
     assert_eq!(engine.get(Rule::RechargePeriodLow, None), None);
 }
 
@@ -170,7 +170,7 @@ fn a_restored_engine_goes_on_as_the_stored_one_would_have() {
     see(&mut first, at(0.0), Rule::RechargePeriodLow, None, Some(800.0), &mut changes);
     see(&mut first, at(5.0), Rule::CapacityLow, CELL, Some(1.3), &mut changes);
     let text = serde_json::to_string(&first.snapshot()).expect("serialises");
-    let mut state: AlarmState = serde_json::from_str(&text).expect("reads back");
+    let mut state: AlarmSnapshot = serde_json::from_str(&text).expect("reads back");
     assert_eq!(text, serde_json::to_string(&state).expect("serialises"));
     state.rebase(1_000_000_000_000);
     let mut second = AlarmEngine::new(rules, 2);
@@ -229,16 +229,16 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
     see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.05), &mut changes);
     changes.clear();
     let cell_1 = Selector { cell: Some(CellIndex(1)), ..Selector::default() };
-    assert_eq!(engine.acknowledge(&cell_1, &mut changes), Outcome { changed: 1, refused: 0 });
-    assert_eq!(engine.acknowledge(&cell_1, &mut changes), Outcome::default());
+    assert_eq!(engine.acknowledge(&cell_1, &mut changes), CommandOutcome { changed: 1, refused: 0 });
+    assert_eq!(engine.acknowledge(&cell_1, &mut changes), CommandOutcome::default());
     let capacity = Selector { rule: Some(Rule::CapacityLow), ..Selector::default() };
-    assert_eq!(engine.clear(&capacity, &mut changes), Outcome { changed: 1, refused: 1 });
+    assert_eq!(engine.clear(&capacity, &mut changes), CommandOutcome { changed: 1, refused: 1 });
     let heard: Vec<_> = changes.iter().map(|c| (c.change, c.alarm.cell, c.alarm.state)).collect();
     assert_eq!(
         heard,
-        [(Change::Acknowledged, Some(CellIndex(1)), State::Active), (Change::Cleared, CELL, State::Inactive),]
+        [(Change::Acknowledged, Some(CellIndex(1)), AlarmState::Active), (Change::Cleared, CELL, AlarmState::Inactive),]
     );
-    assert_eq!(engine.clear(&Selector::default(), &mut changes), Outcome { changed: 1, refused: 2 });
+    assert_eq!(engine.clear(&Selector::default(), &mut changes), CommandOutcome { changed: 1, refused: 2 });
     assert_eq!(engine.get(Rule::CapacityLow, CELL).map(|alarm| alarm.occurrences), Some(0), "forgotten");
     assert_eq!(engine.count(), 2);
 }
@@ -247,10 +247,10 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
 fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
     let rules = [Rule::InputMissing, Rule::EstimateUntrusted, Rule::CellImbalance];
     let mut configs = rules.map(|r| rule(r, 3.0, 0.5, 5.0, 3)).to_vec();
-    // Two thresholds of one rule, and one that cannot judge a value without its deviation.
+    // Two thresholds of one rule, and one that cannot limit a value without its deviation.
     configs.push(RuleConfig { severity: Severity::Severe, ..rule(Rule::InputMissing, 3.1, 0.2, 1.0, 1) });
-    configs[2].when = When::Probability(0.9);
-    let mut seen = AlarmEngine::new(configs, 2);
+    configs[2].when = Comparison::Probability(0.9);
+    let mut observation = AlarmEngine::new(configs, 2);
     let mut rng = ChaCha8Rng::seed_from_u64(11);
     let (mut quiet, mut loud, mut changes) = (0, 0, Vec::new());
     for second in 0..5000 {
@@ -258,14 +258,14 @@ fn a_quiet_value_that_is_shown_is_as_one_that_is_judged() {
         let cell = [None, CELL, Some(CellIndex(1)), Some(CellIndex(2))][rng.random_range(0..4)];
         // Now and then a stretch beyond the threshold.
         let value = rng.random_range(0.0..3.2) + if second % 1000 > 900 { 1.0 } else { 0.0 };
-        let mut shown = seen.clone();
-        let is_quiet = seen.is_quiet(r, value);
+        let mut shown = observation.clone();
+        let is_quiet = observation.is_quiet(r, value);
         assert!(!is_quiet || r != Rule::CellImbalance);
         let before = changes.len();
-        see(&mut seen, now, r, cell, Some(value), &mut changes);
+        see(&mut observation, now, r, cell, Some(value), &mut changes);
         if is_quiet {
             shown.show(r, cell, value);
-            assert_eq!(format!("{shown:?}"), format!("{seen:?}"), "{r:?} {cell:?} {value}");
+            assert_eq!(format!("{shown:?}"), format!("{observation:?}"), "{r:?} {cell:?} {value}");
             assert_eq!(changes.len(), before);
         }
         quiet += u32::from(is_quiet);

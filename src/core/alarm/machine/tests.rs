@@ -1,23 +1,23 @@
-//! Every state with everything it can be told, and what the table cannot say: counting, past, suspension.
+//! Every state with every input, and what the table cannot express: counting, past, suspension.
 
-use super::super::{Rule, Severity, When};
+use super::super::{Comparison, Rule, Severity};
 use super::*;
 
-const STATES: [State; 8] = [
-    State::Unknown,
-    State::Inactive,
-    State::Pending,
-    State::Active,
-    State::Clearing,
-    State::Suppressed,
-    State::Latched,
-    State::Cleared,
+const STATES: [AlarmState; 8] = [
+    AlarmState::Unknown,
+    AlarmState::Inactive,
+    AlarmState::Pending,
+    AlarmState::Active,
+    AlarmState::Clearing,
+    AlarmState::Suppressed,
+    AlarmState::Latched,
+    AlarmState::Cleared,
 ];
-const TOLD: [MachineInput; 6] = [
-    MachineInput::Verdict(Verdict::Beyond),
-    MachineInput::Verdict(Verdict::Between),
-    MachineInput::Verdict(Verdict::Healthy),
-    MachineInput::Verdict(Verdict::Unknown),
+const INPUTS: [MachineInput; 6] = [
+    MachineInput::Check(LimitCheck::Beyond),
+    MachineInput::Check(LimitCheck::Between),
+    MachineInput::Check(LimitCheck::Healthy),
+    MachineInput::Check(LimitCheck::Unknown),
     MachineInput::Acknowledge,
     MachineInput::Clear,
 ];
@@ -28,7 +28,7 @@ fn rule(is_latching: bool) -> RuleConfig {
         severity: Severity::Warning,
         threshold: 1.4,
         clear: 1.5,
-        when: When::Mean,
+        when: Comparison::Mean,
         debounce_s: 10.0,
         debounce_events: 2,
         is_latching,
@@ -39,59 +39,59 @@ fn at(seconds: f64) -> Timestamp {
     Timestamp::from_secs(seconds)
 }
 
-fn look(machine: &mut Machine, rule: &RuleConfig, seconds: f64, verdict: Verdict) -> Option<Change> {
-    let value = match verdict {
-        Verdict::Beyond => Some(1.3),
-        Verdict::Between => Some(1.45),
-        Verdict::Healthy => Some(1.6),
-        Verdict::Unknown => None,
+fn look(machine: &mut Machine, rule: &RuleConfig, seconds: f64, check: LimitCheck) -> Option<Change> {
+    let value = match check {
+        LimitCheck::Beyond => Some(1.3),
+        LimitCheck::Between => Some(1.45),
+        LimitCheck::Healthy => Some(1.6),
+        LimitCheck::Unknown => None,
     };
     machine.observe(at(seconds), rule, &Observation::new(value))
 }
 
 /// A machine that has come to `state` at the latest at 100 s, whose running debounce began then.
-fn machine_in(state: State) -> (Machine, RuleConfig) {
-    use Verdict::{Beyond, Healthy, Unknown};
-    let rule = rule(state == State::Latched);
-    let looks: &[(f64, Verdict)] = match state {
-        State::Unknown => &[],
-        State::Inactive => &[(0.0, Healthy)],
-        State::Pending => &[(100.0, Beyond)],
-        State::Active => &[(0.0, Beyond), (10.0, Beyond)],
-        State::Clearing => &[(0.0, Beyond), (10.0, Beyond), (100.0, Healthy)],
-        State::Suppressed => &[(0.0, Beyond), (10.0, Beyond), (100.0, Unknown)],
-        State::Latched | State::Cleared => &[(0.0, Beyond), (10.0, Beyond), (20.0, Healthy), (30.0, Healthy)],
+fn machine_in(state: AlarmState) -> (Machine, RuleConfig) {
+    use LimitCheck::{Beyond, Healthy, Unknown};
+    let rule = rule(state == AlarmState::Latched);
+    let looks: &[(f64, LimitCheck)] = match state {
+        AlarmState::Unknown => &[],
+        AlarmState::Inactive => &[(0.0, Healthy)],
+        AlarmState::Pending => &[(100.0, Beyond)],
+        AlarmState::Active => &[(0.0, Beyond), (10.0, Beyond)],
+        AlarmState::Clearing => &[(0.0, Beyond), (10.0, Beyond), (100.0, Healthy)],
+        AlarmState::Suppressed => &[(0.0, Beyond), (10.0, Beyond), (100.0, Unknown)],
+        AlarmState::Latched | AlarmState::Cleared => &[(0.0, Beyond), (10.0, Beyond), (20.0, Healthy), (30.0, Healthy)],
     };
     let mut machine = Machine::default();
-    for &(seconds, verdict) in looks {
-        look(&mut machine, &rule, seconds, verdict);
+    for &(seconds, check) in looks {
+        look(&mut machine, &rule, seconds, check);
     }
     assert_eq!(machine.state, state);
     (machine, rule)
 }
 
-/// State after being told, and after being told the same again when the debounce has run out, and what others hear of
+/// AlarmState after being input, and after being input the same again when the debounce has run out, and what others hear of
 /// the first.
-fn expected(state: State, told: MachineInput) -> (State, State, Option<Change>) {
-    use State::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
-    use Verdict::{Between, Beyond, Healthy};
+fn expected(state: AlarmState, input: MachineInput) -> (AlarmState, AlarmState, Option<Change>) {
+    use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
+    use LimitCheck::{Between, Beyond, Healthy};
     let stay = (state, state, None);
-    match (state, told) {
-        (Unknown | Inactive | Cleared, MachineInput::Verdict(Beyond)) => (Pending, Active, None),
-        (Pending, MachineInput::Verdict(Beyond)) => (Pending, Active, None),
-        (Latched, MachineInput::Verdict(Beyond)) => (Latched, Active, None),
-        (Active, MachineInput::Verdict(Beyond)) => stay,
-        (Clearing, MachineInput::Verdict(Beyond | Between)) => (Active, Active, None),
-        (Suppressed, MachineInput::Verdict(Beyond | Between)) => (Active, Active, Some(Change::Resumed)),
-        (Unknown | Pending, MachineInput::Verdict(Between | Healthy)) => (Inactive, Inactive, None),
-        (Inactive | Latched | Cleared, MachineInput::Verdict(Between | Healthy)) => stay,
-        (Active, MachineInput::Verdict(Between)) => stay,
-        (Active | Clearing, MachineInput::Verdict(Healthy)) => (Clearing, Cleared, None),
-        (Suppressed, MachineInput::Verdict(Healthy)) => (Clearing, Cleared, Some(Change::Resumed)),
-        (Unknown, MachineInput::Verdict(Verdict::Unknown)) => stay,
-        (Inactive | Cleared, MachineInput::Verdict(Verdict::Unknown)) => (Unknown, Unknown, None),
-        (Pending | Suppressed | Latched, MachineInput::Verdict(Verdict::Unknown)) => stay,
-        (Active | Clearing, MachineInput::Verdict(Verdict::Unknown)) => {
+    match (state, input) {
+        (Unknown | Inactive | Cleared, MachineInput::Check(Beyond)) => (Pending, Active, None),
+        (Pending, MachineInput::Check(Beyond)) => (Pending, Active, None),
+        (Latched, MachineInput::Check(Beyond)) => (Latched, Active, None),
+        (Active, MachineInput::Check(Beyond)) => stay,
+        (Clearing, MachineInput::Check(Beyond | Between)) => (Active, Active, None),
+        (Suppressed, MachineInput::Check(Beyond | Between)) => (Active, Active, Some(Change::Resumed)),
+        (Unknown | Pending, MachineInput::Check(Between | Healthy)) => (Inactive, Inactive, None),
+        (Inactive | Latched | Cleared, MachineInput::Check(Between | Healthy)) => stay,
+        (Active, MachineInput::Check(Between)) => stay,
+        (Active | Clearing, MachineInput::Check(Healthy)) => (Clearing, Cleared, None),
+        (Suppressed, MachineInput::Check(Healthy)) => (Clearing, Cleared, Some(Change::Resumed)),
+        (Unknown, MachineInput::Check(LimitCheck::Unknown)) => stay,
+        (Inactive | Cleared, MachineInput::Check(LimitCheck::Unknown)) => (Unknown, Unknown, None),
+        (Pending | Suppressed | Latched, MachineInput::Check(LimitCheck::Unknown)) => stay,
+        (Active | Clearing, MachineInput::Check(LimitCheck::Unknown)) => {
             (Suppressed, Suppressed, Some(Change::Suppressed))
         }
         (Unknown | Inactive | Pending, MachineInput::Acknowledge | MachineInput::Clear) => stay,
@@ -105,37 +105,39 @@ fn expected(state: State, told: MachineInput) -> (State, State, Option<Change>) 
     }
 }
 
-fn tell(machine: &mut Machine, rule: &RuleConfig, seconds: f64, told: MachineInput) -> Option<Change> {
-    match told {
-        MachineInput::Verdict(verdict) => look(machine, rule, seconds, verdict),
+fn apply(machine: &mut Machine, rule: &RuleConfig, seconds: f64, input: MachineInput) -> Option<Change> {
+    match input {
+        MachineInput::Check(check) => look(machine, rule, seconds, check),
         MachineInput::Acknowledge => machine.acknowledge().ok(),
         MachineInput::Clear => machine.clear().ok(),
     }
 }
 
 #[test]
-fn every_state_and_everything_told_leads_where_the_table_says() {
+fn every_state_and_input_leads_where_the_table_says() {
     for state in STATES {
-        for told in TOLD {
-            let (early, late, change) = expected(state, told);
+        for input in INPUTS {
+            let (early, late, change) = expected(state, input);
             let (mut machine, rule) = machine_in(state);
-            assert_eq!(tell(&mut machine, &rule, 101.0, told), change, "{state:?} {told:?}");
-            assert_eq!(machine.state, early, "{state:?} {told:?}");
+            assert_eq!(apply(&mut machine, &rule, 101.0, input), change, "{state:?} {input:?}");
+            assert_eq!(machine.state, early, "{state:?} {input:?}");
             assert_eq!(
                 machine.is_known,
-                !matches!(told, MachineInput::Verdict(Verdict::Unknown)) && is_known_in(state, told)
+                !matches!(input, MachineInput::Check(LimitCheck::Unknown)) && is_known_in(state, input)
             );
-            tell(&mut machine, &rule, 120.0, told);
-            assert_eq!(machine.state, late, "{state:?} {told:?}, again");
+            apply(&mut machine, &rule, 120.0, input);
+            assert_eq!(machine.state, late, "{state:?} {input:?}, again");
         }
     }
 }
 
 /// Commands do not make a value known.
-fn is_known_in(state: State, told: MachineInput) -> bool {
-    match told {
-        MachineInput::Verdict(_) => true,
-        MachineInput::Acknowledge | MachineInput::Clear => !matches!(state, State::Unknown | State::Suppressed),
+fn is_known_in(state: AlarmState, input: MachineInput) -> bool {
+    match input {
+        MachineInput::Check(_) => true,
+        MachineInput::Acknowledge | MachineInput::Clear => {
+            !matches!(state, AlarmState::Unknown | AlarmState::Suppressed)
+        }
     }
 }
 
@@ -146,8 +148,8 @@ fn time_that_passes_counts_in_every_state_only_where_a_debounce_runs() {
         let change = machine.poll(at(1e6), &rule);
         // One value each: what is missing is the second value, so that time alone changes nothing.
         assert_eq!((machine.state, change), (state, None), "{state:?}");
-        let runs = matches!(state, State::Pending | State::Clearing);
-        assert_eq!(machine.standing().is_counting, runs, "{state:?}");
+        let runs = matches!(state, AlarmState::Pending | AlarmState::Clearing);
+        assert_eq!(machine.index_entry().is_counting, runs, "{state:?}");
     }
 }
 
@@ -158,9 +160,9 @@ fn commands_that_change_nothing_say_why() {
         let mut cleared = machine;
         let refusal = cleared.clear().err();
         let wanted = match state {
-            State::Unknown | State::Inactive | State::Pending => Some(Refusal::Nothing),
-            State::Active | State::Clearing | State::Suppressed => Some(Refusal::NotHealthy),
-            State::Latched | State::Cleared => None,
+            AlarmState::Unknown | AlarmState::Inactive | AlarmState::Pending => Some(Refusal::Nothing),
+            AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => Some(Refusal::NotHealthy),
+            AlarmState::Latched | AlarmState::Cleared => None,
         };
         assert_eq!(refusal, wanted, "{state:?}");
         let mut twice = machine;
@@ -171,68 +173,69 @@ fn commands_that_change_nothing_say_why() {
 
 #[test]
 fn a_latched_alarm_that_is_beyond_again_is_a_new_occurrence_after_the_debounce() {
-    let (mut machine, rule) = machine_in(State::Latched);
+    let (mut machine, rule) = machine_in(AlarmState::Latched);
     assert_eq!(machine.occurrences, 1);
-    assert_eq!(look(&mut machine, &rule, 50.0, Verdict::Beyond), None);
+    assert_eq!(look(&mut machine, &rule, 50.0, LimitCheck::Beyond), None);
     // Healthy in between: what was counted is forgotten.
-    look(&mut machine, &rule, 55.0, Verdict::Healthy);
-    assert_eq!(look(&mut machine, &rule, 56.0, Verdict::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 65.9, Verdict::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 66.0, Verdict::Beyond), Some(Change::Raised));
+    look(&mut machine, &rule, 55.0, LimitCheck::Healthy);
+    assert_eq!(look(&mut machine, &rule, 56.0, LimitCheck::Beyond), None);
+    assert_eq!(look(&mut machine, &rule, 65.9, LimitCheck::Beyond), None);
+    assert_eq!(look(&mut machine, &rule, 66.0, LimitCheck::Beyond), Some(Change::Raised));
     assert_eq!((machine.occurrences, machine.first_raised, machine.last_raised), (2, at(10.0), at(66.0)));
 }
 
 #[test]
 fn a_latched_alarm_cleared_while_its_value_is_unknown_is_unknown() {
-    let (mut machine, rule) = machine_in(State::Latched);
-    look(&mut machine, &rule, 50.0, Verdict::Unknown);
+    let (mut machine, rule) = machine_in(AlarmState::Latched);
+    look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
     assert_eq!(machine.clear(), Ok(Change::Cleared));
-    assert_eq!((machine.state, machine.occurrences), (State::Unknown, 1));
+    assert_eq!((machine.state, machine.occurrences), (AlarmState::Unknown, 1));
 }
 
 #[test]
 fn an_acknowledged_alarm_rests_inactive_and_raised_anew_is_not_acknowledged() {
-    let (mut machine, rule) = machine_in(State::Active);
+    let (mut machine, rule) = machine_in(AlarmState::Active);
     machine.acknowledge().expect("raised");
-    look(&mut machine, &rule, 200.0, Verdict::Healthy);
-    assert_eq!(look(&mut machine, &rule, 210.0, Verdict::Healthy), Some(Change::Cleared));
-    assert_eq!(machine.state, State::Inactive);
-    look(&mut machine, &rule, 300.0, Verdict::Beyond);
-    look(&mut machine, &rule, 310.0, Verdict::Beyond);
-    assert_eq!((machine.state, machine.is_acknowledged, machine.occurrences), (State::Active, false, 2));
+    look(&mut machine, &rule, 200.0, LimitCheck::Healthy);
+    assert_eq!(look(&mut machine, &rule, 210.0, LimitCheck::Healthy), Some(Change::Cleared));
+    assert_eq!(machine.state, AlarmState::Inactive);
+    look(&mut machine, &rule, 300.0, LimitCheck::Beyond);
+    look(&mut machine, &rule, 310.0, LimitCheck::Beyond);
+    assert_eq!((machine.state, machine.is_acknowledged, machine.occurrences), (AlarmState::Active, false, 2));
 }
 
 #[test]
 fn a_past_alarm_is_cleared_again_when_its_value_comes_back() {
-    let (mut machine, rule) = machine_in(State::Cleared);
-    look(&mut machine, &rule, 50.0, Verdict::Unknown);
-    assert_eq!(machine.state, State::Unknown);
-    look(&mut machine, &rule, 60.0, Verdict::Healthy);
-    assert_eq!(machine.state, State::Cleared);
+    let (mut machine, rule) = machine_in(AlarmState::Cleared);
+    look(&mut machine, &rule, 50.0, LimitCheck::Unknown);
+    assert_eq!(machine.state, AlarmState::Unknown);
+    look(&mut machine, &rule, 60.0, LimitCheck::Healthy);
+    assert_eq!(machine.state, AlarmState::Cleared);
     assert_eq!((machine.raised_value, machine.value()), (Some(1.3), Some(1.6)));
 }
 
 #[test]
 fn time_alone_or_values_alone_do_not_raise() {
-    let (mut by_time, rule) = machine_in(State::Pending);
+    let (mut by_time, rule) = machine_in(AlarmState::Pending);
     assert_eq!(by_time.poll(at(1e6), &rule), None, "one value, endless time");
-    let (mut by_values, rule) = machine_in(State::Pending);
+    let (mut by_values, rule) = machine_in(AlarmState::Pending);
     for _ in 0..1000 {
-        assert_eq!(look(&mut by_values, &rule, 109.9, Verdict::Beyond), None, "many values, 9.9 s");
+        assert_eq!(look(&mut by_values, &rule, 109.9, LimitCheck::Beyond), None, "many values, 9.9 s");
     }
     assert_eq!(by_values.poll(at(110.0), &rule), Some(Change::Raised), "and 0.1 s later both hold");
 }
 
 #[test]
 fn time_beside_an_unknown_value_does_not_count_and_takes_nothing_away() {
-    for (state, verdict, change) in
-        [(State::Pending, Verdict::Beyond, Change::Raised), (State::Clearing, Verdict::Healthy, Change::Cleared)]
-    {
+    for (state, check, change) in [
+        (AlarmState::Pending, LimitCheck::Beyond, Change::Raised),
+        (AlarmState::Clearing, LimitCheck::Healthy, Change::Cleared),
+    ] {
         let (mut machine, rule) = machine_in(state);
-        look(&mut machine, &rule, 104.0, verdict);
-        look(&mut machine, &rule, 105.0, Verdict::Unknown);
+        look(&mut machine, &rule, 104.0, check);
+        look(&mut machine, &rule, 105.0, LimitCheck::Unknown);
         assert_eq!(machine.poll(at(190.0), &rule), None);
-        look(&mut machine, &rule, 200.0, verdict);
+        look(&mut machine, &rule, 200.0, check);
         assert_eq!(machine.poll(at(205.9), &rule), None, "4 s before the unknown value count, 1 s beside it does not");
         assert_eq!(machine.poll(at(206.0), &rule), Some(change));
     }
@@ -240,45 +243,47 @@ fn time_beside_an_unknown_value_does_not_count_and_takes_nothing_away() {
 
 #[test]
 fn time_in_a_gap_does_not_count() {
-    let (mut machine, rule) = machine_in(State::Pending);
+    let (mut machine, rule) = machine_in(AlarmState::Pending);
     machine.handle_gap();
-    assert_eq!(look(&mut machine, &rule, 500.0, Verdict::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, 510.0, Verdict::Beyond), Some(Change::Raised));
+    assert_eq!(look(&mut machine, &rule, 500.0, LimitCheck::Beyond), None);
+    assert_eq!(look(&mut machine, &rule, 510.0, LimitCheck::Beyond), Some(Change::Raised));
 }
 
 #[test]
 fn a_clock_that_goes_back_takes_nothing_away() {
-    let (mut machine, rule) = machine_in(State::Pending);
-    assert_eq!(look(&mut machine, &rule, -50.0, Verdict::Beyond), None);
-    assert_eq!(look(&mut machine, &rule, -40.0, Verdict::Beyond), Some(Change::Raised));
+    let (mut machine, rule) = machine_in(AlarmState::Pending);
+    assert_eq!(look(&mut machine, &rule, -50.0, LimitCheck::Beyond), None);
+    assert_eq!(look(&mut machine, &rule, -40.0, LimitCheck::Beyond), Some(Change::Raised));
 }
 
 #[test]
 fn a_learned_value_whose_inputs_are_lost_is_suppressed_and_stands_when_they_are_back() {
-    let (mut machine, rule) = machine_in(State::Active);
+    let (mut machine, rule) = machine_in(AlarmState::Active);
     assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));
-    assert_eq!(machine.suspend(at(201.0), &rule), None, "told once");
-    assert_eq!((machine.value(), machine.state), (None, State::Suppressed));
+    assert_eq!(machine.suspend(at(201.0), &rule), None, "input once");
+    assert_eq!((machine.value(), machine.state), (None, AlarmState::Suppressed));
     assert_eq!(machine.resume(at(300.0), &rule), Some(Change::Resumed));
-    assert_eq!((machine.value(), machine.state), (Some(1.3), State::Active));
-    let (mut healthy, rule) = machine_in(State::Inactive);
-    assert_eq!((healthy.suspend(at(200.0), &rule), healthy.state), (None, State::Unknown));
-    assert_eq!((healthy.resume(at(300.0), &rule), healthy.state), (None, State::Inactive));
+    assert_eq!((machine.value(), machine.state), (Some(1.3), AlarmState::Active));
+    let (mut healthy, rule) = machine_in(AlarmState::Inactive);
+    assert_eq!((healthy.suspend(at(200.0), &rule), healthy.state), (None, AlarmState::Unknown));
+    assert_eq!((healthy.resume(at(300.0), &rule), healthy.state), (None, AlarmState::Inactive));
 }
 
 #[test]
 fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_raised() {
-    for (value, change, state) in [(1.2, Change::Resumed, State::Active), (1.6, Change::Cleared, State::Cleared)] {
-        let (mut machine, rule) = machine_in(State::Active);
+    for (value, change, state) in
+        [(1.2, Change::Resumed, AlarmState::Active), (1.6, Change::Cleared, AlarmState::Cleared)]
+    {
+        let (mut machine, rule) = machine_in(AlarmState::Active);
         let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
         assert_eq!(machine.suspend(at(200.0), &rule), Some(Change::Suppressed));
         assert_eq!(machine.observe(at(200.2), &rule, &Observation::new(Some(value))), None);
-        assert_eq!((machine.value(), machine.state), (None, State::Suppressed), "neither cleared nor fresh");
+        assert_eq!((machine.value(), machine.state), (None, AlarmState::Suppressed), "neither cleared nor fresh");
         assert_eq!(machine.suspend(at(200.3), &rule), None);
         assert_eq!(machine.resume(at(300.0), &rule), Some(change));
         assert_eq!((machine.value(), machine.state), (Some(value), state));
     }
-    let (mut machine, rule) = machine_in(State::Inactive);
+    let (mut machine, rule) = machine_in(AlarmState::Inactive);
     let rule = RuleConfig { debounce_s: 0.0, debounce_events: 1, ..rule };
     assert_eq!(machine.suspend(at(200.0), &rule), None);
     let last = Observation::new(Some(1.2));
@@ -288,6 +293,6 @@ fn a_value_learned_while_its_inputs_are_lost_waits_for_them_where_the_alarm_is_r
 
 #[test]
 fn wire_codes_are_those_of_the_alarm_frame() {
-    let codes = STATES.map(State::wire_code);
+    let codes = STATES.map(AlarmState::wire_code);
     assert_eq!(codes, [6, 0, 3, 1, 1, 5, 4, 2]);
 }

@@ -1,12 +1,14 @@
 //! The estimators of all cells of a pack, stepped together.
 //!
-//! Almost every step is an ordinary one: the current was measured all the time since the last voltage, and the voltage is
-//! within the gate. Those are made by the [`kernel`], [`WIDTH`] cells at a time, over structures of arrays; wider
-//! instructions are chosen at run time (without the feature `lab` there are none, and cells are stepped one by one).
-//! Whatever else there is (a first voltage, a gap, no current, a reading beyond the gate, a covariance without a factor)
-//! is done by the readable [`CellEstimator`], which is also what the kernel is tested against: SOC within 1e-9 over 100,000
-//! steps. Which of the two steps a cell takes depends on that cell alone, and a
-//! lane's bits do not depend on the lanes beside it, so a cell's estimates are the same in any company.
+//! In: one [`CellStep`] per cell and batch (V, A, s, degrees C). Out: a [`StepResult`] per cell, and its estimates.
+//!
+//! Almost every step is ordinary: the current was measured all the time since the last voltage, and the voltage is
+//! within the gate. The [`kernel`] makes these steps, [`WIDTH`] cells at a time, over structures of arrays; it selects
+//! wider instructions at run time (without the feature `wide`, cells are stepped one by one). The readable
+//! [`CellEstimator`] makes all other steps: a first voltage, a gap, no current, a reading beyond the gate, a covariance
+//! without a factor. The kernel is tested against it: SOC within 1e-9 over 100,000 steps. Which of the two makes a step
+//! depends on that cell alone, and a lane's bits do not depend on other lanes, so a cell's estimates do not depend on the
+//! other cells of the pack.
 
 mod input;
 mod kernel;
@@ -15,17 +17,18 @@ mod tables;
 use std::array::from_fn;
 
 use input::BlockInput;
-use kernel::{Constants, DecayFactors, INFORMATION_S, LOAD_A, MEAN_NIS, REST_S, State, at};
+use kernel::{DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, REST_S, at};
 use nalgebra::{SMatrix, SVector};
-use tables::{Around, Tables};
+use tables::{LineCache, Tables};
 
 use super::{CAPACITY, CellEstimator, CellStep, Filter, LOG_RESISTANCE, Memory, StepResult, thermal_c, widened};
+
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, MAX_BRANCHES};
 use crate::filter::simd::Lanes;
 use crate::filter::{Gaussian, ScalarGaussian};
 
-/// Cells of a block: one of AVX-512's vectors, two of AVX2's (4 and 16 were measured, too: slower with either).
+/// Cells of a block: one AVX-512 vector, two AVX2 vectors (4 and 16 cells measured slower).
 const WIDTH: usize = 8;
 
 /// The estimators of a pack's cells.
@@ -33,82 +36,82 @@ const WIDTH: usize = 8;
 pub struct EstimatorBank {
     model: CellModel,
     config: EstimatorConfig,
-    constants: Constants,
-    filters: Filters,
-    cells: Vec<Cell>,
-    /// The steps of the batch; what is left of an earlier one is not looked at.
+    constants: KernelConstants,
+    filters: FilterArrays,
+    cells: Vec<CellSlot>,
+    /// The steps of the batch. Inputs of absent cells are stale and not read.
     inputs: Vec<BlockInput>,
     results: Vec<StepResult>,
-    /// Cells of the batch that have no ordinary step.
+    /// Cells of the batch whose step is not ordinary.
     others: Vec<(usize, CellStep)>,
     #[cfg(feature = "wide")]
     machine: pulp::Arch,
 }
 
-/// What is kept of a cell beside its lane.
+/// State of a cell in addition to its lane.
 #[derive(Debug, Clone)]
-struct Cell {
-    /// What the kernel works with (load, consistency, information, rest) is in the lane.
+struct CellSlot {
+    /// Load, consistency, information and rest are in the lane, not here.
     memory: Memory,
     has_filter: bool,
 }
 
-impl Cell {
+impl CellSlot {
     /// Whether a step that measured the current all the time can be an ordinary one.
     fn is_ordinary(&self) -> bool {
-        self.has_filter && self.memory.rejected == 0 && self.memory.away_std_if_any().is_none()
+        self.has_filter && self.memory.rejected == 0 && self.memory.downtime_std_if_any().is_none()
     }
 }
 
-/// The lanes of a pack, by number of branches.
+/// The filters of a pack, by number of branches.
 #[derive(Debug, Clone)]
-enum Filters {
-    One(Lane<4, 10, 10>),
-    Two(Lane<5, 15, 14>),
-    Three(Lane<6, 21, 18>),
+enum FilterArrays {
+    One(FilterArray<4, 10, 10>),
+    Two(FilterArray<5, 15, 14>),
+    Three(FilterArray<6, 21, 18>),
 }
 
 #[derive(Debug, Clone)]
-struct Lane<const N: usize, const T: usize, const W: usize> {
+struct FilterArray<const N: usize, const T: usize, const W: usize> {
     tables: Tables<W>,
-    blocks: Vec<State<WIDTH, N, T>>,
-    /// Of each block, for steps of all its cells together, and of each cell, for its own.
-    around: Vec<(Around<WIDTH, W>, [Around<1, W>; WIDTH])>,
-    rhythm: Rhythm,
+    blocks: Vec<FilterState<WIDTH, N, T>>,
+    /// Per block, for steps of all its cells together, and per cell, for its own.
+    cache: Vec<(LineCache<WIDTH, W>, [LineCache<1, W>; WIDTH])>,
+    step_time: StepTime,
 }
 
-/// The time cells last stepped over, s, and what it leaves: readings mostly come in one rhythm.
+/// The last step time, s, with its decay factors: readings mostly arrive at one interval.
 #[derive(Debug, Clone)]
-struct Rhythm {
+struct StepTime {
     time_s: f64,
-    kept: DecayFactors<1>,
+    decay: DecayFactors<1>,
 }
 
 /// Runs an expression for the pack's number of branches.
-macro_rules! each_lane {
+macro_rules! each_array {
     ($filters:expr, $x:ident => $body:expr) => {
         match $filters {
-            Filters::One($x) => $body,
-            Filters::Two($x) => $body,
-            Filters::Three($x) => $body,
+            FilterArrays::One($x) => $body,
+            FilterArrays::Two($x) => $body,
+            FilterArrays::Three($x) => $body,
         }
     };
 }
 
 impl EstimatorBank {
-    /// Estimators of `cells` cells of which nothing was measured yet.
+    /// Estimators of `cells` cells before their first measurement.
     pub fn new(model: &CellModel, config: &EstimatorConfig, cells: usize) -> Self {
         let blocks = cells.div_ceil(WIDTH);
         let filters = match model.branches.len() {
-            1 => Filters::One(Lane::new(model, blocks)),
-            2 => Filters::Two(Lane::new(model, blocks)),
-            _ => Filters::Three(Lane::new(model, blocks)),
+            1 => FilterArrays::One(FilterArray::new(model, blocks)),
+            2 => FilterArrays::Two(FilterArray::new(model, blocks)),
+            _ => FilterArrays::Three(FilterArray::new(model, blocks)),
         };
         let memory = CellEstimator::new(config).memory;
-        let cell = Cell { memory, has_filter: false };
+        let cell = CellSlot { memory, has_filter: false };
         let idle = StepResult { update: None, reset: false };
         let mut bank = Self {
-            constants: each_lane!(&filters, x => x.constants(model, config)),
+            constants: each_array!(&filters, x => x.constants(model, config)),
             model: model.clone(),
             config: *config,
             filters,
@@ -123,7 +126,7 @@ impl EstimatorBank {
         bank
     }
 
-    /// Other settings and tables for the same cells; the model has as many branches.
+    /// Replaces settings and tables for the same cells; the model must have as many branches.
     pub fn reconfigure(&mut self, model: &CellModel, config: &EstimatorConfig) {
         if (&self.model, &self.config) == (model, config) {
             return;
@@ -132,6 +135,11 @@ impl EstimatorBank {
         (0..self.cells.len()).for_each(|cell| new.put(cell, &self.cell(cell)));
         new.results = std::mem::take(&mut self.results);
         *self = new;
+    }
+
+    /// The cell model.
+    pub fn model(&self) -> &CellModel {
+        &self.model
     }
 
     /// The settings.
@@ -163,13 +171,13 @@ impl EstimatorBank {
         input.voltage_v.0[lane] = step.voltage_v;
     }
 
-    /// Makes the steps of the batch; what became of each: [`Self::result`].
+    /// Makes the steps of the batch; their outcomes: [`Self::result`].
     pub fn step(&mut self) {
         #[cfg(feature = "wide")]
         let machine = self.machine;
         let Self { constants, filters, inputs, cells, results, others, .. } = self;
-        each_lane!(filters, lanes => {
-            let all = StepAll { lanes, constants, inputs, cells, results, others };
+        each_array!(filters, lanes => {
+            let all = BatchStep { lanes, constants, inputs, cells, results, others };
             #[cfg(feature = "wide")]
             machine.dispatch(all);
             #[cfg(not(feature = "wide"))]
@@ -184,13 +192,13 @@ impl EstimatorBank {
         self.others.clear();
     }
 
-    /// What became of a cell's last step.
+    /// Outcome of a cell's last step.
     #[inline]
     pub fn result(&self, cell: usize) -> &StepResult {
         &self.results[cell]
     }
 
-    /// Temperature of a cell without a sensor's, degrees C.
+    /// Predicted temperature of a cell without a sensor value, degrees C.
     fn modelled_c(&self, cell: usize, step: &CellStep) -> f64 {
         let soc = self.soc(cell).map_or(0.5, |soc| soc.mean);
         thermal_c(&self.model, self.cells[cell].memory.temperature_c, soc, self.log_resistance(cell).mean, step)
@@ -202,45 +210,48 @@ impl EstimatorBank {
         self.cells[cell].has_filter
     }
 
-    /// State of charge as the filter has it: what may have happened while the program did not run is not in it.
+    /// State of charge in the filter's state, without the widening by downtime.
     pub fn filtered_soc(&self, cell: usize) -> Option<ScalarGaussian> {
-        self.is_started(cell).then(|| self.belief(cell, 0))
+        self.is_started(cell).then(|| self.marginal(cell, 0))
     }
 
     /// State of charge; `None` before the first voltage.
     #[inline]
     pub fn soc(&self, cell: usize) -> Option<ScalarGaussian> {
-        let Cell { memory, has_filter, .. } = &self.cells[cell];
+        let CellSlot { memory, has_filter, .. } = &self.cells[cell];
         has_filter.then(|| {
-            let soc = self.belief(cell, 0);
-            let away = memory.away_std_if_any();
-            ScalarGaussian { variance: away.map_or(soc.variance, |std| widened(soc.variance, std * std)), ..soc }
+            let soc = self.marginal(cell, 0);
+            let downtime_std = memory.downtime_std_if_any();
+            ScalarGaussian {
+                variance: downtime_std.map_or(soc.variance, |std| widened(soc.variance, std * std)),
+                ..soc
+            }
         })
     }
 
-    /// State of charge of the emptiest and the fullest cell; `None` when one's is not known, or of before time away.
+    /// State of charge of the emptiest and the fullest cell; `None` when a cell's is unknown or from before a downtime.
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
         let is_present =
-            |cell: &Cell| cell.has_filter && !cell.memory.is_unseen && cell.memory.away_std_if_any().is_none();
+            |cell: &CellSlot| cell.has_filter && !cell.memory.is_unseen && cell.memory.downtime_std_if_any().is_none();
         if !self.cells.iter().all(is_present) {
             return None;
         }
-        let (lowest, highest) = each_lane!(&self.filters, x => x.extremes(self.cells.len()))?;
-        Some((self.belief(lowest, 0), self.belief(highest, 0)))
+        let (lowest, highest) = each_array!(&self.filters, x => x.extremes(self.cells.len()))?;
+        Some((self.marginal(lowest, 0), self.marginal(highest, 0)))
     }
 
     /// ln of the resistance relative to new.
     #[inline]
     pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
-        let Cell { memory, has_filter, .. } = &self.cells[cell];
-        if *has_filter { self.belief(cell, LOG_RESISTANCE) } else { memory.log_resistance }
+        let CellSlot { memory, has_filter, .. } = &self.cells[cell];
+        if *has_filter { self.marginal(cell, LOG_RESISTANCE) } else { memory.log_resistance }
     }
 
-    /// Capacity as the filter works with it now, Ah.
+    /// Capacity in the filter's present state, Ah.
     #[inline]
     pub fn capacity(&self, cell: usize) -> ScalarGaussian {
-        let Cell { memory, has_filter, .. } = &self.cells[cell];
-        if *has_filter { self.belief(cell, CAPACITY) } else { memory.capacity }
+        let CellSlot { memory, has_filter, .. } = &self.cells[cell];
+        if *has_filter { self.marginal(cell, CAPACITY) } else { memory.capacity }
     }
 
     /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.
@@ -252,47 +263,47 @@ impl EstimatorBank {
     #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
-        each_lane!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
+        each_array!(&self.filters, x => x.blocks[block].memory[MEAN_NIS].0[lane])
     }
 
-    /// The largest of all cells', not below 0; one that is no number counts as infinite.
+    /// Largest [`Self::mean_nis`] of all cells, not below 0; NaN counts as infinite.
     pub fn worst_nis(&self) -> f64 {
         let larger = |a: f64, b: f64| match () {
             () if b <= a => a,
             () if b > a => b,
             () => f64::INFINITY,
         };
-        let worst = each_lane!(&self.filters, x => x.blocks.iter().fold([0.0; WIDTH], |worst, block| {
+        let worst = each_array!(&self.filters, x => x.blocks.iter().fold([0.0; WIDTH], |worst, block| {
             std::array::from_fn(|lane| larger(worst[lane], block.memory[MEAN_NIS].0[lane]))
         }));
         worst.into_iter().fold(0.0, larger)
     }
 
-    /// Temperature the filter works with, degrees C.
+    /// Temperature that the filter uses, degrees C.
     #[inline]
     pub fn temperature_c(&self, cell: usize) -> Option<f64> {
         self.cells[cell].memory.temperature_c
     }
 
-    /// Whether the SOC is still the one from before time away: no voltage has been taken in since.
-    pub fn is_of_before(&self, cell: usize) -> bool {
-        let Cell { memory, .. } = &self.cells[cell];
-        memory.is_unseen || memory.away_std_if_any().is_some()
+    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
+    pub fn is_carried_over(&self, cell: usize) -> bool {
+        let CellSlot { memory, .. } = &self.cells[cell];
+        memory.is_unseen || memory.downtime_std_if_any().is_some()
     }
 
-    /// Voltage the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
+    /// Voltage that the load of the last minutes drops in the settled cell, V; 0 before the first voltage.
     pub fn load_v(&self, cell: usize) -> f64 {
         self.cell(cell).load_v(&self.model)
     }
 
-    /// A cell's estimator, as it stands.
+    /// A copy of a cell's estimator.
     pub fn cell(&self, cell: usize) -> CellEstimator {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
-        let Cell { memory, has_filter, .. } = self.cells[cell];
+        let CellSlot { memory, has_filter, .. } = self.cells[cell];
         let (filter, hot) = match &self.filters {
-            Filters::One(x) => x.filter(block, lane, Filter::One),
-            Filters::Two(x) => x.filter(block, lane, Filter::Two),
-            Filters::Three(x) => x.filter(block, lane, Filter::Three),
+            FilterArrays::One(x) => x.filter(block, lane, Filter::One),
+            FilterArrays::Two(x) => x.filter(block, lane, Filter::Two),
+            FilterArrays::Three(x) => x.filter(block, lane, Filter::Three),
         };
         let memory = Memory {
             load_a: hot[LOAD_A],
@@ -304,17 +315,17 @@ impl EstimatorBank {
         CellEstimator { filter: has_filter.then_some(filter), memory }
     }
 
-    /// Puts a cell's estimator in place of the present one.
+    /// Replaces a cell's estimator.
     pub fn put(&mut self, cell: usize, estimator: &CellEstimator) {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
         let CellEstimator { filter, memory } = estimator;
         self.cells[cell].memory = *memory;
         self.cells[cell].has_filter = match (&mut self.filters, filter) {
-            (Filters::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory),
-            (Filters::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory),
-            (Filters::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory),
-            // A filter of another number of branches cannot be: states are checked when they are taken up.
-            (filters, _) => each_lane!(filters, x => x.clear(block, lane, memory)),
+            (FilterArrays::One(x), Some(Filter::One(filter))) => x.set(block, lane, filter, memory),
+            (FilterArrays::Two(x), Some(Filter::Two(filter))) => x.set(block, lane, filter, memory),
+            (FilterArrays::Three(x), Some(Filter::Three(filter))) => x.set(block, lane, filter, memory),
+            // The filter has as many branches as the model: states are checked when they are restored.
+            (filters, _) => each_array!(filters, x => x.clear(block, lane, memory)),
         };
     }
 
@@ -332,39 +343,39 @@ impl EstimatorBank {
     }
 
     #[inline]
-    fn belief(&self, cell: usize, i: usize) -> ScalarGaussian {
+    fn marginal(&self, cell: usize, i: usize) -> ScalarGaussian {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
-        each_lane!(&self.filters, x => {
+        each_array!(&self.filters, x => {
             let state = &x.blocks[block];
             ScalarGaussian { mean: state.mean[i].0[lane], variance: state.covariance[at(i, i)].0[lane] }
         })
     }
 }
 
-impl Rhythm {
+impl StepTime {
     #[inline(always)]
-    fn kept(&mut self, c: &Constants, time_s: &Lanes<WIDTH>) -> DecayFactors<WIDTH> {
+    fn decay(&mut self, c: &KernelConstants, time_s: &Lanes<WIDTH>) -> DecayFactors<WIDTH> {
         if time_s.0.iter().fold(true, |same, &time_s| same & (time_s == self.time_s)) {
-            return DecayFactors::splat(&self.kept);
+            return DecayFactors::splat(&self.decay);
         }
-        let kept = DecayFactors::after(c, *time_s);
-        *self = Self { time_s: time_s.0[0], kept: kept.lane(0) };
-        kept
+        let decay = DecayFactors::after(c, *time_s);
+        *self = Self { time_s: time_s.0[0], decay: decay.lane(0) };
+        decay
     }
 }
 
-/// The steps of a batch, to be made with the machine's widest instructions.
-struct StepAll<'a, const N: usize, const T: usize, const W: usize> {
-    lanes: &'a mut Lane<N, T, W>,
-    constants: &'a Constants,
+/// The steps of a batch, for the machine's widest instructions.
+struct BatchStep<'a, const N: usize, const T: usize, const W: usize> {
+    lanes: &'a mut FilterArray<N, T, W>,
+    constants: &'a KernelConstants,
     inputs: &'a mut [BlockInput],
-    cells: &'a mut [Cell],
+    cells: &'a mut [CellSlot],
     results: &'a mut [StepResult],
     others: &'a mut Vec<(usize, CellStep)>,
 }
 
 #[cfg(feature = "wide")]
-impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for StepAll<'_, N, T, W> {
+impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for BatchStep<'_, N, T, W> {
     type Output = ();
 
     #[inline(always)]
@@ -373,13 +384,13 @@ impl<const N: usize, const T: usize, const W: usize> pulp::WithSimd for StepAll<
     }
 }
 
-impl<const N: usize, const T: usize, const W: usize> StepAll<'_, N, T, W> {
-    /// Without wide instructions the lanes are stepped one by one: the same bits, and no second kernel.
+impl<const N: usize, const T: usize, const W: usize> BatchStep<'_, N, T, W> {
+    /// Makes the steps. Without wide instructions the same kernel steps the lanes one by one, with the same bits.
     #[inline(always)]
     fn run<const WIDE: bool>(self) {
         self.lanes.step::<WIDE>(self.constants, self.inputs, self.cells, self.results);
         for (block, input) in self.inputs.iter_mut().enumerate().filter(|(_, input)| input.is_present.any()) {
-            // Ordinary by its input, but not by what came of it.
+            // The input was ordinary, but the kernel's outcome was not usable.
             for lane in 0..WIDTH {
                 if input.is_present.lane(lane) {
                     input.is_present.set_lane(lane, false);
@@ -390,47 +401,47 @@ impl<const N: usize, const T: usize, const W: usize> StepAll<'_, N, T, W> {
     }
 }
 
-impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
+impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
     fn new(model: &CellModel, blocks: usize) -> Self {
         let zero = Lanes::splat(0.0);
-        // Any lane can be stepped, even one that is no cell's.
+        // Every lane can be stepped, even one without a cell.
         let mut covariance = [zero; T];
         (0..N).for_each(|i| covariance[at(i, i)] = Lanes::splat(1.0));
         let mut mean = [zero; N];
         mean[CAPACITY] = Lanes::splat(1e3);
-        let state = State { mean, covariance, memory: [zero; kernel::MEMORY] };
+        let state = FilterState { mean, covariance, memory: [zero; kernel::MEMORY] };
         let tables = Tables::new(model);
         Self {
-            around: vec![(Around::new(&tables), from_fn(|_| Around::new(&tables))); blocks],
+            cache: vec![(LineCache::new(&tables), from_fn(|_| LineCache::new(&tables))); blocks],
             tables,
             blocks: vec![state; blocks],
-            rhythm: Rhythm { time_s: f64::NAN, kept: DecayFactors::NONE },
+            step_time: StepTime { time_s: f64::NAN, decay: DecayFactors::NONE },
         }
     }
 
-    fn constants(&self, model: &CellModel, config: &EstimatorConfig) -> Constants {
-        Constants::new::<N>(model, config)
+    fn constants(&self, model: &CellModel, config: &EstimatorConfig) -> KernelConstants {
+        KernelConstants::new::<N>(model, config)
     }
 
-    /// Steps every block that has inputs. Those whose steps are made are no longer present afterwards.
+    /// Steps every block that has inputs. Cells whose steps were made are no longer present afterwards.
     #[inline(always)]
     fn step<const WIDE: bool>(
         &mut self,
-        c: &Constants,
+        c: &KernelConstants,
         inputs: &mut [BlockInput],
-        cells: &mut [Cell],
+        cells: &mut [CellSlot],
         results: &mut [StepResult],
     ) {
-        let states = self.blocks.iter_mut().zip(&mut self.around).zip(inputs);
-        for (((state, around), block), (cells, results)) in
+        let states = self.blocks.iter_mut().zip(&mut self.cache).zip(inputs);
+        for (((state, cache), block), (cells, results)) in
             states.zip(cells.chunks_mut(WIDTH).zip(results.chunks_mut(WIDTH)))
         {
             if !block.is_present.any() {
                 continue;
             }
             block.fill_absent();
-            block.input.kept = self.rhythm.kept(c, &block.input.measured_s);
-            let (around, own) = around;
+            block.input.decay = self.step_time.decay(c, &block.input.measured_s);
+            let (cache, own) = cache;
             if !WIDE || block.is_present.is_one() {
                 for (lane, cell) in cells.iter_mut().zip(results).enumerate() {
                     if block.is_present.lane(lane) {
@@ -439,19 +450,19 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
                 }
                 continue;
             }
-            let (new, outcome) = kernel::step(&mut self.tables, around, c, state, &block.input);
-            let made = outcome.is_usable & block.is_present;
-            if made.all() {
+            let (new, outcome) = kernel::step(&mut self.tables, cache, c, state, &block.input);
+            let done = outcome.is_usable & block.is_present;
+            if done.all() {
                 *state = new;
             } else {
-                state.take_where(made, &new);
+                state.take_where(done, &new);
             }
             for (lane, (cell, result)) in cells.iter_mut().zip(results).enumerate() {
-                if made.lane(lane) {
+                if done.lane(lane) {
                     block.input.note(lane, lane, &outcome, cell, result);
                 }
             }
-            block.is_present = block.is_present & !made;
+            block.is_present = block.is_present & !done;
         }
     }
 
@@ -466,13 +477,13 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
     }
 
     fn filter(&self, block: usize, lane: usize, make: fn(Gaussian<N>) -> Filter) -> (Filter, [f64; kernel::MEMORY]) {
-        let state = State::of_lane(&self.blocks[block], lane);
+        let state = FilterState::of_lane(&self.blocks[block], lane);
         let mean = SVector::from_fn(|i, _| state.mean[i].0[0]);
         let covariance = SMatrix::from_fn(|i, j| state.covariance[at(i.max(j), i.min(j))].0[0]);
         (make(Gaussian { mean, covariance }), state.memory.map(|number| number.0[0]))
     }
 
-    /// Puts a filter into a lane; that there is one.
+    /// Puts a filter into a lane; returns true, the cell's new `has_filter`.
     fn set(&mut self, block: usize, lane: usize, filter: &Gaussian<N>, memory: &Memory) -> bool {
         self.clear(block, lane, memory);
         let state = &mut self.blocks[block];
@@ -485,7 +496,7 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
         true
     }
 
-    /// Puts the memory of a cell without a filter into its lane; that there is none.
+    /// Puts the memory of a cell without a filter into its lane; returns false, the cell's new `has_filter`.
     fn clear(&mut self, block: usize, lane: usize, memory: &Memory) -> bool {
         let hot = &mut self.blocks[block].memory;
         hot[LOAD_A].0[lane] = memory.load_a;
@@ -496,19 +507,19 @@ impl<const N: usize, const T: usize, const W: usize> Lane<N, T, W> {
     }
 }
 
-/// The step of one cell of a block. Not a part of the vector code: it is needed once, not once per width.
+/// Steps one cell of a block. Not inlined into the vector code: one copy serves all widths.
 #[inline(never)]
 fn step_alone<const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
-    around: &mut Around<1, W>,
-    c: &Constants,
-    state: &mut State<WIDTH, N, T>,
+    cache: &mut LineCache<1, W>,
+    c: &KernelConstants,
+    state: &mut FilterState<WIDTH, N, T>,
     block: &mut BlockInput,
     lane: usize,
-    (cell, result): (&mut Cell, &mut StepResult),
+    (cell, result): (&mut CellSlot, &mut StepResult),
 ) {
-    let one = State::of_lane(state, lane);
-    let (new, outcome) = kernel::step(tables, around, c, &one, &block.input.lane(lane));
+    let one = FilterState::of_lane(state, lane);
+    let (new, outcome) = kernel::step(tables, cache, c, &one, &block.input.lane(lane));
     if outcome.is_usable.lane(0) {
         state.set_lane(lane, &new);
         block.input.note(lane, 0, &outcome, cell, result);

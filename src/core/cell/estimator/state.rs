@@ -1,4 +1,7 @@
-//! The estimator's state as a document, to be stored and taken up again.
+//! The estimator's state as a document, for storing and restoring.
+//!
+//! In: an estimator, or a stored document. Out: the document, or the restored estimator. [`CellState::check`] rejects
+//! numbers that no filter can use; a covariance that is not positive definite loses its correlations.
 
 use nalgebra::{SMatrix, SVector};
 use serde::{Deserialize, Serialize};
@@ -18,7 +21,7 @@ pub struct CellState {
     memory: Memory,
 }
 
-/// Where in the filter's state the `i`-th of `n` numbers of the document is.
+/// Index in the filter's state of the `i`-th of `n` numbers of the document.
 const fn place_of(i: usize, n: usize) -> usize {
     match i {
         0 => 0,
@@ -29,16 +32,16 @@ const fn place_of(i: usize, n: usize) -> usize {
 }
 
 impl CellEstimator {
-    /// The state, to be stored.
+    /// Returns the state for storing.
     pub fn snapshot(&self) -> CellState {
         let (mean, covariance) =
             self.filter.as_ref().map_or_else(Default::default, |filter| each!(filter, x => document(x)));
         CellState { mean, covariance, memory: self.memory }
     }
 
-    /// A stored state taken up again; `None` when it is for another number of branches.
+    /// Restores a stored state; `None` when it is for another number of branches.
     ///
-    /// Variances whose correlations do not go together any more (they were stored rounded) are kept without them.
+    /// A covariance that rounding has made inconsistent loses its correlations and keeps its variances.
     pub fn restore(state: &CellState, branches: usize) -> Option<Self> {
         let filter = match (state.mean.len(), branches) {
             (0, _) => None,
@@ -52,10 +55,10 @@ impl CellEstimator {
 }
 
 impl CellState {
-    /// Whether a filter can go on from its numbers.
+    /// Checks that a filter can continue from its numbers.
     ///
     /// # Errors
-    /// The first from which none can.
+    /// The first number that is out of range.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.memory.check()?;
         self.mean.iter().try_for_each(|&x| InvalidState::unless_number("a mean of a cell's filter", x))?;
@@ -79,12 +82,12 @@ impl Memory {
         for signed in [self.temperature_c.unwrap_or(0.0), self.last_current_a] {
             InvalidState::unless_number("a cell's last temperature or current", signed)?;
         }
-        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.away_std, self.rejected_s];
+        let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
         natural.into_iter().try_for_each(|x| InvalidState::unless_natural("a cell's load, consistency or a time", x))
     }
 }
 
-/// A thousand times the resistance of new, or a thousandth, is no cell.
+/// No cell has a thousand times the resistance of a new one, or a thousandth.
 fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidState> {
     InvalidState::unless(log_resistance.abs() <= 7.0, "ln of a cell's resistance ratio", log_resistance, "-7 to 7")
 }
@@ -109,8 +112,8 @@ fn gaussian<const N: usize>(state: &CellState) -> Option<Gaussian<N>> {
         }
     }
     let is_symmetric = (covariance - covariance.transpose()).amax() <= 1e-9 * covariance.amax();
-    let goes_together = is_symmetric && covariance.cholesky().is_some();
-    let covariance = if goes_together { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
+    let is_consistent = is_symmetric && covariance.cholesky().is_some();
+    let covariance = if is_consistent { covariance } else { SMatrix::from_diagonal(&covariance.diagonal()) };
     Some(Gaussian { mean, covariance })
 }
 
@@ -121,7 +124,7 @@ mod tests {
     use crate::cell::estimator::tests::config;
     use crate::cell::model::tests::small_model;
 
-    /// The cell rests at 3.7 V for so many seconds; how often the filter was reset.
+    /// Rests the cell at 3.7 V for `seconds`; returns the number of resets.
     fn resets(estimator: &mut CellEstimator, seconds: u32) -> usize {
         let step = CellStep {
             measured_s: 1.0,
@@ -142,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn variances_whose_correlations_do_not_go_together_are_kept_without_them() {
+    fn inconsistent_correlations_are_dropped_and_variances_kept() {
         let mut state = settled();
         let last = state.covariance.len() - 1;
         let both = (state.covariance[0] * state.covariance[last]).sqrt() * 1.01;
@@ -155,12 +158,12 @@ mod tests {
     }
 
     #[test]
-    fn a_capacity_no_filter_can_go_on_from_is_reset_once_and_not_for_ever() {
+    fn an_unusable_capacity_is_reset_once() {
         for (mean, variance) in [(2.0, -0.04), (2.0, f64::NAN), (0.0, 0.04)] {
             let mut state = settled();
             let last = state.covariance.len() - 1;
             (state.mean[3], state.covariance[last]) = (mean, variance);
-            assert!(state.check().is_err(), "a stored state with it is refused");
+            assert!(state.check().is_err(), "a stored state with it is rejected");
             let mut estimator = CellEstimator::restore(&state, 1).expect("one branch");
             assert!(resets(&mut estimator, 20) <= 1, "{mean} {variance}");
             assert!(estimator.capacity().mean > 0.5 && estimator.capacity().variance > 0.0, "{mean} {variance}");

@@ -42,7 +42,7 @@ pub(crate) fn config() -> EstimatorConfig {
     }
 }
 
-/// A cell that really has `capacity_ah` and `ratio` times the resistance, stepped beside the estimator.
+/// The simulated cell: true capacity, and resistance relative to the model.
 struct Truth {
     soc: f64,
     branch_v: f64,
@@ -52,11 +52,11 @@ struct Truth {
 
 impl Truth {
     fn step(&mut self, model: &CellModel, current_a: f64, dt_s: f64) -> CellStep {
-        let place = model.place(self.soc, 25.0);
-        let branch = BranchAt::new(model, 0, &place, self.ratio);
+        let position = model.grid_position(self.soc, 25.0);
+        let branch = BranchAt::new(model, 0, &position, self.ratio);
         self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, dt_s);
         self.soc = circuit::soc_after(self.soc, current_a * dt_s, self.capacity_ah);
-        let place = model.place(self.soc, 25.0);
+        let position = model.grid_position(self.soc, 25.0);
         CellStep {
             measured_s: dt_s,
             charge_as: current_a * dt_s,
@@ -64,7 +64,7 @@ impl Truth {
             current_a: Some(current_a),
             temperature_c: Some(25.0),
             ambient_c: 25.0,
-            voltage_v: circuit::terminal_v(model, &place, self.ratio, self.branch_v, current_a),
+            voltage_v: circuit::terminal_v(model, &position, self.ratio, self.branch_v, current_a),
         }
     }
 }
@@ -93,7 +93,7 @@ fn soc(estimator: &CellEstimator) -> ScalarGaussian {
 }
 
 #[test]
-fn capacity_and_resistance_come_right_from_a_wrong_start_and_the_intervals_cover() {
+fn capacity_and_resistance_converge_from_a_wrong_start_and_the_intervals_cover() {
     let (config, mut truth) = (config(), truth());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 12.0);
@@ -127,7 +127,7 @@ fn a_start_thirty_points_wrong_recovers() {
 }
 
 #[test]
-fn a_glitch_moves_nothing_and_the_time_it_took_is_still_counted() {
+fn a_glitch_is_rejected_and_its_time_is_still_counted() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
@@ -141,12 +141,12 @@ fn a_glitch_moves_nothing_and_the_time_it_took_is_still_counted() {
 }
 
 #[test]
-fn a_lost_cell_starts_again_from_its_voltage_and_keeps_what_it_learned() {
+fn a_lost_filter_restarts_from_the_voltage_and_keeps_capacity_and_resistance() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 6.0);
     let capacity = estimator.capacity();
-    truth.soc = if truth.soc > 0.5 { 0.05 } else { 0.95 }; // somebody moved charge behind our back
+    truth.soc = if truth.soc > 0.5 { 0.05 } else { 0.95 }; // charge moved without a measurement
     let resets = (0..120).filter(|_| {
         let step = truth.step(&model, 0.0, 1.0);
         estimator.step(&model, &config, &step).reset
@@ -157,7 +157,7 @@ fn a_lost_cell_starts_again_from_its_voltage_and_keeps_what_it_learned() {
 }
 
 #[test]
-fn an_unmeasured_load_may_have_gone_on_and_the_deviation_says_so() {
+fn an_unmeasured_load_widens_the_deviation() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 1.0);
@@ -170,7 +170,7 @@ fn an_unmeasured_load_may_have_gone_on_and_the_deviation_says_so() {
 }
 
 #[test]
-fn nothing_known_stays_nothing_known_however_long_the_gap() {
+fn an_unknown_soc_stays_at_its_largest_variance_through_any_gap() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 0.1);
@@ -197,7 +197,7 @@ fn without_a_sensor_the_thermal_model_warms_the_cell() {
 }
 
 #[test]
-fn a_restored_estimator_goes_on_bit_for_bit() {
+fn a_restored_estimator_continues_bit_for_bit() {
     let (config, mut truth, model) = (config(), truth(), small_model());
     let mut estimator = CellEstimator::new(&config);
     cycle(&mut estimator, &config, &mut truth, 1.0, 0.3);
@@ -221,7 +221,7 @@ fn held_capacity_is_the_papers_filter() {
 }
 
 #[test]
-fn two_and_three_branches_estimate_too() {
+fn two_and_three_branches_estimate_the_soc() {
     for branches in [2, 3] {
         let mut model = small_model();
         for _ in 1..branches {
@@ -241,11 +241,11 @@ fn two_and_three_branches_estimate_too() {
 }
 
 #[test]
-fn a_restated_capacity_moves_the_mean_and_never_makes_the_filter_surer() {
+fn a_restated_capacity_moves_the_mean_and_never_lowers_the_variance() {
     let (config, mut truth) = (config(), truth());
     let mut estimator = CellEstimator::new(&config);
     estimator.restate_capacity(ScalarGaussian::from_std(1.9, 0.1));
-    assert_eq!(estimator.capacity(), ScalarGaussian::from_std(1.9, 0.1)); // before the first voltage it is simply so
+    assert_eq!(estimator.capacity(), ScalarGaussian::from_std(1.9, 0.1)); // before the first voltage
     cycle(&mut estimator, &config, &mut truth, 1.0, 2.0);
     let before = estimator.capacity();
     estimator.restate_capacity(ScalarGaussian { mean: 1.5, variance: 0.1 * before.variance });

@@ -112,7 +112,7 @@ impl<'d> Judge<'d> {
     pub(super) fn model_ohm(&self, model: &CellModel) -> (f64, f64) {
         let voltage_v = self.cell_voltage().unwrap_or(f64::NAN) * self.voltage_factor;
         let temperature_c = self.temperature_c();
-        let place = model.place(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.05, 0.95), temperature_c);
+        let place = model.grid_position(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.05, 0.95), temperature_c);
         (model.r0_ohm(&place), model.settled_ohm(&place))
     }
 

@@ -60,6 +60,6 @@ fn expected_drift_v(judge: &Judge<'_>, model: &CellModel, run: &SteadyRun) -> f6
     let (_, settled) = judge.model_ohm(model);
     let soc = model.soc_of_ocv(run.voltage_v * judge.voltage_factor + cell_a * settled, temperature_c).clamp(0.0, 1.0);
     let moved = -cell_a * run.seconds / 3600.0 / judge.plan.pack.capacity_ah;
-    let end = model.place((soc + moved).clamp(0.0, 1.0), temperature_c);
-    model.ocv_v(&end) - model.ocv_v(&model.place(soc, temperature_c))
+    let end = model.grid_position((soc + moved).clamp(0.0, 1.0), temperature_c);
+    model.ocv_v(&end) - model.ocv_v(&model.grid_position(soc, temperature_c))
 }

@@ -19,7 +19,7 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
 /// Resting voltage, and its slope over charge, against the model's.
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
-    let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.place(soc, temperature_c)));
+    let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
     let rests = judge.doctor.fast_response().rests.iter().map(|rest| rest.end_v);
     let highest = rests.clone().fold(f64::NAN, f64::max);
     let lowest = rests.clone().fold(f64::NAN, f64::min);
@@ -59,7 +59,7 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
 }
 
 fn is_like_iron_phosphate(judge: &Judge<'_>, model: &CellModel, cell_v: f64) -> bool {
-    model.ocv_v(&model.place(0.5, judge.temperature_c())) > 3.5 && (3.18..3.38).contains(&cell_v)
+    model.ocv_v(&model.grid_position(0.5, judge.temperature_c())) > 3.5 && (3.18..3.38).contains(&cell_v)
 }
 
 fn chemistry(voltage_v: f64) -> &'static str {

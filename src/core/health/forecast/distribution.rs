@@ -1,40 +1,43 @@
-//! The distribution of the use until a level has fallen by a loss.
+//! Distribution of the use until a level has fallen by a loss.
+//!
+//! In: mean and covariance of loss and rate (parts of the reference, per unit of use). Out: probabilities and quantiles of
+//! the use. Extreme inputs saturate within [`LOG_RANGE`].
 //!
 //! Given the loss L and the rate r, the use is T = integral over l from 0 to L of exp(-w W(l)) / r, W a Brownian motion
 //! (the rate's logarithm walks with the loss). With k = w^2:
 //! E T = (L / r) (e^a - 1) / a with a = k L / 2, and
 //! E T^2 = (4 / (k r^2)) (e^a (e^{3a} - 1) / (1.5 k) - (e^{4a} - 1) / (2 k)); a lognormal of that mean and variance.
 //! The rate, positive, is a lognormal of its truncated normal's mean and variance; the walk with use adds its variance;
-//! the loss is normal. What of it is not above 0 has passed already: T = 0, with exactly that probability. The rest is cut
-//! into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for its own
-//! width w, a variance of (w / L)^2 / 12 more.
+//! the loss is normal. Its part at or below 0 counts as a crossing in the past: T = 0 with that probability. The rest is
+//! divided into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for
+//! its own width w, an added variance of (w / L)^2 / 12.
 
 use super::{RATE_WALK, RATE_WALK_USE};
 
 /// Slices of the loss.
 const SLICES: usize = 10;
-/// Deviations of the loss on either side within which it is cut; what lies beyond counts with the outermost slices.
+/// Half-width of the sliced range of the loss, deviations; the tails count with the outermost slices.
 const SLICED: f64 = 3.5;
 
 /// Steps of the bisections: from some 20 e-folds to a part in 10^6.
 pub(super) const HALVINGS: u32 = 24;
 
-/// Deviations from its mean beyond which a part has no quantile that anybody asks for.
+/// Half-width of the search for a quantile, deviations of each slice.
 const REACH: f64 = 6.0;
 
-/// Logarithm of the largest use told, and of the least rate.
+/// Range of the logarithm of use and rate.
 const LOG_RANGE: (f64, f64) = (-20.0, 40.0);
 
-/// Below this the moments' closed form loses digits and their series serves.
+/// Below this the moments' closed form loses digits, and the series applies.
 const SMALL: f64 = 1e-3;
 
-/// A slice: its probability, and mean and standard deviation of the logarithm of the use it takes.
+/// A slice: its probability, and mean and standard deviation of the logarithm of its use.
 type Slice = (f64, (f64, f64));
 
 /// The distribution of the use until the crossing.
 #[derive(Debug, Clone)]
 pub(super) struct Crossing {
-    /// Probability that it has come already.
+    /// Probability that the crossing lies in the past.
     passed: f64,
     slices: [Slice; SLICES],
 }
@@ -43,11 +46,11 @@ impl Crossing {
     /// From mean [loss to come, rate], covariance [loss, loss and rate, rate] and the use so far.
     pub(super) fn new(mean: [f64; 2], covariance: [f64; 3], used: f64) -> Self {
         let [loss_variance, both, rate_variance] = covariance;
-        // Of a loss that is certain the slices are all the same.
+        // With a certain loss all slices are equal.
         let loss_std = loss_variance.max(1e-24).sqrt();
         let by_loss = both / (loss_std * loss_std);
         let left = (rate_variance - by_loss * both).max(0.0);
-        // Deviations from the mean at which nothing is left to lose.
+        // Deviation from the mean at which the loss is 0.
         let zero = -mean[0] / loss_std;
         let from = zero.max(-SLICED);
         let width = (SLICED.max(from + 1.0) - from) / SLICES as f64;
@@ -63,7 +66,7 @@ impl Crossing {
             let (log_rate, log_rate_variance) = positive(mean[1] + by_loss * loss_std * deviation, left);
             let (log_use, walked) = use_of_loss(loss);
             let log_mean = log_use - log_rate;
-            // The rate goes on walking with use; over the way the mean of its walk counts, about half.
+            // The rate continues its walk with use; the mean over the walk counts, about half.
             let ahead = libm::log1p(libm::exp(log_mean.min(LOG_RANGE.1)) / used.max(f64::MIN_POSITIVE));
             let own_width = loss_std * width / loss;
             let variance =
@@ -73,7 +76,7 @@ impl Crossing {
         Self { passed, slices }
     }
 
-    /// Probability that the crossing comes within `ahead` units of use.
+    /// Probability of the crossing within `ahead` units of use.
     pub(super) fn probability(&self, ahead: f64) -> f64 {
         self.probability_of_log(libm::log(ahead))
     }
@@ -83,7 +86,7 @@ impl Crossing {
         self.passed + to_come
     }
 
-    /// Use within which it comes with this probability.
+    /// Use within which the crossing has this probability.
     pub(super) fn quantile(&self, probability: f64) -> f64 {
         if self.passed >= probability {
             return 0.0;
@@ -120,7 +123,7 @@ fn positive(mean: f64, variance: f64) -> (f64, f64) {
     if std == 0.0 {
         return (LOG_RANGE.0, 0.0);
     }
-    // Further below 0 the ratio of density and tail is beyond f64, and nothing is known of the rate but its smallness.
+    // Further below 0 the ratio of density and tail exceeds f64; the rate is then merely small.
     let place = (mean / std).max(-8.0);
     let density = libm::exp(-0.5 * place * place) / (2.0 * std::f64::consts::PI).sqrt();
     let hazard = density / (0.5 * libm::erfc(-place / std::f64::consts::SQRT_2));
@@ -148,8 +151,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_moments_of_the_use_are_those_of_the_sampled_walk() {
-        // Antithetic pairs of a fixed generator: no outside randomness, and the first moment nearly exact.
+    fn the_moments_of_the_use_agree_with_a_sampled_walk() {
+        // Antithetic pairs of a fixed generator: reproducible, and the first moment nearly exact.
         let (loss, steps, paths) = (0.3, 200, 4000);
         let mut seed = 1_u64;
         let mut uniform = || {

@@ -1,4 +1,4 @@
-//! Histories made up, and what must be told of them.
+//! Forecasts of synthetic histories.
 
 use super::*;
 
@@ -8,7 +8,7 @@ fn fed(capacity: impl Fn(f64) -> f64, step: f64, until: f64) -> Forecast {
     let mut efc = 0.0;
     while efc <= until {
         let passed = if efc == 0.0 { Usage::default() } else { passed(step) };
-        let reading = Reading { capacity_ah: capacity(efc), variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
+        let reading = CapacityReading { capacity_ah: capacity(efc), variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
         forecast.update(passed, Some(reading));
         efc += step;
     }
@@ -40,7 +40,7 @@ fn the_same_fade_ten_times_slower_lasts_ten_times_longer() {
 }
 
 #[test]
-fn readings_in_one_cycle_are_not_as_many_readings() {
+fn readings_within_one_cycle_count_less_than_separate_ones() {
     let noisy = |efc: f64| 2.0 - 0.002 * efc;
     let (few, many) = (fed(noisy, 1.0, 60.0), fed(noisy, 0.05, 60.0));
     let (few_std, many_std) = (few.rate_ah().1, many.rate_ah().1);
@@ -48,18 +48,18 @@ fn readings_in_one_cycle_are_not_as_many_readings() {
 }
 
 #[test]
-fn a_bump_after_rest_is_not_taken_for_the_end_of_fade() {
+fn a_recovery_after_rest_does_not_end_the_fade() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 99.0);
     let before = forecast.rate_ah().0;
     let rested = Usage { cycles: 1.0, days: 5.0, rest_days: 4.8 };
-    let reading = Reading { capacity_ah: 1.88, variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
+    let reading = CapacityReading { capacity_ah: 1.88, variance_ah2: 1e-5, shared_variance_ah2: 0.0 };
     forecast.update(rested, Some(reading));
     assert!((forecast.rate_ah().0 / before - 1.0).abs() < 0.2, "{:?} {before}", forecast.rate_ah());
     assert!(forecast.level_ah().0 < 1.84, "{:?}", forecast.level_ah());
 }
 
 #[test]
-fn nothing_is_told_of_few_readings_or_of_no_fade() {
+fn few_readings_or_no_fade_give_no_forecast() {
     assert_eq!(Forecast::new(Axis::Cycles, 2.0).remaining(1.5), Err(InsufficientData::Readings { found: 0 }));
     assert_eq!(fed(|efc| 2.0 - 0.01 * efc, 1.0, 3.0).remaining(1.5), Err(InsufficientData::Readings { found: 4 }));
     let flat = fed(|_| 2.0, 1.0, 300.0).remaining(1.5);
@@ -75,24 +75,25 @@ fn below_the_threshold_nothing_remains() {
 }
 
 #[test]
-fn what_all_readings_share_widens_the_interval() {
+fn a_shared_error_widens_the_interval() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let width = |forecast: &Forecast| {
         let cycles = forecast.remaining(1.7).expect("enough").cycles.expect("cycles");
         cycles.high - cycles.low
     };
     let before = width(&forecast);
-    let reading = Reading { capacity_ah: 1.798, variance_ah2: 1e-5, shared_variance_ah2: 0.0016 };
+    let reading = CapacityReading { capacity_ah: 1.798, variance_ah2: 1e-5, shared_variance_ah2: 0.0016 };
     forecast.update(passed(1.0), Some(reading));
     assert!(width(&forecast) > 1.1 * before, "{} {before}", width(&forecast));
 }
 
 #[test]
-fn the_axis_of_days_tells_days_alone() {
+fn the_axis_of_days_gives_days_alone() {
     let mut forecast = Forecast::new(Axis::Days, 2.0);
     for day in 0..12 {
         let days = if day == 0 { 0.0 } else { 5.0 };
-        let reading = Reading { capacity_ah: 2.0 - 0.05 * f64::from(day), variance_ah2: 0.0, shared_variance_ah2: 0.0 };
+        let reading =
+            CapacityReading { capacity_ah: 2.0 - 0.05 * f64::from(day), variance_ah2: 0.0, shared_variance_ah2: 0.0 };
         forecast.update(Usage { days, ..Usage::default() }, Some(reading));
     }
     let life = forecast.remaining(1.2).expect("enough is known");
@@ -102,7 +103,7 @@ fn the_axis_of_days_tells_days_alone() {
 }
 
 #[test]
-fn use_without_a_reading_is_use_all_the_same() {
+fn use_without_a_reading_counts() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let before = forecast.remaining(1.5).expect("enough").cycles.expect("cycles").median;
     (0..50).for_each(|_| forecast.update(passed(1.0), None));
@@ -121,7 +122,7 @@ fn the_fan_passes_the_threshold_when_the_forecast_says() {
 }
 
 #[test]
-fn it_is_the_same_after_being_stored() {
+fn a_stored_forecast_is_restored_unchanged() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 37.0);
     let stored = serde_json::to_string(&forecast).expect("writes");
     assert_eq!(serde_json::from_str::<Forecast>(&stored).expect("reads"), forecast);
@@ -134,21 +135,21 @@ fn any_readings_leave_a_usable_covariance() {
     for k in 0..2000_u32 {
         let capacity_ah = [2.0, 0.01, 3.9, f64::NAN, 1.0][(k % 5) as usize];
         let passed = Usage { cycles: f64::from(k % 7) * 3.0, days: f64::from(k % 3) * 100.0, rest_days: 50.0 };
-        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 }));
+        forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2: 0.0, shared_variance_ah2: 0.0 }));
         assert!((0..N).all(|i| forecast.p[i][i] > 0.0 && forecast.x[i].is_finite()), "{k} {forecast:?}");
         let _ = forecast.remaining(1.0);
     }
 }
 
 #[test]
-fn a_first_reading_that_says_nothing_delays_the_forecast_by_that_reading() {
+fn a_first_reading_without_information_delays_the_forecast_by_one_reading() {
     let told_after = |first_variance_ah2: f64| {
         let mut forecast = Forecast::new(Axis::Cycles, 2.0);
         let told = (0..200).find(|&efc| {
             let variance_ah2 = if efc == 0 { first_variance_ah2 } else { 1e-5 };
             let capacity_ah = 2.0 - 0.002 * f64::from(efc) + if efc == 0 { -0.3 } else { 0.0 };
             let passed = if efc == 0 { Usage::default() } else { passed(1.0) };
-            forecast.update(passed, Some(Reading { capacity_ah, variance_ah2, shared_variance_ah2: 0.0 }));
+            forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2, shared_variance_ah2: 0.0 }));
             forecast.remaining(1.5).is_ok()
         });
         told.expect("told before 200 cycles")
@@ -158,12 +159,12 @@ fn a_first_reading_that_says_nothing_delays_the_forecast_by_that_reading() {
 }
 
 #[test]
-fn a_rest_each_night_does_not_drown_the_fade() {
+fn a_rest_each_night_does_not_hide_the_fade() {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     for day in 0..400 {
         let passed = Usage { cycles: 0.25, days: 1.0, rest_days: 0.9 };
         let capacity_ah = 2.0 - 0.001 * f64::from(day);
-        forecast.update(passed, Some(Reading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+        forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
     }
     let recovery_std = forecast.p[RECOVERY][RECOVERY].sqrt();
     assert!(recovery_std < 1.1 * RECOVERY_IN_REST.hypot(RECOVERY_IN_USE), "{recovery_std}");
@@ -173,12 +174,13 @@ fn a_rest_each_night_does_not_drown_the_fade() {
 }
 
 #[test]
-fn up_to_the_threshold_and_beyond_it_something_is_told_without_a_jump() {
+fn the_forecast_is_continuous_through_the_threshold() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let mut before: Option<Remaining> = None;
     for efc in 101..300 {
         let capacity_ah = 2.0 - 0.002 * f64::from(efc);
-        forecast.update(passed(1.0), Some(Reading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+        forecast
+            .update(passed(1.0), Some(CapacityReading { capacity_ah, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
         let now = forecast.remaining(1.6).unwrap_or_else(|why| panic!("after {efc} cycles: {why}"));
         let now = now.cycles.expect("cycles");
         if let Some(before) = before {
@@ -191,7 +193,7 @@ fn up_to_the_threshold_and_beyond_it_something_is_told_without_a_jump() {
 }
 
 #[test]
-fn a_cell_that_came_worn_is_at_its_end_without_fade() {
+fn a_cell_below_the_threshold_is_at_its_end_without_fade() {
     let forecast = fed(|_| 1.4, 1.0, 30.0);
     let life = forecast.remaining(1.6).expect("known without a fade");
     assert_eq!(life.cycles, Some(Remaining::default()));
@@ -199,7 +201,7 @@ fn a_cell_that_came_worn_is_at_its_end_without_fade() {
 }
 
 #[test]
-fn the_fan_begins_with_the_levels_own_interval() {
+fn the_fan_begins_with_the_interval_of_the_level() {
     let forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let (level, std) = forecast.level_ah();
     let now = forecast.fan(100.0, 2).expect("enough is known")[0];
@@ -208,10 +210,10 @@ fn the_fan_begins_with_the_levels_own_interval() {
 }
 
 #[test]
-fn a_long_rest_is_not_the_use_of_late() {
+fn a_long_rest_does_not_count_as_recent_use() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let rested = Usage { cycles: 0.5, days: 300.0, rest_days: 299.9 };
-    forecast.update(rested, Some(Reading { capacity_ah: 1.8, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
+    forecast.update(rested, Some(CapacityReading { capacity_ah: 1.8, variance_ah2: 1e-4, shared_variance_ah2: 0.0 }));
     (0..20).for_each(|_| forecast.update(passed(1.0), None));
     let life = forecast.remaining(1.5).expect("enough is known");
     let days_per_cycle = life.days.expect("days").median / life.cycles.expect("cycles").median;
@@ -220,31 +222,32 @@ fn a_long_rest_is_not_the_use_of_late() {
 }
 
 #[test]
-fn one_wild_reading_moves_little() {
+fn one_outlier_moves_the_forecast_little() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 100.0);
     let before = forecast.rate_ah().0;
-    forecast.update(passed(1.0), Some(Reading { capacity_ah: 0.9, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
+    forecast
+        .update(passed(1.0), Some(CapacityReading { capacity_ah: 0.9, variance_ah2: 1e-6, shared_variance_ah2: 0.0 }));
     assert!((1.7..1.85).contains(&forecast.level_ah().0), "{:?}", forecast.level_ah());
     assert!((forecast.rate_ah().0 / before - 1.0).abs() < 0.5, "{:?} {before}", forecast.rate_ah());
 }
 
 #[test]
-fn readings_of_one_moment_tell_nothing() {
+fn readings_from_one_time_give_no_forecast() {
     let mut forecast = Forecast::new(Axis::Cycles, 2.0);
     for n in 0..8 {
         let capacity_ah = 2.0 - 0.05 * f64::from(n);
-        let reading = Reading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 };
+        let reading = CapacityReading { capacity_ah, variance_ah2: 1e-6, shared_variance_ah2: 0.0 };
         forecast.update(Usage::default(), Some(reading));
     }
     assert_eq!(forecast.remaining(1.5), Err(InsufficientData::Use));
 }
 
 #[test]
-fn what_is_not_a_number_changes_nothing_and_a_state_of_such_is_refused() {
+fn a_nan_changes_nothing_and_a_stored_nan_is_rejected() {
     let mut forecast = fed(|efc| 2.0 - 0.002 * efc, 1.0, 50.0);
     let before = forecast.clone();
     let wild = Usage { cycles: f64::INFINITY, days: f64::NAN, rest_days: f64::NAN };
-    let reading = Reading { capacity_ah: 1.9, variance_ah2: 1e-5, shared_variance_ah2: f64::NAN };
+    let reading = CapacityReading { capacity_ah: 1.9, variance_ah2: 1e-5, shared_variance_ah2: f64::NAN };
     forecast.update(wild, Some(reading));
     assert_eq!((forecast.x, forecast.readings), (before.x, before.readings));
     assert_eq!(before.check(Axis::Cycles), Ok(()));

@@ -1,4 +1,4 @@
-//! Scenarios over the whole sample stage; the charge counter's arithmetic is tested beside it.
+//! Scenarios over the whole sample stage; the charge counter has its own tests.
 
 use proptest::prelude::*;
 
@@ -30,7 +30,7 @@ fn config() -> SampleConfig {
 const CELL: Channel = Channel::CellVoltage(CellIndex(0));
 const SENSOR: Channel = Channel::Temperature(SensorIndex(0));
 
-/// A sampler and what it told.
+/// A sampler and the changes that it reported.
 struct Bench {
     sampler: Sampler,
     changes: Vec<SignalChange>,
@@ -71,7 +71,7 @@ fn a_sample_carries_what_is_fresh_at_the_time_of_its_voltage() {
 }
 
 #[test]
-fn values_too_old_to_use_are_left_out_and_the_hole_is_unmeasured() {
+fn stale_values_are_left_out_and_the_hole_is_unmeasured() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, SENSOR, 25.0);
     bench.ok(0.0, Channel::Current, 1.0);
@@ -84,7 +84,7 @@ fn values_too_old_to_use_are_left_out_and_the_hole_is_unmeasured() {
 }
 
 #[test]
-fn measured_glitches_make_no_sample_and_are_told_once() {
+fn measured_glitches_make_no_sample_and_are_reported_once() {
     // As in the NASA files: samples of 8.4 V, and empty fields.
     let mut bench = Bench::new(config());
     assert!(bench.ok(0.0, CELL, 3.9).is_some());
@@ -110,7 +110,7 @@ fn a_bad_current_is_neither_used_nor_integrated() {
 }
 
 #[test]
-fn a_jump_is_refused_and_a_step_that_stays_is_accepted() {
+fn a_jump_is_rejected_and_a_step_that_stays_is_accepted() {
     let mut config = config();
     config.voltage.max_rate_per_s = Some(0.1);
     let mut bench = Bench::new(config);
@@ -137,7 +137,7 @@ fn jumps_that_do_not_agree_are_never_accepted() {
 }
 
 #[test]
-fn two_readings_with_one_stamp_are_no_infinite_rate() {
+fn two_readings_with_one_stamp_have_a_finite_rate() {
     let mut config = config();
     config.voltage.max_rate_per_s = Some(10.0);
     let mut bench = Bench::new(config);
@@ -145,7 +145,7 @@ fn two_readings_with_one_stamp_are_no_infinite_rate() {
     assert!(bench.ok(0.0, CELL, 3.905).is_some());
 }
 
-/// Current and a voltage once a second; the first second whose voltage was refused.
+/// Current and a voltage once a second; returns the first second with a rejected voltage.
 fn first_stuck_second(current_a: f64, voltage: impl Fn(u32) -> f64) -> Option<u32> {
     let mut config = config();
     config.voltage.stuck_after_s = Some(60.0);
@@ -178,7 +178,7 @@ fn a_stuck_signal_is_good_again_when_it_moves() {
 }
 
 #[test]
-fn silence_turns_a_signal_stale_once_each_at_its_own_age() {
+fn silence_turns_each_signal_stale_once_at_its_own_age() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(0.0, CELL, 3.7);
@@ -202,7 +202,7 @@ fn silence_turns_a_signal_stale_once_each_at_its_own_age() {
 }
 
 #[test]
-fn ages_tell_good_values_from_anything_heard() {
+fn ages_count_good_values_and_silence_counts_all_readings() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, CELL, 3.7);
     bench.ok(0.0, Channel::Current, 1.0);
@@ -246,7 +246,7 @@ fn strings_share_the_current_and_a_total_voltage_is_shared_by_the_cells() {
 }
 
 #[test]
-fn readings_that_feed_nothing_are_counted() {
+fn readings_without_a_use_are_counted() {
     let mut bench = Bench::new(config());
     for channel in [Channel::PackVoltage, Channel::CellVoltage(CellIndex(2)), Channel::Temperature(SensorIndex(1))] {
         assert!(bench.ok(0.0, channel, 3.7).is_none());
@@ -256,7 +256,7 @@ fn readings_that_feed_nothing_are_counted() {
 }
 
 #[test]
-fn time_that_goes_back_is_taken_as_the_latest() {
+fn time_that_goes_back_counts_as_the_latest() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(2.0, Channel::Current, 1.0);
@@ -265,7 +265,7 @@ fn time_that_goes_back_is_taken_as_the_latest() {
 }
 
 #[test]
-fn a_restored_sampler_counts_the_time_away_as_unmeasured() {
+fn a_restored_sampler_counts_the_downtime_as_unmeasured() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(1.0, CELL, 3.7);
@@ -279,11 +279,11 @@ fn a_restored_sampler_counts_the_time_away_as_unmeasured() {
     let sample = restored.ok(1100.0, CELL, 3.7).expect("a sample");
     assert_eq!((sample.charge_as, sample.unmeasured_s), (2.0, 98.0));
     let mut other = Sampler::new(SampleConfig { cells: 3, ..config() });
-    assert_eq!(other.restore(&state), Err(SamplerShape { found: 4, allowed: 5 }));
+    assert_eq!(other.restore(&state), Err(SignalCountMismatch { found: 4, allowed: 5 }));
 }
 
 #[test]
-fn every_slot_is_found_again_through_its_channel() {
+fn every_channel_leads_to_its_own_slot() {
     let mut config = config();
     config.cells = 1024;
     config.sensor_of_cell = (0..1024).map(|cell| Some(SensorIndex(cell / 12))).collect();
@@ -293,7 +293,7 @@ fn every_slot_is_found_again_through_its_channel() {
     assert!(slots.iter().enumerate().all(|(slot, found)| *found == Some(slot)));
 }
 
-/// Readings of a cell as they may come: mostly ordinary ones, some that are not.
+/// Random readings of a cell, most of them ordinary.
 fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
     let volts = prop_oneof![
         8 => (0_i32..30).prop_map(|step| Ok(3.6 + 0.002 * f64::from(step))),
@@ -309,9 +309,9 @@ fn reading() -> impl Strategy<Value = (Channel, Result<f64, Fault>)> {
 }
 
 proptest! {
-    /// Steps of time in units of 0.1 s: none, a few, backwards, and some after which values are too old.
+    /// Steps of time in units of 0.1 s: none, a few, backwards, and some after which values are stale.
     #[test]
-    fn an_ordinary_voltage_is_taken_as_any_other_reading_is(
+    fn the_ordinary_path_gives_the_result_of_the_full_path(
         source in prop::sample::select(vec![VoltageSource::Cells, VoltageSource::PackTotal { series: 1 }]),
         readings in prop::collection::vec((reading(), prop_oneof![6 => 0_i32..3, 1 => -4_i32..80]), 1..300),
     ) {
@@ -341,7 +341,7 @@ proptest! {
     }
 
     #[test]
-    fn the_number_of_bad_signals_is_that_of_the_bad_signals(
+    fn the_count_of_bad_signals_agrees_with_the_signals(
         readings in prop::collection::vec((reading(), 0_i32..80), 1..100),
     ) {
         let mut bench = Bench::new(config());
@@ -362,7 +362,7 @@ proptest! {
 }
 
 #[test]
-fn voltages_of_a_pack_at_work_are_ordinary_from_the_second_on() {
+fn voltages_of_a_pack_in_use_are_ordinary_from_the_second_on() {
     let mut bench = Bench::new(config());
     let mut ordinary = 0;
     for tenth in 0..100 {

@@ -1,42 +1,43 @@
-//! The tables of what goes out, and of the commands that come in: frames, J1939, commands.
+//! The tables of sent frames and received commands: `[output]`, `[j1939]`, `[commands]`.
 
-use super::E2e;
+use super::E2eKey;
+use crate::config::document::TablePlace;
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
-use crate::config::setting::Allowed::{Any, Between, NotEmpty};
+use crate::config::setting::ValueRange::{Any, Between, NotEmpty};
 
 section! {
-    /// A J1939 node beside the frames of `[output]`: it claims an address and tells alarms as trouble codes, in DM1 once a second and on every change, in DM2 when asked for.
-    /// Of a rule's alarms that share a parameter number the gravest is told. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
-    /// The NAME says who the node is: in a contest for the address the smaller one wins, and a node that loses falls silent.
+    /// A J1939 node, in addition to the frames of `[output]`: it claims an address and sends alarms as trouble codes, in DM1 once a second and on every change, in DM2 on request.
+    /// Of a rule's alarms that share a parameter number the most severe is sent. The failure mode follows from rule and severity, the lamp from the severity (info: protect, warning: amber, severe: red). Without this table there is no node; with `output.enabled = false` it is silent too.
+    /// The NAME identifies the node: of two nodes that claim one address the one with the smaller NAME keeps it, and the other stops sending.
     J1939 at "j1939" {
         /// Interface the node is on. Needed when there are several.
         interface: Option<String>, "", NotEmpty, Optional;
-        /// Address it claims, and keeps or loses: it never takes another one.
-        address: u16, "", Between(0.0, 253.0), Required;
+        /// Address that the node claims; if it loses the address it claims no other.
+        address: u8, "", Between(0.0, 253.0), Required;
         /// Serial number in the NAME, unique among the maker's nodes.
         identity_number: u32, "", Between(0.0, 2_097_151.0), Required;
         /// The maker's number in the NAME, which SAE assigns.
         manufacturer_code: u16, "", Between(0.0, 2047.0), Required;
         /// What the node does, as SAE numbers it; 255 = not available.
-        function: u16, "", Between(0.0, 255.0), Default("255");
+        function: u8, "", Between(0.0, 255.0), Default("255");
         /// Which one of several nodes of this function.
-        function_instance: u16, "", Between(0.0, 31.0), Default("0");
+        function_instance: u8, "", Between(0.0, 31.0), Default("0");
         /// Which one of several computers that share the function.
-        ecu_instance: u16, "", Between(0.0, 7.0), Default("0");
+        ecu_instance: u8, "", Between(0.0, 7.0), Default("0");
         /// Vehicle system within the industry group; 127 = not available.
-        vehicle_system: u16, "", Between(0.0, 127.0), Default("127");
+        vehicle_system: u8, "", Between(0.0, 127.0), Default("127");
         /// Which one of several equal vehicle systems.
-        vehicle_system_instance: u16, "", Between(0.0, 15.0), Default("0");
+        vehicle_system_instance: u8, "", Between(0.0, 15.0), Default("0");
         /// 0 global, 1 on-highway, 2 agriculture and forestry, 3 construction, 4 marine, 5 industrial.
-        industry_group: u16, "", Between(0.0, 7.0), Default("0");
-        /// Suspect parameter number that is told, with FMI 31 and no lamp, while `packwatch test-alarm` runs: a trouble code has no mark of a test of its own.
+        industry_group: u8, "", Between(0.0, 7.0), Default("0");
+        /// Suspect parameter number that is sent, with FMI 31 and no lamp, while `packwatch test-alarm` runs: a trouble code itself cannot mark a test.
         test_spn: u32, "", Between(1.0, 524_287.0), Default("524286");
     }
 }
 
 section! {
-    /// What the daemon sends: a status, a health and an alarm frame. Without this table it only listens, and no other identifier is ever sent. `packwatch dbc` writes the DBC of the frames as they are configured.
+    /// Frames that the daemon sends: status, health and alarm. Without this table it only listens; it never sends another identifier. `packwatch dbc` writes the DBC of the frames as they are configured.
     Output at "output" {
         /// Whether anything is sent.
         enabled: bool, "", Any, Default("true");
@@ -47,11 +48,11 @@ section! {
     }
 }
 
-/// What the table of a frame says.
+/// The keys that all tables of frames have.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FrameKeys<'a> {
-    /// Where it stands.
-    pub place: &'a crate::config::document::Place,
+    /// Place in the file.
+    pub place: &'a TablePlace,
     /// Identifier.
     pub id: Option<u32>,
     /// Whether it has 29 bits.
@@ -63,7 +64,7 @@ pub(crate) struct FrameKeys<'a> {
     /// Period.
     pub period_ms: Option<u32>,
     /// Protection.
-    pub e2e: Option<E2e>,
+    pub e2e: Option<E2eKey>,
     /// Its data id.
     pub data_id: Option<u16>,
 }
@@ -85,15 +86,15 @@ macro_rules! frame_section {
                 /// Period. Without it: the DBC's cycle time, or else 1000 ms.
                 period_ms: Option<u32>, "ms", Between(10.0, 3_600_000.0), Optional;
                 /// AUTOSAR end-to-end protection: a checksum and a counter in the first bytes, profile 1 variant A or C (2 bytes) or profile 5 (3 bytes; the built-in layout then has 12 bytes and needs `fd = true`). Without it: as the DBC says; the built-in one: off.
-                e2e: Option<E2e>, "", Any, Optional;
-                /// Data id of the protection, which sender and receivers know; each protected frame has its own, with "1C" up to 0xFFF. Needed with `e2e`.
+                e2e: Option<E2eKey>, "", Any, Optional;
+                /// Data id of the protection, known to sender and receivers; each protected frame has its own, up to 0xFFF with "1C". Needed with `e2e`.
                 data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
             }
         }
 
         impl $name {
-            /// What all tables of frames have in common.
-            pub fn frame(&self) -> FrameKeys<'_> {
+            /// The keys that all tables of frames have.
+            pub(crate) fn frame(&self) -> FrameKeys<'_> {
                 FrameKeys {
                     place: &self.place,
                     id: self.id,
@@ -115,7 +116,7 @@ frame_section! {
 }
 
 frame_section! {
-    /// The health frame: what was learned, all pages at once.
+    /// The health frame: learned values, all pages at once.
     OutputHealth at "output.health"
 }
 
@@ -125,11 +126,11 @@ frame_section! {
 }
 
 section! {
-    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off unless switched on here, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not obeyed.
+    /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not executed.
     Commands at "commands" {
-        /// Whether commands from the bus are obeyed.
+        /// Whether commands from the bus are executed.
         enabled: bool, "", Any, Default("false");
-        /// Interface the frame comes on. Needed when there are several.
+        /// Interface that carries the frame. Needed when there are several.
         interface: Option<String>, "", NotEmpty, Optional;
         /// Identifier. Without it: the DBC's.
         id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
@@ -137,17 +138,17 @@ section! {
         extended: bool, "", Any, Default("false");
         /// Whether CAN FD frames carry it. Without it: as the DBC says; the built-in one: classic frames.
         fd: Option<bool>, "", Any, Optional;
-        /// Profile of the protection. Needed when commands are obeyed; "off" is refused then.
-        e2e: Option<E2e>, "", Any, Optional;
+        /// Profile of the protection. Needed when commands are enabled; "off" is refused then.
+        e2e: Option<E2eKey>, "", Any, Optional;
         /// Data id of the protection. Needed with `e2e`.
         data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
         /// Frames that may be lost between two.
-        max_delta_counter: u16, "frames", Between(1.0, 14.0), Default("1");
+        max_delta_counter: u8, "frames", Between(1.0, 14.0), Default("1");
     }
 }
 
 impl Commands {
-    /// What all tables of frames have in common.
+    /// The keys that all tables of frames have.
     pub(crate) fn frame(&self) -> FrameKeys<'_> {
         FrameKeys {
             place: &self.place,

@@ -74,7 +74,7 @@ fn faults_of_alarms_and_commands() {
         ),
         (
             "[commands]\nenabled = true\ne2e = \"1A\"\ndata_id = 1\n",
-            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: what became of a command \
+            "pack.toml:16: commands.enabled = true, must have a table [output] that is enabled: the outcome of a command \
              is sent",
         ),
         (

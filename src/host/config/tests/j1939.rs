@@ -54,7 +54,7 @@ fn a_table_becomes_a_node_and_each_alarm_a_code() {
     assert_eq!(
         super::super::j1939::words(&config)[..2],
         [
-            "address 249 (F9) on can0, NAME 00FEFF00FFE004D2; DM1 18FECAF9 every second and on change, DM2 18FECBF9 when asked for",
+            "address 249 (F9) on can0, NAME 00FEFF00FFE004D2; DM1 18FECAF9 every second and on change, DM2 18FECBF9 on request",
             "capacity_low warning: SPN 520193, FMI 18, amber lamp",
         ]
     );
@@ -123,7 +123,7 @@ fn of_several_interfaces_one_must_be_named() {
 
 #[test]
 fn a_number_without_a_node_is_a_fault() {
-    let fault = "pack.toml:21: alarm[2].spn = 7000, must have a table [j1939], without it nothing is told on J1939";
+    let fault = "pack.toml:21: alarm[2].spn = 7000, must have a table [j1939], without it nothing is sent on J1939";
     assert_eq!(faults(&with("")), [fault]);
 }
 

@@ -82,7 +82,7 @@ fn check_says_what_is_protected() {
         description.intake,
         [
             "at most 2000 frames a second of one identifier, a tenth of them at once",
-            "commands of other ECUs are not taken",
+            "commands of other ECUs are not executed",
             "Status (100 on can0): end-to-end protected, profile 1A, data id 0x0123, 1 lost in a row allowed, \
              one missing is counted each 100 ms"
         ]

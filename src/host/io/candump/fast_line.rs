@@ -1,8 +1,8 @@
-//! The line that nearly every log consists of, `(1700000000.123456) can0 123#1122334455667788`, read eight bytes at a time.
+//! Fast parser of the line that nearly every log consists of, `(1700000000.123456) can0 123#1122334455667788`, read eight bytes at a time.
 //!
-//! In: text that begins with a line. Out: what the full grammar gives for that line, or `None`, which says nothing but "use
-//! the full grammar": a stamp of ten digits with six or nine decimals, one space, a name of 1 to 7 bytes, one space, a
-//! standard or extended identifier, and up to eight bytes of payload are all that is known here. Numbers are
+//! In: text that begins with a line. Out: the result of the full grammar for that line, or `None`, which means "use the full
+//! grammar". Known are only: a stamp of ten digits with six or nine decimals, one space, a name of 1 to 7 bytes, one space, a
+//! standard or extended identifier, and up to eight bytes of payload. Numbers are
 //! converted several bytes at a time (as lanes of a `u64`, the first byte lowest, or by loops that become vectors).
 
 use crate::can::{CanId, Frame};
@@ -33,7 +33,7 @@ pub(crate) struct FastLine {
     pub id: CanId,
     /// Payload bytes, the first lowest, zeros above.
     pub payload: u64,
-    /// How many, 0 to 8.
+    /// Number of payload bytes, 0 to 8.
     pub payload_len: u8,
     /// Length of the line with its line feed.
     pub line_len: usize,
@@ -95,18 +95,18 @@ impl FastLineParser {
         lines
     }
 
-    /// These are the interfaces from here on.
+    /// Replaces the interfaces.
     pub(crate) fn know(&mut self, interfaces: &[String]) {
         let numbered = (0..u8::MAX).map(BusIndex).zip(interfaces);
         self.interfaces = numbered.filter_map(|(bus, name)| Interface::new(name.as_bytes(), bus)).collect();
     }
 
-    /// Stamps are moved by so much from here on.
+    /// Moves all further stamps by `shift_ns`.
     pub(crate) fn shift(&mut self, shift_ns: i64) {
         (self.shift_ns, self.head) = (shift_ns, NO_HEAD);
     }
 
-    /// Reads the first line of `text`; `None` where it is none of the usual ones, or too little text is left to tell.
+    /// Reads the first line of `text`; `None` where it has another form, or too little text is left.
     #[inline(always)]
     pub(crate) fn parse(&mut self, text: &[u8]) -> Option<FastLine> {
         let text: &[u8; WINDOW] = text.first_chunk()?;
@@ -119,7 +119,8 @@ impl FastLineParser {
             None => (nine_digits(text)?, 23),
         };
         let time = Timestamp::from_nanos(self.second_ns + fraction_ns.cast_signed());
-        // Where a line goes on depends on its name's length. Found by comparing, that is foreseen; counted, it would be waited for.
+        // The position after the name depends on its length. Comparing known names lets the processor predict it; counting would
+        // make it wait.
         let name = word(text, name_at);
         let is_known = |known: &&Interface| name & known.mask == known.name;
         // Most logs are of one interface: no loop for the first.
@@ -138,7 +139,7 @@ impl FastLineParser {
     #[inline(never)]
     fn begin_second(&mut self, text: &[u8; WINDOW], head: [u64; 2]) -> Option<()> {
         let second_ns = second_ns(text)?.cast_signed().checked_add(self.shift_ns)?;
-        // Any fraction of it can be told too.
+        // Any fraction of it fits as well.
         second_ns.checked_add(1_000_000_000)?;
         (self.second_ns, self.head) = (second_ns, head);
         Some(())
@@ -351,9 +352,9 @@ mod tests {
         let Ok(Line::Frame { time, interface, frame, .. }) = plain else {
             panic!("no frame: {:?}", String::from_utf8_lossy(line));
         };
-        let told = (usual.line_len, usual.time, usual.bus, usual.frame());
+        let found = (usual.line_len, usual.time, usual.bus, usual.frame());
         let bus = BusIndex(u8::from(interface != b"none"));
-        assert_eq!(told, (first + 1, time, bus, frame), "{:?}", String::from_utf8_lossy(line));
+        assert_eq!(found, (first + 1, time, bus, frame), "{:?}", String::from_utf8_lossy(line));
         Some(usual)
     }
 
@@ -426,7 +427,8 @@ mod tests {
     #[test]
     fn unknown_interfaces_are_left_to_the_full_grammar() {
         let line = |name: &str| format!("(1700000000.123456) {name} 123#11\n{MORE}");
-        let mut reader = FastLineParser::new(&["can1".to_owned(), "a name".to_owned(), "vcan10".to_owned(), String::new()]);
+        let mut reader =
+            FastLineParser::new(&["can1".to_owned(), "a name".to_owned(), "vcan10".to_owned(), String::new()]);
         let mut bus = |name: &str| reader.parse(line(name).as_bytes()).map(|usual| usual.bus);
         assert_eq!((bus("can1"), bus("vcan10")), (Some(BusIndex(0)), Some(BusIndex(2))));
         for name in ["can0", "can", "can10", "vcan1", "vcan100", "a name", "a", "", "can1\n"] {
@@ -453,7 +455,7 @@ mod tests {
         };
         let raw = 9_223_371_999_999_999_000;
         assert_eq!((time(0), time(-5), time(5)), (Some(raw), Some(raw - 5), Some(raw + 5)));
-        assert_eq!((time(i64::MAX), time(0)), (None, Some(raw)), "beyond what can be told");
+        assert_eq!((time(i64::MAX), time(0)), (None, Some(raw)), "beyond the range of stamps");
     }
 
     #[test]

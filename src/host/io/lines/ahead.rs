@@ -2,32 +2,32 @@
 //!
 //! Bytes and errors come out in their order and place. At most [`BLOCKS`] blocks are in flight and they are used again, so
 //! memory is bounded and nothing is allocated on the way. When the reader is dropped the thread ends with its next block;
-//! nobody waits for it, since its source may be a pipe that says nothing for long.
+//! no caller waits for it, since its source may be a pipe that is silent for long.
 
 use std::io::{self, Read};
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread;
 
-/// Blocks in flight: one being filled, one being read, two to even out what comes between.
+/// Blocks in flight: one being filled, one being read, two to even out the delays between them.
 const BLOCKS: usize = 4;
 
-/// What the thread hands over.
-enum Piece {
+/// A message of the thread.
+enum AheadMessage {
     Block(Vec<u8>),
     End(io::Result<()>),
 }
 
 /// The reading end.
-pub(super) struct Ahead {
-    pieces: Receiver<Piece>,
+pub(super) struct ReadAhead {
+    pieces: Receiver<AheadMessage>,
     used: Sender<Vec<u8>>,
     block: Vec<u8>,
-    /// Bytes of the block already given.
+    /// Bytes of the block already read.
     given: usize,
     ended: bool,
 }
 
-impl Ahead {
+impl ReadAhead {
     /// Begins to read `source` in blocks of `block_len` bytes.
     pub(super) fn new(source: impl Read + Send + 'static, block_len: usize) -> io::Result<Self> {
         let (full, pieces) = sync_channel(BLOCKS);
@@ -45,28 +45,28 @@ impl Ahead {
             return Ok(false);
         }
         match self.pieces.recv() {
-            Ok(Piece::Block(block)) => {
+            Ok(AheadMessage::Block(block)) => {
                 let used = std::mem::replace(&mut self.block, block);
                 self.given = 0;
                 if !used.is_empty() {
-                    // Nobody takes it once the thread has ended.
+                    // An error means that the thread has ended.
                     let _ = self.used.send(used);
                 }
                 Ok(true)
             }
-            Ok(Piece::End(result)) => {
+            Ok(AheadMessage::End(result)) => {
                 self.ended = true;
                 result.map(|()| false)
             }
             Err(_) => {
                 self.ended = true;
-                Err(io::Error::other("unpacking stopped for no known reason"))
+                Err(io::Error::other("unpacking stopped for an unknown reason"))
             }
         }
     }
 }
 
-impl Read for Ahead {
+impl Read for ReadAhead {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         while self.given == self.block.len() {
             if !self.next_block()? {
@@ -80,18 +80,18 @@ impl Read for Ahead {
     }
 }
 
-/// Fills blocks until the source ends, fails, or nobody wants more.
-fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<Piece>) {
+/// Fills blocks until the source ends or fails, or the reader is dropped.
+fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<AheadMessage>) {
     while let Ok(mut block) = empty.recv() {
         let room = block.capacity();
         block.resize(room, 0);
         let (count, end) = fill(&mut source, &mut block);
         block.truncate(count);
-        if count > 0 && full.send(Piece::Block(block)).is_err() {
+        if count > 0 && full.send(AheadMessage::Block(block)).is_err() {
             return;
         }
         if let Some(end) = end {
-            let _ = full.send(Piece::End(end));
+            let _ = full.send(AheadMessage::End(end));
             return;
         }
     }
@@ -142,14 +142,14 @@ mod tests {
     fn all_bytes_come_through_in_their_order() {
         for len in [0, 1, 99, 100, 101, 12_345] {
             let mut out = Vec::new();
-            Ahead::new(drip(len, None), 100).expect("a thread").read_to_end(&mut out).expect("no error");
+            ReadAhead::new(drip(len, None), 100).expect("a thread").read_to_end(&mut out).expect("no error");
             assert_eq!(out, drip(len, None).bytes, "{len}");
         }
     }
 
     #[test]
     fn an_error_comes_after_every_byte_before_it_and_then_the_end() {
-        let mut ahead = Ahead::new(drip(1234, Some(io::ErrorKind::InvalidData)), 100).expect("a thread");
+        let mut ahead = ReadAhead::new(drip(1234, Some(io::ErrorKind::InvalidData)), 100).expect("a thread");
         let mut out = Vec::new();
         let error = ahead.read_to_end(&mut out).expect_err("the source's error");
         assert_eq!((error.kind(), out.len()), (io::ErrorKind::InvalidData, 1234));
@@ -164,14 +164,14 @@ mod tests {
                 panic!("as a decoder with a fault would");
             }
         }
-        let mut ahead = Ahead::new(Panics, 100).expect("a thread");
+        let mut ahead = ReadAhead::new(Panics, 100).expect("a thread");
         assert!(ahead.read(&mut [0; 8]).is_err());
     }
 
     #[test]
     fn a_reader_that_stops_early_does_not_wait_for_the_rest() {
         let endless = io::repeat(b'x');
-        let mut ahead = Ahead::new(endless, 100).expect("a thread");
+        let mut ahead = ReadAhead::new(endless, 100).expect("a thread");
         assert_eq!(ahead.read(&mut [0; 8]).expect("bytes"), 8);
         drop(ahead);
     }

@@ -1,65 +1,65 @@
-//! What a log is made of: [`Record`], an input that owns its frame, and [`Batch`], many of them at once.
+//! Records of a log: [`Record`], an input that owns its frame, and [`Batch`], many of them at once.
 
 use crate::can::Frame;
-use crate::monitor::{Downtime, BusEvent, Command, Input};
+use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// What a slot holds before a record.
-pub(super) const NOTHING: Record = Record::Tick { time: Timestamp::ZERO };
+/// Content of an unused slot.
+pub(super) const UNUSED: Record = Record::Tick { time: Timestamp::ZERO };
 
 /// An input that owns its frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Record {
     /// A frame.
     Frame {
-        /// When.
+        /// Time.
         time: Timestamp,
-        /// Where.
+        /// Interface.
         bus: BusIndex,
-        /// What.
+        /// Content.
         frame: Frame,
     },
     /// Only in journals.
     Tick {
-        /// When.
+        /// Time.
         time: Timestamp,
     },
     /// An interface event.
     Bus {
-        /// When.
+        /// Time.
         time: Timestamp,
-        /// Where.
+        /// Interface.
         bus: BusIndex,
-        /// What.
+        /// Content.
         event: BusEvent,
     },
-    /// The time between this and what came before is unknown.
+    /// The time between this record and the one before is unknown.
     UnknownGap {
-        /// The stamp from which the record goes on.
+        /// Stamp at which the log continues.
         time: Timestamp,
     },
-    /// Somebody asked for something.
+    /// A command of a client.
     Command {
-        /// When.
+        /// Time.
         time: Timestamp,
-        /// What.
+        /// Content.
         command: Command,
     },
-    /// Whether files could be written changed.
+    /// Writing the store began to fail or to work.
     Store {
-        /// When.
+        /// Time.
         time: Timestamp,
-        /// They could.
+        /// Whether it works.
         works: bool,
     },
-    /// The recorded run took another configuration over here.
+    /// The recorded run changed to another configuration here.
     Reload {
-        /// When.
+        /// Time.
         time: Timestamp,
     },
-    /// The recorded run took up a stored state here.
+    /// The recorded run restored a stored state here.
     Restore {
-        /// When.
+        /// Time.
         time: Timestamp,
         /// How old the state was.
         away: Downtime,
@@ -67,7 +67,7 @@ pub enum Record {
 }
 
 impl Record {
-    /// As the core takes it; `None` for what is not its input.
+    /// The input of the core; `None` for a record that is none.
     pub fn input(&self) -> Option<Input<'_>> {
         Some(match self {
             Self::Frame { time, bus, frame } => Input::Frame { time: *time, bus: *bus, frame },
@@ -109,10 +109,10 @@ impl Record {
     }
 }
 
-/// Records in a row, of memory that is used again and again.
+/// Consecutive records in reused memory.
 #[derive(Debug)]
 pub struct Batch {
-    /// All the room there is.
+    /// All slots.
     pub(super) slots: Box<[Record]>,
     /// How many of them are filled.
     pub(super) len: usize,
@@ -120,13 +120,13 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Most records at once: 12 KiB, which stay in the processor's nearest memory beside the estimators'.
+    /// Most records at once: 12 KiB, which stay in the processor's nearest memory together with the estimators'.
     pub const MAX: usize = 128;
 
     /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may be read a little further
     /// than the records used say.
     pub fn new(max: usize) -> Self {
-        Self { slots: vec![NOTHING; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
+        Self { slots: vec![UNUSED; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
     }
 
     /// The records.

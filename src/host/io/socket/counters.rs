@@ -1,9 +1,8 @@
-//! What a link counts since the program's start, for those who look from outside: written by its task, read by others,
-//! without a lock.
+//! Counters of a link since the program's start: written by its task, read by others, without a lock.
 
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 
-/// What is known of an interface.
+/// State of an interface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[repr(u8)]
@@ -14,7 +13,7 @@ pub enum LinkState {
     Missing = 1,
     /// It exists and is down.
     Down = 2,
-    /// Frames may come.
+    /// Frames may arrive.
     Up = 3,
 }
 
@@ -27,7 +26,7 @@ pub struct LinkCounters {
     pub kernel_dropped: AtomicU64,
     /// Frames that found our own queue full.
     pub inbox_full: AtomicU64,
-    /// Things read that are no frame.
+    /// Reads that are no valid frame.
     pub malformed: AtomicU64,
     /// Frames the kernel took from us.
     pub sent: AtomicU64,

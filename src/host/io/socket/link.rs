@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
 use super::counters::{LinkCounters, LinkState};
-use super::raw::{CALL_BATCH, RawConfig, RawReceived, RawSocket, index_of};
+use super::raw::{CALL_BATCH, RawConfig, RawRead, RawSocket, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -26,42 +26,42 @@ use crate::quantity::{BusIndex, Timestamp};
 
 /// First pause before an interface that is down or missing is looked at again.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// Longest such pause: a look costs a few system calls, a frame missed cannot be had again.
+/// Longest such pause: a look costs a few system calls, a missed frame is lost.
 const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 /// Frames read before other tasks get their turn: 8 ms of a full 1 Mbit/s bus, under one tick.
 const READ_BATCH: usize = 64;
 /// Frames waiting to be sent: the status, health and alarm frames of a second, many times over.
 const SEND_QUEUE: usize = 256;
-/// A frame not sent after this long says something that is no longer true, and is dropped.
+/// A frame not sent after this long is out of date and is dropped.
 const SEND_MAX_AGE: Duration = Duration::from_millis(500);
 /// How often losses are reported: a stalled bus must not fill the journal.
 const REPORT_PERIOD: Duration = Duration::from_millis(250);
 
-/// What a link needs to know.
+/// Settings of a link.
 #[derive(Debug, Clone)]
 pub struct LinkConfig {
     /// Its number.
     pub bus: BusIndex,
     /// Kernel name.
     pub interface: String,
-    /// FD frames too.
+    /// Whether FD frames are accepted.
     pub fd: bool,
-    /// Identifiers wanted, ascending.
+    /// Wanted identifiers, ascending.
     pub ids: Vec<CanId>,
-    /// Extended identifiers wanted besides, as identifier and mask.
+    /// Further extended identifiers, as identifier and mask.
     pub patterns: Vec<(u32, u32)>,
     /// Receive buffer to ask for, bytes.
     pub receive_buffer_bytes: usize,
 }
 
-/// One thing an interface delivered, on the program's clock.
+/// A frame or event of an interface, on the program's clock.
 #[derive(Debug, Clone, Copy)]
-pub struct Received {
-    /// When.
+pub struct LinkMessage {
+    /// Time.
     pub time: Timestamp,
-    /// Where.
+    /// Interface.
     pub bus: BusIndex,
-    /// What.
+    /// Content.
     pub what: LinkEvent,
 }
 
@@ -77,13 +77,13 @@ pub enum LinkEvent {
 /// The sending end of a link. Dropped, it ends the link once what is queued has been sent.
 #[derive(Debug)]
 pub struct LinkOutput {
-    queue: mpsc::Sender<Outgoing>,
+    queue: mpsc::Sender<QueuedFrame>,
     unsent: Arc<AtomicU64>,
     counters: Arc<LinkCounters>,
 }
 
 #[derive(Debug)]
-struct Outgoing {
+struct QueuedFrame {
     since: Instant,
     frame: Frame,
 }
@@ -91,32 +91,24 @@ struct Outgoing {
 impl LinkOutput {
     /// Queues a frame; one that finds the queue full is dropped and counted.
     pub fn send(&self, frame: Frame) {
-        if self.queue.try_send(Outgoing { since: Instant::now(), frame }).is_err() {
+        if self.queue.try_send(QueuedFrame { since: Instant::now(), frame }).is_err() {
             self.unsent.fetch_add(1, Ordering::Relaxed);
             LinkCounters::add(&self.counters.send_queue_full, 1);
         }
     }
 
-    /// What the link has counted.
+    /// Counters of the link.
     pub fn counters(&self) -> &LinkCounters {
         &self.counters
     }
 }
 
-/// What is known of the interface.
+/// Reason why a socket is no longer served.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
-    Up,
-    Down,
-    Missing,
-}
-
-/// Why a socket is no longer served.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum End {
+enum ServiceEnd {
     /// The daemon stops.
     Stopped,
-    /// The socket is of no more use.
+    /// The socket can no longer be used.
     Dead,
 }
 
@@ -125,11 +117,11 @@ enum End {
 pub struct Link {
     config: LinkConfig,
     clock: MappedClock,
-    inbox: mpsc::Sender<Received>,
-    outgoing: mpsc::Receiver<Outgoing>,
+    inbox: mpsc::Sender<LinkMessage>,
+    outgoing: mpsc::Receiver<QueuedFrame>,
     unsent: Arc<AtomicU64>,
     counters: Arc<LinkCounters>,
-    state: Option<State>,
+    state: LinkState,
     /// When that was noted.
     state_since: Timestamp,
     /// Frames lost since the last report: by the kernel, and by our full inbox.
@@ -140,14 +132,14 @@ pub struct Link {
 }
 
 /// An open socket and what belongs to it alone.
-struct Open {
+struct OpenSocket {
     socket: AsyncFd<RawSocket>,
     mapper: StampMapper,
-    /// What one call brought; kept for its room.
-    received: Vec<RawReceived>,
+    /// Frames of one call; kept to reuse its memory.
+    received: Vec<RawRead>,
     dropped_total: u32,
     /// The next frame to send, waiting for room.
-    pending: Option<Outgoing>,
+    pending: Option<QueuedFrame>,
 }
 
 /// Registers a socket with the runtime. Errors too: a removed interface makes the socket neither readable nor writable.
@@ -161,7 +153,7 @@ fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
 
 impl Link {
     /// A link, not yet running, and its sending end. Must be called inside the runtime.
-    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Received>) -> (Self, LinkOutput) {
+    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<LinkMessage>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
         let mut report = interval(REPORT_PERIOD);
@@ -175,7 +167,7 @@ impl Link {
             outgoing,
             unsent,
             counters,
-            state: None,
+            state: LinkState::Unknown,
             state_since: clock.now(),
             lost: 0,
             report,
@@ -192,14 +184,14 @@ impl Link {
                 Some(open) => self.serve(open).await,
                 None => self.wait().await,
             };
-            if end == End::Stopped {
+            if end == ServiceEnd::Stopped {
                 return;
             }
         }
     }
 
-    /// Opens the interface and says what it found; `None` when there is nothing to serve.
-    async fn open(&mut self) -> Option<Open> {
+    /// Opens the interface and sends its state as an event; `None` when it cannot be opened.
+    async fn open(&mut self) -> Option<OpenSocket> {
         let raw = RawConfig {
             interface: &self.config.interface,
             fd: self.config.fd,
@@ -215,27 +207,27 @@ impl Link {
             Ok(opened) => opened,
             Err(error) => {
                 self.problem(&error);
-                self.enter(State::Missing).await;
+                self.enter(LinkState::Missing).await;
                 return None;
             }
         };
         self.last_problem = None;
         self.note_buffer(socket.get_ref());
-        let state = if error.is_none() { State::Up } else { State::Down };
+        let state = if error.is_none() { LinkState::Up } else { LinkState::Down };
         let mapper = StampMapper::new(self.clock, Reading::now());
         self.enter(state).await;
         let received = Vec::with_capacity(CALL_BATCH);
-        Some(Open { socket, mapper, received, dropped_total: 0, pending: None })
+        Some(OpenSocket { socket, mapper, received, dropped_total: 0, pending: None })
     }
 
     /// Receives and sends until the socket is dead or the daemon stops.
-    async fn serve(&mut self, mut open: Open) -> End {
+    async fn serve(&mut self, mut open: OpenSocket) -> ServiceEnd {
         let end = self.serve_open(&mut open).await;
         self.note_dropped(&mut open);
         end
     }
 
-    async fn serve_open(&mut self, open: &mut Open) -> End {
+    async fn serve_open(&mut self, open: &mut OpenSocket) -> ServiceEnd {
         let mut look_at = Instant::now() + self.pause;
         loop {
             let interest = match open.pending {
@@ -246,13 +238,13 @@ impl Link {
                 ready = open.socket.ready(interest) => match ready {
                     Ok(mut guard) => {
                         let ready = guard.ready();
-                        // Cleared before the work: an edge that comes during it sets it again. What the work leaves
-                        // behind is taken in the loop, which reads until the socket is empty.
+                        // Cleared before the work: an edge during the work sets it again. The loop reads until the
+                        // socket is empty.
                         guard.clear_ready_matching(if ready.is_writable() { Ready::WRITABLE } else { Ready::EMPTY });
                         guard.clear_ready_matching(Ready::READABLE | Ready::ERROR);
                         Ok(())
                     }
-                    Err(error) => { self.problem(&error); return End::Dead; }
+                    Err(error) => { self.problem(&error); return ServiceEnd::Dead; }
                 },
                 next = self.outgoing.recv(), if open.pending.is_none() => Err(next),
                 _ = self.report.tick() => {
@@ -260,34 +252,34 @@ impl Link {
                     self.report_losses(open.mapper.event(Reading::now())).await;
                     continue;
                 }
-                () = sleep_until(look_at), if self.state != Some(State::Up) => {
+                () = sleep_until(look_at), if self.state != LinkState::Up => {
                     look_at = Instant::now() + self.lengthen_pause();
-                    if self.look(open).await { continue } else { return End::Dead }
+                    if self.look(open).await { continue } else { return ServiceEnd::Dead }
                 }
             };
             match step {
-                Err(None) => return End::Stopped,
+                Err(None) => return ServiceEnd::Stopped,
                 Err(Some(outgoing)) => open.pending = Some(outgoing),
                 Ok(()) => {
-                    if self.receive_all(open).await == Some(End::Dead) {
-                        return End::Dead;
+                    if self.receive_all(open).await == Some(ServiceEnd::Dead) {
+                        return ServiceEnd::Dead;
                     }
                 }
             }
-            if self.send_pending(open).await == Some(End::Dead) {
-                return End::Dead;
+            if self.send_pending(open).await == Some(ServiceEnd::Dead) {
+                return ServiceEnd::Dead;
             }
         }
     }
 
     /// Reads until the socket is empty, with pauses for the other tasks.
-    async fn receive_all(&mut self, open: &mut Open) -> Option<End> {
+    async fn receive_all(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
                 open.received.clear();
                 match open.socket.get_ref().receive(&mut open.received) {
                     Ok(()) => {
-                        // Once for all of them: what came with one call was read at one moment.
+                        // Once for all of them: the frames of one call are read at one moment.
                         let reading = Reading::now();
                         for received in &open.received {
                             self.take(&mut open.mapper, received, reading).await;
@@ -315,12 +307,12 @@ impl Link {
         self.config.ids.binary_search(&id).is_ok() || self.config.patterns.iter().any(fits)
     }
 
-    /// Hands on one thing read.
-    async fn take(&mut self, mapper: &mut StampMapper, received: &RawReceived, reading: Reading) {
+    /// Forwards one frame or event.
+    async fn take(&mut self, mapper: &mut StampMapper, received: &RawRead, reading: Reading) {
         let time = mapper.arrival(received.stamps, reading);
         // Frames that were still in the socket when the interface went down do not say that it is up again.
-        if self.state != Some(State::Up) && time > self.state_since {
-            self.enter_at(State::Up, time).await;
+        if self.state != LinkState::Up && time > self.state_since {
+            self.enter_at(LinkState::Up, time).await;
         }
         let what = match received.what {
             Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
@@ -332,14 +324,14 @@ impl Link {
                 return;
             }
         };
-        if self.inbox.try_send(Received { time, bus: self.config.bus, what }).is_err() {
+        if self.inbox.try_send(LinkMessage { time, bus: self.config.bus, what }).is_err() {
             self.lost += 1;
             LinkCounters::add(&self.counters.inbox_full, 1);
         }
     }
 
-    /// Takes over what the kernel had no room for since this was asked last.
-    fn note_dropped(&mut self, open: &mut Open) {
+    /// Adds the frames that the kernel dropped since the last call.
+    fn note_dropped(&mut self, open: &mut OpenSocket) {
         let total = open.socket.get_ref().dropped_total();
         let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
         self.lost += dropped;
@@ -347,9 +339,9 @@ impl Link {
     }
 
     /// Sends what waits, if there is room.
-    async fn send_pending(&mut self, open: &mut Open) -> Option<End> {
+    async fn send_pending(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
         let outgoing = open.pending.take()?;
-        let useless = self.state != Some(State::Up) || outgoing.since.elapsed() > SEND_MAX_AGE;
+        let useless = self.state != LinkState::Up || outgoing.since.elapsed() > SEND_MAX_AGE;
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
             Ok(()) => {
@@ -367,16 +359,16 @@ impl Link {
         }
     }
 
-    /// An error of the socket: what it says about the interface, and whether the socket is dead.
-    async fn failed(&mut self, error: Errno) -> Option<End> {
+    /// Handles an error of the socket: notes the interface's state; returns whether the socket is dead.
+    async fn failed(&mut self, error: Errno) -> Option<ServiceEnd> {
         match error {
             Errno::ENETDOWN => {
-                self.enter(State::Down).await;
+                self.enter(LinkState::Down).await;
                 None
             }
             Errno::ENODEV | Errno::ENXIO => {
-                self.enter(State::Missing).await;
-                Some(End::Dead)
+                self.enter(LinkState::Missing).await;
+                Some(ServiceEnd::Dead)
             }
             // A frame this interface cannot carry; counted by the caller.
             Errno::EINVAL | Errno::EMSGSIZE => {
@@ -385,14 +377,14 @@ impl Link {
             }
             other => {
                 self.problem(&other.into());
-                self.enter(State::Down).await;
-                Some(End::Dead)
+                self.enter(LinkState::Down).await;
+                Some(ServiceEnd::Dead)
             }
         }
     }
 
-    /// Looks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
-    async fn look(&mut self, open: &Open) -> bool {
+    /// Checks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
+    async fn look(&mut self, open: &OpenSocket) -> bool {
         let raw = RawConfig {
             interface: &self.config.interface,
             fd: false,
@@ -404,20 +396,20 @@ impl Link {
             return false;
         }
         if let Ok(None) = RawSocket::open(&raw).and_then(|probe| probe.take_error()) {
-            self.enter(State::Up).await;
+            self.enter(LinkState::Up).await;
         }
         true
     }
 
-    /// Without a socket: waits, and drops what should be sent.
-    async fn wait(&mut self) -> End {
+    /// Without a socket: waits, and drops the frames to send.
+    async fn wait(&mut self) -> ServiceEnd {
         let until = Instant::now() + self.lengthen_pause();
         loop {
             tokio::select! {
-                () = sleep_until(until) => return End::Dead,
+                () = sleep_until(until) => return ServiceEnd::Dead,
                 next = self.outgoing.recv() => match next {
                     Some(_) => self.count_unsent(),
-                    None => return End::Stopped,
+                    None => return ServiceEnd::Stopped,
                 },
                 _ = self.report.tick() => self.report_losses(self.clock.now()).await,
             }
@@ -435,46 +427,46 @@ impl Link {
         pause
     }
 
-    /// Notes the interface's state; tells it when it is new.
-    async fn enter(&mut self, state: State) {
+    /// Notes the interface's state; sends an event when it is new.
+    async fn enter(&mut self, state: LinkState) {
         self.enter_at(state, self.clock.now()).await;
     }
 
-    /// The same, found out from something of that time.
-    async fn enter_at(&mut self, state: State, time: Timestamp) {
-        if self.state == Some(state) {
+    /// As [`enter`](Self::enter), at the time of the frame or event that shows the state.
+    async fn enter_at(&mut self, state: LinkState, time: Timestamp) {
+        if self.state == state {
             return;
         }
-        self.state = Some(state);
+        self.state = state;
         self.state_since = time;
-        if state == State::Up {
+        if state == LinkState::Up {
             self.pause = FIRST_PAUSE;
         }
-        let (event, told) = match state {
-            State::Up => (BusEvent::Up, LinkState::Up),
-            State::Down => (BusEvent::Down, LinkState::Down),
-            State::Missing => (BusEvent::Missing, LinkState::Missing),
+        self.counters.enter(state);
+        let event = match state {
+            LinkState::Up => BusEvent::Up,
+            LinkState::Down => BusEvent::Down,
+            LinkState::Missing | LinkState::Unknown => BusEvent::Missing,
         };
-        self.counters.enter(told);
-        self.tell(time, event).await;
+        self.notify(time, event).await;
     }
 
-    /// Tells what was lost since the last report.
+    /// Sends the frames lost since the last report as events.
     async fn report_losses(&mut self, time: Timestamp) {
         let frames = std::mem::take(&mut self.lost);
         if frames > 0 {
-            self.tell(time, BusEvent::Dropped { frames }).await;
+            self.notify(time, BusEvent::Dropped { frames }).await;
         }
         let frames = self.unsent.swap(0, Ordering::Relaxed);
         if frames > 0 {
-            self.tell(time, BusEvent::SendFailed { frames }).await;
+            self.notify(time, BusEvent::SendFailed { frames }).await;
         }
     }
 
-    /// Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
-    async fn tell(&self, time: Timestamp, event: BusEvent) {
-        // An error means that the daemon is stopping: nobody is left to be told.
-        let _ = self.inbox.send(Received { time, bus: self.config.bus, what: LinkEvent::Event(event) }).await;
+    /// Sends an event. Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
+    async fn notify(&self, time: Timestamp, event: BusEvent) {
+        // An error means that the daemon is stopping and no longer receives.
+        let _ = self.inbox.send(LinkMessage { time, bus: self.config.bus, what: LinkEvent::Event(event) }).await;
     }
 
     /// Logs a problem once, until it is another one.

@@ -1,10 +1,10 @@
-//! A listener that asks for what has come: sees what really went out on an interface, whoever sent it.
+//! A listener that is polled: sees every frame on an interface, also those of this computer.
 
 use std::io;
 
 use nix::errno::Errno;
 
-use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawConfig, RawReceived, RawSocket};
+use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawConfig, RawRead, RawSocket};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
@@ -15,8 +15,8 @@ use crate::quantity::Timestamp;
 pub struct CanListener {
     socket: RawSocket,
     mapper: StampMapper,
-    /// What the last call brought, and how much of it was handed on; the clocks at its reading.
-    received: Vec<RawReceived>,
+    /// Frames of the last call, how many of them were returned, and the clocks at its reading.
+    received: Vec<RawRead>,
     taken: usize,
     reading: Reading,
 }
@@ -39,7 +39,7 @@ impl CanListener {
         Ok(Self { socket, mapper, received: Vec::with_capacity(CALL_BATCH), taken: 0, reading: now })
     }
 
-    /// The next frame that has come, and when; `None` = there is none now.
+    /// The next frame and its time; `None` = there is none now.
     ///
     /// # Errors
     /// When the interface went down or away.

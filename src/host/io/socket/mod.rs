@@ -2,9 +2,9 @@
 //!
 //! * [`CanSender`]: a blocking sender for `replay --to` and `simulate --to`:
 //!   `CanSender::open("vcan0", fd)?` then `sender.send(&frame)?`; a full transmit queue is waited for, within a limit.
-//! * `CanListener`: takes what has come of some identifiers, for `test-alarm`.
-//! * `Tap`: takes everything an interface has, for `doctor`.
-//! * `Link`: the daemon's task per interface: receives, sends, and lives through every state of the interface.
+//! * `CanListener`: receives frames of some identifiers, for `test-alarm`.
+//! * `Tap`: receives everything on an interface, for `doctor`.
+//! * `Link`: the daemon's task per interface: receives, sends, and survives every state of the interface.
 //!
 //! Underneath: `raw` is one socket, `wire` the kernel's frame layouts as bytes.
 
@@ -17,8 +17,8 @@ mod tap;
 mod wire;
 
 pub use counters::{LinkCounters, LinkState};
-pub use link::{Link, LinkConfig, LinkOutput, Received, LinkEvent};
+pub use link::{Link, LinkConfig, LinkEvent, LinkMessage, LinkOutput};
 pub use listener::CanListener;
 pub use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
 pub use sender::CanSender;
-pub use tap::{Tap, Tapped};
+pub use tap::{Tap, TapEvent};

@@ -1,8 +1,8 @@
 //! One SocketCAN raw socket: opened so that nothing but the wanted identifiers ever reaches it, read several frames in
 //! one system call with their stamps, written without blocking.
 //!
-//! The kernel's drop counter is asked for by itself, not taken with each frame: a frame's control message tells it only once a
-//! frame has got in again, and changes its size when the first is dropped (see [`Slots`]).
+//! The kernel's drop counter is read separately, not with each frame: a frame's control message carries it only once a later
+//! frame was received, and changes its size when the first is dropped (see [`Slots`]).
 
 use std::cell::RefCell;
 use std::io::{self, IoSliceMut};
@@ -26,8 +26,8 @@ use crate::io::clock::KernelStamps;
 /// bookkeeping), a third of a second of a full 1 Mbit/s bus. The kernel caps it at net.core.rmem_max.
 pub const DEFAULT_RECEIVE_BUFFER_BYTES: usize = 1 << 20;
 
-/// Most frames taken in one system call: with 16 the call itself is no longer what a frame costs, and laying out room for
-/// them costs little when only one comes.
+/// Most frames read in one system call: with 16 the call itself no longer dominates the cost of a frame, and preparing their
+/// buffers costs little when only one arrives.
 pub(super) const CALL_BATCH: usize = 16;
 
 /// Numbers in the kernel's answer to SO_MEMINFO, and which of them counts drops (linux/sock_diag.h; since Linux 4.12).
@@ -42,26 +42,26 @@ const MAX_KERNEL_FILTERS: usize = 512;
 pub(super) struct RawConfig<'a> {
     /// Kernel name of the interface.
     pub(super) interface: &'a str,
-    /// FD frames too.
+    /// Whether FD frames are accepted.
     pub(super) fd: bool,
-    /// Identifiers wanted.
+    /// Wanted identifiers.
     pub(super) ids: &'a [CanId],
-    /// Extended identifiers wanted besides, as identifier and mask.
+    /// Further extended identifiers, as identifier and mask.
     pub(super) patterns: &'a [(u32, u32)],
     /// Receive buffer to ask for, bytes.
     pub(super) receive_buffer_bytes: usize,
 }
 
-/// One thing read, and its stamps.
+/// A read and its stamps.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct RawReceived {
+pub(super) struct RawRead {
     pub(super) what: Wire,
     pub(super) stamps: KernelStamps,
 }
 
-/// Where the kernel puts what one call takes. It is used again and again, and the kernel writes into each header how much of the
-/// room for control messages it has used, which is all the room the next frame there has: enough as long as each carries its stamp.
-/// After one that did not, the headers are made anew.
+/// Buffers of one call. They are reused, and the kernel writes into each header how much of the room for control messages it
+/// used, which is all the room of the next frame there: enough as long as each frame carries its stamp. After one without, the
+/// headers are built again.
 struct Slots {
     headers: MultiHeaders<()>,
     bytes: [[u8; FD_BYTES]; CALL_BATCH],
@@ -76,7 +76,7 @@ impl Slots {
         MultiHeaders::preallocate(CALL_BATCH, Some(cmsg_space!(Timestamps, TimeSpec)))
     }
 
-    fn receive(&mut self, fd: RawFd, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+    fn receive(&mut self, fd: RawFd, into: &mut Vec<RawRead>) -> Result<(), Errno> {
         let mut lengths = [0; CALL_BATCH];
         let begin = into.len();
         {
@@ -86,7 +86,7 @@ impl Slots {
                 *length = message.bytes.min(FD_BYTES);
                 // An error says that a control message was cut off: as good as none.
                 let stamps = message.cmsgs().map_or(KernelStamps::default(), read_control);
-                into.push(RawReceived { what: Wire::Malformed, stamps });
+                into.push(RawRead { what: Wire::Malformed, stamps });
             }
         }
         for ((received, length), bytes) in into[begin..].iter_mut().zip(lengths).zip(&self.bytes) {
@@ -100,7 +100,7 @@ impl Slots {
 }
 
 thread_local! {
-    /// Of all sockets of a thread: headers hold pointers, so they cannot go from thread to thread as a socket may.
+    /// Shared by all sockets of a thread: headers hold pointers, so they cannot move between threads as a socket may.
     static SLOTS: RefCell<Slots> = RefCell::new(Slots::new());
 }
 
@@ -161,11 +161,11 @@ impl RawSocket {
         self.socket.as_raw_socket().recv_buffer_size()
     }
 
-    /// Takes up to [`CALL_BATCH`] frames from the socket and appends them; fewer say that it was empty then.
+    /// Reads up to [`CALL_BATCH`] frames from the socket and appends them; fewer mean that it is empty.
     ///
     /// # Errors
     /// `EAGAIN` when there is none; `ENETDOWN`, `ENODEV` once when the interface went down or away.
-    pub(super) fn receive(&self, into: &mut Vec<RawReceived>) -> Result<(), Errno> {
+    pub(super) fn receive(&self, into: &mut Vec<RawRead>) -> Result<(), Errno> {
         SLOTS.with_borrow_mut(|slots| slots.receive(self.socket.as_raw_fd(), into))
     }
 
@@ -173,10 +173,10 @@ impl RawSocket {
     /// say.
     pub(super) fn dropped_total(&self) -> u32 {
         let mut bytes = [0; MEMINFO_NUMBERS * size_of::<u32>()];
-        let told = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
+        let result = self.socket.get_socket_option_bytes(libc::SOL_SOCKET, libc::SO_MEMINFO, &mut bytes);
         let (numbers, _) = bytes.as_chunks();
         // A shorter answer leaves it zero.
-        told.map_or(0, |_| u32::from_ne_bytes(numbers[MEMINFO_DROPS]))
+        result.map_or(0, |_| u32::from_ne_bytes(numbers[MEMINFO_DROPS]))
     }
 
     /// Hands one frame to the kernel.
@@ -222,8 +222,8 @@ fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
     Ok(())
 }
 
-/// Filters for exactly these identifiers, data frames only. More than the kernel takes: everything comes in,
-/// and the reader passes over what it does not know.
+/// Filters for exactly these identifiers, data frames only. With more than the kernel accepts, the filter is
+/// open and the reader ignores unknown identifiers.
 fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
     if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
         return vec![CanFilter::new(0, 0)];
@@ -270,7 +270,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_filter_tells_standard_from_extended_and_keeps_remote_requests_out() {
+    fn a_filter_separates_standard_from_extended_and_keeps_remote_requests_out() {
         assert_eq!(filter_mask(CanId::Standard(0x123)), 0xC000_07FF);
         assert_eq!(filter_mask(CanId::Extended(0x123)), 0xDFFF_FFFF);
         assert_eq!(wire::id_word(CanId::Extended(0x123)), 0x8000_0123);

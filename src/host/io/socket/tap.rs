@@ -1,23 +1,23 @@
-//! Everything an interface has: all identifiers, classic and FD, error frames, and what the kernel dropped.
+//! Receives everything on an interface: all identifiers, classic and FD, error frames, and the number of dropped frames.
 
 use std::io;
 
 use nix::errno::Errno;
 
-use super::raw::{CALL_BATCH, RawReceived, RawSocket};
+use super::raw::{CALL_BATCH, RawRead, RawSocket};
 use super::wire::Wire;
 use crate::can::Frame;
 use crate::io::clock::{MappedClock, Reading, StampMapper};
 use crate::quantity::Timestamp;
 
-/// One thing that came.
+/// A frame or event on the interface.
 #[derive(Debug, Clone, Copy)]
-pub enum Tapped {
+pub enum TapEvent {
     /// A frame.
     Frame(Frame),
     /// An error frame: its class.
     Error(u32),
-    /// The kernel dropped so many frames.
+    /// Number of frames the kernel dropped.
     Dropped(u64),
 }
 
@@ -26,8 +26,8 @@ pub enum Tapped {
 pub struct Tap {
     socket: RawSocket,
     mapper: StampMapper,
-    /// What one call brought; kept for its room.
-    received: Vec<RawReceived>,
+    /// Frames of one call; kept to reuse its memory.
+    received: Vec<RawRead>,
     dropped_total: u32,
     /// The clocks as last read: before what is read next.
     before: Reading,
@@ -46,11 +46,11 @@ impl Tap {
         Ok((Self { socket, mapper, received, dropped_total: 0, before }, is_up))
     }
 
-    /// Appends what has come, and when; `false` = that was all there is now.
+    /// Appends the frames and events received so far with their times; `false` = there are no more now.
     ///
     /// # Errors
     /// When the interface went down (`ENETDOWN`: the tap stays good) or away.
-    pub fn next(&mut self, into: &mut Vec<(Timestamp, Tapped)>) -> io::Result<bool> {
+    pub fn next(&mut self, into: &mut Vec<(Timestamp, TapEvent)>) -> io::Result<bool> {
         self.received.clear();
         match self.socket.receive(&mut self.received) {
             Ok(()) => self.before = Reading::now(),
@@ -66,20 +66,20 @@ impl Tap {
         for received in &self.received {
             let time = self.mapper.arrival(received.stamps, self.before);
             let what = match received.what {
-                Wire::Frame(frame) => Tapped::Frame(frame),
-                Wire::Error(class) => Tapped::Error(class),
-                Wire::Malformed => Tapped::Dropped(1),
+                Wire::Frame(frame) => TapEvent::Frame(frame),
+                Wire::Error(class) => TapEvent::Error(class),
+                Wire::Malformed => TapEvent::Dropped(1),
             };
             into.push((time, what));
         }
         Ok(true)
     }
 
-    fn note_dropped(&mut self, into: &mut Vec<(Timestamp, Tapped)>) {
+    fn note_dropped(&mut self, into: &mut Vec<(Timestamp, TapEvent)>) {
         let total = self.socket.dropped_total();
         let lost = total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total));
         if lost > 0 {
-            into.push((self.mapper.event(self.before), Tapped::Dropped(u64::from(lost))));
+            into.push((self.mapper.event(self.before), TapEvent::Dropped(u64::from(lost))));
         }
     }
 }

@@ -25,7 +25,7 @@ const FD_BRS: u8 = 0x01;
 /// FD flag: error state indicator.
 const FD_ESI: u8 = 0x02;
 
-/// What the kernel handed over.
+/// Content of a read from the kernel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Wire {
     /// A data or remote frame.

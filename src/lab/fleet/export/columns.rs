@@ -1,4 +1,4 @@
-//! The columns of the exported tables: name, type, unit, meaning and value, once.
+//! The columns of the exported tables: name, type, unit, meaning and value.
 //!
 //! The writers, the schema of the Parquet files and the page `config/EXPORT.md` all come from these lines. A value that is
 //! not known is null (an empty field in CSV), never NaN. Cells count from 0, current is positive for discharge.
@@ -6,15 +6,14 @@
 use std::borrow::Cow;
 use std::fmt::Write as _;
 
-use serde::Serialize;
-
 use super::rows::{AlarmRow, EstimateRow, HalfCycleRow};
+
 use crate::health::Remaining;
 use crate::quantity::Timestamp;
 
 /// Type of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum ColumnType {
     /// A moment: microseconds since 1970, UTC; in CSV like 2008-04-02T13:08:17.921000Z.
     Time,
     /// A number.
@@ -27,7 +26,7 @@ pub(super) enum Kind {
     Word,
 }
 
-impl Kind {
+impl ColumnType {
     /// In a Parquet schema.
     pub(super) const fn parquet(self) -> (&'static str, &'static str) {
         match self {
@@ -52,7 +51,7 @@ impl Kind {
 
 /// A value; `None` inside = not known.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Field<'r> {
+pub(super) enum FieldValue<'r> {
     Time(Timestamp),
     Real(Option<f64>),
     Whole(Option<u32>),
@@ -64,11 +63,11 @@ pub(super) enum Field<'r> {
 pub(super) struct Column<R> {
     pub(super) name: &'static str,
     pub(super) unit: &'static str,
-    pub(super) kind: Kind,
+    pub(super) kind: ColumnType,
     /// Whether it may be null.
     pub(super) optional: bool,
     pub(super) about: &'static str,
-    pub(super) get: for<'r> fn(&'r R) -> Field<'r>,
+    pub(super) get: for<'r> fn(&'r R) -> FieldValue<'r>,
 }
 
 /// Columns: name, kind, unit, `null` where it may be, meaning, value.
@@ -77,7 +76,7 @@ macro_rules! columns {
         &[$( Column::<$row> {
             name: $name,
             unit: $unit,
-            kind: Kind::$kind,
+            kind: ColumnType::$kind,
             optional: columns!(@ $($null)?),
             about: $about,
             get: $get,
@@ -90,7 +89,7 @@ macro_rules! columns {
 /// Of `estimates`.
 pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when the voltage was read", |row| Field::Time(row.estimate.time);
+    "time" Time "UTC", "when the voltage was read", |row| FieldValue::Time(row.estimate.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
     "cell" Whole "", "cell, from 0", |row| whole(row.estimate.cell.0);
     "soc" Real "fraction" null, "state of charge", |row| real(row.estimate.soc);
@@ -104,7 +103,7 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
     "resistance_ratio_std" Real "" null, "its standard deviation", |row| real(row.estimate.resistance_ratio_std);
     "innovation_v" Real "V" null, "measured minus predicted voltage", |row| real(row.estimate.innovation_v);
     "innovation_std_v" Real "V" null, "its predicted standard deviation", |row| real(row.estimate.innovation_std_v);
-    "accepted" Flag "", "whether the reading moved the estimate", |row| Field::Flag(row.estimate.accepted);
+    "accepted" Flag "", "whether the reading moved the estimate", |row| FieldValue::Flag(row.estimate.accepted);
     "voltage_v" Real "V" null, "voltage used", |row| real(row.estimate.voltage_v);
     "current_a" Real "A" null, "cell current used, positive = discharge", |row| real(row.estimate.current_a);
     "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.temperature_c);
@@ -113,29 +112,29 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
 /// Of `half_cycles`.
 pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when it was over", |row| Field::Time(row.time);
+    "time" Time "UTC", "when it was over", |row| FieldValue::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "", "cell, from 0", |row| whole(row.half.cell.0);
+    "cell" Whole "", "cell, from 0", |row| FieldValue::Whole(row.half.whole("cell"));
     "full_cycles" Real "cycles" null, "equivalent full cycles of the connected pack so far: charge moved over twice the rated capacity", |row| real(row.full_cycles);
-    "mode" Word "", "charge or discharge", |row| word(&row.half.mode);
-    "charge_ah" Real "Ah", "charge moved", |row| real(row.half.charge_ah);
-    "swing" Real "fraction" null, "swing of the state of charge that the voltages tell", |row| maybe(row.half.swing);
-    "swing_std" Real "fraction" null, "its standard deviation", |row| maybe(row.half.swing_std);
-    "duration_s" Real "s", "duration", |row| real(row.half.duration_s);
-    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| real(row.half.mean_current_a);
-    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| maybe(row.half.mean_temperature_c);
-    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| maybe(row.learned.measured_ah);
-    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.measured_std_ah);
-    "capacity_ah" Real "Ah", "learned capacity after it", |row| real(row.learned.capacity_ah);
-    "capacity_std_ah" Real "Ah", "its standard deviation", |row| real(row.learned.capacity_std_ah);
-    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| maybe(row.learned.usable_capacity_ah);
-    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| maybe(row.learned.usable_capacity_std_ah);
-    "resistance_ratio" Real "", "resistance relative to new", |row| real(row.learned.resistance_ratio);
-    "resistance_ratio_std" Real "", "its standard deviation", |row| real(row.learned.resistance_ratio_std);
-    "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little known", |row| cycles(row, |left| left.median);
+    "mode" Word "", "charge or discharge", |row| text(row.half.text("mode"));
+    "charge_ah" Real "Ah", "charge moved", |row| FieldValue::Real(row.half.number("charge_ah"));
+    "swing" Real "fraction" null, "swing of the state of charge, from the voltages", |row| FieldValue::Real(row.half.number("swing"));
+    "swing_std" Real "fraction" null, "its standard deviation", |row| FieldValue::Real(row.half.number("swing_std"));
+    "duration_s" Real "s", "duration", |row| FieldValue::Real(row.half.number("duration_s"));
+    "mean_current_a" Real "A", "mean cell current, positive = discharge", |row| FieldValue::Real(row.half.number("mean_current_a"));
+    "mean_temperature_c" Real "degrees C" null, "mean temperature", |row| FieldValue::Real(row.half.number("mean_temperature_c"));
+    "measured_ah" Real "Ah" null, "capacity by this half-cycle alone", |row| FieldValue::Real(row.capacity.number("measured_ah"));
+    "measured_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("measured_std_ah"));
+    "capacity_ah" Real "Ah", "learned capacity after it", |row| FieldValue::Real(row.capacity.number("capacity_ah"));
+    "capacity_std_ah" Real "Ah", "its standard deviation", |row| FieldValue::Real(row.capacity.number("capacity_std_ah"));
+    "usable_capacity_ah" Real "Ah" null, "usable capacity at the load of [usable]", |row| FieldValue::Real(row.capacity.number("usable_capacity_ah"));
+    "usable_capacity_std_ah" Real "Ah" null, "its standard deviation", |row| FieldValue::Real(row.capacity.number("usable_capacity_std_ah"));
+    "resistance_ratio" Real "", "resistance relative to new", |row| FieldValue::Real(row.capacity.number("resistance_ratio"));
+    "resistance_ratio_std" Real "", "its standard deviation", |row| FieldValue::Real(row.capacity.number("resistance_ratio_std"));
+    "remaining_cycles" Real "cycles" null, "equivalent full cycles (as full_cycles) until the cell's end of life, median; null = too little is known", |row| cycles(row, |left| left.median);
     "remaining_cycles_low" Real "cycles" null, "its 5 % quantile", |row| cycles(row, |left| left.low);
     "remaining_cycles_high" Real "cycles" null, "its 95 % quantile", |row| cycles(row, |left| left.high);
-    "remaining_days" Real "days" null, "days until the cell's end of life, used as of late: median", |row| days(row, |left| left.median);
+    "remaining_days" Real "days" null, "days until the cell's end of life at the recent rate of use: median", |row| days(row, |left| left.median);
     "remaining_days_low" Real "days" null, "its 5 % quantile", |row| days(row, |left| left.low);
     "remaining_days_high" Real "days" null, "its 95 % quantile", |row| days(row, |left| left.high);
 };
@@ -143,53 +142,47 @@ pub(super) const HALF_CYCLES: &[Column<HalfCycleRow>] = columns! { HalfCycleRow;
 /// Of `alarms`.
 pub(super) const ALARMS: &[Column<AlarmRow>] = columns! { AlarmRow;
     "log" Word "", "name of the log, that of its folder", |row| text(&row.log);
-    "time" Time "UTC", "when", |row| Field::Time(row.time);
+    "time" Time "UTC", "when", |row| FieldValue::Time(row.time);
     "since_start_s" Real "s", "the same since the log's first result", |row| real(row.since_s);
-    "cell" Whole "" null, "cell, from 0; null = the pack", |row| Field::Whole(row.alarm.cell.map(|cell| cell.0.into()));
-    "rule" Word "", "what it is about", |row| text(row.alarm.rule.name());
-    "severity" Word "", "info, warning or severe", |row| text(row.alarm.severity.name());
-    "change" Word "", "what became of it: raised, cleared, ...", |row| word(&row.alarm.change);
-    "state" Word "", "where it is in its life now", |row| word(&row.alarm.state);
-    "active" Flag "", "whether it is raised now", |row| Field::Flag(row.alarm.active);
-    "value" Real "unit" null, "the value that decided", |row| maybe(row.alarm.value);
-    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| maybe(row.alarm.probability);
-    "threshold" Real "unit", "what it is compared with", |row| real(row.alarm.threshold);
-    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.alarm.rule.row().unit.symbol());
-    "occurrences" Whole "", "times it was raised", |row| Field::Whole(Some(row.alarm.occurrences));
-    "acknowledged" Flag "", "whether somebody has seen it since", |row| Field::Flag(row.alarm.acknowledged);
+    "cell" Whole "" null, "cell, from 0; null = the pack", |row| FieldValue::Whole(row.alarm.whole("cell"));
+    "rule" Word "", "rule of the alarm", |row| text(row.rule.name());
+    "severity" Word "", "info, warning or severe", |row| text(row.alarm.text("severity"));
+    "change" Word "", "change: raised, cleared, ...", |row| text(row.alarm.text("change"));
+    "state" Word "", "its state after the change", |row| text(row.alarm.text("state"));
+    "active" Flag "", "whether it is raised after the change", |row| FieldValue::Flag(row.alarm.flag("active"));
+    "value" Real "unit" null, "the value that caused the change", |row| FieldValue::Real(row.alarm.number("value"));
+    "probability" Real "fraction" null, "that the truth is beyond the threshold", |row| FieldValue::Real(row.alarm.number("probability"));
+    "threshold" Real "unit", "the threshold it is compared with", |row| FieldValue::Real(row.alarm.number("threshold"));
+    "unit" Word "", "unit of value and threshold; empty for fractions and ratios", |row| text(row.rule.spec().unit.symbol());
+    "occurrences" Whole "", "times it was raised", |row| FieldValue::Whole(row.alarm.whole("occurrences"));
+    "acknowledged" Flag "", "whether it was acknowledged", |row| FieldValue::Flag(row.alarm.flag("acknowledged"));
 };
 
-fn real<'r>(value: f64) -> Field<'r> {
-    Field::Real(Some(value).filter(|value| value.is_finite()))
+fn real<'r>(value: f64) -> FieldValue<'r> {
+    FieldValue::Real(Some(value).filter(|value| value.is_finite()))
 }
 
-fn maybe<'r>(value: Option<f64>) -> Field<'r> {
-    Field::Real(value.filter(|value| value.is_finite()))
+fn maybe<'r>(value: Option<f64>) -> FieldValue<'r> {
+    FieldValue::Real(value.filter(|value| value.is_finite()))
 }
 
-fn whole<'r>(value: u16) -> Field<'r> {
-    Field::Whole(Some(value.into()))
+fn whole<'r>(value: u16) -> FieldValue<'r> {
+    FieldValue::Whole(Some(value.into()))
 }
 
-fn text(value: &str) -> Field<'_> {
-    Field::Word(Some(value.into()))
+fn text(value: &str) -> FieldValue<'_> {
+    FieldValue::Word(Some(value.into()))
 }
 
-/// A choice as events and configurations write it.
-fn word<'r>(value: &impl Serialize) -> Field<'r> {
-    let word = serde_json::to_value(value).ok();
-    Field::Word(word.and_then(|word| word.as_str().map(|word| word.to_owned().into())))
-}
-
-fn branch(row: &EstimateRow, index: usize) -> Field<'_> {
+fn branch(row: &EstimateRow, index: usize) -> FieldValue<'_> {
     maybe(row.estimate.branch_v.get(index).copied())
 }
 
-fn cycles(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
+fn cycles(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {
     maybe(row.remaining.and_then(|life| life.cycles).map(get))
 }
 
-fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
+fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> FieldValue<'_> {
     maybe(row.remaining.and_then(|life| life.days).map(get))
 }
 
@@ -197,7 +190,7 @@ fn days(row: &HalfCycleRow, get: fn(Remaining) -> f64) -> Field<'_> {
 pub fn reference() -> String {
     let mut page = String::from(
         "# Exported tables\n\nWritten by `packwatch export --columns-page`; the files are written from the same definition. A value that is not known is null \
-         (an empty field in CSV). `log` is dictionary-encoded: it costs next to nothing, and tells logs apart in a query over all files.\n",
+         (an empty field in CSV). `log` is dictionary-encoded: it takes almost no space, and distinguishes logs in a query over all files.\n",
     );
     page += &section(
         "estimates",
@@ -206,10 +199,10 @@ pub fn reference() -> String {
     );
     page += &section(
         "half_cycles",
-        "A charge or discharge of a cell, what was learned from it, and what remained of the cell's life after it.",
+        "A charge or discharge of a cell, what was learned from it, and the cell's remaining life after it.",
         HALF_CYCLES,
     );
-    page += &section("alarms", "Something that became of an alarm.", ALARMS);
+    page += &section("alarms", "A change of an alarm.", ALARMS);
     page
 }
 

@@ -1,6 +1,6 @@
-//! A table being written: rows in, a Parquet or CSV file out.
+//! Writes a table: rows in, a Parquet or CSV file out.
 //!
-//! In: rows, and what the file says of itself. Promise: rows are kept for one row group only; the file has its name once it is
+//! Input: rows and the file's metadata. Promise: rows are held in memory for one row group only; the file has its name once it is
 //! complete ([`ResultFile`]); a value that is missing or of another type than its column's is an error, never a wrong file.
 
 use std::path::{Path, PathBuf};
@@ -14,8 +14,9 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use parquet::schema::parser::parse_message_type;
 
-use super::Format;
-use super::columns::{Column, Field, Kind};
+use super::TableFormat;
+use super::columns::{Column, ColumnType, FieldValue};
+use crate::error::LabError;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 
@@ -27,21 +28,21 @@ pub(super) struct TableFile<R: 'static> {
     path: PathBuf,
     columns: &'static [Column<R>],
     rows: u64,
-    writer: Writer,
+    writer: TableWriter,
 }
 
-enum Writer {
+enum TableWriter {
     Csv { out: Box<csv::Writer<ResultFile>>, record: csv::StringRecord },
-    Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<Values>, rows: usize },
+    Parquet { out: Box<SerializedFileWriter<ResultFile>>, group: Vec<ColumnBuffer>, rows: usize },
 }
 
 /// The values of one column in the row group at hand, and which rows have one.
-struct Values {
+struct ColumnBuffer {
     present: Vec<i16>,
-    list: List,
+    list: ColumnValues,
 }
 
-enum List {
+enum ColumnValues {
     Micros(Vec<i64>),
     Reals(Vec<f64>),
     Wholes(Vec<i32>),
@@ -54,24 +55,24 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be created; the message names it.
-    pub(super) fn create(path: &Path, format: Format, columns: &'static [Column<R>]) -> Result<Self, String> {
-        let file = ResultFile::create(path).map_err(|error| error.to_string())?;
+    pub(super) fn create(path: &Path, format: TableFormat, columns: &'static [Column<R>]) -> Result<Self, LabError> {
+        let file = ResultFile::create(path)?;
         let writer = match format {
-            Format::Csv => {
+            TableFormat::Csv => {
                 let mut out = Box::new(csv::Writer::from_writer(file));
-                out.write_record(columns.iter().map(|column| column.name)).map_err(|error| error.to_string())?;
-                Writer::Csv { out, record: csv::StringRecord::new() }
+                out.write_record(columns.iter().map(|column| column.name))?;
+                TableWriter::Csv { out, record: csv::StringRecord::new() }
             }
-            Format::Parquet => {
-                let schema = parse_message_type(&schema(columns)).map_err(|error| error.to_string())?;
+            TableFormat::Parquet => {
+                let schema = parse_message_type(&schema(columns))?;
                 let properties = WriterProperties::builder()
                     .set_compression(Compression::SNAPPY)
                     .set_created_by(format!("packwatch {}", env!("CARGO_PKG_VERSION")))
                     .build();
                 let out = SerializedFileWriter::new(file, Arc::new(schema), Arc::new(properties));
-                let out = Box::new(out.map_err(|error| told(path, &error))?);
-                let group = columns.iter().map(|column| Values::new(column.kind)).collect();
-                Writer::Parquet { out, group, rows: 0 }
+                let out = Box::new(out.map_err(|error| named_error(path, &error))?);
+                let group = columns.iter().map(|column| ColumnBuffer::new(column.kind)).collect();
+                TableWriter::Parquet { out, group, rows: 0 }
             }
         };
         Ok(Self { path: path.to_owned(), columns, rows: 0, writer })
@@ -81,22 +82,19 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be written, or a value is not of its column's type.
-    pub(super) fn push(&mut self, row: &R) -> Result<(), String> {
+    pub(super) fn push(&mut self, row: &R) -> Result<(), LabError> {
         self.rows += 1;
         match &mut self.writer {
-            Writer::Csv { out, record } => {
+            TableWriter::Csv { out, record } => {
                 record.clear();
                 self.columns.iter().for_each(|column| record.push_field(&csv_field(&(column.get)(row))));
-                out.write_record(&*record).map_err(|error| error.to_string())
+                Ok(out.write_record(&*record)?)
             }
-            Writer::Parquet { out, group, rows } => {
+            TableWriter::Parquet { out, group, rows } => {
                 for (column, values) in self.columns.iter().zip(group.iter_mut()) {
                     if !values.push((column.get)(row), column.optional) {
-                        return Err(format!(
-                            "{}: {} has no value, or one of another type",
-                            self.path.display(),
-                            column.name
-                        ));
+                        let (file, name) = (self.path.display(), column.name);
+                        return Err(LabError(format!("{file}: {name} has no value, or one of another type")));
                     }
                 }
                 *rows += 1;
@@ -104,7 +102,7 @@ impl<R> TableFile<R> {
                     return Ok(());
                 }
                 *rows = 0;
-                write_group(out, group, self.columns).map_err(|error| told(&self.path, &error))
+                write_group(out, group, self.columns).map_err(|error| named_error(&self.path, &error))
             }
         }
     }
@@ -113,23 +111,23 @@ impl<R> TableFile<R> {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, String> {
+    pub(super) fn finish(self, metadata: &[(&'static str, String)]) -> Result<u64, LabError> {
         let Self { path, columns, rows, writer } = self;
         let file = match writer {
-            Writer::Csv { out, .. } => out.into_inner().map_err(|error| error.error().to_string())?,
-            Writer::Parquet { mut out, mut group, rows } => {
-                let failed = |error: ParquetError| told(&path, &error);
+            TableWriter::Csv { out, .. } => out.into_inner().map_err(|error| LabError(error.error().to_string()))?,
+            TableWriter::Parquet { mut out, mut group, rows } => {
+                let failed = |error: ParquetError| named_error(&path, &error);
                 if rows > 0 {
                     write_group(&mut out, &mut group, columns).map_err(failed)?;
                 }
                 let units = columns.iter().filter(|column| !column.unit.is_empty());
                 let units = units.map(|column| (format!("unit.{}", column.name), column.unit.to_owned()));
-                let said = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone()));
-                said.chain(units).for_each(|(key, value)| out.append_key_value_metadata(KeyValue::new(key, value)));
+                let given = metadata.iter().map(|(key, value)| ((*key).to_owned(), value.clone()));
+                given.chain(units).for_each(|(key, value)| out.append_key_value_metadata(KeyValue::new(key, value)));
                 out.into_inner().map_err(failed)?
             }
         };
-        file.finish().map_err(|error| error.to_string())?;
+        file.finish()?;
         Ok(rows)
     }
 }
@@ -144,45 +142,47 @@ fn schema<R>(columns: &[Column<R>]) -> String {
     format!("message packwatch {{ {} }}", columns.iter().map(line).collect::<Vec<_>>().join(" "))
 }
 
-/// The error with the file's name; an error of the operating system has it already.
-fn told(path: &Path, error: &ParquetError) -> String {
+/// Returns the error with the file's name; an error of the operating system already has it.
+fn named_error(path: &Path, error: &ParquetError) -> LabError {
     let (path, text) = (path.display().to_string(), error.to_string());
-    if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") }
+    LabError(if text.contains(&path) { text } else { format!("{path}: cannot be written: {text}") })
 }
 
-fn csv_field(field: &Field<'_>) -> String {
+fn csv_field(field: &FieldValue<'_>) -> String {
     match field {
-        Field::Time(time) => stamp::format_utc_micros(*time),
+        FieldValue::Time(time) => stamp::format_utc_micros(*time),
         // The shortest form that reads back the same.
-        Field::Real(value) => value.map(|value| format!("{value:?}")).unwrap_or_default(),
-        Field::Whole(value) => value.map(|value| value.to_string()).unwrap_or_default(),
-        Field::Flag(value) => value.to_string(),
-        Field::Word(value) => value.as_deref().unwrap_or_default().to_owned(),
+        FieldValue::Real(value) => value.map(|value| format!("{value:?}")).unwrap_or_default(),
+        FieldValue::Whole(value) => value.map(|value| value.to_string()).unwrap_or_default(),
+        FieldValue::Flag(value) => value.to_string(),
+        FieldValue::Word(value) => value.as_deref().unwrap_or_default().to_owned(),
     }
 }
 
-impl Values {
-    fn new(kind: Kind) -> Self {
+impl ColumnBuffer {
+    fn new(kind: ColumnType) -> Self {
         let list = match kind {
-            Kind::Time => List::Micros(Vec::new()),
-            Kind::Real => List::Reals(Vec::new()),
-            Kind::Whole => List::Wholes(Vec::new()),
-            Kind::Flag => List::Flags(Vec::new()),
-            Kind::Word => List::Words(Vec::new()),
+            ColumnType::Time => ColumnValues::Micros(Vec::new()),
+            ColumnType::Real => ColumnValues::Reals(Vec::new()),
+            ColumnType::Whole => ColumnValues::Wholes(Vec::new()),
+            ColumnType::Flag => ColumnValues::Flags(Vec::new()),
+            ColumnType::Word => ColumnValues::Words(Vec::new()),
         };
         Self { present: Vec::new(), list }
     }
 
-    /// Takes a value; whether it fits.
-    fn push(&mut self, field: Field<'_>, optional: bool) -> bool {
+    /// Adds a value; returns whether it fits the column.
+    fn push(&mut self, field: FieldValue<'_>, optional: bool) -> bool {
         let present = match (&mut self.list, field) {
-            (List::Micros(list), Field::Time(time)) => put(list, Some(time.nanos().div_euclid(1000))),
-            (List::Reals(list), Field::Real(value)) => put(list, value),
-            (List::Wholes(list), Field::Whole(value)) => {
+            (ColumnValues::Micros(list), FieldValue::Time(time)) => put(list, Some(time.nanos().div_euclid(1000))),
+            (ColumnValues::Reals(list), FieldValue::Real(value)) => put(list, value),
+            (ColumnValues::Wholes(list), FieldValue::Whole(value)) => {
                 put(list, value.map(|value| i32::try_from(value).unwrap_or(i32::MAX)))
             }
-            (List::Flags(list), Field::Flag(value)) => put(list, Some(value)),
-            (List::Words(list), Field::Word(value)) => put(list, value.map(|word| ByteArray::from(word.as_ref()))),
+            (ColumnValues::Flags(list), FieldValue::Flag(value)) => put(list, Some(value)),
+            (ColumnValues::Words(list), FieldValue::Word(value)) => {
+                put(list, value.map(|word| ByteArray::from(word.as_ref())))
+            }
             _ => return false,
         };
         self.present.push(i16::from(present));
@@ -198,18 +198,18 @@ fn put<T>(list: &mut Vec<T>, value: Option<T>) -> bool {
 
 fn write_group<R>(
     out: &mut SerializedFileWriter<ResultFile>,
-    group: &mut [Values],
+    group: &mut [ColumnBuffer],
     columns: &[Column<R>],
 ) -> Result<(), ParquetError> {
     let mut writer = out.next_row_group()?;
     for (values, column) in group.iter_mut().zip(columns) {
         let present = column.optional.then_some(values.present.as_slice());
         match &mut values.list {
-            List::Micros(list) => write_column::<Int64Type>(&mut writer, list, present)?,
-            List::Reals(list) => write_column::<DoubleType>(&mut writer, list, present)?,
-            List::Wholes(list) => write_column::<Int32Type>(&mut writer, list, present)?,
-            List::Flags(list) => write_column::<BoolType>(&mut writer, list, present)?,
-            List::Words(list) => write_column::<ByteArrayType>(&mut writer, list, present)?,
+            ColumnValues::Micros(list) => write_column::<Int64Type>(&mut writer, list, present)?,
+            ColumnValues::Reals(list) => write_column::<DoubleType>(&mut writer, list, present)?,
+            ColumnValues::Wholes(list) => write_column::<Int32Type>(&mut writer, list, present)?,
+            ColumnValues::Flags(list) => write_column::<BoolType>(&mut writer, list, present)?,
+            ColumnValues::Words(list) => write_column::<ByteArrayType>(&mut writer, list, present)?,
         }
         values.present.clear();
     }

@@ -1,8 +1,8 @@
-//! What the key of a `--set` means, and how it is set in a configuration's table.
+//! Resolves the key of a `--set`, and sets its value in a configuration's table.
 
 use toml::{Table, Value};
 
-use super::{Choice, Grid};
+use super::{Choice, VariantGrid};
 use crate::alarm::Rule;
 
 /// Severities as keys, mildest first.
@@ -11,7 +11,7 @@ const SEVERITIES: [&str; 3] = ["info", "warning", "severe"];
 const ALARM_KEYS: [&str; 8] =
     ["when", "probability", "hysteresis", "debounce_s", "debounce_events", "latched", "spn", "fmi"];
 
-/// What a key means.
+/// Meaning of a key.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Target {
     /// A threshold of a rule: severity, and `set` or `clear` of it.
@@ -22,8 +22,8 @@ pub(super) enum Target {
     Key(Vec<(String, Option<usize>)>),
 }
 
-/// What the choices mean; notes in the grid what they name.
-pub(super) fn targets(grid: &mut Grid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
+/// Resolves the choices; records in the grid the rules they name.
+pub(super) fn targets(grid: &mut VariantGrid, root: &Table, choices: &[Choice]) -> Result<Vec<Target>, String> {
     let mut targets: Vec<Target> = Vec::new();
     for choice in choices {
         let target =
@@ -90,7 +90,7 @@ impl Target {
         Ok(Self::Key(parts))
     }
 
-    /// Sets it.
+    /// Sets the value.
     pub(super) fn set(&self, root: &mut Table, value: &Value) -> Result<(), String> {
         match self {
             Self::Threshold { rule, severity, part } => set_threshold(root, *rule, severity, part, value),
@@ -113,7 +113,7 @@ impl Target {
     }
 }
 
-/// A fault of the configuration; where it knows no such table, a rule may have been meant.
+/// Rewords a fault of the configuration about an unknown table: the key may have meant a rule.
 pub(super) fn name_rules(fault: String, targets: &[Target]) -> String {
     let unknown = targets.iter().find_map(|target| match target {
         Target::Key(parts) => {
@@ -155,7 +155,7 @@ fn set_threshold(root: &mut Table, rule: Rule, severity: &str, part: &str, value
     }
     let Some(alarm) = alarms_of(root, rule).nth(place) else { return Err(format!("no [[alarm]] of {}", rule.name())) };
     match (alarm.get_mut(severity), part) {
-        // The value to clear at stays as the file says it.
+        // The clear value of the file stays.
         (Some(Value::Table(both)), part) => {
             both.insert(part.to_owned(), value.clone());
         }

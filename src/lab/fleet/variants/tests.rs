@@ -1,10 +1,10 @@
-//! What values to try make of a configuration, and what is refused.
+//! Values of a grid in a configuration, and rejected keys.
 
 use std::fs;
 use std::path::PathBuf;
 
 use super::*;
-use crate::alarm::{Severity, When};
+use crate::alarm::{Comparison, Severity};
 
 const ALARMS: &str = "
 [[alarm]]
@@ -31,7 +31,7 @@ fn written(folder: &tempfile::TempDir) -> PathBuf {
     path
 }
 
-fn made(choices: &[&str]) -> Result<Grid, Vec<String>> {
+fn made(choices: &[&str]) -> Result<VariantGrid, Vec<String>> {
     let folder = tempfile::tempdir().expect("a folder");
     let choices: Vec<Choice> = choices.iter().map(|choice| choice.parse().expect("a choice")).collect();
     grid(&written(&folder), &choices)
@@ -56,7 +56,7 @@ fn thresholds_of_one_rule_share_a_replay() {
     assert_eq!(grid.variants[2].values, ["1.9", "0.9"]);
     assert_eq!(threshold(&grid.variants[1], Severity::Warning).0, 1.9);
     assert_eq!(threshold(&grid.variants[0], Severity::Warning).0, 2.0);
-    assert!(grid.variants[2].config.monitor.rules.iter().any(|rule| rule.when == When::Probability(0.9)));
+    assert!(grid.variants[2].config.monitor.rules.iter().any(|rule| rule.when == Comparison::Probability(0.9)));
     assert_eq!(grid.notes, ["capacity_low.threshold is capacity_low.warning"]);
     assert_eq!(grid.rules, [Rule::CapacityLow]);
 }
@@ -92,7 +92,7 @@ fn a_rule_that_is_not_configured_can_be_tried() {
 }
 
 #[test]
-fn combinations_that_are_no_configuration_are_left_out_and_told() {
+fn combinations_that_are_no_configuration_are_left_out_and_reported() {
     let grid = made(&["capacity_low.warning=1.9,2.25"]).expect("one is good");
     assert_eq!(grid.variants.len(), 2);
     assert!(grid.notes[0].starts_with("1 combinations are no valid configuration"), "{:?}", grid.notes);
@@ -102,14 +102,18 @@ fn combinations_that_are_no_configuration_are_left_out_and_told() {
 }
 
 #[test]
-fn what_means_nothing_is_refused_with_what_may_be_meant() {
-    let told = |choice: &str| made(&[choice]).expect_err("means nothing").join("; ");
-    assert!(told("capacity_low.treshold=1").contains("must be threshold, info, warning, severe"));
-    assert!(told("capacity_lo.warning=1").contains("did you mean capacity_low"), "{}", told("capacity_lo.warning=1"));
-    assert!(told("nothing.at_all=1").contains("no rule (rules: capacity_low, "), "{}", told("nothing.at_all=1"));
-    assert!(told("estimator.nois=1").contains("estimator.nois is not a known key"));
-    assert!(told("interface[3].name=a").contains("the configuration has 1 of them"));
-    assert!(told("capacity_low.warning=a").contains("alarm[1].warning"), "{}", told("capacity_low.warning=a"));
+fn an_unknown_key_is_rejected_with_a_suggestion() {
+    let faults = |choice: &str| made(&[choice]).expect_err("means nothing").join("; ");
+    assert!(faults("capacity_low.treshold=1").contains("must be threshold, info, warning, severe"));
+    assert!(
+        faults("capacity_lo.warning=1").contains("did you mean capacity_low"),
+        "{}",
+        faults("capacity_lo.warning=1")
+    );
+    assert!(faults("nothing.at_all=1").contains("no rule (rules: capacity_low, "), "{}", faults("nothing.at_all=1"));
+    assert!(faults("estimator.nois=1").contains("estimator.nois is not a known key"));
+    assert!(faults("interface[3].name=a").contains("the configuration has 1 of them"));
+    assert!(faults("capacity_low.warning=a").contains("alarm[1].warning"), "{}", faults("capacity_low.warning=a"));
     let many: Vec<String> = (0..32).map(|n| format!("0.{n:03}")).collect();
     let list = |key: &str| format!("{key}={}", many.join(","));
     let (one, other) = (list("capacity_low.warning"), list("soc_low.warning"));

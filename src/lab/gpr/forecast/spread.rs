@@ -1,14 +1,14 @@
-//! How wide an interval has to be, and where, from forecasts that were made and judged.
+//! Calibrates the width of an interval, place by place, from judged forecasts.
 //!
 //! The errors of a cell's voltage are tiny while it is charged at constant voltage and large where a discharge ends: one
-//! factor for all would be right on the whole and wrong everywhere. So the spread at a window is the mean ratio |error| /
+//! factor for all would be right on average and wrong everywhere. So the spread at a window is the mean ratio |error| /
 //! standard deviation of the judged windows nearest to it, shrunk towards and relative to that of all; the factor is the
-//! 95 % quantile of ratio / spread over all judged windows, each with a spread that does not know it nor the windows that
+//! 95 % quantile of ratio / spread over all judged windows, each with a spread computed without it and the windows that
 //! overlap it. Half the interval is factor x spread x standard deviation.
 
 /// Half width of a Gaussian 95 % interval, standard deviations.
 pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
-/// Judged windows that speak for a place.
+/// Nearest judged windows that determine the spread at a place.
 const NEAR: usize = 20;
 /// Weight of the mean of all among them, in windows.
 const SHRINKAGE: f64 = 4.0;
@@ -93,7 +93,7 @@ fn deviation<'a>(values: impl Iterator<Item = &'a f64> + Clone) -> f64 {
     if deviation > 1e-12 * mean.abs() { deviation } else { 1.0 }
 }
 
-/// The 95 % quantile, with the correction for few; never below the Gaussian one when these are few: their luck could
+/// The 95 % quantile, with the correction for few; never below the Gaussian one when these are few: chance could
 /// otherwise make it narrow.
 fn factor(mut ratios: Vec<f64>) -> f64 {
     ratios.sort_by(f64::total_cmp);

@@ -1,29 +1,29 @@
-//! What is known at a row: values and differences of the rows before it, and which rows have that.
+//! Lag windows: values and differences of the rows up to a row, and which rows have them.
 
-use super::super::Table;
+use super::super::ColumnTable;
 
 /// Windows of a table.
 #[derive(Debug)]
-pub struct Windows<'a> {
-    table: &'a Table,
+pub struct LagWindows<'a> {
+    table: &'a ColumnTable,
     columns: usize,
     lags: usize,
     /// First and one past the last row of the part of each row.
     part: Vec<(usize, usize)>,
 }
 
-/// How far apart in time the rows are.
+/// Time between the rows.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Steps {
+pub struct RowSpacing {
     /// Median, in the unit of the time column.
     pub median: f64,
     /// 5 % and 95 % of the steps are below.
     pub range: (f64, f64),
 }
 
-impl Steps {
+impl RowSpacing {
     /// Of a column of the table, within its parts; `None` when there are no steps or no times.
-    pub fn of(table: &Table, column: usize) -> Option<Self> {
+    pub fn of(table: &ColumnTable, column: usize) -> Option<Self> {
         let times: Vec<f64> = table.column(column).collect();
         let steps = (1..times.len()).filter(|row| table.parts.binary_search(row).is_err());
         let mut steps: Vec<f64> =
@@ -33,16 +33,16 @@ impl Steps {
         Some(Self { median: at(0.5)?, range: (at(0.05)?, at(0.95)?) })
     }
 
-    /// Whether nine of ten are as long as the median, give or take a tenth.
+    /// Whether nine of ten steps are within a tenth of the median.
     pub fn even(&self) -> bool {
         let near = |step: f64| (step - self.median).abs() <= 0.1 * self.median.abs();
         near(self.range.0) && near(self.range.1)
     }
 }
 
-impl<'a> Windows<'a> {
-    /// Of the columns of the table that every row has, so many values each.
-    pub fn new(table: &'a Table, lags: usize) -> Self {
+impl<'a> LagWindows<'a> {
+    /// Creates windows over the table's required columns with `lags` values of each.
+    pub fn new(table: &'a ColumnTable, lags: usize) -> Self {
         let ends = table.parts.iter().skip(1).copied().chain([table.len()]);
         let spans = table.parts.iter().copied().zip(ends);
         let part = spans.flat_map(|(begin, end)| std::iter::repeat_n((begin, end), end - begin)).collect();
@@ -73,7 +73,7 @@ impl<'a> Windows<'a> {
         self.table.row(row)[column]
     }
 
-    /// What a column changes by within so many rows.
+    /// Returns the change of a column within `steps` rows.
     pub fn change(&self, row: usize, column: usize, steps: usize) -> f64 {
         self.value(row + steps, column) - self.value(row, column)
     }
@@ -95,21 +95,21 @@ impl<'a> Windows<'a> {
 mod tests {
     use super::*;
 
-    fn table() -> Table {
-        Table {
+    fn table() -> ColumnTable {
+        ColumnTable {
             names: vec!["a".into(), "b".into(), "time_s".into()],
             values: (0..8).flat_map(|k| [f64::from(k * k), f64::from(10 * k), f64::from(k)]).collect(),
             lines: (2..10).collect(),
             has: vec![true],
             parts: vec![0, 5],
-            ..Table::default()
+            ..ColumnTable::default()
         }
     }
 
     #[test]
     fn windows_hold_the_past_and_do_not_cross_parts() {
         let table = table();
-        let windows = Windows::new(&table, 3);
+        let windows = LagWindows::new(&table, 3);
         assert_eq!(windows.features(&[4]), [16.0, 7.0, 5.0, 40.0, 10.0, 10.0]);
         assert_eq!((windows.between(0, 8, 1), windows.between(0, 8, 2)), (vec![2, 3], vec![2]));
         assert_eq!((windows.between(0, 4, 1), windows.between(3, 8, 0)), (vec![2], vec![3, 4, 7]));
@@ -120,9 +120,9 @@ mod tests {
     #[test]
     fn steps_are_counted_within_parts() {
         let mut uneven = table();
-        assert!(Steps::of(&uneven, 2).expect("steps").even());
+        assert!(RowSpacing::of(&uneven, 2).expect("steps").even());
         uneven.values[3 * 5 + 2] = 1000.0;
-        let steps = Steps::of(&uneven, 2).expect("steps");
+        let steps = RowSpacing::of(&uneven, 2).expect("steps");
         assert!(!steps.even() && steps.median == 1.0, "{steps:?}");
     }
 }

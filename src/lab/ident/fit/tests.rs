@@ -2,8 +2,8 @@
 
 use super::*;
 use crate::cell::circuit::BranchAt;
-use crate::cell::{CellModel, Discretisation};
-use crate::ident::Raw;
+use crate::cell::{CellModel, Discretisation, Thermal};
+use crate::ident::RawRows;
 use crate::ident::pass::accumulate;
 use crate::ident::record::Limits;
 
@@ -37,7 +37,7 @@ fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) ->
     for k in 0..current_a.len() {
         let mean_a = if k == 0 { 0.0 } else { 0.5 * (current_a[k] + current_a[k - 1]) };
         soc -= mean_a / 3600.0 / CAPACITY_AH;
-        let place = model.place(soc, temperature_c);
+        let place = model.grid_position(soc, temperature_c);
         for (i, u) in branches_v.iter_mut().enumerate() {
             let dt_s = if k == 0 { 0.0 } else { 1.0 };
             *u = BranchAt::new(model, i, &place, 1.0).voltage_after(Discretisation::Exact, *u, mean_a, dt_s);
@@ -48,8 +48,13 @@ fn simulate(model: &CellModel, temperature_c: f64, noise_v: f64, grid: &Grid) ->
         socs.push(soc);
     }
     let temperatures = vec![temperature_c; time_s.len()];
-    let raw =
-        Raw { time_s: &time_s, current_a: &current_a, voltage_v: &voltage_v, temperature_c: &temperatures, soc: &socs };
+    let raw = RawRows {
+        time_s: &time_s,
+        current_a: &current_a,
+        voltage_v: &voltage_v,
+        temperature_c: &temperatures,
+        soc: &socs,
+    };
     Record::prepare(&raw, &[], grid, &LIMITS)
 }
 
@@ -61,7 +66,7 @@ fn grid() -> Grid {
 fn truth() -> CellModel {
     let grid = grid();
     let theta = truth_theta(&grid);
-    let tables = Tables::new(&Layout::new(&grid, 2), &theta);
+    let tables = ParameterTables::new(&Layout::new(&grid, 2), &theta);
     let (ocv_v, r0_ohm, branches) = tables.model(grid.soc.len());
     CellModel {
         soc: grid.soc,
@@ -69,7 +74,14 @@ fn truth() -> CellModel {
         ocv_v,
         r0_ohm,
         branches,
-        ..crate::cell::model::tests::small_model()
+        name: "test".into(),
+        rated_capacity_ah: CAPACITY_AH,
+        capacity_ah: CAPACITY_AH,
+        voltage_min_v: 2.7,
+        voltage_max_v: 4.2,
+        ocv_ageing_shift: 0.0,
+        voltage_error_v: None,
+        thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
     }
 }
 
@@ -89,15 +101,15 @@ fn truth_theta(grid: &Grid) -> Vec<f64> {
     theta
 }
 
-fn settings(grid: Grid) -> Settings {
-    Settings {
+fn settings(grid: Grid) -> FitSettings {
+    FitSettings {
         grid,
         tau_s: vec![10.0, 150.0],
         voltage_v: (2.5, 4.2),
         ocv: vec![],
         min_slope_v: vec![],
         empty_ocv_v: None,
-        beliefs: Beliefs::FREE_OCV,
+        deviations: PriorDeviations::FREE_OCV,
     }
 }
 
@@ -118,10 +130,10 @@ fn the_gradient_is_that_of_finite_differences() {
     let start = truth_theta(&grid);
     let theta: Vec<f64> =
         start.iter().enumerate().map(|(k, x)| x + if k < 10 { 0.02 } else { 0.2 } * scatter(k)).collect();
-    let prior = Prior::new(&grid, &layout, &start, true, &Beliefs::SLOW_TEST);
+    let prior = Prior::new(&grid, &layout, &start, true, &PriorDeviations::SLOW_TEST);
     let evaluate = |theta: &[f64]| {
-        let mut normal = Normal::new(layout.len());
-        accumulate(&record, 0.7, &layout, &Tables::new(&layout, theta), &mut normal);
+        let mut normal = NormalEquations::new(layout.len());
+        accumulate(&record, 0.7, &layout, &ParameterTables::new(&layout, theta), &mut normal);
         prior.accumulate(theta, &mut normal);
         normal
     };
@@ -144,12 +156,12 @@ fn known_parameters_come_back_from_noisy_data() {
     let grid = grid();
     let truth = truth();
     let records: Vec<Record> = [5.0, 25.0].iter().map(|&t| simulate(&truth, t, 0.002, &grid)).collect();
-    // The noise is white here: a second says more than one of real data.
+    // The noise is white here: a second holds more information than one of real data.
     let fitted = fit(&settings(grid.clone()), &records, &[10.0, 10.0], |_, _| {}).expect("a fit");
     assert!(fitted.converged && fitted.total.rmse_v < 0.002, "{:?}", fitted.total);
     let expected = truth_theta(&grid);
     let layout = Layout::new(&grid, 2);
-    let true_tables = Tables::new(&layout, &expected);
+    let true_tables = ParameterTables::new(&layout, &expected);
     // Below SOC 0.3 there is little data.
     for node in (0..10).filter(|node| node % 5 >= 2) {
         let ocv_error = fitted.tables.ocv_v[node] - true_tables.ocv_v[node];
@@ -200,7 +212,7 @@ fn without_drives_the_correction_of_a_slow_test_fades() {
         voltage_v: truth().ocv_v.values[1].iter().map(|v| v + offset_v).collect(),
     };
     let ocv = vec![curve(5.0, 0.0), curve(25.0, 0.05)];
-    let settings = Settings { ocv, beliefs: Beliefs::SLOW_TEST, ..settings(grid.clone()) };
+    let settings = FitSettings { ocv, deviations: PriorDeviations::SLOW_TEST, ..settings(grid.clone()) };
     let fitted = fit(&settings, &[simulate(&truth(), 25.0, 0.001, &grid)], &[1.0], |_, _| {}).expect("a fit");
     let correction = |node: usize, curve: usize| fitted.tables.ocv_v[node] - settings.ocv[curve].voltage_v[3];
     let (driven, undriven) = (correction(8, 1), correction(3, 0));
@@ -226,7 +238,7 @@ fn what_is_no_number_is_refused_and_makes_no_model() {
     let grid = grid();
     let record = simulate(&truth(), 25.0, 0.0, &grid);
     let curve = OcvCurve { temperature_c: 25.0, soc: vec![0.0, 1.0], voltage_v: vec![3.0, f64::NAN] };
-    let settings = Settings { ocv: vec![curve], ..settings(grid) };
+    let settings = FitSettings { ocv: vec![curve], ..settings(grid) };
     let refused = fit(&settings, &[record], &[1.0], |_, _| {}).expect_err("a NaN");
     assert_eq!(refused, FitError::NotFinite);
 }

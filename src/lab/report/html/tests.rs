@@ -1,14 +1,14 @@
-//! What a page of a long life weighs, and what a page of nothing says.
+//! The size of a page of a long life, and the text of a page without data.
 
 use super::*;
-use crate::alarm::{Change, Rule, Severity, State};
+use crate::alarm::{AlarmState, Change, Rule, Severity};
 use crate::monitor::{Estimate, Event, EventKind};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
 #[test]
 fn a_page_of_nothing_says_unknown_and_fetches_nothing() {
-    let setting = Setting { title: "bus <7> & co".into(), ..Setting::default() };
-    let page = page(&Data::new(Origin::Replay), &setting);
+    let context = PageContext { title: "bus <7> & co".into(), ..PageContext::default() };
+    let page = page(&Data::new(Origin::Replay), &context);
     assert!(page.contains("<h1>bus &lt;7&gt; &amp; co</h1>") && page.matches("unknown").count() > 8);
     for forbidden in ["http://", "https://", "<script", "url(", "src="] {
         let found = page.replace("style-src=", "").contains(forbidden);
@@ -110,7 +110,7 @@ fn alarm(half: u16, active: bool) -> EventKind {
         rule: Rule::CapacityLow,
         cell: Some(CellIndex(half % 96)),
         change: if active { Change::Raised } else { Change::Cleared },
-        state: if active { State::Active } else { State::Inactive },
+        state: if active { AlarmState::Active } else { AlarmState::Inactive },
         active,
         severity: Severity::Warning,
         value: Some(capacity_ah(half, half % 96)),
@@ -123,8 +123,8 @@ fn alarm(half: u16, active: bool) -> EventKind {
 
 #[test]
 fn a_life_of_600_half_cycles_of_96_cells_fits_into_five_megabytes_with_everything_in_it() {
-    let setting = Setting { title: "pack".into(), ..Setting::default() };
-    let page = page(&life(), &setting);
+    let context = PageContext { title: "pack".into(), ..PageContext::default() };
+    let page = page(&life(), &context);
     println!("{} bytes", page.len());
     assert!(page.len() < 5_000_000, "{} bytes", page.len());
     for part in

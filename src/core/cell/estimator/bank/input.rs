@@ -1,9 +1,11 @@
-//! What was measured of the cells of a block, and what is noted of them after their steps.
+//! Inputs of the cells of a block, and the results of their steps.
 //!
-//! In: steps, lane by lane. Out: the kernel's inputs, or a step again where the kernel did not make it.
+//! In: steps, lane by lane (V, A, s, degrees C). Out: the kernel's inputs, or the original step where the kernel's outcome
+//! is not usable.
 
-use super::kernel::{DecayFactors, Input, Outcome};
-use super::{Cell, WIDTH};
+use super::kernel::{DecayFactors, StepInput, StepOutcome};
+use super::{CellSlot, WIDTH};
+
 use crate::cell::{CellStep, StepResult};
 use crate::filter::Update;
 use crate::filter::simd::{Lanes, Mask};
@@ -12,23 +14,24 @@ use crate::filter::simd::{Lanes, Mask};
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BlockInput {
     pub(super) is_present: Mask<WIDTH>,
-    pub(super) input: Input<WIDTH>,
+    pub(super) input: StepInput<WIDTH>,
 }
 
 impl BlockInput {
     pub(super) const NONE: Self = Self {
         is_present: Mask::splat(false),
-        input: Input {
+        input: StepInput {
             measured_s: Lanes([1.0; WIDTH]),
             charge_as: Lanes([0.0; WIDTH]),
             current_a: Lanes([0.0; WIDTH]),
             voltage_v: Lanes([0.0; WIDTH]),
             temperature_c: Lanes([25.0; WIDTH]),
-            kept: DecayFactors::NONE,
+            decay: DecayFactors::NONE,
         },
     };
 
-    /// Lanes without a step step over the time of the others: nobody looks at them, and their rhythm is no other.
+    /// Gives lanes without a step the time of the others, so that one set of decay factors serves all. Their results are
+    /// discarded.
     #[inline(always)]
     pub(super) fn fill_absent(&mut self) {
         if !self.is_present.all() {
@@ -38,7 +41,7 @@ impl BlockInput {
         }
     }
 
-    /// The step that was put into a lane.
+    /// The original step of a lane.
     pub(super) fn step(&self, lane: usize) -> CellStep {
         let input = &self.input;
         CellStep {
@@ -47,40 +50,40 @@ impl BlockInput {
             unmeasured_s: 0.0,
             current_a: Some(input.current_a.0[lane]),
             temperature_c: Some(input.temperature_c.0[lane]),
-            // Not asked for where the temperature is known.
+            // Not used where the temperature is known.
             ambient_c: input.temperature_c.0[lane],
             voltage_v: input.voltage_v.0[lane],
         }
     }
 }
 
-impl Input<WIDTH> {
+impl StepInput<WIDTH> {
     #[inline(always)]
-    pub(super) fn lane(&self, lane: usize) -> Input<1> {
+    pub(super) fn lane(&self, lane: usize) -> StepInput<1> {
         let take = |x: &Lanes<WIDTH>| Lanes([x.0[lane]]);
-        Input {
+        StepInput {
             measured_s: take(&self.measured_s),
             charge_as: take(&self.charge_as),
             current_a: take(&self.current_a),
             voltage_v: take(&self.voltage_v),
             temperature_c: take(&self.temperature_c),
-            kept: self.kept.lane(lane),
+            decay: self.decay.lane(lane),
         }
     }
 
-    /// Notes that the step of a lane is made, with what became of it in lane `from` of the outcome.
+    /// Records the step of a lane, whose outcome is in lane `from`.
     #[inline(always)]
     pub(super) fn note<const L: usize>(
         &self,
         lane: usize,
         from: usize,
-        outcome: &Outcome<L>,
-        cell: &mut Cell,
+        outcome: &StepOutcome<L>,
+        cell: &mut CellSlot,
         result: &mut StepResult,
     ) {
         cell.memory.last_current_a = self.current_a.0[lane];
         cell.memory.temperature_c = Some(self.temperature_c.0[lane]);
-        (cell.memory.away_std, cell.memory.is_unseen) = (0.0, false);
+        (cell.memory.downtime_std, cell.memory.is_unseen) = (0.0, false);
         let update = Update {
             innovation: outcome.innovation_v.0[from],
             innovation_variance: outcome.innovation_variance.0[from],

@@ -1,19 +1,19 @@
-//! The ordinary step of L cells at once: predict over a measured time, take a voltage in that passes the gate.
+//! The ordinary step of L cells at once: predict over a measured time, update with a voltage that passes the gate.
 //!
-//! The same filter as [`Gaussian`](crate::filter::Gaussian) with the circuit of [`crate::cell::circuit`], to rounding. What
-//! is saved, all of it exact:
+//! The same filter as [`Gaussian`](crate::filter::Gaussian) with the circuit of [`crate::cell::circuit`], to rounding.
+//! It saves the following work, all exactly:
 //! * With the points in pairs x +- s L_k (s = sqrt(N + lambda)) and f's odd and even parts over each pair, o_k = (f+ - f-) / 2s
 //!   and e_k = ((f+ + f-) / 2 - f0) / s, the weighted sums become f0 + m with m = sum e_k / s for the mean, and
-//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. A pair that is moved by a linear map has
-//!   its image for o_k, and e_k = 0.
-//! * The state is ordered so that only the first three columns of the Cholesky factor L move what the circuit is not
-//!   linear in. Those of the branches add up to P less the first three columns: they are never computed.
-//! * SOC differs in one pair only, so a phase looks its tables up at three places and not at 2 N + 1.
-//! * A cell's lines of the tables are kept from step to step: [`Around`].
+//!   sum (o_k o_k' + e_k e_k') plus beta - alpha^2 times m m' for the covariance. For a pair moved by a linear map, o_k is
+//!   its image and e_k = 0.
+//! * The state is ordered so that only the first three columns of the Cholesky factor L move states in which the circuit
+//!   is not linear. The columns of the branches add up to P less the first three columns: they are never computed.
+//! * SOC differs in one pair only, so each phase looks up the tables at three places instead of 2 N + 1.
+//! * A cell's lines of the tables are cached from step to step: [`LineCache`].
 //! * exp(x + d) = exp(x) exp(d), and exp(-2x) = exp(-x)^2 for the branches' noise.
 //!
-//! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and where they may be
-//! used: all numbers finite, the covariance with a factor, the reading within the gate.
+//! In: states, and for each the charge, time, current, temperature and voltage. Out: the new states, and a mask of
+//! the usable ones: all numbers finite, the covariance positive definite, the reading within the gate.
 #![expect(clippy::needless_range_loop, reason = "indices of states say more than iterators over parts of a matrix")]
 
 mod points;
@@ -27,67 +27,67 @@ use update::update;
 
 use super::super::noise::REST_REPEATS_S;
 use super::super::{LOG_RESISTANCE, square};
-use super::tables::{Around, Tables};
+use super::tables::{LineCache, Tables};
 use crate::cell::config::{Discretisation, EstimatorConfig};
 use crate::cell::model::CellModel;
 use crate::filter::simd::{Lanes, Mask};
 
-/// What the filters of L cells know: N numbers each, the T of their covariance's lower half, and a memory.
+/// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct State<const L: usize, const N: usize, const T: usize> {
+pub(super) struct FilterState<const L: usize, const N: usize, const T: usize> {
     /// Means in the order of the estimator's state.
     pub(super) mean: [Lanes<L>; N],
     /// Covariance, row by row to the diagonal.
     pub(super) covariance: [Lanes<L>; T],
-    /// See the estimator's `Memory`.
+    /// Part of the estimator's `Memory`, see [`LOAD_A`] to [`REST_S`].
     pub(super) memory: [Lanes<L>; MEMORY],
 }
 
-/// Numbers of the estimator's memory that every step changes.
+/// Number of memory values that every step changes.
 pub(super) const MEMORY: usize = 4;
 /// |current| low-passed, A.
 pub(super) const LOAD_A: usize = 0;
 /// Mean normalised innovation squared.
 pub(super) const MEAN_NIS: usize = 1;
-/// Time the next reading speaks for, s.
+/// Time that the next reading stands for, s.
 pub(super) const INFORMATION_S: usize = 2;
 /// Time at rest, s.
 pub(super) const REST_S: usize = 3;
 
-/// Where the covariance of `i` and `j` <= `i` is.
+/// Index of the covariance of `i` and `j` <= `i`.
 pub(super) const fn at(i: usize, j: usize) -> usize {
     i * (i + 1) / 2 + j
 }
 
-/// What happened to L cells since their last step.
+/// Inputs of L cells since their last step.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Input<const L: usize> {
+pub(super) struct StepInput<const L: usize> {
     pub(super) measured_s: Lanes<L>,
     pub(super) charge_as: Lanes<L>,
     pub(super) current_a: Lanes<L>,
     pub(super) voltage_v: Lanes<L>,
     pub(super) temperature_c: Lanes<L>,
-    /// What the measured time leaves of memories.
-    pub(super) kept: DecayFactors<L>,
+    /// Decay of the memories over the measured time.
+    pub(super) decay: DecayFactors<L>,
 }
 
-/// What a time leaves of what fades with it.
+/// Decay factors of a step time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DecayFactors<const L: usize> {
-    /// Of the load's memory.
+    /// Of the load's low-pass.
     load: Lanes<L>,
-    /// Of the consistency monitor's.
+    /// Of the consistency monitor.
     consistency: Lanes<L>,
     /// 1 / time, 1/s; 0 where no time passed.
     per_s: Lanes<L>,
 }
 
 impl<const L: usize> DecayFactors<L> {
-    /// Nothing fades.
+    /// No decay.
     pub(super) const NONE: Self = Self { load: Lanes([1.0; L]), consistency: Lanes([1.0; L]), per_s: Lanes([0.0; L]) };
 
     #[inline(always)]
-    pub(super) fn after(c: &Constants, time_s: Lanes<L>) -> Self {
+    pub(super) fn after(c: &KernelConstants, time_s: Lanes<L>) -> Self {
         Self {
             load: (-(time_s / c.load_memory_s)).exp(),
             consistency: (-(time_s.at_least(1e-3) / c.consistency_window_s)).exp(),
@@ -95,7 +95,7 @@ impl<const L: usize> DecayFactors<L> {
         }
     }
 
-    /// The same of every lane.
+    /// The same factors in every lane.
     pub(super) fn splat(one: &DecayFactors<1>) -> Self {
         let splat = |x: &Lanes<1>| Lanes::splat(x.0[0]);
         Self { load: splat(&one.load), consistency: splat(&one.consistency), per_s: splat(&one.per_s) }
@@ -107,19 +107,19 @@ impl<const L: usize> DecayFactors<L> {
     }
 }
 
-/// What became of it.
+/// Outcome of a step.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Outcome<const L: usize> {
-    /// The new state may be used.
+pub(super) struct StepOutcome<const L: usize> {
+    /// Whether the new state is usable.
     pub(super) is_usable: Mask<L>,
     pub(super) innovation_v: Lanes<L>,
     pub(super) innovation_variance: Lanes<L>,
     pub(super) test_ratio: Lanes<L>,
 }
 
-/// The settings as the kernel uses them.
+/// Settings in the form that the kernel uses.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Constants {
+pub(super) struct KernelConstants {
     /// s: spread of the sigma points.
     scale: f64,
     /// beta - alpha^2.
@@ -130,7 +130,7 @@ pub(super) struct Constants {
     branch_variance_per_s: f64,
     log_resistance_variance_per_s: f64,
     sensor_variance: f64,
-    /// One-second variance of the model's error; where the tables have none.
+    /// One-second variance of the model's error, V^2, where the tables state none.
     model_variance: f64,
     drop_variance: f64,
     load_variance: f64,
@@ -145,7 +145,7 @@ pub(super) struct Constants {
     new_capacity_ah: f64,
 }
 
-impl Constants {
+impl KernelConstants {
     pub(super) fn new<const N: usize>(model: &CellModel, config: &EstimatorConfig) -> Self {
         Self {
             scale: (square(config.alpha) * (N as f64 + config.kappa)).sqrt(),
@@ -172,9 +172,9 @@ impl Constants {
     }
 }
 
-impl<const N: usize, const T: usize> State<1, N, T> {
+impl<const N: usize, const T: usize> FilterState<1, N, T> {
     /// Copies the states of one lane.
-    pub(super) fn of_lane<const L: usize>(all: &State<L, N, T>, lane: usize) -> Self {
+    pub(super) fn of_lane<const L: usize>(all: &FilterState<L, N, T>, lane: usize) -> Self {
         let take = |x: &Lanes<L>| Lanes([x.0[lane]]);
         Self {
             mean: from_fn(|i| take(&all.mean[i])),
@@ -184,9 +184,9 @@ impl<const N: usize, const T: usize> State<1, N, T> {
     }
 }
 
-impl<const L: usize, const N: usize, const T: usize> State<L, N, T> {
+impl<const L: usize, const N: usize, const T: usize> FilterState<L, N, T> {
     /// Puts the state of one cell into a lane.
-    pub(super) fn set_lane(&mut self, lane: usize, one: &State<1, N, T>) {
+    pub(super) fn set_lane(&mut self, lane: usize, one: &FilterState<1, N, T>) {
         for i in 0..N {
             self.mean[i].0[lane] = one.mean[i].0[0];
         }
@@ -198,7 +198,7 @@ impl<const L: usize, const N: usize, const T: usize> State<L, N, T> {
         }
     }
 
-    /// The new state where the mask says so.
+    /// Takes the new state where the mask is true.
     #[inline(always)]
     pub(super) fn take_where(&mut self, mask: Mask<L>, new: &Self) {
         for i in 0..N {
@@ -217,21 +217,21 @@ impl<const L: usize, const N: usize, const T: usize> State<L, N, T> {
 #[inline(always)]
 pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
-    around: &mut Around<L, W>,
-    c: &Constants,
-    before: &State<L, N, T>,
-    input: &Input<L>,
-) -> (State<L, N, T>, Outcome<L>) {
-    tables.warm(around, &input.temperature_c);
+    cache: &mut LineCache<L, W>,
+    c: &KernelConstants,
+    before: &FilterState<L, N, T>,
+    input: &StepInput<L>,
+) -> (FilterState<L, N, T>, StepOutcome<L>) {
+    tables.refresh_temperatures(cache, &input.temperature_c);
     let ratio = before.mean[LOG_RESISTANCE].exp();
-    let (mean, covariance, has_factor) = predict(tables, around, c, before, input, ratio);
-    let mut x = State { mean, covariance, memory: before.memory };
-    let information_s = remember(c, &mut x, input);
-    let mut outcome = update(tables, around, c, &mut x, input, ratio, information_s);
+    let (mean, covariance, has_factor) = predict(tables, cache, c, before, input, ratio);
+    let mut x = FilterState { mean, covariance, memory: before.memory };
+    let information_s = update_memory(c, &mut x, input);
+    let mut outcome = update(tables, cache, c, &mut x, input, ratio, information_s);
     x.memory[INFORMATION_S] = Lanes::splat(0.0);
-    let forget = Lanes::splat(1.0) - input.kept.consistency;
+    let forget = Lanes::splat(1.0) - input.decay.consistency;
     x.memory[MEAN_NIS] = x.memory[MEAN_NIS] + forget * (outcome.test_ratio - x.memory[MEAN_NIS]);
-    // One number that is not finite makes the sum one that is not.
+    // The sum is not finite when any of its numbers is not.
     let mut sum = outcome.innovation_variance + outcome.test_ratio;
     for i in 0..N {
         sum = sum + x.mean[i];
@@ -244,18 +244,18 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     (x, outcome)
 }
 
-/// Follows the load, and the time the reading speaks for, which is given, s.
+/// Updates the load's low-pass and the time at rest; returns the time that the reading stands for, s.
 #[inline(always)]
-fn remember<const L: usize, const N: usize, const T: usize>(
-    c: &Constants,
-    x: &mut State<L, N, T>,
-    input: &Input<L>,
+fn update_memory<const L: usize, const N: usize, const T: usize>(
+    c: &KernelConstants,
+    x: &mut FilterState<L, N, T>,
+    input: &StepInput<L>,
 ) -> Lanes<L> {
     let dt = input.measured_s;
     let moved_as = input.charge_as.abs();
     let load_a = x.memory[LOAD_A];
-    let mean_a = moved_as * input.kept.per_s;
-    let kept_a = mean_a + (load_a - mean_a) * input.kept.load;
+    let mean_a = moved_as * input.decay.per_s;
+    let kept_a = mean_a + (load_a - mean_a) * input.decay.load;
     x.memory[LOAD_A] = kept_a.or_else(dt.above_number(0.0), load_a);
 
     let is_loaded = moved_as.above(dt * c.rest_current_a);

@@ -1,30 +1,29 @@
 //! A cell model's tables in the form the kernel reads.
 //!
-//! Per interval of SOC one row with the line of every quantity (value at SOC 0 and slope), so that one place gives all of
-//! them without a division. Temperatures change slowly and are shared by cells: the rows of a temperature are made once
-//! and kept until room is needed for another ([`KEPT`] of them). A cell stays in its interval for thousands of steps: the
-//! lines it is on are kept beside its state ([`Around`]), lane by lane, and what is left of a look-up is a comparison.
-//! What is kept depends on temperature and SOC alone, so results do not depend on what was kept.
+//! Each interval of SOC has one row with the line of every quantity (value at SOC 0 and slope), so that one position gives
+//! all of them without a division. Temperatures change slowly and are shared by cells: the rows of a temperature are
+//! computed once and stay until their room is needed ([`MAX_ISOTHERMS`]). A cell stays in its interval for thousands of
+//! steps: its lines are cached lane by lane ([`LineCache`]), and a look-up is one comparison. Cached values depend on
+//! temperature and SOC alone, so results do not depend on the state of the cache.
 //!
-//! In: states of charge, degrees C. Out: V, ohm, s. What is no number gives values that are none, in its own lane alone: such
-//! a step is not usable.
+//! In: states of charge, degrees C. Out: V, ohm, s. A NaN gives NaN in its own lane alone: such a step is not usable.
 
 use crate::cell::model::CellModel;
 use crate::filter::simd::Lanes;
 
-/// Where a quantity's value is in a row; its slope (per unit of SOC) is behind it. Open-circuit voltage, V.
+/// Index of the open-circuit voltage, V, in a row. The slope of every quantity (per unit of SOC) follows its value.
 pub(super) const OCV_V: usize = 0;
-/// Series resistance, ohm.
+/// Index of the series resistance, ohm.
 pub(super) const R0_OHM: usize = 2;
-/// Voltage error, V; 0 where the model has none.
+/// Index of the voltage error, V; 0 where the model has none.
 pub(super) const ERROR_V: usize = 4;
-/// Resistance of the first branch, ohm; then its time constant, s, then the next branch's.
+/// Index of the first branch's resistance, ohm; its time constant, s, follows, then the next branch.
 const BRANCHES: usize = 6;
 
-/// Temperatures whose rows are kept: more than packs have sensors. With more, rows are made again, and results stay.
-const KEPT: usize = 64;
+/// Temperatures with cached rows: more than packs have sensors. Beyond that, rows are computed again with equal results.
+const MAX_ISOTHERMS: usize = 64;
 
-/// Where branch `i`'s resistance is; its time constant follows.
+/// Index of the resistance of branch `i`; its time constant follows.
 pub(super) const fn branch(i: usize) -> usize {
     BRANCHES + 4 * i
 }
@@ -33,45 +32,45 @@ pub(super) const fn branch(i: usize) -> usize {
 #[derive(Debug, Clone)]
 pub(super) struct Tables<const W: usize> {
     model: CellModel,
-    /// Where each interval of SOC ends and the next begins; beyond the ends of the tables the outer ones go on.
+    /// Borders between intervals of SOC; the outer intervals are unbounded.
     borders: Vec<f64>,
-    /// Rows at the model's temperatures, temperature by temperature; the highest twice, so that each has an upper neighbour.
+    /// Rows at the model's temperatures, temperature by temperature; the highest one twice, so that each has an upper
+    /// neighbour.
     nodes: Vec<[f64; W]>,
-    /// Rows at the temperatures of `kept`.
+    /// Rows at `temperatures_c`.
     rows: Vec<[f64; W]>,
-    kept: [f64; KEPT],
-    /// Which makes room next.
+    temperatures_c: [f64; MAX_ISOTHERMS],
+    /// Slot of the next new temperature.
     next: usize,
     has_error: bool,
 }
 
-/// The lines of L cells at three places each, about its SOC and on both sides: kept from step to step, as a cell stays in
-/// an interval for thousands of them.
+/// Cached lines of L cells at three points each: at the SOC and on both sides of it.
 #[derive(Debug, Clone)]
-pub(super) struct Around<const L: usize, const W: usize> {
+pub(super) struct LineCache<const L: usize, const W: usize> {
     temperature_c: [f64; L],
-    /// Where the rows of the temperatures were.
+    /// Last slots of the temperatures' rows.
     isotherms: [usize; L],
-    places: [Lines<L, W>; 3],
+    places: [CachedLines<L, W>; 3],
 }
 
-/// The lines of L cells at one place each.
+/// Cached lines of L cells at one point each.
 #[derive(Debug, Clone)]
-struct Lines<const L: usize, const W: usize> {
+struct CachedLines<const L: usize, const W: usize> {
     interval: [usize; L],
-    /// Where the intervals begin.
+    /// Lower ends of the intervals.
     from: Lanes<L>,
-    /// Where the next ones do.
+    /// Upper ends of the intervals.
     to: Lanes<L>,
     row: [Lanes<L>; W],
 }
 
-/// Lines of L cells, and where on them.
+/// Points on the lines of L cells.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Spot<'a, const L: usize, const W: usize> {
+pub(super) struct TablePoint<'a, const L: usize, const W: usize> {
     row: &'a [Lanes<L>; W],
     soc: Lanes<L>,
-    /// SOC held at the ends of the tables.
+    /// SOC limited to the ends of the tables.
     inside: Lanes<L>,
 }
 
@@ -86,8 +85,8 @@ impl<const W: usize> Tables<W> {
         Self {
             borders,
             nodes: nodes.collect(),
-            rows: vec![[0.0; W]; KEPT * intervals],
-            kept: [f64::NAN; KEPT],
+            rows: vec![[0.0; W]; MAX_ISOTHERMS * intervals],
+            temperatures_c: [f64::NAN; MAX_ISOTHERMS],
             next: 0,
             has_error: model.voltage_error_v.is_some(),
             model: model.clone(),
@@ -98,29 +97,33 @@ impl<const W: usize> Tables<W> {
         self.has_error
     }
 
-    /// Number of the rows of a temperature, until the next is asked for; `hint` is what it was the last time.
+    /// Slot of the rows of a temperature, valid until the next call; `hint` is the slot of the last call.
     fn isotherm(&mut self, temperature_c: f64, hint: usize) -> usize {
-        if self.kept[hint % KEPT] == temperature_c { hint % KEPT } else { self.find(temperature_c) }
+        if self.temperatures_c[hint % MAX_ISOTHERMS] == temperature_c {
+            hint % MAX_ISOTHERMS
+        } else {
+            self.find(temperature_c)
+        }
     }
 
-    /// The rows of a temperature are found among the kept ones, or made.
+    /// Finds the rows of a temperature in the cache, or computes them.
     #[cold]
     #[inline(never)]
     fn find(&mut self, temperature_c: f64) -> usize {
-        if let Some(found) = self.kept.iter().position(|&kept| kept == temperature_c) {
+        if let Some(found) = self.temperatures_c.iter().position(|&cached_c| cached_c == temperature_c) {
             return found;
         }
         let slot = self.next;
-        self.next = (slot + 1) % KEPT;
-        self.kept[slot] = temperature_c;
-        let place = self.model.row(temperature_c);
-        let mut along = [place.along_t; W];
+        self.next = (slot + 1) % MAX_ISOTHERMS;
+        self.temperatures_c[slot] = temperature_c;
+        let position = self.model.temperature_position(temperature_c);
+        let mut along = [position.along_t; W];
         for i in std::iter::once(R0_OHM).chain((0..self.model.branches.len()).map(branch)) {
-            (along[i], along[i + 1]) = (place.along_arrhenius, place.along_arrhenius);
+            (along[i], along[i + 1]) = (position.along_arrhenius, position.along_arrhenius);
         }
         let intervals = self.intervals();
-        let low = &self.nodes[place.t * intervals..][..intervals];
-        let high = &self.nodes[(place.t + 1) * intervals..][..intervals];
+        let low = &self.nodes[position.t * intervals..][..intervals];
+        let high = &self.nodes[(position.t + 1) * intervals..][..intervals];
         for ((row, low), high) in self.rows[slot * intervals..].iter_mut().zip(low).zip(high) {
             *row = std::array::from_fn(|i| low[i] + along[i] * (high[i] - low[i]));
         }
@@ -136,88 +139,92 @@ impl<const W: usize> Tables<W> {
         self.borders[1..self.intervals()].iter().filter(|&&border| soc >= border).count()
     }
 
-    /// Takes the lines of `around` at these temperatures.
+    /// Brings the lines of `cache` to these temperatures.
     #[inline(always)]
-    pub(super) fn warm<const L: usize>(&mut self, around: &mut Around<L, W>, temperature_c: &Lanes<L>) {
-        let same = (0..L).fold(true, |same, lane| same & (around.temperature_c[lane] == temperature_c.0[lane]));
+    pub(super) fn refresh_temperatures<const L: usize>(
+        &mut self,
+        cache: &mut LineCache<L, W>,
+        temperature_c: &Lanes<L>,
+    ) {
+        let same = (0..L).fold(true, |same, lane| same & (cache.temperature_c[lane] == temperature_c.0[lane]));
         if !same {
-            self.follow_temperatures(around, temperature_c);
+            self.reload_temperatures(cache, temperature_c);
         }
     }
 
     #[cold]
     #[inline(never)]
-    fn follow_temperatures<const L: usize>(&mut self, around: &mut Around<L, W>, temperature_c: &Lanes<L>) {
+    fn reload_temperatures<const L: usize>(&mut self, cache: &mut LineCache<L, W>, temperature_c: &Lanes<L>) {
         for lane in 0..L {
-            if around.temperature_c[lane] != temperature_c.0[lane] {
-                around.temperature_c[lane] = temperature_c.0[lane];
-                let isotherm = self.isotherm(temperature_c.0[lane], around.isotherms[lane]);
-                around.isotherms[lane] = isotherm;
-                around.places.iter_mut().for_each(|lines| self.copy(isotherm, lines, lane));
+            if cache.temperature_c[lane] != temperature_c.0[lane] {
+                cache.temperature_c[lane] = temperature_c.0[lane];
+                let isotherm = self.isotherm(temperature_c.0[lane], cache.isotherms[lane]);
+                cache.isotherms[lane] = isotherm;
+                cache.places.iter_mut().for_each(|lines| self.copy(isotherm, lines, lane));
             }
         }
     }
 
-    /// The places of L states of charge, and of those `reach` above and below, at the temperatures of the last
-    /// [`Self::warm`].
+    /// Table points of L states of charge, and of those `reach` above and below, at the temperatures of the last
+    /// [`Self::refresh_temperatures`].
     #[inline(always)]
-    pub(super) fn spots<'a, const L: usize>(
+    pub(super) fn table_points<'a, const L: usize>(
         &mut self,
-        around: &'a mut Around<L, W>,
+        cache: &'a mut LineCache<L, W>,
         soc: Lanes<L>,
         reach: Lanes<L>,
-    ) -> [Spot<'a, L, W>; 3] {
+    ) -> [TablePoint<'a, L, W>; 3] {
         let all = [soc, soc + reach, soc - reach];
         let mut same = true;
-        for (lines, soc) in around.places.iter().zip(&all) {
+        for (lines, soc) in cache.places.iter().zip(&all) {
             same = (0..L).fold(same, |same, lane| same & lines.holds(soc, lane));
         }
         if !same {
-            self.follow_charges(around, &all);
+            self.reload_intervals(cache, &all);
         }
-        let [a, b, c] = &around.places;
-        [Spot::new(a, all[0]), Spot::new(b, all[1]), Spot::new(c, all[2])]
+        let [a, b, c] = &cache.places;
+        [TablePoint::new(a, all[0]), TablePoint::new(b, all[1]), TablePoint::new(c, all[2])]
     }
 
     #[cold]
     #[inline(never)]
-    fn follow_charges<const L: usize>(&mut self, around: &mut Around<L, W>, all: &[Lanes<L>; 3]) {
-        for (lines, soc) in around.places.iter_mut().zip(all) {
+    fn reload_intervals<const L: usize>(&mut self, cache: &mut LineCache<L, W>, all: &[Lanes<L>; 3]) {
+        for (lines, soc) in cache.places.iter_mut().zip(all) {
             for lane in 0..L {
                 if !lines.holds(soc, lane) {
                     let interval = self.interval(soc.0[lane]);
                     lines.interval[lane] = interval;
                     (lines.from.0[lane], lines.to.0[lane]) = (self.borders[interval], self.borders[interval + 1]);
-                    let isotherm = self.isotherm(around.temperature_c[lane], around.isotherms[lane]);
-                    around.isotherms[lane] = isotherm;
+                    let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
+                    cache.isotherms[lane] = isotherm;
                     self.copy(isotherm, lines, lane);
                 }
             }
         }
     }
 
-    /// Copies the lines of a lane's interval.
-    fn copy<const L: usize>(&self, isotherm: usize, lines: &mut Lines<L, W>, lane: usize) {
+    /// Copies the lines of a lane's interval into the cache.
+    fn copy<const L: usize>(&self, isotherm: usize, lines: &mut CachedLines<L, W>, lane: usize) {
         let row = &self.rows[isotherm * self.intervals() + lines.interval[lane]];
         lines.row.iter_mut().zip(row).for_each(|(lanes, value)| lanes.0[lane] = *value);
     }
 
     /// Open-circuit voltages at other states of charge, V.
     #[inline(never)]
-    pub(super) fn ocv_v<const L: usize>(&mut self, around: &Around<L, W>, soc: &Lanes<L>) -> Lanes<L> {
+    pub(super) fn ocv_v<const L: usize>(&mut self, cache: &LineCache<L, W>, soc: &Lanes<L>) -> Lanes<L> {
         Lanes(std::array::from_fn(|lane| {
-            let isotherm = self.isotherm(around.temperature_c[lane], around.isotherms[lane]);
+            let isotherm = self.isotherm(cache.temperature_c[lane], cache.isotherms[lane]);
             let row = &self.rows[isotherm * self.intervals() + self.interval(soc.0[lane])];
             row[OCV_V] + row[OCV_V + 1] * soc.0[lane]
         }))
     }
 }
 
-impl<const L: usize, const W: usize> Around<L, W> {
-    /// Of no temperature yet.
+impl<const L: usize, const W: usize> LineCache<L, W> {
+    /// A cache without temperatures.
     pub(super) fn new(tables: &Tables<W>) -> Self {
         let zero = Lanes::splat(0.0);
-        let lines = Lines {
+        let lines = CachedLines {
             interval: [0; L],
             from: Lanes::splat(tables.borders[0]),
             to: Lanes::splat(tables.borders[1]),
@@ -227,17 +234,17 @@ impl<const L: usize, const W: usize> Around<L, W> {
     }
 }
 
-impl<const L: usize, const W: usize> Lines<L, W> {
-    /// Whether they are those of a lane's state of charge.
+impl<const L: usize, const W: usize> CachedLines<L, W> {
+    /// Whether the lines are those of a lane's state of charge.
     #[inline(always)]
     fn holds(&self, soc: &Lanes<L>, lane: usize) -> bool {
         (soc.0[lane] >= self.from.0[lane]) & (soc.0[lane] < self.to.0[lane])
     }
 }
 
-impl<'a, const L: usize, const W: usize> Spot<'a, L, W> {
+impl<'a, const L: usize, const W: usize> TablePoint<'a, L, W> {
     #[inline(always)]
-    fn new(lines: &'a Lines<L, W>, soc: Lanes<L>) -> Self {
+    fn new(lines: &'a CachedLines<L, W>, soc: Lanes<L>) -> Self {
         Self { row: &lines.row, soc, inside: soc.at_least(0.0).at_most(1.0) }
     }
 
@@ -254,18 +261,19 @@ impl<'a, const L: usize, const W: usize> Spot<'a, L, W> {
         (self.one(branch(i)), self.one(branch(i) + 2))
     }
 
-    /// One quantity, held at the ends of the tables.
+    /// One quantity; constant beyond the ends of the tables.
     #[inline(always)]
     pub(super) fn one(&self, at: usize) -> Lanes<L> {
         self.row[at] + self.row[at + 1] * self.inside
     }
 }
 
+/// Row of the interval from SOC breakpoint `s` at temperature breakpoint `t`.
 fn row<const W: usize>(model: &CellModel, t: usize, s: usize) -> [f64; W] {
     let mut row = [0.0; W];
-    let mut set = |place: usize, value: &dyn Fn(usize) -> f64| {
+    let mut set = |index: usize, value: &dyn Fn(usize) -> f64| {
         let slope = (value(s + 1) - value(s)) / (model.soc[s + 1] - model.soc[s]);
-        (row[place], row[place + 1]) = (value(s) - slope * model.soc[s], slope);
+        (row[index], row[index + 1]) = (value(s) - slope * model.soc[s], slope);
     };
     set(OCV_V, &|s| model.ocv_v.values[t][s]);
     set(R0_OHM, &|s| model.r0_ohm.values[t][s]);

@@ -1,4 +1,4 @@
-//! The kernel against the readable filter, and a cell in company against the same cell alone.
+//! The kernel against the readable filter, and a cell in a pack against the same cell alone.
 
 use super::*;
 use crate::cell::Table;
@@ -7,7 +7,7 @@ use crate::cell::config::{CapacityState, Discretisation};
 use crate::cell::estimator::tests::config;
 use crate::cell::model::tests::small_model;
 
-/// A generator of numbers in [0, 1) that needs no seed from outside.
+/// A generator of numbers in [0, 1) with a fixed seed.
 struct Dice(u64);
 
 impl Dice {
@@ -19,7 +19,7 @@ impl Dice {
     }
 }
 
-/// Cells that drift apart, and what is measured of them: with noise, outliers, gaps, and currents that are not known.
+/// Simulated cells that drift apart, measured with noise, outliers, gaps and unknown currents.
 struct Pack {
     model: CellModel,
     dice: Dice,
@@ -66,7 +66,7 @@ impl Pack {
 
     fn measure(&mut self, index: usize, time: u32, dt_s: f64) -> Option<(usize, CellStep)> {
         let (current_a, dice) = (self.current_a, &mut self.dice);
-        // Neighbours do not always report in one rhythm, and now and then twice at one time.
+        // Neighbours do not always report at one interval, and sometimes twice at one time.
         let dt_s = match dice.roll() {
             roll if roll < 0.01 => 0.0,
             roll if roll < 0.02 => 0.5 * dt_s,
@@ -76,17 +76,17 @@ impl Pack {
         let gap_s = if dice.roll() < 2e-4 { 40.0 } else { 0.0 };
         let temperature_c = self.temperature_c + 0.1 * (index as f64).sin();
         let cell = &mut self.cells[index];
-        let place = self.model.place(cell.soc, temperature_c);
+        let position = self.model.grid_position(cell.soc, temperature_c);
         for i in 0..self.model.branches.len() {
-            let branch = BranchAt::new(&self.model, i, &place, cell.ratio);
+            let branch = BranchAt::new(&self.model, i, &position, cell.ratio);
             let moved = branch.voltage_after(Discretisation::Exact, cell.branch_v[i], current_a, dt_s);
             cell.branch_v[i] = branch.voltage_after(Discretisation::Exact, moved, 0.0, gap_s);
         }
         cell.soc = circuit::soc_after(cell.soc, current_a * dt_s, cell.capacity_ah);
         let state = (cell.soc, cell.ratio, cell.capacity_ah);
         let branches_v = cell.branch_v.iter().sum();
-        let row = self.model.row(temperature_c);
-        let truth_v = circuit::aged_terminal_v(&self.model, state, &row, branches_v, current_a);
+        let temperature = self.model.temperature_position(temperature_c);
+        let truth_v = circuit::aged_terminal_v(&self.model, state, &temperature, branches_v, current_a);
         let outlier_v = if dice.roll() < 1e-3 { 0.8 } else { 0.0 };
         let lost = time % 4000 > 3900 && index == 1;
         let step = CellStep {
@@ -163,7 +163,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
 }
 
 #[test]
-fn soc_is_the_readable_filters_within_1e_9_over_100_000_steps() {
+fn soc_agrees_with_the_readable_filter_within_1e_9_over_100_000_steps() {
     for branches in 1..=3 {
         let (soc, learned) = differences(&model(branches), &config(), 100_000);
         assert!(soc < 1e-9 && learned < 1e-8, "{branches} branches: {soc} {learned}");
@@ -202,7 +202,7 @@ fn every_setting_that_changes_the_filter_changes_the_kernel() {
 }
 
 #[test]
-fn a_cell_does_not_know_its_company() {
+fn a_cells_estimate_does_not_depend_on_other_cells() {
     let (model, config) = (model(1), config());
     let mut together = EstimatorBank::new(&model, &config, 11);
     let mut alone: Vec<_> = (0..11).map(|_| EstimatorBank::new(&model, &config, 1)).collect();
@@ -222,14 +222,14 @@ fn a_cell_does_not_know_its_company() {
 }
 
 #[test]
-fn a_cell_in_another_interval_finds_its_temperature_though_others_had_its_room() {
+fn a_cell_in_another_interval_finds_its_temperature_after_its_rows_were_replaced() {
     let (model, config) = (model(1), config());
     let mut together = EstimatorBank::new(&model, &config, 2);
     let mut alone = EstimatorBank::new(&model, &config, 1);
     let mut pack = Pack::new(&model, 2);
     let mut socs = Vec::new();
     for time in 0..4500 {
-        // One cell keeps its temperature, the other has more of them than are kept.
+        // One cell keeps its temperature, the other has more temperatures than the cache.
         let at = |cell: usize| if cell == 0 { 20.0 } else { 0.01 * f64::from(time) };
         let mut steps = pack.round(time);
         steps.iter_mut().for_each(|(cell, step)| step.temperature_c = Some(at(*cell)));
@@ -242,7 +242,7 @@ fn a_cell_in_another_interval_finds_its_temperature_though_others_had_its_room()
 }
 
 #[test]
-fn what_is_put_in_is_what_comes_out() {
+fn an_estimator_put_into_the_bank_is_returned_unchanged() {
     let (model, config) = (model(3), config());
     let mut bank = EstimatorBank::new(&model, &config, 9);
     let mut pack = Pack::new(&model, 9);

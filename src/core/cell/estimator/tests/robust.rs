@@ -1,19 +1,20 @@
-//! Wrong starts, a current sensor with an offset, rests that still relax: a cell with a slow branch that the estimator's
-//! model lacks, without noise.
+//! Wrong starts, a current sensor with an offset, rests that still relax.
+//!
+//! The simulated cell has a slow branch that the estimator's model lacks; there is no noise.
 
 use super::*;
 
-/// Time constant of the slow polarisation that the estimator knows nothing of, s.
+/// Time constant of the slow polarisation that the estimator's model lacks, s.
 const SLOW_TAU_S: f64 = 1500.0;
 
-/// Its resistance, ohm: a fifth of what the model has. From 15 mohm on the default model error of 0.15 V
+/// Resistance of the slow polarisation, ohm: a fifth of the model's. From 15 mohm on the default model error of 0.15 V
 /// over a second is too little for an error that lasts for 1500 s, and the interval falls short.
 const SLOW_OHM: f64 = 0.01;
 
 /// Half of a 95 % interval, standard deviations.
 const STD_OF_95: f64 = 1.96;
 
-/// A cell with slow polarisation beside the estimator, behind a current sensor with an offset.
+/// An estimator and a cell with slow polarisation, behind a current sensor with an offset.
 struct Bench {
     estimator: CellEstimator,
     config: EstimatorConfig,
@@ -24,18 +25,18 @@ struct Bench {
     offset_a: f64,
 }
 
-/// What a stretch was worth: points.
+/// Errors over a stretch, percentage points of SOC.
 #[derive(Debug, Clone, Copy, Default)]
-struct Seen {
+struct StretchErrors {
     largest_error: f64,
     /// Largest |error| over the 95 % interval's half-width.
     largest_ratio: f64,
 }
 
 impl Bench {
-    fn new(soc: f64, told: Option<(f64, f64)>, slow_ohm: f64, offset_a: f64) -> Self {
+    fn new(soc: f64, initial: Option<(f64, f64)>, slow_ohm: f64, offset_a: f64) -> Self {
         let mut config = config();
-        if let Some((soc, std)) = told {
+        if let Some((soc, std)) = initial {
             (config.initial_soc, config.initial_soc_std) = (Some(soc), std);
         }
         let truth = Truth { soc, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.1 };
@@ -43,22 +44,22 @@ impl Bench {
         Self { estimator, config, model: small_model(), truth, slow_ohm, slow_v: 0.0, offset_a }
     }
 
-    fn run(&mut self, current_a: f64, seconds: f64) -> Seen {
+    fn run(&mut self, current_a: f64, seconds: f64) -> StretchErrors {
         const DT_S: f64 = 5.0;
         let steps = (seconds / DT_S) as u32;
-        let mut seen = Seen::default();
+        let mut errors = StretchErrors::default();
         for _ in 0..steps {
             let mut step = self.truth.step(&self.model, current_a, DT_S);
             self.slow_v += (self.slow_ohm * current_a - self.slow_v) * -libm::expm1(-DT_S / SLOW_TAU_S);
             step.voltage_v -= self.slow_v;
             step.charge_as += self.offset_a * DT_S;
             step.current_a = Some(current_a + self.offset_a);
-            assert!(!self.estimator.step(&self.model, &self.config, &step).reset, "lost its cell");
+            assert!(!self.estimator.step(&self.model, &self.config, &step).reset, "the filter restarted");
             let (error, half_width) = (self.error_points().abs(), self.half_width_points());
-            seen.largest_error = seen.largest_error.max(error);
-            seen.largest_ratio = seen.largest_ratio.max(error / half_width);
+            errors.largest_error = errors.largest_error.max(error);
+            errors.largest_ratio = errors.largest_ratio.max(error / half_width);
         }
-        seen
+        errors
     }
 
     fn error_points(&self) -> f64 {
@@ -71,10 +72,10 @@ impl Bench {
 }
 
 /// The worst of three days of partial cycles with rests between.
-fn three_days(slow_ohm: f64, offset_a: f64) -> Seen {
+fn three_days(slow_ohm: f64, offset_a: f64) -> StretchErrors {
     let mut bench = Bench::new(0.8, None, slow_ohm, offset_a);
     bench.run(1.0, 1800.0);
-    let mut worst = Seen::default();
+    let mut worst = StretchErrors::default();
     for _ in 0..36 {
         for (current_a, seconds) in [(1.0, 1800.0), (0.0, 1800.0), (-1.0, 1800.0), (0.0, 1800.0)] {
             let seen = bench.run(current_a, seconds);
@@ -91,7 +92,7 @@ fn an_offset_of_the_current_sensor_does_not_walk_the_soc_away_in_three_days() {
     for offset_a in [-0.01, 0.01] {
         let worst = three_days(0.0, offset_a);
         assert!(worst.largest_error < 0.75, "{offset_a} A: {worst:?}");
-        // The interval knows of no offset: it is up to a quarter too narrow for one that lasts for ever.
+        // The interval knows of no offset: it is up to a quarter too narrow for one that never ends.
         assert!(worst.largest_ratio < 1.25, "{offset_a} A: {worst:?}");
         let worst = three_days(SLOW_OHM, offset_a);
         assert!(worst.largest_error < 1.25, "with a slow branch, {offset_a} A: {worst:?}");
@@ -101,7 +102,7 @@ fn an_offset_of_the_current_sensor_does_not_walk_the_soc_away_in_three_days() {
 }
 
 #[test]
-fn thirty_points_wrong_recover_within_minutes_of_load_and_within_a_rest() {
+fn an_error_of_thirty_points_recovers_within_minutes_of_load_and_within_a_rest() {
     for current_a in [1.0, -1.0, 0.0] {
         for wrong in [-0.3, 0.3] {
             let mut bench = Bench::new(0.5, Some((0.5 + wrong, 0.3)), SLOW_OHM, 0.0);
@@ -113,9 +114,9 @@ fn thirty_points_wrong_recover_within_minutes_of_load_and_within_a_rest() {
 }
 
 #[test]
-fn a_rest_that_still_relaxes_makes_the_estimate_no_surer_than_it_is_right() {
+fn the_interval_covers_the_error_in_a_rest_that_still_relaxes() {
     for current_a in [1.0, -1.0] {
-        // Nothing known before but the load: what the estimate then has, it has from voltages under way to rest.
+        // Starts with the load: the estimate has only the voltages that relax towards rest.
         let mut bench = Bench::new(0.5 + 0.3 * current_a, None, SLOW_OHM, 0.0);
         bench.run(current_a, 3600.0);
         let mut rested_s = 0.0;
@@ -124,9 +125,9 @@ fn a_rest_that_still_relaxes_makes_the_estimate_no_surer_than_it_is_right() {
             rested_s = until_s;
             assert!(seen.largest_ratio < 1.0, "{current_a} A, {until_s} s: {seen:?}");
         }
-        // The slow branch has gone: now the voltage is the open circuit's, and the estimate has come to it.
+        // The slow branch has relaxed: the voltage is the open-circuit voltage, and the estimate has converged to it.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
-        // Ten hours tell as much as 1000 s x ln 37 under load, not as ten hours would.
+        // Ten hours of rest count as 1000 s x ln 37 under load, not as ten hours.
         let least = 100.0 * STD_OF_95 * bench.config.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
         assert!(bench.half_width_points() > least, "{current_a} A: {} {least}", bench.half_width_points());
     }

@@ -33,7 +33,7 @@ fn row(index: u32) -> EstimateRow {
     EstimateRow { log: "life".into(), since_s: number, estimate }
 }
 
-fn written(format: Format, rows: u32) -> (tempfile::TempDir, PathBuf) {
+fn written(format: TableFormat, rows: u32) -> (tempfile::TempDir, PathBuf) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("estimates");
     let mut table = TableFile::create(&path, format, ESTIMATES).expect("created");
@@ -46,11 +46,11 @@ fn written(format: Format, rows: u32) -> (tempfile::TempDir, PathBuf) {
 #[test]
 fn parquet_reads_back_over_several_row_groups() {
     let rows = u32::try_from(GROUP_ROWS).expect("small") + 10;
-    let (_folder, path) = written(Format::Parquet, rows);
+    let (_folder, path) = written(TableFormat::Parquet, rows);
     let reader = SerializedFileReader::new(fs::File::open(path).expect("there")).expect("Parquet");
     assert_eq!(reader.metadata().num_row_groups(), 2);
-    let said = reader.metadata().file_metadata().key_value_metadata().expect("metadata");
-    let value = |key: &str| said.iter().find(|pair| pair.key == key).and_then(|pair| pair.value.clone());
+    let metadata = reader.metadata().file_metadata().key_value_metadata().expect("metadata");
+    let value = |key: &str| metadata.iter().find(|pair| pair.key == key).and_then(|pair| pair.value.clone());
     assert_eq!(value("packwatch.log").as_deref(), Some("life.log"));
     assert_eq!(value("unit.capacity_ah").as_deref(), Some("Ah"));
     let mut count = 0;
@@ -69,7 +69,7 @@ fn parquet_reads_back_over_several_row_groups() {
 
 #[test]
 fn csv_has_the_same_columns_and_empty_fields() {
-    let (_folder, path) = written(Format::Csv, 1);
+    let (_folder, path) = written(TableFormat::Csv, 1);
     let text = fs::read_to_string(path).expect("there");
     let lines: Vec<&str> = text.lines().collect();
     assert!(lines[0].starts_with("log,time,since_start_s,cell,soc,soc_std,u1_v"));
@@ -78,7 +78,7 @@ fn csv_has_the_same_columns_and_empty_fields() {
 
 #[test]
 fn a_table_without_rows_is_a_table() {
-    let (_folder, path) = written(Format::Parquet, 0);
+    let (_folder, path) = written(TableFormat::Parquet, 0);
     let reader = SerializedFileReader::new(fs::File::open(path).expect("there")).expect("Parquet");
     assert_eq!(reader.metadata().file_metadata().num_rows(), 0);
     assert_eq!(reader.metadata().file_metadata().schema_descr().num_columns(), ESTIMATES.len());

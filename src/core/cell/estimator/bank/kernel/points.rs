@@ -1,29 +1,29 @@
-//! The sigma points in pairs: columns of the Cholesky factor, and what something becomes over the pair of each.
+//! Sigma points in pairs: columns of the Cholesky factor, and odd and even parts of a function over each pair.
 //!
 //! In: covariances. Out: columns, resistance ratios, odd and even parts (see [`super`]), in the units of the states. NaN
-//! where there is no factor.
+//! where the covariance has no factor.
 
-use super::{Constants, at};
+use super::{KernelConstants, at};
 use crate::cell::estimator::LOG_RESISTANCE;
 use crate::filter::simd::{Lanes, Mask};
 
 /// Columns of the factor that move more than branch voltages.
 pub(super) const COLUMNS: usize = 3;
 
-/// The first columns of the lower Cholesky factor, and what they leave of the branches' covariance.
-pub(super) struct Factor<const L: usize, const N: usize> {
+/// The first columns of the lower Cholesky factor, and the remaining covariance of the branches.
+pub(super) struct PartialCholesky<const L: usize, const N: usize> {
     pub(super) columns: [[Lanes<L>; N]; COLUMNS],
     /// `rest[i][j]`, both of the branches, j <= i; zero elsewhere.
     pub(super) rest: [[Lanes<L>; N]; N],
     pub(super) is_positive: Mask<L>,
 }
 
-impl<const L: usize, const N: usize> Factor<L, N> {
+impl<const L: usize, const N: usize> PartialCholesky<L, N> {
     #[inline(always)]
     pub(super) fn new<const T: usize>(covariance: &[Lanes<L>; T]) -> Self {
-        let first = Column::new::<T, 0>(covariance, []);
-        let second = Column::new::<T, 1>(covariance, [&first]);
-        let third = Column::new::<T, 2>(covariance, [&first, &second]);
+        let first = CholeskyColumn::new::<T, 0>(covariance, []);
+        let second = CholeskyColumn::new::<T, 1>(covariance, [&first]);
+        let third = CholeskyColumn::new::<T, 2>(covariance, [&first, &second]);
         let columns = [first.scaled, second.scaled, third.scaled];
         let mut rest = [[Lanes::splat(0.0); N]; N];
         for i in COLUMNS..N {
@@ -40,17 +40,17 @@ impl<const L: usize, const N: usize> Factor<L, N> {
 }
 
 /// A column of the factor.
-struct Column<const L: usize, const N: usize> {
-    /// What the columns before it leave of the covariance.
+struct CholeskyColumn<const L: usize, const N: usize> {
+    /// The covariance that remains after the columns before it.
     left: [Lanes<L>; N],
     per_pivot: Lanes<L>,
-    /// The same over the root of the pivot: the factor's column.
+    /// The remainder over the root of the pivot: the factor's column.
     scaled: [Lanes<L>; N],
 }
 
-impl<const L: usize, const N: usize> Column<L, N> {
-    /// Column K, from those before it: these are not waited for until their roots are known. NaN where there is none: it
-    /// goes on into every result.
+impl<const L: usize, const N: usize> CholeskyColumn<L, N> {
+    /// Column K, from those before it, without waiting for their square roots. NaN where there is no factor; it
+    /// propagates into every result.
     #[inline(always)]
     fn new<const T: usize, const K: usize>(covariance: &[Lanes<L>; T], done: [&Self; K]) -> Self {
         let mut left = [Lanes::splat(0.0); N];
@@ -75,7 +75,7 @@ impl<const L: usize, const N: usize> Column<L, N> {
     }
 }
 
-/// Whether what is left has a factor, too.
+/// Whether the remaining covariance is positive definite.
 #[inline(always)]
 fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mask<L> {
     let mut left = *rest;
@@ -92,17 +92,17 @@ fn is_positive<const L: usize, const N: usize>(rest: &[[Lanes<L>; N]; N]) -> Mas
     positive
 }
 
-/// The resistance ratios of the sigma points over that at the centre: those of the first two pairs differ from it.
-pub(super) struct Ratios<const L: usize> {
+/// Resistance ratios of the sigma points relative to the centre's: those of the first two pairs differ from it.
+pub(super) struct ResistanceRatios<const L: usize> {
     /// Factor of the first pair's plus and minus point.
     pub(super) first: [Lanes<L>; 2],
     /// Odd and even part of the second pair's factor: sinh d / s and (cosh d - 1) / s.
     pub(super) second: [Lanes<L>; 2],
 }
 
-impl<const L: usize> Ratios<L> {
+impl<const L: usize> ResistanceRatios<L> {
     #[inline(always)]
-    pub(super) fn new<const N: usize>(c: &Constants, columns: &[[Lanes<L>; N]; COLUMNS]) -> Self {
+    pub(super) fn new<const N: usize>(c: &KernelConstants, columns: &[[Lanes<L>; N]; COLUMNS]) -> Self {
         let (up, down) = (columns[0][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
         let (grown, shrunk) = (columns[1][LOG_RESISTANCE] * c.scale).exp_of_both_signs();
         let per_scale = 1.0 / c.scale;
@@ -113,26 +113,26 @@ impl<const L: usize> Ratios<L> {
     }
 }
 
-/// Odd and even parts of something over the pairs of the first columns.
+/// Odd and even parts of a function over the pairs of the first columns.
 #[derive(Clone, Copy)]
-pub(super) struct Parts<const L: usize> {
+pub(super) struct OddEvenParts<const L: usize> {
     pub(super) odd: [Lanes<L>; COLUMNS],
     pub(super) even: [Lanes<L>; COLUMNS],
 }
 
-impl<const L: usize> Parts<L> {
+impl<const L: usize> OddEvenParts<L> {
     pub(super) const NONE: Self = Self { odd: [Lanes([0.0; L]); COLUMNS], even: [Lanes([0.0; L]); COLUMNS] };
 
-    /// Of pair `k`, from what its plus and minus point and the centre became.
+    /// Sets the parts of pair `k` from the images of its plus point, its minus point and the centre.
     #[inline(always)]
-    pub(super) fn put(&mut self, c: &Constants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
+    pub(super) fn put(&mut self, c: &KernelConstants, k: usize, plus: Lanes<L>, minus: Lanes<L>, centre: Lanes<L>) {
         self.odd[k] = (plus - minus) * (0.5 / c.scale);
         self.even[k] = ((plus + minus) * 0.5 - centre) * (1.0 / c.scale);
     }
 
-    /// Mean of what the pairs are moved by beside the centre.
+    /// Offset of the mean from the image of the centre.
     #[inline(always)]
-    pub(super) fn shift(&self, c: &Constants) -> Lanes<L> {
+    pub(super) fn shift(&self, c: &KernelConstants) -> Lanes<L> {
         (self.even[0] + self.even[1] + self.even[2]) * (1.0 / c.scale)
     }
 }

@@ -1,24 +1,24 @@
 //! The measurement update.
 //!
 //! In: the state before it, and the reading, V. Out: the state after it, innovation, V, its variance, V^2, and the test
-//! ratio, which is 1 for an innovation of one standard deviation.
+//! ratio, which is 1 for an innovation of one standard deviation. A lane outside the gate is marked as not usable.
 
-use super::points::{COLUMNS, Factor, Parts, Ratios};
-use super::{Constants, Input, LOAD_A, Outcome, State, at};
-use crate::cell::estimator::bank::tables::{Around, ERROR_V, Tables, branch};
+use super::points::{COLUMNS, OddEvenParts, PartialCholesky, ResistanceRatios};
+use super::{FilterState, KernelConstants, LOAD_A, StepInput, StepOutcome, at};
+use crate::cell::estimator::bank::tables::{ERROR_V, LineCache, Tables, branch};
 use crate::cell::estimator::{BRANCHES, CAPACITY};
 use crate::cell::model::ERROR_WINDOW_S;
 use crate::filter::simd::Lanes;
 
-/// The voltage that is foreseen.
+/// Predicted voltage.
 struct PredictedVoltage<const L: usize> {
     /// At the centre, V.
     centre_v: Lanes<L>,
     /// Over the pairs of the first columns.
-    parts: Parts<L>,
+    parts: OddEvenParts<L>,
     /// Slope of the open-circuit voltage, V per unit of SOC.
     slope_v: Lanes<L>,
-    /// Voltage lost in the cell now, V.
+    /// Present voltage drop in the cell, V.
     lost_v: Lanes<L>,
     /// Standard deviation of the model's error over one second, squared.
     base_variance: Lanes<L>,
@@ -30,21 +30,21 @@ impl<const L: usize> PredictedVoltage<L> {
     #[inline(always)]
     fn new<const N: usize, const T: usize, const W: usize>(
         tables: &mut Tables<W>,
-        around: &mut Around<L, W>,
-        c: &Constants,
-        x: &State<L, N, T>,
-        input: &Input<L>,
+        cache: &mut LineCache<L, W>,
+        c: &KernelConstants,
+        x: &FilterState<L, N, T>,
+        input: &StepInput<L>,
         l: &[[Lanes<L>; N]; COLUMNS],
         ratio: Lanes<L>,
     ) -> Self {
         let reach = l[0][0] * c.scale;
-        let mut parts = Parts::NONE;
-        let aged = (c.ocv_ageing_shift != 0.0).then(|| aged_voltages(tables, around, c, x, l, &mut parts));
-        let spots = tables.spots(around, x.mean[0], reach);
-        let ratios = Ratios::new(c, l);
-        let (mut ocv_v, slope_v, r0_ohm) = spots[0].ocv_and_r0();
-        let (plus_v, _, plus_ohm) = spots[1].ocv_and_r0();
-        let (minus_v, _, minus_ohm) = spots[2].ocv_and_r0();
+        let mut parts = OddEvenParts::NONE;
+        let aged = (c.ocv_ageing_shift != 0.0).then(|| aged_voltages(tables, cache, c, x, l, &mut parts));
+        let table_points = tables.table_points(cache, x.mean[0], reach);
+        let ratios = ResistanceRatios::new(c, l);
+        let (mut ocv_v, slope_v, r0_ohm) = table_points[0].ocv_and_r0();
+        let (plus_v, _, plus_ohm) = table_points[1].ocv_and_r0();
+        let (minus_v, _, minus_ohm) = table_points[2].ocv_and_r0();
         let mut side_v = [plus_v, minus_v];
         if let Some(aged) = aged {
             (ocv_v, side_v) = aged;
@@ -53,7 +53,7 @@ impl<const L: usize> PredictedVoltage<L> {
         let mut branches_v = Lanes::splat(0.0);
         let mut branches = [Lanes::splat(0.0); COLUMNS];
         for i in BRANCHES..N {
-            settled_ohm = settled_ohm + spots[0].one(branch(i - BRANCHES));
+            settled_ohm = settled_ohm + table_points[0].one(branch(i - BRANCHES));
             branches_v = branches_v + x.mean[i];
             for k in 0..COLUMNS {
                 branches[k] = branches[k] + l[k][i];
@@ -69,7 +69,7 @@ impl<const L: usize> PredictedVoltage<L> {
         parts.even[1] = parts.even[1] - drop_v * ratios.second[1];
         parts.odd[2] = parts.odd[2] - branches[2];
         let base_variance = if tables.has_error() {
-            spots[0].one(ERROR_V).square() * ERROR_WINDOW_S
+            table_points[0].one(ERROR_V).square() * ERROR_WINDOW_S
         } else {
             Lanes::splat(c.model_variance)
         };
@@ -77,16 +77,16 @@ impl<const L: usize> PredictedVoltage<L> {
     }
 }
 
-/// Open-circuit voltages of aged cells at the centre and the first pair, V; the parts of the other pairs, whose capacity is
-/// another.
+/// Open-circuit voltages of aged cells at the centre and the first pair, V; sets the parts of the other pairs, which differ
+/// in capacity.
 #[inline(always)]
 fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
-    around: &Around<L, W>,
-    c: &Constants,
-    x: &State<L, N, T>,
+    cache: &LineCache<L, W>,
+    c: &KernelConstants,
+    x: &FilterState<L, N, T>,
     l: &[[Lanes<L>; N]; COLUMNS],
-    parts: &mut Parts<L>,
+    parts: &mut OddEvenParts<L>,
 ) -> (Lanes<L>, [Lanes<L>; 2]) {
     let (soc, capacity) = (x.mean[0], x.mean[CAPACITY]);
     let reach = l[0][0] * c.scale;
@@ -100,10 +100,10 @@ fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>
         (soc, capacity + reach_ah[2]),
         (soc, capacity - reach_ah[2]),
     ];
-    // A loop, not seven copies of the look-up: few cells are modelled so.
+    // A loop instead of seven copies of the look-up: few models have an ageing shift.
     let mut voltages = [Lanes::splat(0.0); 7];
     for (voltage, (soc, capacity_ah)) in voltages.iter_mut().zip(places) {
-        *voltage = aged_ocv_v(tables, around, c, soc, capacity_ah);
+        *voltage = aged_ocv_v(tables, cache, c, soc, capacity_ah);
     }
     let [centre_v, plus, minus, plus_1, minus_1, plus_2, minus_2] = voltages;
     parts.put(c, 1, plus_1, minus_1, centre_v);
@@ -111,21 +111,21 @@ fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>
     (centre_v, [plus, minus])
 }
 
-/// The measurement update: moves `x`, whether that may be used or not.
+/// The measurement update. Moves `x` in every lane; the outcome marks the usable ones.
 #[inline(always)]
 pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: usize>(
     tables: &mut Tables<W>,
-    around: &mut Around<L, W>,
-    c: &Constants,
-    x: &mut State<L, N, T>,
-    input: &Input<L>,
+    cache: &mut LineCache<L, W>,
+    c: &KernelConstants,
+    x: &mut FilterState<L, N, T>,
+    input: &StepInput<L>,
     ratio: Lanes<L>,
     information_s: Lanes<L>,
-) -> Outcome<L> {
-    let Factor { columns: l, rest, is_positive } = Factor::<L, N>::new(&x.covariance);
-    let foreseen = PredictedVoltage::new(tables, around, c, x, input, &l, ratio);
-    let Parts { odd, even } = foreseen.parts;
-    let shift_v = foreseen.parts.shift(c);
+) -> StepOutcome<L> {
+    let PartialCholesky { columns: l, rest, is_positive } = PartialCholesky::<L, N>::new(&x.covariance);
+    let predicted = PredictedVoltage::new(tables, cache, c, x, input, &l, ratio);
+    let OddEvenParts { odd, even } = predicted.parts;
+    let shift_v = predicted.parts.shift(c);
 
     // Covariance of state and voltage, and the voltage's variance.
     let mut cross = [Lanes::splat(0.0); N];
@@ -147,12 +147,13 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
         variance = variance + others;
     }
 
-    // What noise the reading carries: see `noise::Reading`.
-    let load_v = foreseen.settled_ohm * ratio * x.memory[LOAD_A];
-    let model = foreseen.base_variance + foreseen.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
+    // Measurement noise: see `noise::VoltageReading`.
+    let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
+    let model =
+        predicted.base_variance + predicted.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
     let total = variance + (model / information_s + c.sensor_variance);
-    let innovation_v = input.voltage_v - (foreseen.centre_v + shift_v);
-    let gate = variance + (foreseen.slope_v.square() * c.gate_soc_variance + c.gate_variance);
+    let innovation_v = input.voltage_v - (predicted.centre_v + shift_v);
+    let gate = variance + (predicted.slope_v.square() * c.gate_soc_variance + c.gate_variance);
     let test_ratio = innovation_v.square() / gate;
 
     let inverse = total.reciprocal();
@@ -166,15 +167,15 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
         }
     }
     let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.gate_limit);
-    Outcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
+    StepOutcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
 }
 
-/// Open-circuit voltage of a cell that has aged to a capacity, V: that of a new one at [`crate::cell::CellModel::ocv_soc`].
+/// Open-circuit voltage of a cell that has aged to a capacity, V, see [`crate::cell::CellModel::ocv_soc`].
 #[inline(always)]
 fn aged_ocv_v<const L: usize, const W: usize>(
     tables: &mut Tables<W>,
-    around: &Around<L, W>,
-    c: &Constants,
+    cache: &LineCache<L, W>,
+    c: &KernelConstants,
     soc: Lanes<L>,
     capacity_ah: Lanes<L>,
 ) -> Lanes<L> {
@@ -182,5 +183,5 @@ fn aged_ocv_v<const L: usize, const W: usize>(
     let lost = (one - capacity_ah / c.new_capacity_ah) * c.ocv_ageing_shift;
     let inside = soc.at_least(0.0).at_most(1.0);
     let soc = soc + lost.at_least(-0.9).at_most(0.9) * inside * (one - inside);
-    tables.ocv_v(around, &soc)
+    tables.ocv_v(cache, &soc)
 }

@@ -1,0 +1,132 @@
+//! Configuration of a [`Monitor`](super::Monitor), already checked, and comparisons of two of them.
+//!
+//! Each stage keeps its part. The whole is assembled again only to compare it with another one.
+
+use super::{CommandConfig, J1939Config, OutputConfig, ReconfigureError};
+use crate::alarm::RuleConfig;
+use crate::can::CanId;
+use crate::can::decode::InputMap;
+use crate::can::flood::FloodConfig;
+use crate::can::guard::GuardConfig;
+use crate::can::j1939::Node;
+use crate::cell::{CellModel, EstimatorConfig};
+use crate::health::{CapacityMethod, HealthConfig};
+use crate::quantity::BusIndex;
+use crate::sample::SampleConfig;
+
+/// Checked settings of all stages.
+#[derive(Debug, Clone)]
+pub struct MonitorConfig {
+    /// How many interfaces there are.
+    pub interfaces: usize,
+    /// Meaning of the input frames.
+    pub input: InputMap,
+    /// Input messages with end-to-end protection.
+    pub guards: Vec<GuardConfig>,
+    /// Readings in a row that must give another pack identity, where such a signal is among `input`.
+    pub identity_readings: u32,
+    /// Limits on the number of frames of one identifier.
+    pub flood: FloodConfig,
+    /// Sample stage.
+    pub sample: SampleConfig,
+    /// Cell model.
+    pub model: CellModel,
+    /// Estimator.
+    pub estimator: EstimatorConfig,
+    /// Learning at transitions.
+    pub health: HealthConfig,
+    /// Alarm rules.
+    pub rules: Vec<RuleConfig>,
+    /// Sent frames; `None` = the daemon only listens.
+    pub output: Option<OutputConfig>,
+    /// Commands accepted from the bus; `None` = none.
+    pub commands: Option<CommandConfig>,
+    /// The J1939 node; `None` = there is none.
+    pub j1939: Option<J1939Config>,
+}
+
+impl MonitorConfig {
+    /// Identifiers to be received on an interface, ascending.
+    pub fn wanted_ids(&self, bus: BusIndex) -> Vec<CanId> {
+        let mut ids = self.input.ids(bus);
+        ids.extend(self.commands.iter().filter(|commands| commands.bus == bus).map(|commands| commands.plan.id()));
+        ids.sort_unstable();
+        ids
+    }
+
+    /// Extended identifiers to be received in addition, as identifier and mask.
+    pub fn wanted_patterns(&self, bus: BusIndex) -> Vec<(u32, u32)> {
+        let node = self.j1939.iter().filter(|j1939| j1939.bus == bus);
+        node.flat_map(|j1939| Node::new(&j1939.node).wanted()).collect()
+    }
+
+    /// Checks whether a monitor of this configuration can continue with `new`.
+    pub(super) fn check_fits(&self, new: &Self) -> Result<(), ReconfigureError> {
+        let (old_sample, new_sample) = (&self.sample, &new.sample);
+        let counts = [
+            ("[[interface]]", new.interfaces, self.interfaces),
+            ("pack.cells", usize::from(new_sample.cells), usize::from(old_sample.cells)),
+            ("pack.strings", usize::from(new_sample.strings), usize::from(old_sample.strings)),
+            ("pack.cell_model: branches", new.model.branches.len(), self.model.branches.len()),
+        ];
+        if let Some((key, found, allowed)) = counts.into_iter().find(|(_, found, allowed)| found != allowed) {
+            return Err(ReconfigureError { key, found: found.to_string(), allowed: allowed.to_string() });
+        }
+        // The rated capacity only scales published values.
+        let same_model = CellModel { rated_capacity_ah: self.model.rated_capacity_ah, ..new.model.clone() };
+        let reported = |sample: &SampleConfig| (sample.reported_soc.is_some(), sample.reported_soh.is_some());
+        let is_nominal = |config: &Self| matches!(config.health.capacity.method, CapacityMethod::Nominal { .. });
+        let buses = || (0..=u8::MAX).map(BusIndex).take(self.interfaces);
+        let same = [
+            ("[input.cell_voltage] or [input.pack_voltage]", old_sample.voltage_source == new_sample.voltage_source),
+            ("[[input.temperature]]", old_sample.sensor_of_cell == new_sample.sensor_of_cell),
+            ("[input.reported_soc] and [input.reported_soh]", reported(old_sample) == reported(new_sample)),
+            ("[input]", self.input == new.input),
+            ("[commands]", buses().all(|bus| self.wanted_ids(bus) == new.wanted_ids(bus))),
+            ("[j1939]", buses().all(|bus| self.wanted_patterns(bus) == new.wanted_patterns(bus))),
+            ("pack.cell_model", self.model == same_model),
+            ("estimator.capacity_state", self.estimator.capacity_state == new.estimator.capacity_state),
+            ("capacity.method", is_nominal(self) == is_nominal(new)),
+        ];
+        match same.into_iter().find(|(_, same)| !same) {
+            None => Ok(()),
+            Some((key, _)) => Err(ReconfigureError {
+                key,
+                found: "other frames, signals or tables".to_owned(),
+                allowed: "those it was started with".to_owned(),
+            }),
+        }
+    }
+
+    /// Whether `new` gives the same estimate for a sample.
+    pub(super) fn estimates_as(&self, new: &Self) -> bool {
+        self.model == new.model
+            && self.estimator == new.estimator
+            && self.health.usable == new.health.usable
+            && self.sample.ambient_c == new.sample.ambient_c
+    }
+
+    /// The tables with other settings in `new`.
+    pub(super) fn changed_tables(&self, new: &Self) -> Vec<&'static str> {
+        let (old_sample, new_sample) = (&self.sample, &new.sample);
+        let limits = |sample: &SampleConfig| {
+            (sample.current, sample.voltage, sample.temperature, sample.reported_soc, sample.reported_soh)
+        };
+        let capacity = |config: &Self| (config.health.capacity, config.health.end_of_life_ah);
+        let same = [
+            ("[pack]", self.model == new.model && old_sample.ambient_c == new_sample.ambient_c),
+            ("[input]", self.flood == new.flood && self.guards == new.guards),
+            ("[limits]", limits(old_sample) == limits(new_sample)),
+            ("[estimator]", self.estimator == new.estimator),
+            ("[transition]", self.health.transition == new.health.transition),
+            ("[capacity]", capacity(self) == capacity(new)),
+            ("[recharge]", self.health.recharge == new.health.recharge),
+            ("[usable]", self.health.usable == new.health.usable),
+            ("[[alarm]]", self.rules == new.rules),
+            ("[output]", self.output == new.output),
+            ("[commands]", self.commands == new.commands),
+            ("[j1939]", self.j1939 == new.j1939),
+        ];
+        same.into_iter().filter(|(_, same)| !same).map(|(table, _)| table).collect()
+    }
+}

@@ -1,0 +1,226 @@
+//! Estimation stage: from cell samples to the estimate of every cell.
+//!
+//! In: batches of samples, and what half-cycles have taught ([`Learner`]). Out: one filter step per sample, and whether
+//! each cell's innovations agree with their covariance. A sample whose filter fails resets that filter, no other.
+
+use serde::{Deserialize, Serialize};
+
+use super::batch::CellBatch;
+use super::{Estimate, MonitorConfig};
+use crate::cell::{CellStep, EstimatorBank};
+use crate::filter::ScalarGaussian;
+use crate::health::{CellCondition, Learner};
+use crate::quantity::{CellIndex, Timestamp};
+use crate::sample::CellSample;
+
+/// The estimation stage.
+#[derive(Debug)]
+pub(super) struct Estimation {
+    pub(super) bank: EstimatorBank,
+    pub(super) batch: CellBatch,
+    /// One per cell.
+    progress: Vec<CellProgress>,
+    /// Per cell: whether its innovations agree with their covariance.
+    trusted: Vec<bool>,
+    all_trusted: bool,
+    ambient_c: f64,
+    /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
+    after_gap: Vec<usize>,
+}
+
+/// How far a cell's samples have been used. Every sample touches this, so it lies apart from all other data of a cell.
+#[derive(Debug, Clone, Copy, Default)]
+struct CellProgress {
+    /// Sampler totals at the last step; `None` before the first.
+    consumed: Option<Consumed>,
+    /// The sample of the latest estimate.
+    sample: Option<CellSample>,
+}
+
+/// Totals of the sampler that a cell's steps have used.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(super) struct Consumed {
+    pub(super) time: Timestamp,
+    pub(super) charge_as: f64,
+    pub(super) unmeasured_s: f64,
+}
+
+impl Estimation {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        let cells = usize::from(config.sample.cells);
+        Self {
+            bank: EstimatorBank::new(&config.model, &config.estimator, cells),
+            batch: CellBatch::new(cells),
+            progress: vec![CellProgress::default(); cells],
+            trusted: vec![true; cells],
+            all_trusted: true,
+            ambient_c: config.sample.ambient_c,
+            after_gap: Vec::new(),
+        }
+    }
+
+    /// Other settings for the same cells.
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
+        self.bank.reconfigure(&config.model, &config.estimator);
+        self.ambient_c = config.sample.ambient_c;
+    }
+
+    /// Forgets all cells: another pack is connected.
+    pub(super) fn forget(&mut self) {
+        let cells = self.cells();
+        self.bank = EstimatorBank::new(self.bank.model(), self.bank.config(), cells);
+        self.progress.fill(CellProgress::default());
+        self.trusted.fill(true);
+        self.all_trusted = true;
+    }
+
+    /// Number of cells.
+    pub(super) fn cells(&self) -> usize {
+        self.progress.len()
+    }
+
+    /// Every cell.
+    pub(super) fn cell_indices(&self) -> impl ExactSizeIterator<Item = CellIndex> + use<> {
+        (0..u16::try_from(self.cells()).unwrap_or(u16::MAX)).map(CellIndex)
+    }
+
+    /// Steps the filters of all waiting samples; returns these, for [`finish`](Self::finish).
+    pub(super) fn step(&mut self, learner: &mut Learner) -> Vec<CellSample> {
+        let samples = std::mem::take(&mut self.batch.waiting);
+        for sample in &samples {
+            let step = self.next_step(sample, learner);
+            self.bank.add(sample.cell.index(), &step);
+        }
+        self.bank.step();
+        samples
+    }
+
+    /// Ends the work on stepped samples.
+    pub(super) fn finish(&mut self, mut samples: Vec<CellSample>, learner: &mut Learner) {
+        samples.clear();
+        self.batch.waiting = samples;
+        let bank = &self.bank;
+        self.after_gap.drain(..).for_each(|cell| learner.move_mark(cell, end_state(bank, cell)));
+    }
+
+    /// The filter step from the sample before to this one.
+    fn next_step(&mut self, sample: &CellSample, learner: &mut Learner) -> CellStep {
+        let index = sample.cell.index();
+        let (charge, unmeasured) = (sample.charge_as, sample.unmeasured_s);
+        let now = Consumed { time: sample.time, charge_as: charge, unmeasured_s: unmeasured };
+        let (mut measured_s, mut charge_as, mut unmeasured_s) = (0.0, 0.0, 0.0);
+        // Before the first reading, and after a gap of unknown length, nothing was measured for ever.
+        let mut gap_s = f64::INFINITY;
+        if let Some(before) = self.progress[index].consumed.replace(now) {
+            charge_as = charge - before.charge_as;
+            unmeasured_s = unmeasured - before.unmeasured_s;
+            measured_s = (sample.time.since(before.time) - unmeasured_s).max(0.0);
+            gap_s = unmeasured_s;
+        }
+        if learner.observe(index, sample.time, sample.temperature_c, measured_s, gap_s) {
+            self.after_gap.push(index);
+        }
+        // The part of the current that charges and discharges have shown to be the sensor's, not the cell's.
+        let offset_a = learner.current_offset_a(index);
+        CellStep {
+            measured_s,
+            charge_as: charge_as - offset_a * measured_s,
+            unmeasured_s,
+            current_a: sample.current_a.map(|current_a| current_a - offset_a),
+            temperature_c: sample.temperature_c,
+            ambient_c: self.ambient_c,
+            voltage_v: sample.voltage_v,
+        }
+    }
+
+    /// Records the sample of a cell's latest step; whether that step reset its filter.
+    #[inline]
+    pub(super) fn record(&mut self, sample: &CellSample) -> bool {
+        self.progress[sample.cell.index()].sample = Some(*sample);
+        self.bank.result(sample.cell.index()).reset
+    }
+
+    /// Whether every cell is trusted.
+    pub(super) fn all_trusted(&self) -> bool {
+        self.all_trusted
+    }
+
+    /// Whether a cell's innovations agree with their covariance.
+    pub(super) fn is_trusted(&self, index: usize) -> bool {
+        self.trusted[index]
+    }
+
+    /// Judges a cell's innovations; whether it is trusted, when that has changed.
+    pub(super) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
+        let is_trusted = self.bank.mean_nis(cell.index()) <= self.bank.config().consistency_limit;
+        if is_trusted == self.trusted[cell.index()] {
+            return None;
+        }
+        self.trusted[cell.index()] = is_trusted;
+        self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
+        Some(is_trusted)
+    }
+
+    /// A gap of unknown length: no charge counts over it.
+    pub(super) fn handle_unknown_gap(&mut self) {
+        self.bank.change_all(crate::cell::CellEstimator::handle_unknown_gap);
+        self.progress.iter_mut().for_each(|cell| cell.consumed = None);
+    }
+
+    /// A cell's estimate after its latest step; `None` before the first.
+    pub(super) fn estimate(&self, index: usize, capacity: ScalarGaussian) -> Option<Estimate> {
+        let sample = self.progress[index].sample.as_ref()?;
+        let soc = self.bank.soc(index)?;
+        let update = self.bank.result(index).update;
+        let resistance = self.resistance(index);
+        Some(Estimate {
+            time: sample.time,
+            cell: sample.cell,
+            soc: soc.mean,
+            soc_std: soc.std(),
+            branch_v: self.bank.branch_v(index),
+            capacity_ah: capacity.mean,
+            capacity_std_ah: capacity.std(),
+            resistance_ratio: resistance.mean,
+            resistance_ratio_std: resistance.std(),
+            innovation_v: update.map_or(f64::NAN, |u| u.innovation),
+            innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
+            accepted: update.is_some_and(|u| u.accepted),
+            voltage_v: sample.voltage_v,
+            current_a: sample.current_a.unwrap_or(f64::NAN),
+            temperature_c: self.bank.temperature_c(index).unwrap_or(f64::NAN),
+        })
+    }
+
+    /// Resistance of a cell relative to new.
+    pub(super) fn resistance(&self, index: usize) -> ScalarGaussian {
+        resistance(&self.bank, index)
+    }
+
+    /// Totals that a cell's steps have used, for the snapshot.
+    pub(super) fn consumed(&self, cell: usize) -> Option<Consumed> {
+        self.progress[cell].consumed
+    }
+
+    /// Continues from stored cells: what their steps have used, whether they are trusted, and the batch.
+    pub(super) fn restore(&mut self, cells: impl Iterator<Item = (Option<Consumed>, bool)>, batch: CellBatch) {
+        for (index, (consumed, trusted)) in cells.enumerate() {
+            self.progress[index].consumed = consumed;
+            self.trusted[index] = trusted;
+        }
+        self.all_trusted = self.trusted.iter().all(|&trusted| trusted);
+        self.batch = batch;
+    }
+}
+
+/// Resistance of a cell relative to new.
+pub(super) fn resistance(bank: &EstimatorBank, index: usize) -> ScalarGaussian {
+    let log_resistance = bank.log_resistance(index);
+    let ratio = libm::exp(log_resistance.mean);
+    ScalarGaussian::from_std(ratio, ratio * log_resistance.std())
+}
+
+/// Where a half-cycle that begins or ends now begins or ends for a cell.
+pub(super) fn end_state(bank: &EstimatorBank, index: usize) -> CellCondition {
+    CellCondition { soc: bank.filtered_soc(index), load_v: bank.load_v(index) }
+}

@@ -1,0 +1,83 @@
+//! The end of the data path: events, alarm values and the frames that follow from them, at the time of one input.
+//!
+//! A stage publishes an event or the value of a rule; what changes in an alarm by it follows at once, as an event, as the
+//! alarm's frame and as J1939 trouble codes.
+
+use super::alarming::Alarming;
+use super::sender::Sender;
+use super::{Event, EventKind, Outputs};
+use crate::alarm::{Alarm, AlarmChange, AlarmInput, CommandOutcome, Observation, Rule};
+use crate::filter::ScalarGaussian;
+use crate::quantity::{CellIndex, Timestamp};
+
+/// Alarms, frames and outputs at one moment.
+pub(super) struct Publisher<'a> {
+    pub(super) now: Timestamp,
+    pub(super) alarming: &'a mut Alarming,
+    pub(super) sender: &'a mut Sender,
+    pub(super) out: &'a mut Outputs,
+}
+
+impl Publisher<'_> {
+    /// Publishes an event.
+    pub(super) fn event(&mut self, kind: EventKind) {
+        self.out.events.push(Event { time: self.now, kind });
+    }
+
+    /// Passes a value to its rule, and publishes what it changes.
+    pub(super) fn observe(&mut self, rule: Rule, cell: Option<CellIndex>, observation: Observation) {
+        self.apply(AlarmInput::Observe { rule, cell, observation });
+        self.publish_alarms();
+    }
+
+    /// Passes an input to the alarm engine; changes wait for [`publish_alarms`](Self::publish_alarms).
+    pub(super) fn apply(&mut self, input: AlarmInput) -> CommandOutcome {
+        if self.out.want_alarm_inputs {
+            self.out.alarm_inputs.push((self.now, input));
+        }
+        self.alarming.engine.apply(self.now, &input, &mut self.alarming.changes)
+    }
+
+    /// Publishes waiting changes of alarms, and sends each changed alarm as it is now.
+    pub(super) fn publish_alarms(&mut self) {
+        if self.alarming.changes.is_empty() {
+            return;
+        }
+        let mut changes = std::mem::take(&mut self.alarming.changes);
+        for change in changes.drain(..) {
+            self.event(alarm_event(&change));
+            self.sender.send_alarm(self.now, &change.alarm, self.out);
+        }
+        self.alarming.changes = changes;
+        self.update_trouble_codes();
+        self.sender.poll_j1939(self.now, self.out);
+    }
+
+    /// Passes the present alarms to the J1939 node.
+    pub(super) fn update_trouble_codes(&mut self) {
+        self.sender.update_trouble_codes(self.now, &self.alarming.engine);
+    }
+}
+
+/// The value of a rule that was learned now.
+pub(super) fn learned(value: ScalarGaussian) -> Observation {
+    Observation::new(Some(value.mean)).with_std(value.std())
+}
+
+fn alarm_event(change: &AlarmChange) -> EventKind {
+    let Alarm { rule, cell, state, severity, value, probability, threshold, occurrences, is_acknowledged, .. } =
+        change.alarm;
+    EventKind::Alarm {
+        rule,
+        cell,
+        change: change.change,
+        state,
+        active: state.is_raised(),
+        severity,
+        value,
+        probability,
+        threshold,
+        occurrences,
+        acknowledged: is_acknowledged,
+    }
+}

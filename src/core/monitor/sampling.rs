@@ -1,0 +1,154 @@
+//! Sampling stage: from readings to cell samples, and which pack is connected.
+//!
+//! In: judged readings. Out: a [`CellSample`] for each good voltage, events on each change of a signal, and the pack's
+//! identity once enough readings in a row agree. Bad readings and single odd identities change nothing. The identity is
+//! kept over restarts, so that a pack changed meanwhile is found.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Event, EventKind, MonitorConfig, Outputs};
+use crate::quantity::{CellIndex, Channel, Fault, Reading, Timestamp};
+use crate::sample::{CellSample, Sampler, SignalChange, VoltageSource};
+
+/// The sampling stage.
+#[derive(Debug)]
+pub(super) struct Sampling {
+    pub(super) sampler: Sampler,
+    pub(super) identity: Identity,
+    identity_readings: u32,
+    /// Whether a usable reading has come since the first input.
+    has_usable_reading: bool,
+    /// Changes of the input at hand, kept for their memory.
+    changes: Vec<SignalChange>,
+}
+
+/// The pack's identity as its signal gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub(super) struct Identity {
+    known: Option<f64>,
+    /// Another number, and how many readings in a row have given it.
+    #[serde(skip)]
+    candidate: Option<(f64, u32)>,
+}
+
+/// A pack identity that was found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct IdentityChange {
+    /// As the signal gives it.
+    pub(super) identity: f64,
+    /// Whether another pack was known before.
+    pub(super) is_replacement: bool,
+}
+
+impl Identity {
+    /// The known number; `None` = none yet.
+    pub(super) fn known(&self) -> Option<f64> {
+        self.known
+    }
+
+    /// Takes a reading; the new number when `readings` in a row have given it.
+    fn observe(&mut self, value: f64, readings: u32) -> Option<IdentityChange> {
+        if self.known == Some(value) {
+            self.candidate = None;
+            return None;
+        }
+        let count = self.candidate.filter(|(number, _)| *number == value).map_or(0, |(_, count)| count) + 1;
+        self.candidate = Some((value, count));
+        if count < readings {
+            return None;
+        }
+        let is_replacement = self.known.is_some();
+        *self = Self { known: Some(value), candidate: None };
+        Some(IdentityChange { identity: value, is_replacement })
+    }
+}
+
+impl Sampling {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        Self {
+            sampler: Sampler::new(config.sample.clone()),
+            identity: Identity::default(),
+            identity_readings: config.identity_readings,
+            has_usable_reading: false,
+            changes: Vec::new(),
+        }
+    }
+
+    /// Other limits for the same signals.
+    pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
+        self.sampler.reconfigure(&config.sample);
+        self.identity_readings = config.identity_readings;
+    }
+
+    /// Readings in a row that give another identity.
+    pub(super) fn identity_readings(&self) -> u32 {
+        self.identity_readings
+    }
+
+    /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
+    /// [`handle_reading`](Self::handle_reading) has still to take it.
+    #[inline]
+    pub(super) fn take_ordinary_voltage(
+        &mut self,
+        now: Timestamp,
+        cell: CellIndex,
+        voltage_v: f64,
+    ) -> Option<CellSample> {
+        let sample = self.sampler.take_ordinary_voltage(now, cell, voltage_v)?;
+        self.has_usable_reading = true;
+        Some(sample)
+    }
+
+    /// Takes any reading of a signal; the sample it completes, if it is a good voltage.
+    pub(super) fn handle_reading(&mut self, now: Timestamp, reading: Reading, out: &mut Outputs) -> Option<CellSample> {
+        let sample = self.sampler.handle_reading(now, reading, &mut self.changes);
+        self.has_usable_reading =
+            self.has_usable_reading || (reading.value.is_ok() && self.sampler.is_fresh(reading.channel, now));
+        self.report(now, out);
+        sample
+    }
+
+    /// Takes a reading of the identity signal.
+    pub(super) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<IdentityChange> {
+        let value = reading.ok().filter(|value| value.is_finite())?;
+        self.identity.observe(value, self.identity_readings)
+    }
+
+    /// Finds signals that have become stale.
+    pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sampler.poll(now, &mut self.changes);
+        self.report(now, out);
+    }
+
+    /// Whether a usable reading has come since the first input. Values of a restored state do not count.
+    pub(super) fn has_usable_reading(&self) -> bool {
+        self.has_usable_reading
+    }
+
+    /// The channel of a cell's voltage.
+    pub(super) fn voltage_channel(&self, cell: CellIndex) -> Channel {
+        match self.sampler.config().voltage_source {
+            VoltageSource::Cells => Channel::CellVoltage(cell),
+            VoltageSource::PackTotal { .. } => Channel::PackVoltage,
+        }
+    }
+
+    /// Whether the current and a cell's voltage come: the inputs of its estimate.
+    pub(super) fn inputs_valid(&self, cell: CellIndex, now: Timestamp) -> bool {
+        let is_lost = |channel| self.sampler.is_lost(channel, now);
+        !is_lost(Channel::Current) && !is_lost(self.voltage_channel(cell))
+    }
+
+    fn report(&mut self, time: Timestamp, out: &mut Outputs) {
+        if self.changes.is_empty() {
+            return;
+        }
+        for SignalChange { channel, state } in self.changes.drain(..) {
+            let kind = match state {
+                Err(fault) => EventKind::SignalBad { channel, fault },
+                Ok(bad_readings) => EventKind::SignalGood { channel, bad_readings },
+            };
+            out.events.push(Event { time, kind });
+        }
+    }
+}

@@ -1,0 +1,350 @@
+//! Sending stage: cyclic frames, alarm frames, tests of them, and the J1939 node.
+//!
+//! In: fields of the frames from the other stages, alarms, ticks. Out: frames in [`Outputs`]. Missed periods are skipped,
+//! not made up for. Without `[output]` nothing but the J1939 node sends.
+
+use serde::{Deserialize, Serialize};
+
+use super::j1939::J1939;
+use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
+use crate::can::Frame;
+use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
+use crate::quantity::{BusIndex, CellIndex, Timestamp};
+
+/// Period of a test's frames, s: a consumer that reads once a second receives several.
+const TEST_PERIOD_S: f64 = 0.1;
+/// Longest test, s: a forgotten test ends by itself.
+pub const MAX_TEST_S: f64 = 600.0;
+
+/// The daemon's sent frames.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OutputConfig {
+    /// Layouts and identifiers.
+    pub plan: OutputPlan,
+    /// Interfaces they are sent on.
+    pub buses: Vec<BusIndex>,
+    /// Period of the status frame, s.
+    pub status_period_s: f64,
+    /// Period of the health frame (all its pages), s.
+    pub health_period_s: f64,
+    /// Period of the alarm frame while alarms are raised, one alarm each time in turn, s.
+    pub alarm_period_s: f64,
+}
+
+/// The sending stage.
+#[derive(Debug)]
+pub(super) struct Sender {
+    config: Option<OutputConfig>,
+    schedule: Schedule,
+    /// A running test of an alarm frame; it ends with the process.
+    test: Option<AlarmTest>,
+    j1939: Option<J1939>,
+}
+
+/// A running test of an alarm frame.
+#[derive(Debug, Clone, Copy)]
+struct AlarmTest {
+    rule: Rule,
+    next: Timestamp,
+    end: Timestamp,
+}
+
+/// When each cyclic piece of work is due next.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+pub(super) struct Schedule {
+    housekeeping: Timestamp,
+    status: Timestamp,
+    health: Timestamp,
+    alarm: Timestamp,
+    /// Which of the raised alarms is next in the cycle.
+    alarm_turn: usize,
+    /// Counters of the frames' end-to-end protection.
+    #[serde(default)]
+    counters: SendCounters,
+}
+
+/// Which cyclic frames are due now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct DueFrames {
+    pub(super) status: bool,
+    pub(super) health: bool,
+    pub(super) alarm: bool,
+}
+
+impl Schedule {
+    /// Moves stored times onto another clock.
+    pub(super) fn rebase(&mut self, by_nanos: i64) {
+        for due in [&mut self.housekeeping, &mut self.status, &mut self.health, &mut self.alarm] {
+            *due = due.plus_nanos(by_nanos);
+        }
+    }
+
+    /// Other periods; a shorter one begins now, not when the longer one is over.
+    fn reconfigure(&mut self, now: Timestamp, before: &OutputConfig, after: &OutputConfig) {
+        let periods_s = |output: &OutputConfig| [output.status_period_s, output.health_period_s, output.alarm_period_s];
+        let dues = [&mut self.status, &mut self.health, &mut self.alarm];
+        for (due, (before_s, after_s)) in dues.into_iter().zip(periods_s(before).into_iter().zip(periods_s(after))) {
+            if before_s != after_s {
+                *due = (*due).min(now.plus_secs(after_s));
+            }
+        }
+    }
+}
+
+/// Whether work is due; if so, its next time is set, with missed periods skipped.
+fn take_due(due: &mut Timestamp, now: Timestamp, period_s: f64) -> bool {
+    if now < *due {
+        return false;
+    }
+    let next = due.plus_secs(period_s);
+    *due = if next > now { next } else { now.plus_secs(period_s) };
+    true
+}
+
+impl Sender {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        Self {
+            config: config.output.clone(),
+            schedule: Schedule::default(),
+            test: None,
+            j1939: config.j1939.clone().map(J1939::new),
+        }
+    }
+
+    /// Settings of the cyclic frames.
+    pub(super) fn config(&self) -> Option<&OutputConfig> {
+        self.config.as_ref()
+    }
+
+    /// The J1939 node.
+    pub(super) fn j1939(&self) -> Option<&J1939> {
+        self.j1939.as_ref()
+    }
+
+    /// Other cyclic frames. Without any, a running test ends.
+    pub(super) fn reconfigure(
+        &mut self,
+        now: Timestamp,
+        config: Option<&OutputConfig>,
+        engine: &AlarmEngine,
+        out: &mut Outputs,
+    ) {
+        let before = std::mem::replace(&mut self.config, config.cloned());
+        match (before, config) {
+            (_, None) => self.end_test(now, engine, out),
+            (Some(before), Some(after)) => self.schedule.reconfigure(now, &before, after),
+            (None, Some(_)) => {}
+        }
+    }
+
+    /// Another J1939 configuration: the same node keeps its address, another one claims it.
+    pub(super) fn reconfigure_j1939(
+        &mut self,
+        now: Timestamp,
+        config: &MonitorConfig,
+        has_started: bool,
+        out: &mut Outputs,
+    ) {
+        let Some(config) = &config.j1939 else {
+            self.j1939 = None;
+            return;
+        };
+        if !self.j1939.as_mut().is_some_and(|running| running.reconfigure(config)) {
+            self.j1939 = Some(J1939::new(config.clone()));
+            if has_started {
+                self.claim_address(now, out);
+            }
+        }
+    }
+
+    /// Makes everything due now: after a start and after time asleep.
+    pub(super) fn restart(&mut self, now: Timestamp) {
+        let schedule = &mut self.schedule;
+        (schedule.housekeeping, schedule.status, schedule.health, schedule.alarm) = (now, now, now, now);
+    }
+
+    pub(super) fn snapshot(&self) -> Schedule {
+        self.schedule.clone()
+    }
+
+    pub(super) fn restore(&mut self, schedule: Schedule) {
+        self.schedule = schedule;
+    }
+
+    /// When a tick next does something.
+    pub(super) fn next_due(&self) -> Timestamp {
+        let schedule = &self.schedule;
+        let sending = self.config.as_ref().map(|_| schedule.status.min(schedule.health).min(schedule.alarm));
+        let test = self.test.map(|test| test.next.min(test.end));
+        let node = self.j1939.as_ref().and_then(J1939::next_due);
+        [sending, test, node].into_iter().flatten().fold(schedule.housekeeping, Timestamp::min)
+    }
+
+    /// Whether housekeeping is due.
+    pub(super) fn take_housekeeping_due(&mut self, now: Timestamp, period_s: f64) -> bool {
+        take_due(&mut self.schedule.housekeeping, now, period_s)
+    }
+
+    /// Which cyclic frames are due; `None` = none is configured.
+    pub(super) fn take_frames_due(&mut self, now: Timestamp) -> Option<DueFrames> {
+        let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
+        Some(DueFrames {
+            status: take_due(&mut schedule.status, now, config.status_period_s),
+            health: take_due(&mut schedule.health, now, config.health_period_s),
+            alarm: take_due(&mut schedule.alarm, now, config.alarm_period_s),
+        })
+    }
+
+    /// Sends the status frame.
+    pub(super) fn send_status(&mut self, now: Timestamp, fields: &StatusFields, out: &mut Outputs) {
+        self.send(now, false, out, |plan, counters| plan.status(fields, counters));
+    }
+
+    /// Sends all pages of the health frame.
+    pub(super) fn send_health(&mut self, now: Timestamp, fields: &HealthFields, out: &mut Outputs) {
+        let pages = self.config.as_ref().map_or(0, |output| output.plan.health_pages());
+        for page in 0..pages {
+            self.send(now, true, out, |plan, counters| plan.health(page, fields, counters));
+        }
+    }
+
+    /// Sends one of the raised alarms in turn, and one of those with an unknown value: the first are not slowed by the
+    /// second.
+    pub(super) fn send_next_alarm(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let turn = self.schedule.alarm_turn;
+        self.schedule.alarm_turn = turn.wrapping_add(1);
+        let raised = turn.checked_rem(engine.count()).and_then(|turn| engine.raised().nth(turn));
+        for alarm in raised.into_iter().chain(engine.unknown_alarm(turn)) {
+            self.send_alarm(now, &alarm, out);
+        }
+    }
+
+    /// Sends an alarm as it is now.
+    pub(super) fn send_alarm(&mut self, now: Timestamp, alarm: &Alarm, out: &mut Outputs) {
+        let fields = AlarmFields {
+            rule: alarm.rule as u8,
+            state: Some(alarm.state.wire_code()),
+            severity: Some(alarm.severity as u8),
+            test: false,
+            acknowledged: alarm.is_acknowledged,
+            cell: alarm.cell,
+            value: alarm.value,
+            threshold: Some(alarm.threshold),
+        };
+        self.send_alarm_fields(now, &fields, out);
+    }
+
+    /// Sends that no threshold watches an alarm any more: its state is not known.
+    pub(super) fn send_alarm_end(
+        &mut self,
+        now: Timestamp,
+        (rule, severity, cell): (Rule, Severity, Option<CellIndex>),
+        out: &mut Outputs,
+    ) {
+        let (rule, state, severity) = (rule as u8, Some(AlarmState::Unknown.wire_code()), Some(severity as u8));
+        self.send_alarm_fields(now, &AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
+    }
+
+    fn send_alarm_fields(&mut self, now: Timestamp, fields: &AlarmFields, out: &mut Outputs) {
+        self.send(now, true, out, |plan, counters| plan.alarm(fields, counters));
+    }
+
+    /// Sends a frame on every interface.
+    fn send(
+        &mut self,
+        time: Timestamp,
+        announces: bool,
+        out: &mut Outputs,
+        encode: impl FnOnce(&OutputPlan, &mut SendCounters) -> Frame,
+    ) {
+        let Some(output) = &self.config else { return };
+        let frame = encode(&output.plan, &mut self.schedule.counters);
+        out.frames.extend(output.buses.iter().map(|&bus| Transmit { time, bus, frame, announces }));
+    }
+
+    /// Begins to send a rule's alarm frame marked as a test, in place of a running one; of 0 s, only ends that one.
+    /// `false` = there is no output to send it on.
+    pub(super) fn start_test(
+        &mut self,
+        now: Timestamp,
+        rule: Rule,
+        seconds: f64,
+        engine: &AlarmEngine,
+        out: &mut Outputs,
+    ) -> bool {
+        if self.config.is_none() {
+            return false;
+        }
+        self.end_test(now, engine, out);
+        if seconds.is_nan() || seconds <= 0.0 {
+            return true;
+        }
+        self.test = Some(AlarmTest { rule, next: now, end: now.plus_secs(seconds.min(MAX_TEST_S)) });
+        out.events.push(Event { time: now, kind: EventKind::Test { rule, running: true } });
+        self.update_trouble_codes(now, engine);
+        self.poll_j1939(now, out);
+        self.continue_test(now, engine, out);
+        true
+    }
+
+    /// Sends the test's frame when it is due, and ends the test in time.
+    pub(super) fn continue_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(test) = &mut self.test else { return };
+        if now >= test.end {
+            self.end_test(now, engine, out);
+        } else if take_due(&mut test.next, now, TEST_PERIOD_S) {
+            let rule = test.rule;
+            self.send_test(now, rule, AlarmState::Active, out);
+        }
+    }
+
+    /// Ends a running test.
+    pub(super) fn end_test(&mut self, now: Timestamp, engine: &AlarmEngine, out: &mut Outputs) {
+        let Some(AlarmTest { rule, .. }) = self.test.take() else { return };
+        self.send_test(now, rule, AlarmState::Inactive, out);
+        out.events.push(Event { time: now, kind: EventKind::Test { rule, running: false } });
+        self.update_trouble_codes(now, engine);
+        self.poll_j1939(now, out);
+    }
+
+    /// Sends no value and no threshold, so that no part of a test can be taken for a measurement.
+    fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
+        let (rule, state) = (rule as u8, Some(state.wire_code()));
+        self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
+    }
+
+    /// Whether there is a J1939 node.
+    #[inline]
+    pub(super) fn has_j1939(&self) -> bool {
+        self.j1939.is_some()
+    }
+
+    /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.
+    pub(super) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.claim_address(now, out);
+        }
+    }
+
+    /// Passes a frame to the J1939 node, if it came on the node's interface.
+    pub(super) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        if let Some(j1939) = self.j1939.as_mut().filter(|j1939| j1939.config().bus == bus) {
+            j1939.handle_frame(now, frame, out);
+        }
+    }
+
+    /// Sends what is due from the J1939 node.
+    pub(super) fn poll_j1939(&mut self, now: Timestamp, out: &mut Outputs) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.poll(now, out);
+        }
+    }
+
+    /// Passes the present alarms to the J1939 node.
+    pub(super) fn update_trouble_codes(&mut self, now: Timestamp, engine: &AlarmEngine) {
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.update_trouble_codes(now, engine, self.test.is_some());
+        }
+    }
+}

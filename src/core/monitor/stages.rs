@@ -1,0 +1,319 @@
+//! The stages behind the intake, wired: readings → samples → estimates → health → alarms → frames.
+//!
+//! Each stage owns its configuration and state; this file alone knows their order. Every function takes the time of the
+//! input at hand.
+
+use super::alarming::Alarming;
+use super::estimation::Estimation;
+use super::learning::Learning;
+use super::publisher::Publisher;
+use super::sampling::Sampling;
+use super::sender::Sender;
+use super::watch::HOUSEKEEPING_S;
+use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
+use crate::alarm::{AlarmInput, Observation};
+use crate::can::encode::StatusFields;
+use crate::filter::ScalarGaussian;
+use crate::health::ModeChange;
+use crate::quantity::{BusIndex, Channel, Reading, Timestamp};
+use crate::sample::CellSample;
+
+/// All stages behind the intake.
+#[derive(Debug)]
+pub(super) struct Stages {
+    pub(super) sampling: Sampling,
+    pub(super) estimation: Estimation,
+    pub(super) learning: Learning,
+    pub(super) alarming: Alarming,
+    pub(super) sender: Sender,
+    pub(super) statistics: Statistics,
+}
+
+impl Stages {
+    pub(super) fn new(config: &MonitorConfig) -> Self {
+        Self {
+            sampling: Sampling::new(config),
+            estimation: Estimation::new(config),
+            learning: Learning::new(config),
+            alarming: Alarming::new(config),
+            sender: Sender::new(config),
+            statistics: Statistics::default(),
+        }
+    }
+
+    pub(super) fn publisher<'a>(&'a mut self, now: Timestamp, out: &'a mut Outputs) -> Publisher<'a> {
+        self.learning_and_publisher(now, out).1
+    }
+
+    pub(super) fn learning_and_publisher<'a>(
+        &'a mut self,
+        now: Timestamp,
+        out: &'a mut Outputs,
+    ) -> (&'a mut Learning, Publisher<'a>) {
+        let publisher = Publisher { now, alarming: &mut self.alarming, sender: &mut self.sender, out };
+        (&mut self.learning, publisher)
+    }
+
+    /// Takes a reading. Nearly all are ordinary cell voltages: they alone are inlined into the loop over a frame's signals.
+    #[inline]
+    pub(super) fn handle_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
+        if let (Channel::CellVoltage(cell), Ok(voltage_v)) = (reading.channel, reading.value)
+            && let Some(sample) = self.sampling.take_ordinary_voltage(now, cell, voltage_v)
+        {
+            self.handle_sample(now, sample, out);
+        } else {
+            self.handle_other_reading(now, bus, reading, out);
+        }
+    }
+
+    #[inline(never)]
+    fn handle_other_reading(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
+        if reading.channel == Channel::PackIdentity {
+            return self.handle_identity(now, bus, reading, out);
+        }
+        let sample = self.sampling.handle_reading(now, reading, out);
+        if reading.channel == Channel::Current {
+            self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
+        }
+        if let Some(sample) = sample {
+            self.handle_sample(now, sample, out);
+        }
+    }
+
+    fn handle_identity(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
+        let Some(found) = self.sampling.handle_identity(reading.value) else { return };
+        if found.is_replacement {
+            self.handle_command(now, Source::Bus(bus), Command::PackReplaced, out);
+        }
+        out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity: found.identity } });
+    }
+
+    /// Takes a sample: it waits until all cells have one, or its cell reports for the second time.
+    #[inline]
+    fn handle_sample(&mut self, now: Timestamp, sample: CellSample, out: &mut Outputs) {
+        if !self.estimation.batch.awaits(sample.cell) {
+            self.complete_batch(now, out);
+        }
+        self.estimation.batch.add(sample);
+        if self.estimation.batch.is_complete() {
+            self.complete_batch(now, out);
+        }
+    }
+
+    /// Steps the batch, and combines the pack's values.
+    #[inline(never)]
+    fn complete_batch(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.step_waiting(now, true, out);
+        self.estimation.batch.begin();
+        let all_fresh = self.sampling.sampler.voltages_fresh(now);
+        let Self { estimation, learning, alarming, sender, .. } = self;
+        learning.combine_pack(all_fresh, &estimation.bank, &mut Publisher { now, alarming, sender, out });
+    }
+
+    /// Steps the cells with a waiting sample, without waiting for the others: before anything that uses estimates.
+    /// `is_current`: the samples are of now, so the rule about innovations takes them.
+    pub(super) fn step_waiting(&mut self, now: Timestamp, is_current: bool, out: &mut Outputs) {
+        if self.estimation.batch.waiting.is_empty() {
+            return;
+        }
+        let samples = self.estimation.step(&mut self.learning.state.learner);
+        let bank = &self.estimation.bank;
+        self.statistics.note_voltages(samples.iter().map(|sample| bank.result(sample.cell.index())));
+        let is_quiet = self.are_innovations_quiet(out);
+        for sample in &samples {
+            self.handle_step(now, sample, out);
+            if !is_quiet {
+                self.judge_trust(now, sample.cell, is_current, out);
+            }
+        }
+        if is_quiet && is_current {
+            self.show_innovations(now, &samples);
+        }
+        self.estimation.finish(samples, &mut self.learning.state.learner);
+    }
+
+    /// Takes the outcome of a cell's step.
+    fn handle_step(&mut self, now: Timestamp, sample: &CellSample, out: &mut Outputs) {
+        let was_reset = self.estimation.record(sample);
+        if was_reset {
+            out.events.push(Event { time: now, kind: EventKind::FilterReset { cell: sample.cell } });
+        }
+        self.learning.handle_sample(sample, was_reset, self.estimation.bank.model());
+        if out.want_estimates {
+            out.estimates.extend(self.estimate(sample.cell.index()));
+        }
+    }
+
+    /// A cell's estimate after its latest step; `None` before the first.
+    pub(super) fn estimate(&self, index: usize) -> Option<Estimate> {
+        self.estimation.estimate(index, self.learning.capacity(index))
+    }
+
+    /// Takes the pack current into the mode detector; `None` = stale. A change of mode is learned from.
+    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
+        let observed = self.learning.observe_current(now, current_a);
+        if observed.change.is_none() && !observed.candidate_begins {
+            return;
+        }
+        self.step_waiting(now, true, out);
+        if let Some(change) = observed.change {
+            self.complete_mode(now, change, out);
+        }
+        if observed.candidate_begins {
+            let (charge_as, _) = self.sampling.sampler.counted(now);
+            self.learning.mark_candidate(now, charge_as, &self.estimation.bank);
+        }
+    }
+
+    fn complete_mode(&mut self, now: Timestamp, change: ModeChange, out: &mut Outputs) {
+        let Self { estimation, learning, alarming, sender, .. } = self;
+        learning.complete_mode(change, &mut estimation.bank, &mut Publisher { now, alarming, sender, out });
+    }
+
+    /// Executes a command.
+    pub(super) fn handle_command(&mut self, now: Timestamp, source: Source, command: Command, out: &mut Outputs) {
+        self.step_waiting(now, true, out);
+        let (changed, refused) = match command {
+            Command::Acknowledge(which) => {
+                let outcome = self.publisher(now, out).apply(AlarmInput::Acknowledge(which));
+                (outcome.changed, outcome.refused)
+            }
+            Command::Clear(which) => {
+                let outcome = self.publisher(now, out).apply(AlarmInput::Clear(which));
+                (outcome.changed, outcome.refused)
+            }
+            Command::PackReplaced => {
+                self.replace_pack(now, out);
+                (u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX), 0)
+            }
+            Command::Test { rule, seconds } => {
+                let has_output = self.sender.start_test(now, rule, seconds, &self.alarming.engine, out);
+                (0, u32::from(!has_output))
+            }
+        };
+        let mut publisher = self.publisher(now, out);
+        publisher.event(EventKind::Command { source, command, changed, refused });
+        publisher.publish_alarms();
+    }
+
+    /// Records what was learned of the old pack, and forgets it.
+    fn replace_pack(&mut self, now: Timestamp, out: &mut Outputs) {
+        let capacity = self.learning.weakest_capacity();
+        let kind = EventKind::PackReplaced {
+            capacity_ah: capacity.map(|capacity| capacity.mean),
+            capacity_std_ah: capacity.as_ref().map(ScalarGaussian::std),
+        };
+        out.events.push(Event { time: now, kind });
+        self.estimation.forget();
+        self.learning.forget(&self.estimation.bank);
+        self.forget_pack_state();
+        self.alarming.knows_all_valid = false;
+        self.publisher(now, out).apply(AlarmInput::ForgetLearned);
+    }
+
+    /// The pack's values are not known until every cell has a new estimate.
+    fn forget_pack_state(&mut self) {
+        self.learning.state.pack = None;
+        self.estimation.batch.begin();
+    }
+
+    /// Ends what was under way: no input came after `now`. The mode is unknown from there, no period is timed over it, and
+    /// the pack's values wait for a new reading of every cell.
+    pub(super) fn fall_asleep(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.observe_current(now, None, out);
+        self.publisher(now, out).apply(AlarmInput::Gap);
+        self.learning.state.recharge.interrupt();
+        self.estimation.bank.change_all(crate::cell::CellEstimator::note_sleep);
+        self.forget_pack_state();
+    }
+
+    /// Continues at `time` after a time asleep.
+    pub(super) fn wake(&mut self, time: Timestamp, out: &mut Outputs) {
+        self.sampling.sampler.wake(time);
+        self.sender.restart(time);
+        self.sender.claim_address(time, out);
+    }
+
+    /// Ends what cannot continue over a gap of unknown length that begins at `now`.
+    pub(super) fn begin_unknown_gap(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sender.end_test(now, &self.alarming.engine, out);
+        if let Some(change) = self.learning.state.detector.settle() {
+            self.complete_mode(now, change, out);
+        }
+        self.learning.state.learned_at = None;
+    }
+
+    /// Continues at `time` after a gap of unknown length.
+    pub(super) fn end_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
+        self.sampling.sampler.handle_gap(time);
+        self.sender.restart(time);
+        self.sender.claim_address(time, out);
+        self.estimation.handle_unknown_gap();
+    }
+
+    /// Checks the ages of the inputs, the mode's minimum duration, and the alarms.
+    pub(super) fn keep_house(&mut self, now: Timestamp, bus_fault: Observation, out: &mut Outputs) {
+        self.sampling.poll(now, out);
+        self.observe_current(now, self.sampling.sampler.pack_current_a(now), out);
+        if !self.sampling.sampler.voltages_fresh(now) {
+            // A cell without a voltage may be the weakest.
+            self.forget_pack_state();
+        }
+        self.watch(now, bus_fault, out);
+    }
+
+    /// Whether housekeeping is due.
+    pub(super) fn take_housekeeping_due(&mut self, now: Timestamp) -> bool {
+        self.sender.take_housekeeping_due(now, HOUSEKEEPING_S)
+    }
+
+    /// Sends the frames that are due.
+    pub(super) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
+        self.sender.poll_j1939(now, out);
+        let Some(due) = self.sender.take_frames_due(now) else { return };
+        if due.status {
+            let fields = self.status_fields();
+            self.sender.send_status(now, &fields, out);
+        }
+        if due.health {
+            let fields = self.learning.health_fields(&self.estimation.bank);
+            self.sender.send_health(now, &fields, out);
+        }
+        if due.alarm {
+            self.sender.send_next_alarm(now, &self.alarming.engine, out);
+        }
+        self.sender.continue_test(now, &self.alarming.engine, out);
+    }
+
+    /// Validity of the published estimates.
+    pub(super) fn validity(&self) -> Validity {
+        if self.learning.state.pack.is_none() {
+            Validity::Unavailable
+        } else if !self.estimation.all_trusted() {
+            Validity::Untrusted
+        } else if self.sampling.sampler.any_bad() {
+            Validity::Degraded
+        } else {
+            Validity::Valid
+        }
+    }
+
+    fn status_fields(&self) -> StatusFields {
+        let (pack, engine) = (self.learning.state.pack.as_ref(), &self.alarming.engine);
+        StatusFields {
+            soc: pack.map(|pack| pack.soc),
+            soc_std: pack.map(|pack| pack.soc_std),
+            mode: Some(self.learning.mode()),
+            validity: self.validity() as u8,
+            // Without an estimate "no alarm" would be a claim without evidence.
+            highest_severity: engine.highest_severity().map(|severity| severity as u8).or(pack.map(|_| 0)),
+            active_alarms: Some(u16::try_from(engine.count()).unwrap_or(u16::MAX)),
+            limiting_cell: pack.map(|pack| pack.limiting_cell),
+            unknown_rules: Some(match engine.unknown() {
+                (_, 0) => 0,
+                (all, unknown) if unknown < all => 1,
+                (_, _) => 2,
+            }),
+        }
+    }
+}

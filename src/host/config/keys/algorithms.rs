@@ -1,0 +1,196 @@
+//! The tables of the algorithms: cell filter, transitions, capacity, recharge, usable capacity. Each gives the parameters
+//! of its algorithm; what a key means where it is not written stands next to the key.
+
+use super::{DEVIATION, MethodKey, Pack, TEMPERATURE_C};
+use crate::cell::{CapacityState, CellModel, Discretisation, EstimatorConfig};
+use crate::config::schema::Presence::{Default, Optional, Required};
+use crate::config::schema::section;
+use crate::config::setting::ValueRange::{Above, Any, Between};
+use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
+
+/// Of 365.25 / 12 days.
+const SECONDS_PER_MONTH: f64 = 2_629_800.0;
+
+section! {
+    /// The unscented Kalman filter of each cell. Noises are densities, per square root of a second, so that the sample rate does not change the result.
+    Estimator at "estimator" gives EstimatorConfig, |keys, pack: &Pack, model: &CellModel| {
+        /// Spread of the sigma points.
+        alpha: f64, "", Above(0.0, 1.0), Default("1.0");
+        /// Prior knowledge of the distribution; 2 for a Gaussian one.
+        beta: f64, "", Between(0.0, 10.0), Default("2.0");
+        /// Secondary scaling of the sigma points.
+        kappa: f64, "", Between(0.0, 10.0), Default("0.0");
+        /// How the circuit is stepped: exactly, or by forward Euler as in the paper.
+        discretisation: Discretisation, "", Any, Default("\"exact\"");
+        /// Whether the filter carries the capacity as a state ("joint", with method "swing"), or uses the learned one as in the paper ("held", with method "nominal").
+        capacity_state: CapacityState, "", Any, Default("\"joint\"");
+        /// SOC to start from. Without it: from the first voltage through the open-circuit voltage curve.
+        initial_soc: Option<f64>, "fraction", Between(0.0, 1.0), Optional;
+        /// Standard deviation of the first SOC.
+        initial_soc_std: f64, "fraction", Above(0.0, 1.0), Default("0.3");
+        /// Standard deviation of the first branch voltages.
+        initial_branch_std_v: f64, "V", Between(0.0, 10.0), Default("0.05");
+        /// Standard deviation of the logarithm of the resistance relative to new, at the start.
+        initial_log_resistance_std: f64, "", Between(0.0, 5.0), Default("0.2");
+        /// Process noise of the SOC.
+        soc_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("3e-5");
+        /// Process noise of the SOC per charge moved: errors of the current reading.
+        charge_noise_per_sqrt_soc: f64, "fraction/sqrt(SOC)", DEVIATION, Default("3e-3");
+        /// Process noise of the branch voltages.
+        branch_noise_v_per_sqrt_s: f64, "V/sqrt(s)", DEVIATION, Default("1e-3");
+        /// Process noise of the logarithm of the resistance: how fast a cell may age, and how far its resistance may be from the tables in the cold or in the next minutes of a drive.
+        log_resistance_noise_per_sqrt_s: f64, "1/sqrt(s)", DEVIATION, Default("1e-3");
+        /// Process noise of the SOC while no current is measured (asleep).
+        gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
+        /// Self-discharge of a cell in a month: the deviation of the SOC grows with the time without measurement (asleep, off).
+        self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03")
+            => self_discharge_per_s: keys.self_discharge_per_month / SECONDS_PER_MONTH;
+        /// Charge or discharge that is possible in an hour while the program does not run. The first voltage after that time shows whether it happened; until then the deviation of the SOC covers it. 0: the cells are certainly not used.
+        away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5")
+            => away_use_per_s: keys.away_use_per_h / 3600.0;
+        /// A current up to this is rest; a larger one next to a gap may have flowed during the gap. Without it: the rated capacity over 50 h (C/50), per cell.
+        rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional
+            => rest_current_a: keys.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0);
+        /// Standard deviation of the voltage sensor's noise.
+        voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
+        /// Slow error of the cell model: standard deviation of its average over one second. More samples per second add no information beyond this. A `voltage_error_v` of the cell model replaces it.
+        model_error_v_sqrt_s: f64, "V sqrt(s)", DEVIATION, Default("0.15");
+        /// Slow error of the cell model, relative to the voltage dropped in the cell at the reading: standard deviation of its average over one second.
+        drop_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.3");
+        /// Slow error of the cell model under load, relative to the voltage that the load of the last minutes drops in the cell: standard deviation of its average over one second.
+        load_error_sqrt_s: f64, "sqrt(s)", DEVIATION, Default("0.5");
+        /// Time constant with which that error decays after the load (slow diffusion).
+        load_memory_s: f64, "s", Above(0.0, 1e6), Default("1200.0");
+        /// Longest time that one voltage reading may represent: readings further apart carry no more information.
+        max_information_s: f64, "s", Above(0.0, 1e6), Default("100.0");
+        /// A voltage further from its prediction than this many standard deviations changes no estimate.
+        gate_sigma: f64, "", Above(0.0, 1e6), Default("5.0");
+        /// Standard deviation of the cell model's error in a single reading, for the gate and the consistency monitor.
+        gate_model_error_v: f64, "V", Between(0.0, 10.0), Default("0.06");
+        /// The same as an error along the open-circuit voltage curve.
+        gate_soc_error: f64, "fraction", Between(0.0, 1.0), Default("0.02");
+        /// When every reading has been beyond the gate for this long, the filter starts again from the voltage.
+        lost_after_s: f64, "s", Above(0.0, 1e9), Default("30.0");
+        /// Window over which the filter's consistency is judged.
+        consistency_window_s: f64, "s", Above(0.0, 1e9), Default("600.0");
+        /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected).
+        consistency_limit: f64, "", Above(0.0, 1e9), Default("4.0");
+    } and {
+        initial_capacity_ah: pack.initial_capacity_ah(model),
+        initial_capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * pack.initial_capacity_ah(model)),
+    }
+}
+
+impl Pack {
+    /// Capacity of a cell to start from, Ah.
+    fn initial_capacity_ah(&self, model: &CellModel) -> f64 {
+        self.initial_capacity_ah.unwrap_or(model.capacity_ah)
+    }
+}
+
+section! {
+    /// Detection of charge, rest and discharge.
+    Transition at "transition" gives TransitionConfig, |keys, pack_ah: f64| {
+        /// Pack current up to which the pack rests. Without it: the rated capacity of all strings over 50 h (C/50).
+        dead_band_a: Option<f64>, "A", Between(0.0, 1e6), Optional => dead_band_a: keys.dead_band_a(pack_ah);
+        /// The current must be this far beyond the dead band's edge for a mode to change. Without it: half the dead band.
+        hysteresis_a: Option<f64>, "A", Between(0.0, 1e6), Optional
+            => hysteresis_a: keys.hysteresis_a.unwrap_or(0.5 * keys.dead_band_a(pack_ah));
+        /// A new mode must hold this long before it counts.
+        min_duration_s: f64, "s", Between(0.0, 1e6), Default("10.0");
+        /// A charge or discharge of less than this part of the rated capacity is joined to the following ones until their sum reaches it. For method "nominal": most of its swing, so that a pause does not cut a half-cycle in two.
+        min_swing: f64, "fraction", Between(0.0, 1.0), Default("0.02");
+    }
+}
+
+impl Transition {
+    /// The dead band, or its default: C/50 of the pack.
+    fn dead_band_a(&self, pack_ah: f64) -> f64 {
+        self.dead_band_a.unwrap_or(pack_ah / 50.0)
+    }
+}
+
+section! {
+    /// The capacity filter, which runs at each transition.
+    Capacity at "capacity" gives CapacityConfig, |keys, rated_ah: f64| {
+        /// Charge over the SOC swing that the voltages show (variance from the swing's uncertainty), or over a nominal swing as in the paper.
+        method: MethodKey, "", Any, Default("\"swing\"") => method: keys.method();
+        /// Swing assumed by method "nominal".
+        nominal_swing: f64, "fraction", Above(0.0, 1.0), Default("0.6") =>;
+        /// Measurement variance of method "nominal".
+        nominal_variance_ah2: f64, "Ah^2", Above(0.0, 1e9), Default("0.1") =>;
+        /// Standard deviation gained per equivalent full cycle ("swing") or per event ("nominal"). Without it: 0.5 % of the rated capacity ("swing"), 1 Ah ("nominal", as in the paper).
+        noise_ah_per_cycle: Option<f64>, "Ah", DEVIATION, Optional
+            => noise_ah_per_cycle: keys.noise_ah_per_cycle.unwrap_or(keys.usual_noise_ah(rated_ah));
+        /// Standard deviation gained in a day of rest, in which some capacity recovers ("swing" only). Without it: 2 % of the rated capacity.
+        noise_ah_per_rest_day: Option<f64>, "Ah", DEVIATION, Optional
+            => noise_ah_per_rest_day: keys.noise_ah_per_rest_day.unwrap_or(0.02 * rated_ah);
+        /// Error of the cell model's open-circuit voltage at the ends of a half-cycle ("swing" only). It repeats from half-cycle to half-cycle and limits the information of each.
+        end_error_v: f64, "V", DEVIATION, Default("0.005");
+        /// The same, relative to the voltage that the load drops in the cell ("swing" only).
+        end_load_error: f64, "", DEVIATION, Default("0.075");
+        /// Standard deviation of the cell model's `ocv_ageing_shift` ("swing" only): uncertainty of how the curve changes with lost capacity.
+        ageing_shift_error: f64, "", DEVIATION, Default("0.3");
+        /// Standard deviation of the current sensor's gain: no capacity is more accurate than this.
+        current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
+        /// Standard deviation of the current sensor's offset, per cell. The offset is learned from the difference between charges and discharges and subtracted from the current ("swing" only; 0 = not learned). Use it where the cell model is accurate to a few mV.
+        current_offset_std_a: f64, "A", DEVIATION, Default("0.0");
+        /// Standard deviation of the capacity lost in a full cycle, at the start. The loss is learned and predicted at the end of each charge ("swing" only; 0 = not learned). For cells that lose several percent in a cycle; in others, capacity that recovers in rest would be mistaken for it.
+        fade_std_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
+        /// Rate at which that loss may change: standard deviation gained per equivalent full cycle.
+        fade_noise_ah_per_cycle: f64, "Ah", DEVIATION, Default("0.0");
+        /// Part of the rated capacity at which the life of a cell ends; the remaining life until then is forecast.
+        end_of_life: f64, "fraction", Above(0.0, 1.0), Default("0.8") =>;
+    }
+}
+
+impl Capacity {
+    fn method(&self) -> CapacityMethod {
+        match self.method {
+            MethodKey::Swing => CapacityMethod::Swing,
+            MethodKey::Nominal => {
+                CapacityMethod::Nominal { swing: self.nominal_swing, variance_ah2: self.nominal_variance_ah2 }
+            }
+        }
+    }
+
+    /// Noise where none is configured.
+    fn usual_noise_ah(&self, rated_ah: f64) -> f64 {
+        match self.method {
+            MethodKey::Swing => 0.005 * rated_ah,
+            MethodKey::Nominal => 1.0,
+        }
+    }
+}
+
+section! {
+    /// The SOC window whose charging time is the recharge period: raw, the time of the actual charge; normalised, the time a reference charger would need.
+    Recharge at "recharge" gives RechargeConfig, |keys, rated_ah: f64| {
+        /// Lower SOC.
+        from_soc: f64, "fraction", Between(0.0, 1.0), Default("0.3");
+        /// Upper SOC.
+        to_soc: f64, "fraction", Between(0.0, 1.0), Default("0.9");
+        /// Current of the reference charger, per cell, constant over the whole window: the normalised period is the window's share of the learned capacity divided by this current. Without it: the rated capacity over 2 h (C/2).
+        reference_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional
+            => reference_current_a: keys.reference_current_a.unwrap_or(rated_ah / 2.0);
+        /// Part of the window that a charge must cover for a normalised period to be reported (a raw period needs all of it).
+        min_coverage: f64, "fraction", Above(0.0, 1.0), Default("0.5");
+        /// What the alarm `recharge_period_low` compares. "raw": each period as soon as the charge leaves the window; a stronger charger looks like a worn pack, a weaker one hides wear. "normalised": the period of the reference charger, at the end of each charge that covers enough of the window.
+        alarm_on: RechargeAlarm, "", Any, Default("\"raw\"");
+    }
+}
+
+section! {
+    /// The load at which usable capacity is stated; without this table it is not reported.
+    Usable at "usable" gives UsableConfig, |keys, rated_ah: f64| {
+        /// Discharge current, per cell.
+        current_a: f64, "A", Above(0.0, 1e6), Required;
+        /// Cell temperature.
+        temperature_c: f64, "degrees C", TEMPERATURE_C, Required;
+        /// Voltage under load at which the discharge ends.
+        cutoff_v: f64, "V", Above(0.0, 100.0), Required;
+        /// A charge whose current, per cell, has fallen to this at the cell model's highest voltage ends full: usable capacity is counted from the SOC it leaves. Without it: the rated capacity over 20 h (C/20).
+        taper_current_a: Option<f64>, "A", Above(0.0, 1e6), Optional
+            => taper_current_a: keys.taper_current_a.unwrap_or(rated_ah / 20.0);
+    }
+}

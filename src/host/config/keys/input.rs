@@ -1,0 +1,145 @@
+//! The tables of what is read from the buses: `[input]` and the signals below it.
+
+use super::{CellRanges, PositiveCurrent};
+use crate::can::e2e::Profile;
+use crate::config::document::TablePlace;
+use crate::config::schema::Presence::{Default, Optional, Required};
+use crate::config::schema::section;
+use crate::config::setting::ValueRange::{Above, Any, Between, NotEmpty};
+
+section! {
+    /// The inputs: what is read from the buses. One of `[input.cell_voltage]` and `[input.pack_voltage]` is needed, and `[input.current]`.
+    Input at "input" {
+        /// DBC files that describe the signals named below, relative to this file.
+        dbc: Vec<String>, "", NotEmpty, Required;
+        /// Most frames of one identifier on one interface that are processed in a second; a tenth of them may arrive at once. Further frames are dropped, counted and reported, so that a faulty sender takes no time from the others. The default is twice the rate of the fastest sensible sender (one frame a millisecond) and half the rate of a saturated bus of 500 kbit/s.
+        max_frames_per_s: u32, "frames/s", Between(10.0, 1e6), Default("2000");
+    }
+}
+
+section! {
+    /// An input message whose sender protects it end to end (AUTOSAR). The readings of a frame that fails its check (damaged, repeated, out of sequence, of another message, or the first after a start) are bad. Each outcome is counted; a change between good and bad is reported.
+    ProtectedInput at "input.protected" {
+        /// Name of the message in its DBC file; one of its signals must be an input.
+        message: String, "", NotEmpty, Required;
+        /// Interface that carries the message. Needed when there are several.
+        interface: Option<String>, "", NotEmpty, Optional;
+        /// AUTOSAR profile: 1 with the whole data identifier in the CRC (variant A), 1 with four bits of it sent (variant C), or 5.
+        profile: Profile, "", Any, Required;
+        /// Data identifier agreed with the sender; up to 0xFFF in 1C.
+        data_id: u16, "", Between(0.0, 65535.0), Required;
+        /// Frames that may be lost between two; each further check without a good frame allows one more. Up to 14 in profile 1.
+        max_delta_counter: u8, "frames", Between(0.0, 255.0), Default("1");
+        /// Repeated or missing frames in a row after which the sender must show its sequence again (`sync_counter`); 14 = any number.
+        max_repeated: u8, "frames", Between(0.0, 14.0), Default("14");
+        /// Frames in sequence that show it after too large a jump of the counter; their readings are used. 0 = none is needed: then profile 1 keeps its old counter after a jump (of a sender that restarted) until the sender reaches that counter, after at most 14 frames.
+        sync_counter: u8, "frames", Between(0.0, 14.0), Default("0");
+    }
+}
+
+/// Declares a table that names a signal on a bus; every such table has these keys.
+macro_rules! signal_section {
+    ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
+        section! {
+            $(#[doc = $about])+
+            $name at $path {
+                /// `Message.Signal` of one of the DBC files; in `[input.cell_voltage]` a pattern, see there.
+                signal: String, "", NotEmpty, Required;
+                /// Interface that carries the signal. Needed when there are several.
+                interface: Option<String>, "", NotEmpty, Optional;
+                /// Factor from the DBC's unit to this program's, after the DBC's own factor (0.001 for a DBC in milli-units).
+                scale: f64, $unit, Above(0.0, 1e9), Default("1.0");
+                /// Added after `scale`, in this program's unit (-273.15 for a DBC in kelvin).
+                offset: f64, "", Between(-1e9, 1e9), Default("0.0");
+                /// Raw codes that mean "not available", in addition to those of the DBC's value table.
+                not_available: Vec<u64>, "", Any, Default("[]");
+                $($keys)*
+            }
+        }
+
+        impl $name {
+            /// The keys that all signal tables have.
+            pub(crate) fn source(&self) -> SignalSource<'_> {
+                SignalSource {
+                    place: &self.place,
+                    signal: &self.signal,
+                    interface: self.interface.as_deref(),
+                    scale: self.scale,
+                    offset: self.offset,
+                    not_available: &self.not_available,
+                }
+            }
+        }
+    };
+}
+
+/// The keys that all signal tables have.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SignalSource<'a> {
+    /// Place in the file.
+    pub place: &'a TablePlace,
+    /// `Message.Signal`, or a pattern.
+    pub signal: &'a str,
+    /// Interface name, when given.
+    pub interface: Option<&'a str>,
+    /// DBC unit to ours.
+    pub scale: f64,
+    /// Added after it.
+    pub offset: f64,
+    /// Raw codes that mean "not available".
+    pub not_available: &'a [u64],
+}
+
+signal_section! {
+    /// The pack current.
+    CurrentInput at "input.current", "A per unit of the DBC" {
+        /// What a positive value on the bus means. Buses differ, so there is no default. Inside this program and in everything it reports, positive is discharge.
+        positive: PositiveCurrent, "", Any, Required;
+    }
+}
+
+signal_section! {
+    /// One voltage per cell. `{n}` in `signal` stands for the cell's number, `{m}` for any number, in message and signal name:
+    /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal; multiplexed signals are supported.
+    CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
+        /// Number of the first cell in the names.
+        first: u16, "", Between(0.0, 60000.0), Default("1");
+    }
+}
+
+signal_section! {
+    /// The pack's total voltage, for a pack that publishes no cell voltages: `pack.cells` equal cells are assumed and estimated as one.
+    PackVoltageInput at "input.pack_voltage", "V per unit of the DBC" {}
+}
+
+signal_section! {
+    /// A temperature sensor.
+    TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
+        /// Cells this sensor serves. Without it: all cells.
+        cells: Option<CellRanges>, "", Any, Optional;
+    }
+}
+
+signal_section! {
+    /// State of charge as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
+    ReportedSocInput at "input.reported_soc", "fraction per unit of the DBC" {
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0");
+    }
+}
+
+signal_section! {
+    /// State of health (capacity over rated capacity) as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
+    ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
+        /// A reading older than this is stale.
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0");
+    }
+}
+
+signal_section! {
+    /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, also when the pack was exchanged while the program did not run. Everything learned of the old pack is reported once more and discarded, as with the command `pack-replaced`.
+    PackIdentityInput at "input.pack_identity", "any unit" {
+        /// Readings in a row that must show the same new value.
+        readings: u32, "", Between(1.0, 10000.0), Default("10");
+    }
+}

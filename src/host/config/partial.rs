@@ -1,0 +1,60 @@
+//! As much of a configuration as can be read, with all its faults: for `packwatch doctor`.
+
+use std::path::Path;
+
+use super::document::{Document, Faults};
+use super::resolve::{self, Databases, ResolvedSignal};
+use super::tables::RawTables;
+use super::{Config, ConfigFaults, load, protect, read_file, read_model, read_text};
+use crate::can::guard::GuardConfig;
+use crate::cell::CellModel;
+
+/// The readable part of a configuration.
+#[derive(Debug)]
+pub(crate) struct PartialConfig {
+    /// The whole, when it is good.
+    pub config: Option<Config>,
+    /// Every fault; empty when it is good.
+    pub faults: Vec<String>,
+    /// The tables of the file.
+    pub raw: RawTables,
+    /// The DBC files.
+    pub databases: Databases,
+    /// The cell model.
+    pub model: Option<CellModel>,
+}
+
+impl PartialConfig {
+    /// Reads what can be read.
+    ///
+    /// # Errors
+    /// When the file or a DBC file cannot be read: every fault found.
+    pub(crate) fn read(path: &Path) -> Result<Self, ConfigFaults> {
+        let (config, faults) = match load(path) {
+            Ok(config) => (Some(config), Vec::new()),
+            Err(faults) => (None, faults.0),
+        };
+        // The second reading finds the same faults again.
+        let again = &mut Faults::default();
+        let Some(text) = read_text(path, &read_file, again) else { return Err(ConfigFaults(faults)) };
+        let document = Document::parse(&path.display().to_string(), &text, again);
+        let raw = RawTables::read(&document, again);
+        let names = raw.input.as_ref().map_or(&[][..], |input| &input.dbc);
+        let Some(databases) = Databases::load(path, names, &read_file, again) else { return Err(ConfigFaults(faults)) };
+        let model = read_model(path, &document, &read_file, again);
+        Ok(Self { config, faults, raw, databases, model })
+    }
+
+    /// The configured signals that are found.
+    pub(crate) fn signals(&self) -> Vec<ResolvedSignal<'_>> {
+        resolve::resolve(&self.raw, &self.databases, &mut Faults::default())
+    }
+
+    /// End-to-end protection of the inputs, as far as it can be read.
+    pub(crate) fn guards(&self, signals: &[ResolvedSignal<'_>]) -> Vec<GuardConfig> {
+        match &self.config {
+            Some(config) => config.monitor.guards.clone(),
+            None => protect::guards(&self.raw, signals, false, &mut Faults::default()),
+        }
+    }
+}

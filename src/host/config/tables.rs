@@ -1,0 +1,102 @@
+//! The tables of a configuration file as they are read: one line per table.
+
+use super::keys::{
+    Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
+    Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, ProtectedInput,
+    Recharge, ReportedSocInput, ReportedSohInput, SignalSource, Store, TemperatureInput, TemperatureLimits, Transition,
+    Usable, VoltageLimits,
+};
+use super::schema::tables;
+use crate::quantity::{BusIndex, CellIndex, Channel, SensorIndex};
+
+tables! {
+    /// The tables of a file; `None` = not written, or faulty (and noted).
+    RawTables, SECTIONS {
+        pack: one Pack,
+        interfaces: many Interface,
+        input: one Input,
+        current: one CurrentInput,
+        cell_voltage: optional CellVoltageInput,
+        pack_voltage: optional PackVoltageInput,
+        temperatures: many TemperatureInput,
+        reported_soc: optional ReportedSocInput,
+        reported_soh: optional ReportedSohInput,
+        pack_identity: optional PackIdentityInput,
+        protected: many ProtectedInput,
+        current_limits: one CurrentLimits,
+        voltage_limits: one VoltageLimits,
+        temperature_limits: one TemperatureLimits,
+        estimator: one Estimator,
+        transition: one Transition,
+        capacity: one Capacity,
+        recharge: one Recharge,
+        usable: optional Usable,
+        alarms: many Alarm,
+        j1939: optional J1939,
+        output: optional Output,
+        output_status: one OutputStatus,
+        output_health: one OutputHealth,
+        output_alarm: one OutputAlarm,
+        commands: one Commands,
+        store: one Store,
+    }
+}
+
+impl RawTables {
+    /// Whether every `[[interface]]` that is written is in `interfaces`; otherwise names cannot be judged.
+    pub(super) fn has_all_interfaces(&self) -> bool {
+        !self.broken && self.interfaces.len() == self.count::<Interface>()
+    }
+
+    /// Whether the pack's total voltage is configured, so that the pack is estimated as one cell.
+    pub(crate) fn is_pack_total(&self) -> bool {
+        self.is_written::<PackVoltageInput>()
+    }
+
+    /// Whether `[output]` is written with `enabled = false`.
+    pub(super) fn is_output_disabled(&self) -> bool {
+        self.output.as_ref().is_some_and(|output| !output.enabled)
+    }
+
+    /// The interface of this name, the first one without a name; `None` = not there (noted by the cross checks).
+    pub(crate) fn bus_of(&self, interface: Option<&str>) -> Option<BusIndex> {
+        let index = match interface {
+            Some(name) => self.interfaces.iter().position(|interface| interface.name == name)?,
+            None => 0,
+        };
+        u8::try_from(index).ok().map(BusIndex)
+    }
+
+    /// Names of the interfaces, as a fault lists them.
+    pub(super) fn interface_names(&self) -> String {
+        let names: Vec<&str> = self.interfaces.iter().map(|interface| interface.name.as_str()).collect();
+        names.join(" or ")
+    }
+
+    /// What is configured of the signal of a channel.
+    pub(crate) fn source(&self, channel: Channel) -> Option<SignalSource<'_>> {
+        match channel {
+            Channel::Current => self.current.as_ref().map(|keys| keys.source()),
+            Channel::Temperature(sensor) => self.temperatures.get(usize::from(sensor.0)).map(|keys| keys.source()),
+            Channel::PackVoltage => self.pack_voltage.as_ref().map(|keys| keys.source()),
+            Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.source()),
+            Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.source()),
+            Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.source()),
+            Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.source()),
+        }
+    }
+
+    /// What is configured of all signals, with `[input.cell_voltage]` once, for the first cell.
+    pub(super) fn sources(&self) -> impl Iterator<Item = (Channel, SignalSource<'_>)> {
+        let sensors = (0..).take(self.temperatures.len()).map(|index| Channel::Temperature(SensorIndex(index)));
+        let others = [
+            Channel::PackVoltage,
+            Channel::ReportedSoc,
+            Channel::ReportedSoh,
+            Channel::PackIdentity,
+            Channel::CellVoltage(CellIndex(0)),
+        ];
+        let channels = [Channel::Current].into_iter().chain(sensors).chain(others);
+        channels.filter_map(|channel| Some((channel, self.source(channel)?)))
+    }
+}

@@ -1,0 +1,185 @@
+//! What a configuration expects of the buses, also of one that is not good: the [`Plan`] of the doctor.
+//!
+//! In: the configuration file. Out: the plan, every fault as [`config::load`](crate::config::load) reports it, and where
+//! each key stands. A configuration of which no signal can be found in a DBC file is refused.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use crate::can::dbc::{Message, Signal};
+use crate::can::decode::{Binding, InputMap};
+use crate::cell::CellModel;
+use crate::config::{
+    Config, ConfigFaults, Databases, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource, TablePlace,
+    input_map,
+};
+use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
+use crate::quantity::{CellIndex, Channel, MAX_CELLS};
+
+/// Capacity where nothing states one, Ah: a car's cell.
+const USUAL_AH: f64 = 50.0;
+
+/// The readable part of a configuration, as the doctor needs it.
+#[derive(Debug)]
+pub struct Survey {
+    /// What is expected of the buses.
+    pub plan: Plan,
+    /// The signals that were found.
+    pub input: InputMap,
+    /// The whole, when it is good.
+    pub config: Option<Config>,
+    /// Every fault; empty when it is good.
+    pub faults: Vec<String>,
+    places: BTreeMap<String, TablePlace>,
+}
+
+impl Survey {
+    /// Place of a key (of its table, when it is not written) as `file:line`, and what is written there.
+    pub fn locate(&self, table: &str, key: &str) -> Option<(String, Option<String>)> {
+        let place = self.places.get(table)?;
+        let found = place.found(key).map(str::to_owned);
+        Some((format!("{}:{}", place.file, place.line_of(key)), found))
+    }
+}
+
+/// Reads what can be read of a configuration.
+///
+/// # Errors
+/// When no interface is configured or no signal can be found: every fault.
+pub fn survey(path: &Path) -> Result<Survey, ConfigFaults> {
+    let partial = PartialConfig::read(path)?;
+    let found = partial.signals();
+    let input = input_map(&found).filter(|_| !partial.raw.interfaces.is_empty() && !found.is_empty());
+    let Some(input) = input else { return Err(ConfigFaults(partial.faults)) };
+    let plan = plan(&partial, &found);
+    let places = partial.raw.places().map(|place| (place.path.clone(), place.clone())).collect();
+    Ok(Survey { plan, input, places, config: partial.config, faults: partial.faults })
+}
+
+fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
+    let PartialConfig { config, raw, model, databases, .. } = partial;
+    let (pack, config, model) = (raw.pack.as_ref(), config.as_ref(), model.as_ref());
+    let signals: Vec<SignalPlan> = found.iter().filter_map(|resolved| signal(raw, resolved)).collect();
+    let strings = pack.map_or(1, |pack| pack.strings);
+    let pack_ah = model.map_or(USUAL_AH, |model| model.rated_capacity_ah) * f64::from(strings);
+    let pack_plan = PackPlan {
+        cells: pack.map_or_else(|| cells_of(found), |pack| pack.cells),
+        is_total: raw.is_pack_total(),
+        strings,
+        capacity_ah: capacity_ah(raw, model),
+        model: model.cloned(),
+        ambient_c: pack.map_or(25.0, |pack| pack.ambient_c),
+        dead_band_a: raw.transition.as_ref().map_or(pack_ah / 50.0, |keys| keys.config(pack_ah).dead_band_a),
+        voltage_noise_v: raw.estimator.as_ref().map_or(0.0, |keys| keys.voltage_noise_v),
+    };
+    Plan {
+        interfaces: raw.interfaces.iter().map(|i| InterfacePlan { name: i.name.clone(), fd: i.fd }).collect(),
+        more_cells: more_cells(raw, databases),
+        messages: messages(found, &signals),
+        signals,
+        pack: pack_plan,
+        limits: config.map(limits).unwrap_or_default(),
+        ages: ages(raw),
+        guards: partial.guards(found),
+        outputs: config.map(outputs).unwrap_or_default(),
+        is_csv: false,
+    }
+}
+
+fn capacity_ah(raw: &RawTables, model: Option<&CellModel>) -> f64 {
+    let configured = raw.pack.as_ref().and_then(|pack| pack.initial_capacity_ah.or(pack.rated_capacity_ah));
+    configured.or(model.map(|model| model.capacity_ah)).unwrap_or(USUAL_AH)
+}
+
+fn cells_of(found: &[ResolvedSignal<'_>]) -> u16 {
+    let cells = found.iter().filter(|resolved| matches!(resolved.channel, Channel::CellVoltage(_))).count();
+    u16::try_from(cells).unwrap_or(1).max(1)
+}
+
+fn signal(raw: &RawTables, resolved: &ResolvedSignal<'_>) -> Option<SignalPlan> {
+    let source = raw.source(resolved.channel)?;
+    Some(signal_plan(&source, resolved.message, resolved.signal, resolved.binding().ok()?))
+}
+
+fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, binding: Binding) -> SignalPlan {
+    SignalPlan {
+        binding,
+        layout: signal.layout,
+        table: source.place.path.clone(),
+        message: message.name.clone(),
+        name: format!("{}.{}", message.name, signal.name),
+        unit: signal.unit.clone(),
+        scale: source.scale,
+        offset: source.offset,
+    }
+}
+
+/// Signals that fit the cells' pattern beyond the configured number, one after the other.
+fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
+    let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
+    let source = keys.source();
+    let (Ok(pattern), Some(bus)) = (Pattern::parse(source.signal), raw.bus_of(source.interface)) else {
+        return Vec::new();
+    };
+    let end = u32::from(keys.first) + u32::from(pack.cells);
+    let mut numbered: BTreeMap<u32, SignalPlan> = BTreeMap::new();
+    for (_, message, signal) in databases.signals() {
+        let name = format!("{}.{}", message.name, signal.name);
+        let Some(Some(number)) = pattern.fits(&name).filter(|number| number.is_some_and(|n| n >= end)) else {
+            continue;
+        };
+        let Some(cell) = u16::try_from(number - u32::from(keys.first)).ok().filter(|c| usize::from(*c) < MAX_CELLS)
+        else {
+            continue;
+        };
+        let Ok(mut binding) = Binding::new(bus, message, signal, Channel::CellVoltage(CellIndex(cell))) else {
+            continue;
+        };
+        (binding.scale, binding.offset) = (source.scale, source.offset);
+        binding.not_available.extend(source.not_available);
+        numbered.insert(number, signal_plan(&source, message, signal, binding));
+    }
+    (end..).zip(numbered).take_while(|(next, (number, _))| next == number).map(|(_, (_, plan))| plan).collect()
+}
+
+fn messages(found: &[ResolvedSignal<'_>], signals: &[SignalPlan]) -> Vec<MessagePlan> {
+    let mut messages: Vec<MessagePlan> = Vec::new();
+    for resolved in found {
+        let (bus, id) = (resolved.bus, resolved.message.id);
+        if messages.iter().any(|message| (message.bus, message.id) == (bus, id)) {
+            continue;
+        }
+        let mut pages: Vec<_> =
+            signals.iter().filter(|s| (s.binding.bus, s.binding.id) == (bus, id)).map(|s| &s.binding.mux).collect();
+        pages.dedup();
+        messages.push(MessagePlan {
+            bus,
+            id,
+            name: resolved.message.name.clone(),
+            cycle_time_s: resolved.message.cycle_time_ms.map(|ms| f64::from(ms) / 1000.0),
+            pages: pages.len(),
+        });
+    }
+    messages
+}
+
+fn ages(raw: &RawTables) -> Ages {
+    Ages {
+        current_s: raw.current_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
+        voltage_s: raw.voltage_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
+        temperature_s: raw.temperature_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
+    }
+}
+
+fn limits(config: &Config) -> [(f64, f64); 3] {
+    let sample = &config.monitor.sample;
+    [sample.current, sample.voltage, sample.temperature].map(|limits| (limits.min, limits.max))
+}
+
+fn outputs(config: &Config) -> Vec<OutputPlan> {
+    let Some(output) = &config.monitor.output else { return Vec::new() };
+    let named = output.plan.ids().into_iter().zip(["status", "health", "alarm"]);
+    named
+        .map(|(id, name)| OutputPlan { buses: output.buses.clone(), id, name, table: format!("output.{name}") })
+        .collect()
+}

@@ -1,0 +1,277 @@
+//! The program's one reader of CSV tables: columns by name, rows streamed, every fault with its place.
+//!
+//! In: CSV with one header line, plain, gzip or zstd. Out: [`Row`]s of fields that are read as text, numbers or stamps.
+//! Blanks around fields and a byte order mark are removed. Rows may be shorter or longer than the header: a field that a
+//! row lacks reads as empty. A fault reads `FILE:LINE: column NAME: found X, must be ALLOWED`; it never ends the reading,
+//! so that the caller may skip the row.
+
+use std::borrow::Cow;
+use std::io::Read;
+use std::ops::RangeInclusive;
+use std::path::Path;
+use std::sync::Arc;
+
+use super::{lines, stamp};
+use crate::quantity::Timestamp;
+
+/// Columns at whose values time starts again, where the user names none.
+pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
+
+/// What is allowed where a point in time is read.
+const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
+
+/// A table that cannot be read or a field that cannot be used, with its place.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct TableError(pub String);
+
+/// Whether `"` encloses fields.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Quotes {
+    /// Quotes may enclose fields that hold commas or line breaks.
+    Enclose,
+    /// A line is a row, whatever quotes it holds: one stray quote would swallow every row after it. Quotes around a whole
+    /// number or column name are still removed.
+    Literal,
+}
+
+/// A table being read.
+pub struct Table {
+    reader: csv::Reader<Box<dyn Read>>,
+    record: csv::ByteRecord,
+    header: Header,
+}
+
+/// The file's name and its columns.
+#[derive(Debug)]
+pub struct Header {
+    file: String,
+    names: Vec<String>,
+}
+
+/// One row.
+#[derive(Debug, Clone, Copy)]
+pub struct Row<'t> {
+    /// Line of the file, from 1.
+    pub line: u64,
+    record: &'t csv::ByteRecord,
+    header: &'t Header,
+}
+
+impl Table {
+    /// Opens a file and reads its header; `-` is standard input.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn open(path: &Path) -> Result<Self, TableError> {
+        let file = path.display().to_string();
+        let source = lines::open(path, &Arc::default());
+        let source = source.map_err(|error| TableError(format!("{file}: cannot be read: {error}")))?;
+        Self::new(source, file, Quotes::Enclose)
+    }
+
+    /// Reads the header of unpacked text; `file` is its name for messages.
+    ///
+    /// # Errors
+    /// The source cannot be read.
+    pub fn new(source: Box<dyn Read>, file: String, quotes: Quotes) -> Result<Self, TableError> {
+        let mut builder = csv::ReaderBuilder::new();
+        builder.quoting(quotes == Quotes::Enclose).flexible(true).trim(csv::Trim::All);
+        let mut reader = builder.from_reader(source);
+        let fields = reader.byte_headers().map_err(|error| damaged(&file, &error))?;
+        let name = |field| String::from_utf8_lossy(field).trim_start_matches('\u{feff}').trim_matches('"').to_owned();
+        let names = fields.iter().map(name).collect();
+        Ok(Self { reader, record: csv::ByteRecord::new(), header: Header { file, names } })
+    }
+
+    /// The file's name and its columns.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// The next row; `None` at the end.
+    ///
+    /// # Errors
+    /// The source fails, as a damaged compressed file does.
+    pub fn next_row(&mut self) -> Result<Option<Row<'_>>, TableError> {
+        let more = self.reader.read_byte_record(&mut self.record).map_err(|e| damaged(&self.header.file, &e))?;
+        let line = self.record.position().map_or(0, csv::Position::line);
+        Ok(more.then_some(Row { line, record: &self.record, header: &self.header }))
+    }
+}
+
+fn damaged(file: &str, error: &csv::Error) -> TableError {
+    TableError(format!("{file}: damaged: {error}"))
+}
+
+impl Header {
+    /// The columns' names.
+    pub fn names(&self) -> &[String] {
+        &self.names
+    }
+
+    /// Number of the column called `name`.
+    pub fn find(&self, name: &str) -> Option<usize> {
+        self.names.iter().position(|known| known == name)
+    }
+
+    /// Number of the first of these columns that the table has.
+    pub fn find_any(&self, names: &[&str]) -> Option<usize> {
+        names.iter().find_map(|name| self.find(name))
+    }
+
+    /// Number of the first of these columns that the table has.
+    ///
+    /// # Errors
+    /// The table has none of them.
+    pub fn required(&self, names: &[&str]) -> Result<usize, TableError> {
+        let missing = || self.fault(format!("no column {}, found {}", names.join(" or "), self.names.join(",")));
+        self.find_any(names).ok_or_else(missing)
+    }
+
+    /// A fault of the header line.
+    pub fn fault(&self, what: impl std::fmt::Display) -> TableError {
+        TableError(format!("{}:1: {what}", self.file))
+    }
+
+    /// A fault of the whole file.
+    pub fn file_fault(&self, what: impl std::fmt::Display) -> TableError {
+        TableError(format!("{}: {what}", self.file))
+    }
+}
+
+impl<'t> Row<'t> {
+    /// A field as written; `None` when the row is too short.
+    pub fn bytes(&self, column: usize) -> Option<&'t [u8]> {
+        self.record.get(column)
+    }
+
+    /// A field as text; empty when the row is too short.
+    pub fn text(&self, column: usize) -> Cow<'t, str> {
+        self.bytes(column).map_or(Cow::Borrowed(""), String::from_utf8_lossy)
+    }
+
+    /// A finite number; `None` for an empty field.
+    ///
+    /// # Errors
+    /// The field is neither.
+    pub fn number(&self, column: usize) -> Result<Option<f64>, TableError> {
+        self.number_in(column, f64::MIN..=f64::MAX, "a finite number or an empty field")
+    }
+
+    /// A number of `range`; `None` for an empty field.
+    ///
+    /// # Errors
+    /// The field is neither; the message says `allowed`.
+    pub fn number_in(
+        &self,
+        column: usize,
+        range: RangeInclusive<f64>,
+        allowed: &str,
+    ) -> Result<Option<f64>, TableError> {
+        let value = parse_field(self.bytes(column).unwrap_or_default());
+        let value = value.filter(|value| value.is_none_or(|value| range.contains(&value)));
+        value.ok_or_else(|| self.fault(column, allowed))
+    }
+
+    /// A point in time: a date, or seconds.
+    ///
+    /// # Errors
+    /// The field is neither.
+    pub fn stamp(&self, column: usize) -> Result<Timestamp, TableError> {
+        stamp::parse_stamp(&self.text(column)).ok_or_else(|| self.fault(column, STAMP))
+    }
+
+    /// A fault of a field: what was found, and that it must be `allowed`.
+    pub fn fault(&self, column: usize, allowed: &str) -> TableError {
+        let found = self.bytes(column).map(String::from_utf8_lossy);
+        let found = found.map_or("no such field".to_owned(), |found| format!("{found:?}"));
+        let name = self.header.names.get(column).map_or("", String::as_str);
+        self.row_fault(format_args!("column {name}: found {found}, must be {allowed}"))
+    }
+
+    /// A fault of the row.
+    pub fn row_fault(&self, what: impl std::fmt::Display) -> TableError {
+        TableError(format!("{}:{}: {what}", self.header.file, self.line))
+    }
+}
+
+/// Reads a field: `Some(None)` when it is empty, `None` when it is no finite number.
+pub(super) fn parse_field(field: &[u8]) -> Option<Option<f64>> {
+    let field = field.strip_prefix(b"\"").and_then(|field| field.strip_suffix(b"\"")).unwrap_or(field);
+    if field.is_empty() {
+        return Some(None);
+    }
+    let value: f64 = std::str::from_utf8(field).ok()?.parse().ok()?;
+    value.is_finite().then_some(Some(value))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write as _;
+
+    use super::*;
+
+    const TEXT: &str = "\u{feff}time, \"soc\" ,name\n2008-04-02T13:08:17, 0.5,a\n1,,b\n2,x\n";
+
+    fn table(text: &str, quotes: Quotes) -> Table {
+        Table::new(Box::new(std::io::Cursor::new(text.to_owned())), "t.csv".to_owned(), quotes).expect("memory reads")
+    }
+
+    #[test]
+    fn fields_are_read_by_the_names_of_their_columns() {
+        let mut table = table(TEXT, Quotes::Enclose);
+        assert_eq!(table.header().names(), ["time", "soc", "name"]);
+        let [time, soc] = ["time", "soc"].map(|name| table.header().find(name).expect("there"));
+        let row = table.next_row().expect("reads").expect("a row");
+        assert_eq!((row.line, row.number(soc), row.text(2)), (2, Ok(Some(0.5)), "a".into()));
+        assert_eq!(row.stamp(time), Ok(Timestamp::from_secs(1_207_141_697.0)));
+        let row = table.next_row().expect("reads").expect("a row");
+        assert_eq!((row.line, row.number(soc), row.stamp(time)), (3, Ok(None), Ok(Timestamp::from_secs(1.0))));
+    }
+
+    #[test]
+    fn a_fault_names_file_line_column_found_and_allowed_and_the_next_row_is_read() {
+        let mut table = table(TEXT, Quotes::Enclose);
+        let missing = table.header().required(&["ah", "capacity_ah"]).expect_err("missing");
+        assert_eq!(missing.0, "t.csv:1: no column ah or capacity_ah, found time,soc,name");
+        let mut faults = Vec::new();
+        while let Some(row) = table.next_row().expect("reads") {
+            faults.extend(row.number_in(1, 0.0..=0.4, "a fraction").err().map(|fault| fault.0));
+            faults.extend((row.bytes(2).is_none()).then(|| row.fault(2, "a name").0));
+        }
+        assert_eq!(
+            faults,
+            [
+                "t.csv:2: column soc: found \"0.5\", must be a fraction",
+                "t.csv:4: column soc: found \"x\", must be a fraction",
+                "t.csv:4: column name: found no such field, must be a name",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_stray_quote_costs_one_row_where_quotes_are_literal() {
+        let mut table = table("a,b\n1,\"2\n3,\"4\"\n", Quotes::Literal);
+        assert!(table.next_row().expect("reads").expect("a row").number(1).is_err());
+        assert_eq!(table.next_row().expect("reads").expect("a row").number(1), Ok(Some(4.0)));
+        assert!(table.next_row().expect("reads").is_none());
+    }
+
+    #[test]
+    fn compressed_tables_are_unpacked_and_damage_is_an_error() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("t.csv.gz");
+        let mut packed = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        packed.write_all(b"a\n7\n").expect("packed");
+        let packed = packed.finish().expect("packed");
+        std::fs::write(&path, &packed).expect("written");
+        let mut table = Table::open(&path).expect("opens");
+        assert_eq!(table.next_row().expect("reads").expect("a row").number(0), Ok(Some(7.0)));
+        std::fs::write(&path, &packed[..packed.len() - 4]).expect("written");
+        let mut table = Table::open(&path).expect("opens");
+        let _ = table.next_row();
+        let error = table.next_row().expect_err("torn");
+        assert!(error.0.contains("t.csv.gz: damaged: "), "{error}");
+    }
+}

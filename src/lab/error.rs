@@ -1,0 +1,36 @@
+//! The one error of offline work: a text with the place, what was found and what is allowed.
+
+use crate::chart::PlotError;
+use crate::ident::fit::FitError;
+use crate::io::log::LogError;
+use crate::io::table::TableError;
+
+/// Why offline work failed: one line per fault.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct LabError(pub String);
+
+/// Errors that already name their place.
+macro_rules! convert {
+    ($($error:ty),+ $(,)?) => {
+        $(impl From<$error> for LabError {
+            fn from(error: $error) -> Self {
+                Self(error.to_string())
+            }
+        })+
+    };
+}
+
+convert!(
+    String,
+    &str,
+    std::io::Error,
+    csv::Error,
+    serde_json::Error,
+    parquet::errors::ParquetError,
+    crate::regress::RegressionError,
+    FitError,
+    LogError,
+    PlotError,
+    TableError,
+);

@@ -1,0 +1,54 @@
+//! The values of an event or of a history row, by name.
+//!
+//! Events and the rows of a store have the same names for the same values. A value that is not known (null, or a number that
+//! is not finite) reads as `None`; numbers keep every bit.
+
+use serde_json::{Map, Value};
+
+use crate::monitor::EventKind;
+use crate::store::Entry;
+
+/// Values by name.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Fields(Map<String, Value>);
+
+impl Fields {
+    /// The values of an event.
+    pub(crate) fn of_event(kind: &EventKind) -> Self {
+        match serde_json::to_value(kind) {
+            Ok(Value::Object(fields)) => Self(fields),
+            _ => Self::default(),
+        }
+    }
+
+    /// The values of a row of a store.
+    pub(crate) fn of_entry(entry: &Entry) -> Self {
+        let names = entry.kind.columns().iter().map(|name| (*name).to_owned());
+        Self(names.zip(entry.values.iter().cloned()).collect())
+    }
+
+    /// A number.
+    pub(crate) fn number(&self, name: &str) -> Option<f64> {
+        self.0.get(name)?.as_f64()
+    }
+
+    /// A whole number.
+    pub(crate) fn whole(&self, name: &str) -> Option<u32> {
+        self.0.get(name)?.as_u64()?.try_into().ok()
+    }
+
+    /// A mean with its standard deviation.
+    pub(crate) fn pair(&self, mean: &str, std: &str) -> Option<(f64, f64)> {
+        self.number(mean).zip(self.number(std))
+    }
+
+    /// A text; empty when there is none.
+    pub(crate) fn text(&self, name: &str) -> &str {
+        self.0.get(name).and_then(Value::as_str).unwrap_or_default()
+    }
+
+    /// Whether a flag is set; a store keeps flags as 0 and 1.
+    pub(crate) fn flag(&self, name: &str) -> bool {
+        self.0.get(name).is_some_and(|value| value.as_bool().unwrap_or_else(|| value.as_f64().unwrap_or(0.0) != 0.0))
+    }
+}

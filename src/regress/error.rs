@@ -1,0 +1,59 @@
+//! Errors of rows, settings and saved models.
+
+/// Reason why there is no model or no prediction.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum RegressionError {
+    /// A text that is not a kernel.
+    #[error("kernel {text:?}, column {column}: found {found}, allowed: {allowed}")]
+    Kernel {
+        /// The whole text.
+        text: String,
+        /// Column of the error, from 1.
+        column: usize,
+        /// Text found there.
+        found: String,
+        /// Allowed text.
+        allowed: String,
+    },
+    /// A number that is not finite among the rows.
+    #[error("line {line}: {what} = {found}, must be a finite number")]
+    NotFinite {
+        /// Line of the file, or the row from 1.
+        line: u64,
+        /// `input 2` or `target`.
+        what: String,
+        /// The value.
+        found: f64,
+    },
+    /// A setting or a length out of its range.
+    #[error("{what} = {found}, must be {allowed}")]
+    OutOfRange {
+        /// Name of the quantity.
+        what: String,
+        /// Its value.
+        found: String,
+        /// Allowed range.
+        allowed: String,
+    },
+    /// A covariance matrix without a Cholesky factor, even with the largest jitter.
+    #[error("covariance matrix is not positive definite, even with {jitter:e} of the signal variance on its diagonal")]
+    NotPositiveDefinite {
+        /// Largest jitter tried, as part of the signal variance.
+        jitter: f64,
+    },
+    /// The progress callback cancelled the fit.
+    #[error("cancelled")]
+    Cancelled,
+    /// An unusable saved model.
+    #[error("saved model: {0}")]
+    Saved(String),
+    /// The threads could not be started.
+    #[error("threads cannot be started: {0}")]
+    Threads(String),
+}
+
+impl RegressionError {
+    pub(super) fn range(what: &str, found: impl ToString, allowed: impl ToString) -> Self {
+        Self::OutOfRange { what: what.to_owned(), found: found.to_string(), allowed: allowed.to_string() }
+    }
+}

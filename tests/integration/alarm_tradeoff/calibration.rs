@@ -1,0 +1,79 @@
+//! Whether what the Monitor says of its own uncertainty is so: stated probabilities against frequencies, errors against
+//! standard deviations.
+
+use super::Fleet;
+use super::life::{Life, Look, RATED_AH, THRESHOLD};
+
+/// Edges of the stated probability.
+pub(crate) const EDGES: [f64; 9] = [0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99, 1.0];
+/// Half-cycles at the start of a life that are left out: what was assumed of the capacity is still in them.
+const SETTLING: usize = 10;
+
+/// The probability that the truth is below the threshold, as the rule computes it.
+pub(crate) fn stated(look: &Look) -> f64 {
+    0.5 * libm::erfc((look.mean_ah - THRESHOLD * RATED_AH) / (look.std_ah * std::f64::consts::SQRT_2))
+}
+
+fn is_beyond(look: &Look) -> bool {
+    look.true_ah < THRESHOLD * RATED_AH
+}
+
+fn looks(lives: &[Life]) -> impl Iterator<Item = &Look> {
+    lives.iter().flat_map(|life| life.looks.iter().skip(SETTLING)).filter(|look| look.is_measured)
+}
+
+/// Number of looks, mean stated probability and share truly below the threshold, by stated probability.
+pub(crate) fn bins(fleet: &Fleet) -> Vec<(usize, f64, f64)> {
+    let bin = |edges: &[f64]| {
+        let inside = |p: f64| p >= edges[0] && (p < edges[1] || edges[1] == 1.0);
+        let all: Vec<&Look> = looks(&fleet.ageing).chain(looks(&fleet.healthy)).filter(|l| inside(stated(l))).collect();
+        let n = all.len() as f64;
+        let said = all.iter().map(|look| stated(look)).sum::<f64>() / n;
+        let true_share = all.iter().filter(|look| is_beyond(look)).count() as f64 / n;
+        (all.len(), said, true_share)
+    };
+    EDGES.windows(2).map(bin).collect()
+}
+
+/// How the capacity's error compares with its stated standard deviation, over the looks at ageing cells.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Errors {
+    /// Percent of rated: mean error, standard deviation of the lives' mean errors, scatter within a life, stated.
+    pub(crate) mean: f64,
+    pub(crate) between_lives: f64,
+    pub(crate) within_life: f64,
+    pub(crate) stated: f64,
+    /// Shares of looks inside the stated 68 and 95 % intervals.
+    pub(crate) inside_68: f64,
+    pub(crate) inside_95: f64,
+}
+
+fn mean(values: impl Iterator<Item = f64> + Clone) -> f64 {
+    values.clone().sum::<f64>() / values.count() as f64
+}
+
+/// Errors of a fleet's ageing lives.
+pub(crate) fn errors(fleet: &Fleet) -> Errors {
+    let percent = |look: &Look| 100.0 * (look.mean_ah - look.true_ah) / RATED_AH;
+    let sigmas = |look: &Look| (look.mean_ah - look.true_ah).abs() / look.std_ah;
+    let of_life = |life: &Life| {
+        let errors: Vec<f64> = looks(std::slice::from_ref(life)).map(percent).collect();
+        let middle = mean(errors.iter().copied());
+        (middle, mean(errors.iter().map(|error| (error - middle) * (error - middle))))
+    };
+    let lives: Vec<(f64, f64)> = fleet.ageing.iter().map(of_life).collect();
+    let middle = mean(lives.iter().map(|life| life.0));
+    let share = |limit: f64| {
+        mean(
+            looks(&fleet.ageing).map(|look| f64::from(u8::from(sigmas(look) <= limit))).collect::<Vec<_>>().into_iter(),
+        )
+    };
+    Errors {
+        mean: middle,
+        between_lives: mean(lives.iter().map(|life| (life.0 - middle) * (life.0 - middle))).sqrt(),
+        within_life: mean(lives.iter().map(|life| life.1)).sqrt(),
+        stated: mean(looks(&fleet.ageing).map(|look| 100.0 * look.std_ah / RATED_AH).collect::<Vec<_>>().into_iter()),
+        inside_68: share(1.0),
+        inside_95: share(1.96),
+    }
+}

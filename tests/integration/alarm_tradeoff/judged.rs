@@ -1,0 +1,106 @@
+//! A life judged by one rule: when it was raised, how long before the end, whether the truth was beyond then.
+
+use packwatch::alarm::{AlarmEngine, Change, Comparison, Observation, Rule, RuleConfig, Severity};
+use packwatch::quantity::CellIndex;
+
+use super::life::{Life, Look, RATED_AH, THRESHOLD};
+
+/// Cleared this much above the threshold, as by default.
+const HYSTERESIS: f64 = 0.02;
+
+/// One of the rules compared.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Candidate {
+    pub(crate) name: &'static str,
+    pub(crate) when: Comparison,
+    pub(crate) debounce_events: u32,
+}
+
+const fn candidate(name: &'static str, when: Comparison, debounce_events: u32) -> Candidate {
+    Candidate { name, when, debounce_events }
+}
+
+/// The rules compared. `MONITORED` are also run by the Monitor itself, by severity.
+pub(crate) const CANDIDATES: [Candidate; 8] = [
+    candidate("p = 0.05", Comparison::Probability(0.05), 1),
+    candidate("p = 0.2", Comparison::Probability(0.2), 1),
+    candidate("p = 0.5", Comparison::Probability(0.5), 1),
+    candidate("mean", Comparison::Mean, 1),
+    candidate("mean, 2 events", Comparison::Mean, 2),
+    candidate("p = 0.8", Comparison::Probability(0.8), 1),
+    candidate("p = 0.95", Comparison::Probability(0.95), 1),
+    candidate("p = 0.99", Comparison::Probability(0.99), 1),
+];
+
+/// Candidates that the study's configuration gives to the Monitor as info, warning and severe.
+pub(crate) const MONITORED: [usize; 3] = [0, 3, 6];
+pub(crate) const HALF: usize = 2;
+pub(crate) const MEAN: usize = 3;
+pub(crate) const P95: usize = 6;
+
+/// What a rule made of a life.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Judged {
+    /// The look at which it was raised first.
+    pub(crate) first: Option<Look>,
+    /// Raises at which the truth was above the threshold, by any amount, and by more than 1 % of rated.
+    pub(crate) false_raises: u32,
+    pub(crate) far_false_raises: u32,
+    /// Times it was cleared again before the end of life.
+    pub(crate) flickers: u32,
+}
+
+impl Judged {
+    /// Whether the first raise came while the truth was still above the threshold by more than `margin` of rated.
+    pub(crate) fn is_false(&self, margin: f64) -> bool {
+        self.first.is_some_and(|look| look.true_ah > (THRESHOLD + margin) * RATED_AH)
+    }
+
+    /// The first raise before the end of life.
+    pub(crate) fn in_time(&self, life: &Life) -> Option<Look> {
+        self.first.filter(|look| life.end.is_none_or(|end| look.cycle < end.cycle))
+    }
+}
+
+/// What the rule's alarm did at each look of a life.
+pub(crate) fn changes(rule: &Candidate, life: &Life) -> Vec<Option<Change>> {
+    let threshold = THRESHOLD * RATED_AH;
+    let config = RuleConfig {
+        rule: Rule::CapacityLow,
+        severity: Severity::Warning,
+        threshold,
+        clear: threshold * (1.0 + HYSTERESIS),
+        when: rule.when,
+        debounce_s: 0.0,
+        debounce_events: rule.debounce_events,
+        is_latching: false,
+    };
+    let mut engine = AlarmEngine::new(vec![config], 1);
+    let mut observe = |look: &Look| {
+        let mut out = Vec::new();
+        if look.is_measured {
+            let seen = Observation::new(Some(look.mean_ah)).with_std(look.std_ah);
+            engine.observe(look.time, Rule::CapacityLow, Some(CellIndex(0)), &seen, &mut out);
+        }
+        out.first().map(|change| change.change)
+    };
+    life.looks.iter().map(&mut observe).collect()
+}
+
+/// Judges a life by a rule.
+pub(crate) fn judge(rule: &Candidate, life: &Life) -> Judged {
+    let mut judged = Judged::default();
+    for (look, change) in life.looks.iter().zip(changes(rule, life)) {
+        let margin = look.true_ah / RATED_AH - THRESHOLD;
+        match change {
+            Some(Change::Raised) => {
+                judged.first.get_or_insert(*look);
+                judged.false_raises += u32::from(margin > 0.0);
+                judged.far_false_raises += u32::from(margin > 0.01);
+            }
+            Some(Change::Cleared) if life.end.is_none_or(|end| look.cycle < end.cycle) => judged.flickers += 1,
+            _ => {}
+        }
+    }
+    judged
+}

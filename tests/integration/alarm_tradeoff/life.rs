@@ -1,0 +1,418 @@
+//! One simulated life: a cell that ages, its usage, its sensors, a model that is somewhat wrong, and its Monitor.
+//!
+//! Out: what the Monitor said of the capacity after each half-cycle, beside the truth, and which of its own alarms it
+//! raised there. The same life (cell, usage, errors of the model) is lived with every sensor set; only what is drawn for
+//! the sensors differs, and that by its size alone.
+
+use std::path::Path;
+
+use packwatch::alarm::{Change, Severity};
+use packwatch::can::encode::InputEncoder;
+use packwatch::cell::CellModel;
+use packwatch::config;
+use packwatch::monitor::{EventKind, Input, Monitor, MonitorConfig, Outputs};
+use packwatch::quantity::{CellIndex, Channel, SensorIndex, Timestamp};
+use packwatch::sim::{Ageing, Hysteresis, Pack, PackSettings, Settings};
+
+use super::dice::Dice;
+
+pub(crate) const RATED_AH: f64 = 2.6;
+/// Parts of the rated capacity: the alarm's threshold, and the end of life.
+pub(crate) const THRESHOLD: f64 = 0.80;
+pub(crate) const END_OF_LIFE: f64 = 0.70;
+
+/// Between two readings, s.
+const SAMPLE_S: f64 = 10.0;
+/// The load is switched this long after the last reading before, s: no reading stands for two loads.
+const SWITCH_S: f64 = 0.1;
+/// Ticks per reading: without any for 5 s the Monitor takes the computer to have been asleep.
+const TICKS: u32 = 4;
+/// An ageing cell is followed for this many half-cycles beyond its end; a healthy one would come near the threshold.
+const AFTERLIFE: u32 = 4;
+/// A charge at constant voltage ends at this current, A.
+const TAPER_END_A: f64 = RATED_AH / 10.0;
+/// Charge moved in one cycle on average, relative to the rated capacity: what turns cycles into ampere-hours.
+const MOVED_PER_CYCLE: f64 = 2.0 * 0.55 * 0.85;
+
+/// Streams of a life's random numbers.
+const CELL: u64 = 0;
+const USAGE: u64 = 1;
+const SENSORS: u64 = 2;
+
+/// What is known of a sensor set. Offsets and gains are standard deviations over the lives: each life's sensors have
+/// their own, for good. Noise is white, per reading.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SensorSet {
+    pub(crate) name: &'static str,
+    pub(crate) voltage_noise_v: f64,
+    pub(crate) voltage_offset_v: f64,
+    pub(crate) current_noise_a: f64,
+    pub(crate) current_gain: f64,
+    pub(crate) current_offset_a: f64,
+    pub(crate) temperature_noise_c: f64,
+    pub(crate) temperature_offset_c: f64,
+    pub(crate) dead_band_a: f64,
+}
+
+pub(crate) const SENSOR_SETS: [SensorSet; 3] = [
+    SensorSet {
+        name: "good",
+        voltage_noise_v: 0.001,
+        voltage_offset_v: 0.0005,
+        current_noise_a: 0.005,
+        current_gain: 0.002,
+        current_offset_a: 0.002,
+        temperature_noise_c: 0.1,
+        temperature_offset_c: 0.3,
+        dead_band_a: 0.1,
+    },
+    SensorSet {
+        name: "usual",
+        voltage_noise_v: 0.005,
+        voltage_offset_v: 0.002,
+        current_noise_a: 0.020,
+        current_gain: 0.005,
+        current_offset_a: 0.010,
+        temperature_noise_c: 0.3,
+        temperature_offset_c: 1.0,
+        dead_band_a: 0.1,
+    },
+    SensorSet {
+        name: "poor",
+        voltage_noise_v: 0.015,
+        voltage_offset_v: 0.005,
+        current_noise_a: 0.080,
+        current_gain: 0.015,
+        current_offset_a: 0.030,
+        temperature_noise_c: 1.0,
+        temperature_offset_c: 3.0,
+        dead_band_a: 0.25,
+    },
+];
+
+/// Which lives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// Fades through the threshold to its end.
+    Ageing,
+    /// Stays above the threshold.
+    Healthy,
+}
+
+/// What the Monitor said after one half-cycle, and what was true.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Look {
+    pub(crate) time: Timestamp,
+    /// Cycles so far: half-cycles over two.
+    pub(crate) cycle: f64,
+    /// Equivalent full cycles so far: charge moved over twice the rated capacity.
+    pub(crate) full_cycles: f64,
+    pub(crate) true_ah: f64,
+    pub(crate) mean_ah: f64,
+    pub(crate) std_ah: f64,
+    /// Whether the half-cycle carried information: else no rule is asked.
+    pub(crate) is_measured: bool,
+    /// What the Monitor's own alarms of severity info, warning and severe did here.
+    pub(crate) reported: [Option<Change>; 3],
+}
+
+/// Where in a life something happened.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Place {
+    pub(crate) cycle: f64,
+    pub(crate) full_cycles: f64,
+}
+
+/// A life as it was lived.
+#[derive(Debug, Clone)]
+pub(crate) struct Life {
+    pub(crate) looks: Vec<Look>,
+    pub(crate) crossing: Option<Place>,
+    pub(crate) end: Option<Place>,
+    pub(crate) resets: u32,
+}
+
+/// How the capacity falls: from `start` by `loss * x^curvature`, x = charge moved over `span_ah`.
+#[derive(Debug, Clone, Copy)]
+struct Fade {
+    start: f64,
+    loss: f64,
+    curvature: f64,
+    span_ah: f64,
+    growth: f64,
+}
+
+impl Fade {
+    fn draw(kind: Kind, dice: &mut Dice) -> Self {
+        let start = 1.0 + dice.normal(0.02).clamp(-0.05, 0.05);
+        let floor = match kind {
+            Kind::Ageing => END_OF_LIFE,
+            Kind::Healthy => dice.uniform(THRESHOLD + 0.01, 0.95),
+        };
+        let cycles = dice.uniform(60.0, 150.0);
+        Self {
+            start,
+            loss: (start - floor).max(0.0),
+            curvature: dice.uniform(0.7, 1.8),
+            span_ah: cycles * MOVED_PER_CYCLE * RATED_AH,
+            growth: dice.uniform(0.2, 0.8),
+        }
+    }
+
+    fn capacity_ah(&self, moved_ah: f64) -> f64 {
+        RATED_AH * (self.start - self.loss * libm::pow(moved_ah / self.span_ah, self.curvature))
+    }
+
+    /// What a charge of `ah` takes from here on, per Ah.
+    fn ageing(&self, moved_ah: f64, ah: f64) -> Ageing {
+        Ageing {
+            capacity_loss_ah_per_ah: (self.capacity_ah(moved_ah) - self.capacity_ah(moved_ah + ah)) / ah,
+            resistance_growth_per_ah: self.growth / self.span_ah,
+            ..Ageing::default()
+        }
+    }
+}
+
+/// The Monitor's configuration for a sensor set whose data sheet is known.
+pub(crate) fn configuration(set: &SensorSet) -> MonitorConfig {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("config");
+    let numbers = [
+        ("@DEAD_BAND_A@", set.dead_band_a),
+        ("@VOLTAGE_NOISE_V@", set.voltage_noise_v),
+        ("@CURRENT_GAIN@", set.current_gain),
+    ];
+    let text = numbers
+        .iter()
+        .fold(include_str!("study.toml").to_owned(), |text, (name, number)| text.replace(name, &format!("{number:?}")));
+    let path = folder.join("study.toml");
+    let read = |asked: &Path| if asked == path { Ok(text.clone().into_bytes()) } else { std::fs::read(asked) };
+    let config = config::load_with(&path, &read).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n")));
+    config.monitor
+}
+
+/// The cell as it really is, seen from the model the estimator has: a few mV and a few percent beside it.
+fn true_model(model: &CellModel, dice: &mut Dice) -> CellModel {
+    let mut truth = model.clone();
+    let common_v = dice.normal(0.002);
+    let offsets_v: Vec<f64> = truth.soc.iter().map(|_| common_v + dice.normal(0.003)).collect();
+    for row in &mut truth.ocv_v.values {
+        row.iter_mut().zip(&offsets_v).for_each(|(ocv_v, offset_v)| *ocv_v += offset_v);
+    }
+    let mut scale = |values: &mut Vec<Vec<f64>>, std: f64| {
+        let factor = dice.factor(std);
+        values.iter_mut().flatten().for_each(|value| *value *= factor);
+    };
+    scale(&mut truth.r0_ohm.values, 0.05);
+    for branch in &mut truth.branches {
+        scale(&mut branch.r_ohm.values, 0.10);
+        scale(&mut branch.c_farad.values, 0.20);
+    }
+    truth
+}
+
+/// One life being lived.
+struct Rig {
+    fade: Fade,
+    pack: Pack,
+    ambient_c: f64,
+    usage: Dice,
+    sensors: Sensors,
+    monitor: Monitor,
+    encoder: InputEncoder,
+    out: Outputs,
+    time: Timestamp,
+    half_cycles: u32,
+    life: Life,
+}
+
+/// A life's sensors: what was drawn for good, and the dice for the noise.
+struct Sensors {
+    set: SensorSet,
+    gain: f64,
+    offset_a: f64,
+    offset_v: f64,
+    offset_c: f64,
+    dice: Dice,
+}
+
+impl Sensors {
+    fn new(set: &SensorSet, seed: u64) -> Self {
+        let mut dice = Dice::new(seed, SENSORS);
+        Self {
+            set: *set,
+            gain: dice.normal(set.current_gain),
+            offset_a: dice.normal(set.current_offset_a),
+            offset_v: dice.normal(set.voltage_offset_v),
+            offset_c: dice.normal(set.temperature_offset_c),
+            dice,
+        }
+    }
+
+    fn read(&mut self, current_a: f64, voltage_v: f64, temperature_c: f64) -> [(Channel, Option<f64>); 3] {
+        let (set, dice) = (&self.set, &mut self.dice);
+        let current_a = current_a * (1.0 + self.gain) + self.offset_a + dice.normal(set.current_noise_a);
+        let voltage_v = voltage_v + self.offset_v + dice.normal(set.voltage_noise_v);
+        let temperature_c = temperature_c + self.offset_c + dice.normal(set.temperature_noise_c);
+        [
+            (Channel::Current, Some(current_a)),
+            (Channel::Temperature(SensorIndex(0)), Some(temperature_c)),
+            (Channel::CellVoltage(CellIndex(0)), Some(voltage_v)),
+        ]
+    }
+}
+
+/// Lives one life to its end.
+pub(crate) fn live(config: &MonitorConfig, set: &SensorSet, kind: Kind, seed: u64) -> Life {
+    let mut rig = Rig::new(config, set, kind, seed);
+    let mut after = 0;
+    while after < AFTERLIFE {
+        rig.cycle();
+        let is_over = match kind {
+            Kind::Ageing => rig.life.end.is_some(),
+            Kind::Healthy => rig.truth().throughput_ah >= rig.fade.span_ah,
+        };
+        after += match (is_over, kind) {
+            (false, _) => 0,
+            (true, Kind::Ageing) => 2,
+            (true, Kind::Healthy) => AFTERLIFE,
+        };
+    }
+    rig.life
+}
+
+impl Rig {
+    fn new(config: &MonitorConfig, set: &SensorSet, kind: Kind, seed: u64) -> Self {
+        let mut dice = Dice::new(seed, CELL);
+        let fade = Fade::draw(kind, &mut dice);
+        let model = true_model(&config.model, &mut dice);
+        let ambient_c = dice.uniform(10.0, 35.0);
+        let settings = PackSettings {
+            capacity_ah: fade.start * RATED_AH,
+            initial_soc: dice.uniform(0.4, 0.8),
+            hysteresis: Hysteresis { magnitude_v: dice.uniform(0.0, 0.004), ..Hysteresis::default() },
+            ambient_c,
+            ageing: Ageing::default(),
+            ..Settings::of(packwatch::sim::Scenario::Paper, RATED_AH).pack
+        };
+        Self {
+            fade,
+            pack: Pack::new(model, settings, seed),
+            ambient_c,
+            usage: Dice::new(seed, USAGE),
+            sensors: Sensors::new(set, seed),
+            monitor: Monitor::new(config.clone()),
+            encoder: InputEncoder::new(&config.input),
+            out: Outputs::default(),
+            time: Timestamp::ZERO,
+            half_cycles: 0,
+            life: Life { looks: Vec::new(), crossing: None, end: None, resets: 0 },
+        }
+    }
+
+    fn truth(&self) -> &packwatch::sim::TruthCell {
+        &self.pack.cells()[0]
+    }
+
+    fn place(&self) -> Place {
+        Place { cycle: f64::from(self.half_cycles) / 2.0, full_cycles: self.truth().throughput_ah / (2.0 * RATED_AH) }
+    }
+
+    /// Discharge, pause, charge, pause: a partial swing of 30 to 80 % at currents and a temperature of its own.
+    fn cycle(&mut self) {
+        let usage = &mut self.usage;
+        let (low, high) = (usage.uniform(0.12, 0.38), usage.uniform(0.68, 0.92));
+        let (discharge_a, charge_a) = (RATED_AH * usage.uniform(0.3, 1.0), RATED_AH * usage.uniform(0.2, 0.7));
+        let pauses_s = [usage.uniform(600.0, 2400.0), usage.uniform(600.0, 2400.0)];
+        let ambient_c = (self.ambient_c + usage.normal(4.0)).clamp(5.0, 40.0);
+        self.pack.set_ambient(ambient_c);
+        self.age();
+        let (low_v, high_v) = (self.pack.model().voltage_min_v, self.pack.model().voltage_max_v);
+        while self.truth().soc > low && self.pack.lowest_v(discharge_a) > low_v {
+            self.step(discharge_a, SAMPLE_S);
+        }
+        self.half_cycles += 1;
+        self.pause(discharge_a, pauses_s[0]);
+        self.age();
+        let mut current_a = 0.0;
+        while self.truth().soc < high {
+            current_a = self.pack.current_at_highest_a(high_v).max(-charge_a);
+            if current_a > -TAPER_END_A {
+                break;
+            }
+            self.step(current_a, SAMPLE_S);
+        }
+        self.half_cycles += 1;
+        self.pause(current_a, pauses_s[1]);
+    }
+
+    /// The fade of the next half-cycle, as steep as its curve is here.
+    fn age(&mut self) {
+        let moved_ah = self.truth().throughput_ah;
+        self.pack.set_ageing(self.fade.ageing(moved_ah, 0.5 * MOVED_PER_CYCLE * RATED_AH));
+    }
+
+    fn pause(&mut self, last_a: f64, duration_s: f64) {
+        self.step(last_a, SWITCH_S);
+        for _ in 0..(duration_s / SAMPLE_S) as u32 {
+            self.step(0.0, SAMPLE_S);
+        }
+        self.step(0.0, SWITCH_S);
+    }
+
+    /// One reading at `current_a`, which flows for `dt_s` from there.
+    fn step(&mut self, current_a: f64, dt_s: f64) {
+        let (voltage_v, temperature_c) = (self.pack.lowest_v(current_a), self.truth().temperature_c);
+        let readings = self.sensors.read(current_a, voltage_v, temperature_c);
+        let mut frames = Vec::new();
+        self.encoder.encode(&readings, &mut frames);
+        let time = self.time;
+        self.monitor.handle(Input::Tick { time }, &mut self.out);
+        for (bus, frame) in &frames {
+            self.monitor.handle(Input::Frame { time, bus: *bus, frame }, &mut self.out);
+        }
+        for tick in 1..TICKS {
+            let time = time.plus_secs(dt_s * f64::from(tick) / f64::from(TICKS));
+            self.monitor.handle(Input::Tick { time }, &mut self.out);
+        }
+        self.listen();
+        self.pack.step(current_a, dt_s);
+        self.time = time.plus_secs(dt_s);
+        let (mut place, health) = (self.place(), self.truth().capacity_ah / RATED_AH);
+        place.cycle += 0.5; // dated to the end of the half-cycle it falls in: the first moment anybody could know
+        let (life, beyond) = (&mut self.life, |limit: f64| (health < limit).then_some(place));
+        life.crossing = life.crossing.or(beyond(THRESHOLD));
+        life.end = life.end.or(beyond(END_OF_LIFE));
+    }
+
+    fn listen(&mut self) {
+        for event in &self.out.events {
+            match event.kind {
+                EventKind::Capacity { measured_ah, capacity_ah, capacity_std_ah, .. } => {
+                    let (place, true_ah) = (self.place(), self.truth().capacity_ah);
+                    self.life.looks.push(Look {
+                        time: event.time,
+                        cycle: place.cycle,
+                        full_cycles: place.full_cycles,
+                        true_ah,
+                        mean_ah: capacity_ah,
+                        std_ah: capacity_std_ah,
+                        is_measured: measured_ah.is_some(),
+                        reported: [None; 3],
+                    });
+                }
+                EventKind::Alarm { change, severity, .. } => {
+                    let slot = match severity {
+                        Severity::Info => 0,
+                        Severity::Warning => 1,
+                        Severity::Severe => 2,
+                    };
+                    let look = self.life.looks.last_mut().expect("an alarm about capacity follows a half-cycle");
+                    look.reported[slot] = Some(change);
+                }
+                EventKind::FilterReset { .. } => self.life.resets += 1,
+                _ => {}
+            }
+        }
+        self.out.clear();
+    }
+}

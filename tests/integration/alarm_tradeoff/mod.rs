@@ -1,0 +1,130 @@
+//! Lead time against false alarms: `when = "mean"` beside `when = { probability = p }`, on simulated lives.
+//!
+//! Each life goes through the whole core in this process: a cell that fades its own way, sensors with errors of their
+//! own, frames, Monitor. What the Monitor said of the capacity is then judged by every rule; three of the rules run in
+//! the Monitor itself and must do the same there. A few lives are judged on every run; the whole study (200 lives and
+//! 100 that stay healthy, by three sensor sets) writes `tests/alarm_tradeoff.md`, in some minutes:
+//! `PACKWATCH_WRITE_TRADEOFF=1 cargo test --release --test integration alarm_tradeoff -- --nocapture`
+
+mod calibration;
+mod dice;
+mod judged;
+mod life;
+mod report;
+
+use std::path::Path;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use judged::{CANDIDATES, HALF, MEAN, MONITORED, P95, judge};
+use life::{Kind, Life, SENSOR_SETS, SensorSet};
+
+/// Lives of the whole study, per sensor set.
+const LIVES: usize = 200;
+/// Lives that stay healthy beside them.
+const HEALTHY: usize = 100;
+/// Seeds: the n-th ageing life has `AGEING_SEED + n`, the n-th healthy one `HEALTHY_SEED + n`.
+const AGEING_SEED: u64 = 1_000;
+const HEALTHY_SEED: u64 = 5_000;
+/// Lives of each kind that every run judges.
+const QUICK: (usize, usize) = (6, 3);
+
+const WRITE: &str = "PACKWATCH_WRITE_TRADEOFF";
+
+/// All lives seen by one sensor set.
+struct Fleet {
+    set: &'static SensorSet,
+    ageing: Vec<Life>,
+    healthy: Vec<Life>,
+}
+
+impl Fleet {
+    fn live(set: &'static SensorSet, ageing: usize, healthy: usize) -> Self {
+        let config = life::configuration(set);
+        let lives = in_parallel(ageing + healthy, |n| match n.checked_sub(ageing) {
+            None => life::live(&config, set, Kind::Ageing, AGEING_SEED + n as u64),
+            Some(n) => life::live(&config, set, Kind::Healthy, HEALTHY_SEED + n as u64),
+        });
+        let healthy = lives[ageing..].to_vec();
+        Self { set, ageing: lives[..ageing].to_vec(), healthy }
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Life> {
+        self.ageing.iter().chain(&self.healthy)
+    }
+
+    /// What must hold whatever the sensors.
+    fn check(&self) {
+        assert!(self.ageing.iter().all(|life| life.crossing.is_some() && life.end.is_some()), "every life ends");
+        assert!(self.healthy.iter().all(|life| life.crossing.is_none()), "healthy cells stay above");
+        for life in self.all() {
+            for (severity, rule) in MONITORED.into_iter().enumerate() {
+                let reported: Vec<_> = life.looks.iter().map(|look| look.reported[severity]).collect();
+                assert_eq!(
+                    reported,
+                    judged::changes(&CANDIDATES[rule], life),
+                    "the Monitor's own {}",
+                    CANDIDATES[rule].name
+                );
+            }
+            let firsts = CANDIDATES.map(|rule| judge(&rule, life).first.map_or(f64::INFINITY, |look| look.cycle));
+            assert_eq!(firsts[HALF], firsts[MEAN], "one half is the mean");
+            let by_level: Vec<f64> =
+                firsts.iter().zip(&CANDIDATES).filter(|(_, rule)| rule.debounce_events == 1).map(|(f, _)| *f).collect();
+            assert!(by_level.is_sorted(), "a higher probability is never reached earlier: {by_level:?}");
+        }
+    }
+}
+
+/// `work(0..count)` on every processor, results in order.
+fn in_parallel<T: Send>(count: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
+    let (next, done) = (AtomicUsize::new(0), Mutex::new(Vec::with_capacity(count)));
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        for _ in 0..threads.min(count) {
+            scope.spawn(|| {
+                loop {
+                    let n = next.fetch_add(1, Ordering::Relaxed);
+                    if n >= count {
+                        break;
+                    }
+                    let result = work(n);
+                    done.lock().expect("no thread panics while it holds this").push((n, result));
+                }
+            });
+        }
+    });
+    let mut done = done.into_inner().expect("no thread panics while it holds this");
+    done.sort_by_key(|(n, _)| *n);
+    done.into_iter().map(|(_, result)| result).collect()
+}
+
+#[test]
+fn a_higher_probability_is_reached_later_and_with_fewer_false_alarms() {
+    let fleet = Fleet::live(&SENSOR_SETS[1], QUICK.0, QUICK.1);
+    fleet.check();
+    let early = |rule: usize| fleet.ageing.iter().filter(|life| judge(&CANDIDATES[rule], life).is_false(0.0)).count();
+    let (eager, sure) = (early(0), early(P95));
+    println!("{}", report::rules_table(&fleet));
+    assert!(eager > sure, "early raises: {eager} at p = 0.05, {sure} at p = 0.95");
+    for life in &fleet.ageing {
+        assert!(judge(&CANDIDATES[MEAN], life).in_time(life).is_some(), "the mean rule misses a life");
+    }
+    for life in &fleet.healthy {
+        assert!(judge(&CANDIDATES[P95], life).first.is_none(), "p = 0.95 calls a healthy cell worn");
+    }
+}
+
+#[test]
+fn the_whole_study_is_written_when_asked_for() {
+    if std::env::var_os(WRITE).is_none() {
+        println!("skipped: {WRITE} is not set");
+        return;
+    }
+    let fleets: Vec<Fleet> = SENSOR_SETS.iter().map(|set| Fleet::live(set, LIVES, HEALTHY)).collect();
+    let text = report::document(&fleets);
+    println!("{text}");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/alarm_tradeoff.md");
+    std::fs::write(&path, text).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    fleets.iter().for_each(Fleet::check);
+}

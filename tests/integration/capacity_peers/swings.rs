@@ -1,0 +1,235 @@
+//! Swings from the voltage alone: SOC at both ends by inversion of the open-circuit curve.
+//!
+//! V + I R0 rho + sum U is taken as the open-circuit voltage, with the branches' voltages stepped open loop from rest
+//! (from 180 s on where a record begins under load) and the resistance ratio rho that the filter has; all readings of
+//! the first and of the last 60 s count, each with the charge that had flowed by then, so nothing is assumed of the
+//! capacity but the curve's change of shape with it. The deviation of an end is the product's own (`[capacity]`).
+
+use packwatch::cell::circuit::BranchAt;
+use packwatch::cell::{CellModel, Discretisation, MAX_BRANCHES};
+use packwatch::health::CapacityConfig;
+
+use super::least_squares::Swing;
+
+/// A longer step is a gap: what flowed in it is unknown.
+const GAP_S: f64 = 60.0;
+/// Below it the cell rests, A.
+const REST_A: f64 = 0.05;
+/// Three time constants of the models' slowest branch, after which its unknown start is forgotten.
+const SETTLING_S: f64 = 180.0;
+/// Length of an end, s.
+const END_S: f64 = 60.0;
+/// The charge that must flow back before a swing is over, part of the model's capacity.
+const REVERSAL: f64 = 0.02;
+/// The least swing used, part of the model's capacity.
+const MIN_SWING: f64 = 0.05;
+/// White noise of a voltage reading, V.
+const VOLTAGE_NOISE_V: f64 = 0.005;
+
+/// One reading and the resistance ratio of the moment.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Reading {
+    pub(crate) time_s: f64,
+    pub(crate) voltage_v: f64,
+    pub(crate) current_a: f64,
+    pub(crate) temperature_c: f64,
+    pub(crate) resistance_ratio: f64,
+    /// The filter's SOC and its variance.
+    pub(crate) soc: f64,
+    pub(crate) soc_variance: f64,
+}
+
+/// What one reading says, or the mean of several.
+#[derive(Debug, Clone, Copy, Default)]
+struct Point {
+    time_s: f64,
+    /// From the open-circuit curve of the new cell.
+    new_soc: f64,
+    /// Variance of that.
+    variance: f64,
+    /// Charge taken out so far, Ah.
+    charge_ah: f64,
+    /// The filter's SOC and its variance.
+    soc: f64,
+    soc_variance: f64,
+    known: bool,
+}
+
+/// A swing between two ends.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Weighed {
+    pub(crate) start_s: f64,
+    pub(crate) end_s: f64,
+    ends: [Point; 2],
+}
+
+impl Weighed {
+    /// For the least squares of a cell believed to have `capacity_ah` (the curve's shape follows it).
+    pub(crate) fn swing(&self, model: &CellModel, config: &CapacityConfig, capacity_ah: f64) -> Swing {
+        let lost = 1.0 - capacity_ah / model.capacity_ah;
+        let [(a, a_variance), (b, b_variance)] = self.ends.map(|end| {
+            let soc = aged_soc(model, end.new_soc, capacity_ah);
+            let shape = config.ageing_shift_error * lost * soc * (1.0 - soc);
+            (soc, end.variance + shape * shape)
+        });
+        self.between(config, a - b, a_variance + b_variance)
+    }
+
+    /// With the filter's own SOC at the same ends.
+    pub(crate) fn filter_swing(&self, config: &CapacityConfig) -> Swing {
+        let [a, b] = &self.ends;
+        self.between(config, a.soc - b.soc, a.soc_variance + b.soc_variance)
+    }
+
+    fn between(&self, config: &CapacityConfig, fall: f64, x_variance: f64) -> Swing {
+        let moved_ah = self.ends[1].charge_ah - self.ends[0].charge_ah;
+        let (x, y_ah) = (fall * moved_ah.signum(), moved_ah.abs());
+        Swing { x, x_variance, y_ah, y_variance: charge_variance(config, y_ah, self.end_s - self.start_s) }
+    }
+}
+
+/// Variance of a charge by the sensor's gain and offset, Ah^2.
+pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_s: f64) -> f64 {
+    let gain_ah = config.current_gain_std * charge_ah;
+    let offset_ah = config.current_offset_std_a * duration_s / 3600.0;
+    // The floor is for a configuration which knows of neither: a thousandth of the charge.
+    (gain_ah * gain_ah + offset_ah * offset_ah).max(1e-6 * charge_ah * charge_ah)
+}
+
+/// The SOC whose open-circuit voltage an aged cell shares with a new one at `new_soc`.
+fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
+    let (mut low, mut high) = (-0.5, 1.5);
+    for _ in 0..40 {
+        let middle = 0.5 * (low + high);
+        if model.ocv_soc(middle, capacity_ah) < new_soc { low = middle } else { high = middle }
+    }
+    0.5 * (low + high)
+}
+
+/// Which readings make the ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ends {
+    /// The first and last there are, at rest where the cell rests.
+    Outer,
+    /// Those with current only.
+    Loaded,
+}
+
+/// All swings of a life.
+pub(crate) fn weigh(model: &CellModel, config: &CapacityConfig, ends: Ends, readings: &[Reading]) -> Vec<Weighed> {
+    let mut swings = Vec::new();
+    let mut points: Vec<Point> = Vec::new();
+    let mut circuit = Circuit::default();
+    for reading in readings {
+        if circuit.last.is_none_or(|last| reading.time_s - last.time_s > GAP_S) {
+            swings.extend(between_ends(model, &points));
+            points.clear();
+            circuit.begin(reading);
+        }
+        let mut point = circuit.step(model, config, reading);
+        point.known &= ends == Ends::Outer || reading.current_a.abs() >= REST_A;
+        points.push(point);
+        if let Some(turn) = reversal(model, &points) {
+            let after = points.split_off(turn);
+            swings.extend(between_ends(model, &points));
+            points = after;
+        }
+    }
+    swings.extend(between_ends(model, &points));
+    swings
+}
+
+/// Where the charge turned, when enough has flowed back by the last point.
+fn reversal(model: &CellModel, points: &[Point]) -> Option<usize> {
+    let (first, last) = (points.first()?.charge_ah, points.last()?.charge_ah);
+    // Looked for at every 32nd point only: a turn lies in the past by far more when it counts.
+    if !points.len().is_multiple_of(32) {
+        return None;
+    }
+    let by =
+        |a: &usize, b: &usize| (points[*a].charge_ah - first).abs().total_cmp(&(points[*b].charge_ah - first).abs());
+    let turn = (0..points.len()).max_by(by)?;
+    let back_ah = (points[turn].charge_ah - last).abs();
+    let gone_ah = (points[turn].charge_ah - first).abs();
+    (back_ah > REVERSAL * model.capacity_ah && gone_ah > REVERSAL * model.capacity_ah && turn > 0).then_some(turn)
+}
+
+fn between_ends(model: &CellModel, points: &[Point]) -> Option<Weighed> {
+    let start_s = points.iter().find(|point| point.known)?.time_s;
+    let end_s = points.iter().rfind(|point| point.known)?.time_s;
+    if end_s - start_s < 2.0 * END_S {
+        return None;
+    }
+    let ends = [(start_s, start_s + END_S), (end_s - END_S, end_s)]
+        .map(|(from, to)| mean(points.iter().filter(|p| p.known && (from..=to).contains(&p.time_s))));
+    let moved_ah = (ends[1].charge_ah - ends[0].charge_ah).abs();
+    (moved_ah > MIN_SWING * model.capacity_ah).then_some(Weighed { start_s, end_s, ends })
+}
+
+/// Mean of points; the errors of the curve repeat, so their variance does not fall with the count.
+fn mean<'a>(points: impl Iterator<Item = &'a Point> + Clone) -> Point {
+    let n = points.clone().count() as f64;
+    let of = |value: fn(&Point) -> f64| points.clone().map(value).sum::<f64>() / n;
+    Point {
+        time_s: of(|p| p.time_s),
+        new_soc: of(|p| p.new_soc),
+        variance: of(|p| p.variance),
+        charge_ah: of(|p| p.charge_ah),
+        soc: of(|p| p.soc),
+        soc_variance: of(|p| p.soc_variance),
+        known: true,
+    }
+}
+
+/// The branches, open loop.
+#[derive(Debug, Default)]
+struct Circuit {
+    last: Option<Reading>,
+    branch_v: [f64; MAX_BRANCHES],
+    known_from_s: f64,
+    charge_ah: f64,
+}
+
+impl Circuit {
+    fn begin(&mut self, reading: &Reading) {
+        self.branch_v = [0.0; MAX_BRANCHES];
+        let rested = reading.current_a.abs() < REST_A;
+        self.known_from_s = reading.time_s + if rested { 0.0 } else { SETTLING_S };
+        self.last = None;
+    }
+
+    fn step(&mut self, model: &CellModel, config: &CapacityConfig, reading: &Reading) -> Point {
+        let &Reading { time_s, voltage_v, current_a, temperature_c, resistance_ratio, .. } = reading;
+        let mut load_v = self.branch_v.iter().sum::<f64>();
+        // Resistances are those at the SOC of the voltage; two passes settle it.
+        let mut soc = 0.5;
+        for _ in 0..3 {
+            let r0_ohm = model.r0_ohm(&model.grid_position(soc, temperature_c)) * resistance_ratio;
+            soc = model.soc_of_ocv(voltage_v + load_v + current_a * r0_ohm, temperature_c);
+        }
+        let place = model.grid_position(soc, temperature_c);
+        if let Some(last) = self.last {
+            let (dt_s, mean_a) = (time_s - last.time_s, 0.5 * (current_a + last.current_a));
+            self.charge_ah += mean_a * dt_s / 3600.0;
+            for (i, v) in self.branch_v.iter_mut().enumerate().take(model.branches.len()) {
+                let branch = BranchAt::new(model, i, &place, resistance_ratio);
+                *v = branch.voltage_after(Discretisation::Exact, *v, mean_a, dt_s);
+            }
+            load_v = self.branch_v.iter().sum();
+        }
+        load_v += current_a * model.r0_ohm(&place) * resistance_ratio;
+        let new_soc = model.soc_of_ocv(voltage_v + load_v, temperature_c);
+        let volts = config.end_error_v.hypot(config.end_load_error * load_v).hypot(0.25 * VOLTAGE_NOISE_V);
+        let deviation = volts / model.ocv_slope_v(&model.grid_position(new_soc, temperature_c));
+        self.last = Some(*reading);
+        Point {
+            time_s,
+            new_soc,
+            variance: deviation * deviation,
+            charge_ah: self.charge_ah,
+            soc: reading.soc,
+            soc_variance: reading.soc_variance,
+            known: time_s >= self.known_from_s,
+        }
+    }
+}

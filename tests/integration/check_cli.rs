@@ -1,0 +1,116 @@
+//! `packwatch check` as its user runs it.
+
+use std::path::{Path, PathBuf};
+
+use assert_cmd::Command;
+
+fn packwatch() -> Command {
+    let mut command = Command::cargo_bin("packwatch").unwrap();
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
+    command
+}
+
+/// Standard output of a run that must succeed without a word on standard error.
+fn good(args: &[&str]) -> String {
+    let output = packwatch().args(args).output().unwrap();
+    let text = |bytes: &[u8]| String::from_utf8(bytes.to_vec()).unwrap();
+    assert!(output.status.success() && output.stderr.is_empty(), "{args:?}: {}", text(&output.stderr));
+    text(&output.stdout)
+}
+
+/// Exit code and lines on standard error of a run that must fail without a word on standard output.
+fn bad(file: &Path) -> (i32, Vec<String>) {
+    let output = packwatch().arg("check").arg(file).output().unwrap();
+    assert!(output.stdout.is_empty());
+    let lines = String::from_utf8(output.stderr).unwrap().lines().map(str::to_owned).collect();
+    (output.status.code().unwrap(), lines)
+}
+
+/// The shipped files of `config/`, or of a folder below, that end in `.toml`.
+fn shipped(folder: &str) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap();
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    files.retain(|file| file.extension().is_some_and(|extension| extension == "toml"));
+    files.sort();
+    assert!(!files.is_empty());
+    files
+}
+
+#[test]
+fn every_shipped_configuration_is_good() {
+    for file in shipped("config") {
+        let said = good(&["check", file.to_str().unwrap()]);
+        assert!(said.starts_with(&format!("{}: good\n", file.display())), "{said}");
+    }
+}
+
+#[test]
+fn every_shipped_cell_model_is_good() {
+    for file in shipped("config/cells") {
+        packwatch::config::cell_model::load(&file).unwrap();
+    }
+}
+
+#[test]
+fn a_good_file_is_explained() {
+    let said = good(&["check", "config/example.toml"]);
+    for part in [
+        "96 cells in series, each with its own voltage",
+        "can0: classic, kernel filter 100 110 120",
+        "bit 0 length 16 little-endian signed     x 0.1 + 0 A",
+        "positive = charge on the bus; not available 8000",
+        "CellVoltages.CellVoltage96 [Page = 31]",
+        "cells 89-96; not available 8000",
+        "pack current from -15 to 30 A, stale after 0.5 s",
+        "severe when a cell's capacity is below 1.82 Ah (70 % of rated) with a probability above 80 %, cleared at 1.872 Ah",
+    ] {
+        assert!(said.contains(part), "{part} in\n{said}");
+    }
+}
+
+#[test]
+fn json_says_the_same_for_scripts() {
+    let json: serde_json::Value = serde_json::from_str(&good(&["check", "--json", "config/example.toml"])).unwrap();
+    assert_eq!(json["signals"].as_array().unwrap().len(), 1 + 12 + 96);
+    assert_eq!(json["signals"][0]["channel"], "pack current");
+    assert_eq!(json["signals"][0]["scale"], -1.0);
+    assert_eq!(json["signals"][108]["multiplex"], "Page = 31");
+    assert_eq!(json["interfaces"][0]["filter_ids"], serde_json::json!(["100", "110", "120"]));
+}
+
+#[test]
+fn all_faults_of_all_files_are_reported_and_the_exit_code_is_78() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    write("cell.toml", "format = 1\nname = \"x\"\nrated_capacity_ah = 0\n");
+    write("pack.dbc", "VERSION \"\"\nBO_ 1 A: 8 X\n SG_ nonsense\n");
+    write("pack.toml", "[pack]\ncells = 0\ncell_model = \"cell.toml\"\n[input]\ndbc = [\"pack.dbc\"]\nspeed = 3\n");
+    let (code, lines) = bad(&folder.path().join("pack.toml"));
+    assert_eq!(code, 78);
+    let at = |name: &str, line: usize| format!("{}:{line}: ", folder.path().join(name).display());
+    let beginnings = [
+        at("pack.toml", 1) + "interface is missing, must be at least one table [[interface]]",
+        at("pack.toml", 4) + "input.current.signal is missing",
+        at("pack.toml", 2) + "pack.cells = 0, must be 1 to 1024",
+        at("pack.toml", 6) + "input.speed is not a known key",
+        at("cell.toml", 1) + "tables.soc is missing",
+        at("cell.toml", 3) + "rated_capacity_ah = 0, must be above 0 and at most 100000",
+        at("pack.dbc", 3),
+    ];
+    for beginning in beginnings {
+        assert!(lines.iter().any(|line| line.starts_with(&beginning)), "{beginning} in {lines:#?}");
+    }
+}
+
+#[test]
+fn a_file_that_is_not_there_is_a_bad_configuration() {
+    let (code, lines) = bad(Path::new("no/such/file.toml"));
+    assert_eq!((code, lines.len()), (78, 1));
+    assert!(lines[0].starts_with("no/such/file.toml: cannot be read: "), "{lines:?}");
+}
+
+#[test]
+fn the_reference_page_is_printed() {
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/config/REFERENCE.md")).unwrap();
+    assert_eq!(good(&["check", "--reference"]), page);
+}

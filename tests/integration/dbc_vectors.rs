@@ -1,0 +1,225 @@
+//! Our decoding against `cantools`, an independent decoder, run live with the interpreter `PACKWATCH_PYTHON` names.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use crate::support::oracle::{ask, hex, python, values};
+use packwatch::alarm::Rule;
+use packwatch::can::dbc::{Database, Message, MuxCondition};
+use packwatch::can::encode::default_database;
+use packwatch::quantity::Fault;
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+/// Payloads per page of a message (a message without pages is one page).
+const PAYLOADS: usize = 1000;
+
+fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
+    message.signals[signal].multiplex.conditions.iter().all(|condition| {
+        let code = message.signals[condition.selector].layout.plan().unwrap().raw(payload).unwrap();
+        condition.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code))
+    })
+}
+
+/// Random payloads: for each page of the message `PAYLOADS` of them with its selectors written. The other selectors
+/// get codes that some signal is there for: cantools refuses a payload with any other code.
+fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
+    let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.multiplex.conditions).collect();
+    let mut pages: Vec<&[MuxCondition]> = Vec::new();
+    for signal in message.signals.iter().filter(|signal| !signal.multiplex.conditions.is_empty()) {
+        if !pages.contains(&signal.multiplex.conditions.as_slice()) {
+            pages.push(&signal.multiplex.conditions);
+        }
+    }
+    if pages.is_empty() {
+        pages.push(&[]);
+    }
+    let mut made = Vec::new();
+    for page in pages {
+        for _ in 0..PAYLOADS {
+            let mut payload = vec![0; usize::from(message.len_bytes)];
+            random.fill_bytes(&mut payload);
+            let mut pick = |among: usize| usize::try_from(random.next_u32()).unwrap() % among;
+            let mut write = |condition: &MuxCondition, pick: &mut dyn FnMut(usize) -> usize| {
+                let (low, high) = condition.ranges[pick(condition.ranges.len())];
+                let span = usize::try_from(high - low).unwrap() + 1;
+                let code = low + u64::try_from(pick(span)).unwrap();
+                message.signals[condition.selector].layout.plan().unwrap().encode_raw(&mut payload, code).unwrap();
+            };
+            let selectors: BTreeSet<usize> = all.iter().map(|condition| condition.selector).collect();
+            for selector in selectors {
+                let asked: Vec<_> = all.iter().filter(|condition| condition.selector == selector).collect();
+                write(asked[pick(asked.len())], &mut pick);
+            }
+            page.iter().for_each(|condition| write(condition, &mut pick));
+            made.push(payload);
+        }
+    }
+    made
+}
+
+/// What a comparison of a whole DBC came to.
+#[derive(Debug, Default)]
+struct Tally {
+    payloads: usize,
+    values: usize,
+    /// Values compared of each signal, by full name.
+    per_signal: BTreeMap<String, usize>,
+    /// Short frames of each signal that reaches past its message.
+    short: BTreeMap<String, usize>,
+}
+
+/// Compares every signal of every message in every payload, presence included.
+fn compare(python: &OsString, path: &Path, strict: bool) -> Tally {
+    let db = Database::parse_bytes(&std::fs::read(path).unwrap()).unwrap();
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let made = db
+        .messages
+        .iter()
+        .flat_map(|message| payloads(message, &mut random).into_iter().map(move |payload| (message, payload)));
+    let made: Vec<_> = made.collect();
+    let lines: Vec<_> = made.iter().map(|(message, payload)| format!("{} {}", message.name, hex(payload))).collect();
+    let arguments: &[&str] = if strict { &["decode", "strict"] } else { &["decode"] };
+    let answers = ask(python, path, arguments, &lines);
+    assert_eq!(answers.len(), lines.len());
+    let mut tally = Tally { payloads: made.len(), ..Default::default() };
+    for (((message, payload), line), answer) in made.iter().zip(&lines).zip(&answers) {
+        compare_payload(message, payload, &mut values(line, answer), &mut tally);
+    }
+    let signals: usize = db.messages.iter().map(|message| message.signals.len()).sum();
+    let counted = ask(python, path, &["count"], &[]);
+    assert_eq!(counted, [format!("{} {signals}", db.messages.len())], "messages and signals");
+    // A message that cannot exist (no bytes) has no signal; every other signal is in one list or in the other.
+    assert_eq!(tally.per_signal.len() + tally.short.len(), signals, "a signal was never there");
+    for (name, count) in tally.per_signal.iter().chain(&tally.short) {
+        assert!(*count >= PAYLOADS, "{name} was there {count} times");
+    }
+    eprintln!(
+        "{}: {} messages, {signals} signals ({} past their message), {} payloads, {} values compared",
+        path.file_name().unwrap().display(),
+        db.messages.len(),
+        tally.short.len(),
+        tally.payloads,
+        tally.values
+    );
+    tally
+}
+
+fn compare_payload(message: &Message, payload: &[u8], expected: &mut HashMap<String, f64>, tally: &mut Tally) {
+    for (_, signal) in message.signals.iter().enumerate().filter(|(n, _)| is_there(message, *n, payload)) {
+        let name = format!("{}.{}", message.name, signal.name);
+        let found = signal.layout.plan().unwrap().physical(payload);
+        let Some(wanted) = expected.remove(&signal.name) else {
+            assert_eq!(found, Err(Fault::ShortFrame), "cantools has no {name} in {}", hex(payload));
+            *tally.short.entry(name).or_default() += 1;
+            continue;
+        };
+        if wanted.is_finite() {
+            let found = found.unwrap();
+            let close = (found - wanted).abs() <= 1e-9 * wanted.abs().max(1e-9);
+            assert!(close, "{name} in {}: {found} for {wanted}", hex(payload));
+        } else {
+            // On the wire, or only after the factor: neither may come out as a value.
+            let plan = signal.layout.plan().unwrap();
+            let fault = plan.decode(payload).unwrap_err();
+            assert!(matches!(fault, Fault::NotFinite | Fault::OutOfRange), "{name} in {}: {fault:?}", hex(payload));
+        }
+        tally.values += 1;
+        *tally.per_signal.entry(name).or_default() += 1;
+    }
+    assert!(expected.is_empty(), "cantools alone finds {expected:?} of {} in {}", message.name, hex(payload));
+}
+
+#[test]
+fn every_signal_of_the_tesla_dbc_decodes_as_cantools_does() {
+    let data = std::env::var_os("PACKWATCH_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
+    let path = data.join("can_ev/tesla_model3.dbc");
+    if !path.is_file() {
+        eprintln!("SKIPPED: {} is not there", path.display());
+        return;
+    }
+    let Some(python) = python() else { return };
+    let tally = compare(&python, &path, false);
+    let past: BTreeSet<String> = ask(&python, &path, &["short"], &[]).into_iter().collect();
+    assert_eq!(tally.short.keys().cloned().collect::<BTreeSet<_>>(), past, "signals that reach past their message");
+    assert!(!past.is_empty() && tally.per_signal.len() > 3000);
+    eprintln!("past their message, always a short frame: {past:?}");
+}
+
+#[test]
+fn every_signal_of_the_shipped_dbcs_decodes_as_cantools_does() {
+    let Some(python) = python() else { return };
+    for name in ["packwatch.dbc", "pack96.dbc", "measured.dbc"] {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name);
+        assert!(compare(&python, &path, true).short.is_empty());
+    }
+}
+
+/// Pages below pages, ranges of codes, two multiplexors side by side, an extended identifier, both byte orders,
+/// floats, 64 bits across nine bytes, a payload of 64 bytes.
+const EXTENDED: &str = r#"VERSION ""
+
+NS_ :
+
+BS_:
+
+BU_: A
+
+BO_ 2566834709 Nested: 16 A
+ SG_ Outer M : 0|8@1+ (1,0) [0|0] "" A
+ SG_ Inner m3M : 15|8@0+ (1,0) [0|0] "" A
+ SG_ Always : 16|8@1- (0.5,-3) [0|0] "" A
+ SG_ Middle m3 : 31|12@0- (1,0) [0|0] "" A
+ SG_ Deep m7 : 64|16@1+ (0.001,0) [0|0] "V" A
+ SG_ Single m4 : 96|32@1- (1,0) [0|0] "" A
+
+BO_ 512 Beside: 8 A
+ SG_ Left M : 0|4@1+ (1,0) [0|0] "" A
+ SG_ Right M : 7|4@0+ (1,0) [0|0] "" A
+ SG_ LeftA m0 : 8|13@1- (0.25,1) [0|0] "" A
+ SG_ LeftB m1 : 8|20@1+ (1,0) [0|0] "" A
+ SG_ RightA m0 : 39|13@0- (0.1,0) [0|0] "" A
+ SG_ RightB m2 : 39|24@0+ (1,0) [0|0] "" A
+
+BO_ 513 Long: 64 A
+ SG_ NineBytes : 3|64@1- (1,0) [0|0] "" A
+ SG_ NineBytesBig : 130|64@0+ (1,0) [0|0] "" A
+ SG_ Double : 256|64@1- (2,1) [0|0] "" A
+ SG_ SingleBig : 391|32@0- (1,0) [0|0] "" A
+ SG_ LastBit : 511|1@1+ (1,0) [0|0] "" A
+
+SG_MUL_VAL_ 2566834709 Inner Outer 3-3;
+SG_MUL_VAL_ 2566834709 Middle Outer 3-5, 9-9;
+SG_MUL_VAL_ 2566834709 Deep Inner 7-8, 200-255;
+SG_MUL_VAL_ 2566834709 Single Outer 4-6;
+SG_MUL_VAL_ 512 LeftA Left 0-0, 5-7;
+SG_MUL_VAL_ 512 LeftB Left 1-3;
+SG_MUL_VAL_ 512 RightA Right 0-1;
+SG_MUL_VAL_ 512 RightB Right 2-2, 15-15;
+SIG_VALTYPE_ 2566834709 Single : 1;
+SIG_VALTYPE_ 513 Double : 2;
+SIG_VALTYPE_ 513 SingleBig : 1;
+"#;
+
+#[test]
+fn extended_multiplexing_floats_and_long_payloads_decode_as_cantools_does() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("extended.dbc");
+    std::fs::write(&path, EXTENDED).unwrap();
+    let tally = compare(&python, &path, true);
+    assert!(tally.short.is_empty());
+    assert_eq!(tally.per_signal.len(), 17);
+}
+
+#[test]
+fn the_alarm_rules_are_those_of_the_shipped_value_table() {
+    let db = default_database().unwrap();
+    let table = &db.signal("PACKWATCH_Alarm.Rule").unwrap().1.values;
+    for rule in Rule::ALL {
+        let named = (i64::from(rule as u8), format!("{rule:?}"));
+        assert!(table.contains(&named), "{named:?}");
+    }
+    assert_eq!(table.len(), 14 + 1, "and not available");
+}

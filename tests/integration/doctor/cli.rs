@@ -1,0 +1,81 @@
+//! The command as its user runs it.
+
+use assert_cmd::Command;
+
+use super::bench::{Bench, Broken};
+
+fn doctor(broken: &Broken, args: &[&str]) -> (i32, String, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let config = broken.write(folder.path());
+    let mut command = Command::cargo_bin("packwatch").unwrap();
+    command.arg("doctor").arg("-c").arg(config).arg(folder.path().join("pack.log")).args(args);
+    let output = command.output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+}
+
+#[test]
+fn a_healthy_pack_gives_status_0_and_says_what_is_fine() {
+    let (status, page, _) = doctor(&Broken::of(Bench::Pack12, 1), &[]);
+    assert_eq!(status, 0, "{page}");
+    for words in [
+        "Nothing is wrong",
+        "12 of 12 cell voltages every 100 ms",
+        "pack current every 10 ms",
+        "the sign of the current is right",
+    ] {
+        assert!(page.contains(words), "{words}: {page}");
+    }
+}
+
+#[test]
+fn a_finding_gives_status_1_with_the_line_as_it_is_and_as_it_should_be() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.config("positive = \"charge\"", "positive = \"discharge\"");
+    let (status, page, _) = doctor(&broken, &[]);
+    assert_eq!(status, 1, "{page}");
+    for words in [
+        "the sign of the current is inverted",
+        "pack.toml:19  [input.current]",
+        "- positive = \"discharge\"",
+        "+ positive = \"charge\"",
+    ] {
+        assert!(page.contains(words), "{words}: {page}");
+    }
+    let (status, json, _) = doctor(&broken, &["--json"]);
+    let document: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((status, document["ok"].as_bool()), (1, Some(false)));
+    let first = &document["report"]["findings"][0];
+    assert_eq!((first["topic"].as_str(), first["severity"].as_str()), (Some("current_sign"), Some("error")));
+    assert_eq!(first["changes"][0]["now"].as_str(), Some("\"discharge\""));
+}
+
+#[test]
+fn a_name_that_is_not_in_the_dbc_is_reported_and_the_rest_is_diagnosed() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.config("PackStatus.Current\"", "PackStatus.Curent\"");
+    broken.table("[input.cell_voltage]", "scale = 1000.0");
+    let (status, page, _) = doctor(&broken, &[]);
+    assert_eq!(status, 78, "{page}");
+    for words in ["did you mean PackStatus.Current", "cell voltages: off by a factor of 1000", "+ scale = 1.0"] {
+        assert!(page.contains(words), "{words}: {page}");
+    }
+}
+
+#[test]
+fn a_configuration_that_says_nothing_of_a_bus_is_refused() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.config = "[pack]\ncells = 3\n".to_owned();
+    let (status, page, faults) = doctor(&broken, &[]);
+    assert_eq!((status, page.as_str()), (78, ""));
+    assert!(faults.contains("pack.cell_model is missing"), "{faults}");
+}
+
+#[test]
+fn a_part_of_a_log_is_judged_and_another_interface_named() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.frames(|stamp, _, id, data| Some(format!("{stamp} can9 {id}#{data}")));
+    let (status, page, _) = doctor(&broken, &["-i", "can9", "--for", "20"]);
+    assert_eq!(status, 0, "{page}");
+    assert!(page.contains(": 20 s, "), "{page}");
+}

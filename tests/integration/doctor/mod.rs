@@ -1,0 +1,137 @@
+//! `packwatch doctor` against faults made on purpose: healthy packs of several configurations, scenarios and seeds are
+//! simulated, then the configuration, the DBC or the log is broken in one way, and the finding that comes first must be
+//! the right one. On the healthy ones nothing at all may be found.
+//!
+//! `faults` is the whole table: name, how it is broken, what must come first, the line proposed.
+
+mod bench;
+mod cli;
+mod faults;
+
+use bench::{Bench, Broken};
+use faults::{FAULTS, Fault};
+use packwatch::doctor::{Report, Severity, Topic};
+
+/// Seeds to begin with: `PACKWATCH_FIRST_SEED` for packs that no earlier run had.
+fn first_seed() -> u64 {
+    std::env::var("PACKWATCH_FIRST_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1)
+}
+
+/// Healthy packs, and how many of each.
+const HEALTHY: &[(Bench, u64)] = &[
+    (Bench::Pack12, 6),
+    (Bench::Pack96, 2),
+    (Bench::Protected, 3),
+    (Bench::Total, 4),
+    (Bench::Pulses, 5),
+    (Bench::Steady, 4),
+    (Bench::Charge, 3),
+    (Bench::Walk, 4),
+    (Bench::Day, 1),
+];
+
+fn findings(report: &Report) -> Vec<String> {
+    let reported = report.findings.iter().filter(|finding| finding.severity != Severity::Note);
+    reported
+        .map(|finding| format!("{:?} {:?} {} | {}", finding.severity, finding.topic, finding.title, finding.seen))
+        .collect()
+}
+
+#[test]
+fn nothing_is_found_on_healthy_packs() {
+    let (mut logs, mut wrong) = (0, Vec::new());
+    for (bench, seeds) in HEALTHY {
+        for seed in first_seed()..first_seed() + seeds {
+            let report = Broken::of(*bench, seed).report();
+            assert!(report.frames > 50, "{bench:?} {seed}: only {} frames", report.frames);
+            logs += 1;
+            let found = findings(&report);
+            if !found.is_empty() {
+                wrong.push(format!("{bench:?} seed {seed}: {}", found.join("; ")));
+            }
+        }
+    }
+    eprintln!("{logs} healthy logs, {} with a finding", wrong.len());
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+    assert!(logs >= 20);
+}
+
+#[test]
+fn a_dead_last_module_is_not_reported_as_a_smaller_pack_for_certain() {
+    let mut broken = Broken::of(Bench::Pack12, 1);
+    broken.data("110", |data| {
+        if data[0] > 2 {
+            data[2..].fill(0xFF);
+        }
+    });
+    let report = broken.report();
+    let found = report.findings.iter().find(|finding| finding.topic == Topic::CellCount).unwrap();
+    assert_eq!((found.severity, &*found.title), (Severity::Warning, "the pack may have 9 cells, 12 are configured"));
+    assert!(found.advice.as_ref().is_some_and(|advice| advice.contains("count the cells")), "{found:?}");
+}
+
+#[test]
+fn a_silent_interface_is_reported_with_the_listening_time() {
+    let mut doctor = Broken::of(Bench::Pack12, 1).doctor();
+    doctor.handle_listened(60.0);
+    let report = doctor.finish();
+    let seen = &report.findings[0].seen;
+    assert!(seen.contains("no frame on") && seen.contains("in 60 s;"), "{seen}");
+    assert_eq!(report.seconds, 60.0);
+}
+
+/// Found first, found but not first, not found.
+#[derive(Default)]
+struct Tally {
+    first: usize,
+    later: usize,
+    missed: usize,
+    reported: Vec<String>,
+}
+
+fn try_fault(fault: &Fault, bench: Bench, seed: u64, tally: &mut Tally) {
+    let mut broken = Broken::of(bench, seed);
+    (fault.breaks)(&mut broken);
+    let report = broken.report();
+    let is_it = |topic| fault.expected.contains(&topic);
+    let says = |proposed: &str| {
+        let mut changes = report.findings.iter().filter(|f| is_it(f.topic)).flat_map(|f| &f.changes);
+        proposed.is_empty() || changes.any(|c| format!("{} = {}", c.key, c.proposed).contains(proposed))
+    };
+    let reported: Vec<_> = report.findings.iter().filter(|f| f.severity != Severity::Note).collect();
+    let is_first = reported.first().is_some_and(|finding| is_it(finding.topic));
+    if is_first && says(fault.proposed) {
+        tally.first += 1;
+        return;
+    }
+    if reported.iter().any(|finding| is_it(finding.topic)) {
+        tally.later += 1;
+    } else {
+        tally.missed += 1;
+    }
+    let changes: Vec<_> =
+        report.findings.iter().flat_map(|f| &f.changes).map(|c| format!("{}={}", c.key, c.proposed)).collect();
+    tally.reported.push(format!("{} on {bench:?} {seed}: {:?} {changes:?}", fault.name, findings(&report)));
+}
+
+#[test]
+fn each_fault_made_on_purpose_is_found_first() {
+    let mut tally = Tally::default();
+    for fault in FAULTS {
+        for bench in fault.benches {
+            for seed in first_seed()..first_seed() + fault.seeds {
+                try_fault(fault, *bench, seed, &mut tally);
+            }
+        }
+    }
+    let all = tally.first + tally.later + tally.missed;
+    eprintln!(
+        "{all} broken cases of {} faults: {} named first, {} named after another, {} missed",
+        FAULTS.len(),
+        tally.first,
+        tally.later,
+        tally.missed
+    );
+    assert!(tally.reported.is_empty(), "{}", tally.reported.join("\n"));
+    assert!(all >= 200, "only {all} cases");
+}

@@ -1,0 +1,146 @@
+//! Our end-to-end protection against two independent ones, PyPI `autosar-e2e` (profiles 1A, 1C and 5) and `cantools`
+//! (profile 5), run live with the interpreter `PACKWATCH_PYTHON` names. Both ways: what we protect they accept, what they
+//! protect we accept, byte for byte equal, and a payload with one wrong bit is refused by all alike.
+
+use std::ffi::OsString;
+use std::io::Write;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+use packwatch::can::e2e::{Profile, Protection};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+/// Payloads of each profile.
+const PAYLOADS: usize = 100_000;
+
+/// The interpreter; `None`, and said so, when none is named.
+fn python() -> Option<OsString> {
+    let python = std::env::var_os("PACKWATCH_PYTHON");
+    if python.is_none() {
+        eprintln!("SKIPPED: PACKWATCH_PYTHON names no Python with autosar-e2e and cantools, nothing was compared");
+    }
+    python
+}
+
+/// What the oracle answers, line by line.
+fn ask(python: &OsString, lines: &[String]) -> Vec<String> {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/e2e_oracle.py");
+    let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let (mut stdin, text) = (child.stdin.take().unwrap(), lines.join("\n"));
+    let writer = std::thread::spawn(move || stdin.write_all(text.as_bytes()));
+    let output = child.wait_with_output().unwrap();
+    let _ = writer.join().unwrap();
+    assert!(output.status.success());
+    String::from_utf8(output.stdout).unwrap().lines().map(str::to_owned).collect()
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn bytes(hex: &str) -> Vec<u8> {
+    (0..hex.len() / 2).map(|n| u8::from_str_radix(&hex[2 * n..2 * n + 2], 16).unwrap()).collect()
+}
+
+/// One payload on both sides.
+struct Case {
+    protection: Protection,
+    /// Our next counter.
+    counter: u8,
+    /// Before protection, with the previous counter in its place.
+    raw: Vec<u8>,
+    ours: Vec<u8>,
+    flipped: Vec<u8>,
+}
+
+impl Case {
+    /// Random identifier, length, payload, counter and wrong bit.
+    fn random(profile: Profile, random: &mut ChaCha8Rng) -> Self {
+        let mut below = |limit: usize| usize::try_from(random.next_u32()).unwrap() % limit;
+        let data_id = u16::try_from(below(usize::from(profile.max_data_id()) + 1)).unwrap();
+        let protection = Protection { profile, data_id };
+        let length = profile.header_bytes() + below(profile.max_bytes() - profile.header_bytes() + 1);
+        let previous = u8::try_from(below(usize::from(profile.max_counter()) + 1)).unwrap();
+        let bit = below(8 * length);
+        let mut raw = vec![0; length];
+        random.fill_bytes(&mut raw);
+        match profile {
+            Profile::P01A | Profile::P01C => raw[1] = raw[1] & 0xF0 | previous,
+            Profile::P05 => raw[2] = previous,
+        }
+        let counter = profile.next_counter(previous);
+        let mut ours = raw.clone();
+        protection.protect(&mut ours, counter).unwrap();
+        let mut flipped = ours.clone();
+        flipped[bit / 8] ^= 1 << (bit % 8);
+        Self { protection, counter, raw, ours, flipped }
+    }
+
+    fn question(&self) -> String {
+        let Protection { profile, data_id } = self.protection;
+        format!("{} {data_id} {} {} {}", profile.name(), hex(&self.raw), hex(&self.ours), hex(&self.flipped))
+    }
+
+    /// Compares one peer's answer: its payload, and whether it accepts ours and the one with a wrong bit.
+    fn compare(&self, peer: &str, answer: &[&str]) {
+        let what = self.question();
+        let [theirs, accepts, accepts_flipped] = answer else { panic!("{peer} answers {answer:?} to {what}") };
+        let theirs = bytes(theirs);
+        assert_eq!(theirs, self.ours, "{peer} protects otherwise: {what}");
+        assert_eq!(self.protection.verified_counter(&theirs), Some(self.counter), "we refuse {peer}'s: {what}");
+        assert_eq!(*accepts, "1", "{peer} refuses ours: {what}");
+        assert_eq!(*accepts_flipped, "0", "{peer} accepts a wrong bit: {what}");
+        assert_eq!(self.protection.verified_counter(&self.flipped), None, "we accept a wrong bit: {what}");
+    }
+}
+
+fn compare(profile: Profile) {
+    let Some(python) = python() else { return };
+    let mut random = ChaCha8Rng::seed_from_u64(4);
+    let cases: Vec<_> = (0..PAYLOADS).map(|_| Case::random(profile, &mut random)).collect();
+    let answers = ask(&python, &cases.iter().map(Case::question).collect::<Vec<_>>());
+    assert_eq!(answers.len(), cases.len());
+    let mut by_cantools = 0;
+    for (case, answer) in cases.iter().zip(&answers) {
+        let words: Vec<_> = answer.split(' ').collect();
+        let (first, second) = words.split_at(3);
+        case.compare("autosar-e2e", first);
+        if !second.is_empty() {
+            case.compare("cantools", second);
+            by_cantools += 1;
+        }
+    }
+    // cantools has profile 5 only, and that from 4 bytes on.
+    let wanted = cases.iter().filter(|case| profile == Profile::P05 && case.raw.len() >= 4).count();
+    assert_eq!(by_cantools, wanted);
+    let counters: std::collections::BTreeSet<_> = cases.iter().map(|case| case.counter).collect();
+    assert_eq!(counters.len(), usize::from(profile.max_counter()) + 1, "every counter occurred");
+    eprintln!("profile {}: {} payloads both ways, {by_cantools} of them by cantools too", profile.name(), cases.len());
+}
+
+#[test]
+fn profile_1a_is_that_of_the_peer() {
+    compare(Profile::P01A);
+}
+
+#[test]
+fn profile_1c_is_that_of_the_peer() {
+    compare(Profile::P01C);
+}
+
+#[test]
+fn profile_5_is_that_of_the_peers() {
+    compare(Profile::P05);
+}
+
+#[test]
+fn the_invalid_counter_15_is_refused_by_the_peer_too_whatever_the_crc() {
+    let Some(python) = python() else { return };
+    let protection = Protection { profile: Profile::P01A, data_id: 0x0123 };
+    let payload = |crc: u8| vec![crc, 0x0F, 1, 2];
+    let question = |crc: u8| format!("1A 291 00000000 {} {}", hex(&payload(crc)), hex(&payload(crc)));
+    let answers = ask(&python, &(0..=255).map(question).collect::<Vec<_>>());
+    assert!(answers.len() == 256 && answers.iter().all(|answer| answer.ends_with(" 0 0")), "{answers:?}");
+    assert!((0..=255).all(|crc| protection.verified_counter(&payload(crc)).is_none()));
+}

@@ -1,0 +1,58 @@
+//! The integration tests: one program, one module for each subject, so that they are compiled and linked once.
+//!
+//! `cargo nextest run` runs each test in a process of its own, `cargo test` all of them as threads of one process; the
+//! tests depend on neither. One subject alone: `cargo test --test integration doctor::`.
+//! Shared helpers are in `support`. `tests/allocations.rs` is a program of its own: it replaces the global allocator.
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "in a test a panic is the message, and tables and skipped comparisons are printed"
+)]
+
+mod alarm_noise;
+mod alarm_tradeoff;
+mod can_data;
+mod capacity_peers;
+mod check_cli;
+mod dbc_vectors;
+mod doctor;
+mod e2e_peer;
+#[cfg(feature = "lab")]
+mod export_cli;
+mod fit_cli;
+#[cfg(feature = "lab")]
+mod gp_measured;
+#[cfg(feature = "lab")]
+mod gp_peer;
+#[cfg(feature = "lab")]
+mod gpr_cli;
+mod layering;
+mod life_decodes;
+mod log_grammar;
+mod measured_life;
+mod monitor_alarms;
+mod monitor_damaged;
+mod monitor_properties;
+mod monitor_reconfigure;
+mod monitor_restart;
+mod monitor_scenarios;
+mod monitor_statistics;
+mod output_dbc;
+mod paper_scenario;
+mod protected_input;
+mod recharge_fleet;
+mod reference_scenario;
+mod replay_cli;
+#[cfg(feature = "lab")]
+mod report_cli;
+mod restart;
+#[cfg(feature = "lab")]
+mod rul;
+mod sample_measured;
+mod score_cli;
+mod simulate_cli;
+mod store_cli;
+mod support;
+#[cfg(feature = "lab")]
+mod whatif_cli;

@@ -1,0 +1,342 @@
+//! Properties of the core that no single module can promise: a restored monitor behaves as if it had never stopped, and
+//! ticks before `next_due` may be left out. Inputs: the paper's cell (with a recharge window, transitions and alarms in
+//! it) and a pack of 96 cells whose voltages come in many frames, both from the simulator. Outputs are compared bit for
+//! bit (floats by their shortest text that reads back the same).
+
+use std::path::Path;
+
+use packwatch::can::Frame;
+use packwatch::can::encode::InputEncoder;
+use packwatch::config;
+use packwatch::monitor::{Downtime, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot, TICK_PERIOD_MS};
+use packwatch::quantity::{BusIndex, Timestamp};
+use packwatch::sim::{Scenario, Settings, Simulation, Wiring};
+
+/// One input that owns its frame.
+#[derive(Debug, Clone)]
+enum Record {
+    Frame(Timestamp, BusIndex, Frame),
+    Tick(Timestamp),
+}
+
+impl Record {
+    fn input(&self) -> Input<'_> {
+        match self {
+            Self::Frame(time, bus, frame) => Input::Frame { time: *time, bus: *bus, frame },
+            Self::Tick(time) => Input::Tick { time: *time },
+        }
+    }
+
+    fn time(&self) -> Timestamp {
+        self.input().time()
+    }
+}
+
+fn load(file: &str) -> MonitorConfig {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(file);
+    config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor
+}
+
+/// The paper's cell, two and a half cycles, and a threshold that is crossed at the first half-cycle.
+fn paper() -> (MonitorConfig, Vec<Record>) {
+    let mut config = load("paper.toml");
+    config.rules[0].threshold = 2.6;
+    let settings = Settings { duration_s: Some(20_000.0), ..Settings::of(Scenario::Paper, 2.6) };
+    let records = stream(&config, settings, Wiring::single());
+    (config, records)
+}
+
+/// 96 cells once a second, 20 minutes of the drive.
+fn pack() -> (MonitorConfig, Vec<Record>) {
+    let config = load("example.toml");
+    let capacity_ah = config.model.capacity_ah;
+    let settings = Settings {
+        duration_s: Some(1200.0),
+        current_period_ns: 100_000_000,
+        cell_period_ns: 1_000_000_000,
+        ..Settings::of(Scenario::EvDay, capacity_ah)
+    };
+    let strings = config.sample.strings;
+    let sensors = config.sample.sensor_of_cell.iter().flatten().map(|s| s.index() + 1).max().unwrap_or(0);
+    let wiring = Wiring { strings, temperature_at: vec![None; sensors] };
+    let records = stream(&config, settings, wiring);
+    (config, records)
+}
+
+/// The simulator's frames and every tick; frames of one moment are spread over a few milliseconds, as a bus would.
+fn stream(config: &MonitorConfig, settings: Settings, wiring: Wiring) -> Vec<Record> {
+    let mut sim = Simulation::new(config.model.clone(), settings, wiring);
+    let encoder = InputEncoder::new(&config.input);
+    let period_ns = i64::from(TICK_PERIOD_MS) * 1_000_000;
+    let (mut records, mut frames, mut next_tick) = (Vec::new(), Vec::new(), 0);
+    while let Some(moment) = sim.advance() {
+        frames.clear();
+        encoder.encode(sim.readings(), &mut frames);
+        for (nth, (bus, frame)) in (0..).zip(&frames) {
+            let time = moment.time.plus_nanos(nth * 230_000);
+            while next_tick < time.nanos() {
+                records.push(Record::Tick(Timestamp::from_nanos(next_tick)));
+                next_tick += period_ns;
+            }
+            records.push(Record::Frame(time, *bus, *frame));
+        }
+    }
+    records
+}
+
+/// What came out of one input, as text.
+fn outputs(monitor: &mut Monitor, record: &Record, out: &mut Outputs) -> [String; 3] {
+    out.clear();
+    monitor.handle(record.input(), out);
+    let text = |empty: bool, text: &dyn Fn() -> String| if empty { String::new() } else { text() };
+    [
+        text(out.estimates.is_empty(), &|| format!("{:?}", out.estimates)),
+        text(out.events.is_empty(), &|| format!("{:?}", out.events)),
+        text(out.frames.is_empty(), &|| format!("{:?}", out.frames)),
+    ]
+}
+
+fn wanting_estimates() -> Outputs {
+    Outputs { want_estimates: true, ..Outputs::default() }
+}
+
+/// Fixed pseudo-random numbers below `limit`.
+fn draws(seed: u64, limit: usize) -> impl Iterator<Item = usize> {
+    let mut state = seed;
+    std::iter::repeat_with(move || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        usize::try_from(state % limit as u64).expect("below limit")
+    })
+}
+
+const WHAT: [&str; 3] = ["estimates", "events", "frames"];
+
+/// The differences between a monitor that never stopped and ones restored at `splits`: a line for the first of each kind.
+fn differences(config: &MonitorConfig, records: &[Record], splits: &[usize], away: Downtime) -> Vec<String> {
+    let mut found = Vec::new();
+    for &split in splits {
+        let (mut whole, mut out) = (Monitor::new(config.clone()), wanting_estimates());
+        for record in &records[..split] {
+            out.clear();
+            whole.handle(record.input(), &mut out);
+        }
+        let text = serde_json::to_string(&whole.snapshot()).expect("a snapshot is a document");
+        let snapshot: Snapshot = serde_json::from_str(&text).expect("reads back");
+        let mut restored = Monitor::new(config.clone());
+        restored.restore(snapshot, away).expect("fits");
+        let mut reported = [false; 3];
+        for (nth, record) in (0..).zip(&records[split..]) {
+            let expected = outputs(&mut whole, record, &mut out);
+            let got = outputs(&mut restored, record, &mut out);
+            for kind in 0..3 {
+                if expected[kind] != got[kind] && !reported[kind] {
+                    reported[kind] = true;
+                    found.push(format!(
+                        "split {split} (t = {} s), {} differ {nth} inputs later at {} s\n  whole    {:.300}\n  restored {:.300}",
+                        records[split - 1].time().secs(), WHAT[kind], record.time().secs(), expected[kind], got[kind],
+                    ));
+                }
+            }
+        }
+        if whole.alarms().snapshot() != restored.alarms().snapshot() {
+            found.push(format!("split {split}: alarm states differ at the end"));
+        }
+        if whole.pack() != restored.pack()
+            || whole.recharge_period_s() != restored.recharge_period_s()
+            || whole.normalised_recharge_period() != restored.normalised_recharge_period()
+        {
+            found.push(format!("split {split}: pack or a recharge period differ at the end"));
+        }
+    }
+    found
+}
+
+/// Splits anywhere, and (for `away` = 0 s, which says that no time passed) between two inputs of one stamp.
+fn splits(records: &[Record], count: usize, same_stamp: bool) -> Vec<usize> {
+    draws(0x9E37_79B9_7F4A_7C15, records.len() - 2)
+        .map(|k| k + 1)
+        .filter(|&k| !same_stamp || records[k].time() == records[k - 1].time())
+        .take(count)
+        .collect()
+}
+
+fn assert_same(found: &[String]) {
+    assert!(found.is_empty(), "{} differences\n{}", found.len(), found.join("\n"));
+}
+
+/// What the core works out, and what it sends: two promises, since the second also needs the schedule of the frames.
+fn results(found: Vec<String>, frames: bool) -> Vec<String> {
+    found.into_iter().filter(|line| line.contains("frames differ") == frames).collect()
+}
+
+#[test]
+fn a_restored_cell_estimates_as_if_it_had_never_stopped() {
+    let (config, records) = paper();
+    assert_same(&results(differences(&config, &records, &splits(&records, 6, false), Downtime::AsStamped), false));
+}
+
+#[test]
+fn a_restored_cell_that_was_not_away_estimates_as_if_it_had_never_stopped() {
+    let (config, records) = paper();
+    assert_same(&results(differences(&config, &records, &splits(&records, 3, true), Downtime::Seconds(0.0)), false));
+}
+
+#[test]
+fn a_restored_cell_learns_from_a_mode_that_ends_with_its_first_input() {
+    let (config, records) = paper();
+    // The input at which the monitor that never stopped reports its first half-cycle.
+    let (mut monitor, mut out) = (Monitor::new(config.clone()), Outputs::default());
+    let reported = records.iter().position(|record| {
+        out.clear();
+        monitor.handle(record.input(), &mut out);
+        out.events.iter().any(|event| matches!(event.kind, EventKind::HalfCycle { .. }))
+    });
+    let split = reported.expect("a half-cycle");
+    assert_same(&results(differences(&config, &records, &[split], Downtime::AsStamped), false));
+}
+
+#[test]
+fn a_restored_pack_estimates_as_if_it_had_never_stopped() {
+    let (config, records) = pack();
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), false));
+}
+
+#[test]
+fn a_restored_cell_sends_as_if_it_had_never_stopped() {
+    let (config, records) = paper();
+    let mut found = differences(&config, &records, &splits(&records, 3, false), Downtime::AsStamped);
+    found.extend(differences(&config, &records, &splits(&records, 2, true), Downtime::Seconds(0.0)));
+    assert_same(&results(found, true));
+}
+
+#[test]
+fn a_restored_pack_sends_as_if_it_had_never_stopped() {
+    let (config, records) = pack();
+    assert_same(&results(differences(&config, &records, &splits(&records, 4, false), Downtime::AsStamped), true));
+}
+
+/// The whole run against one that continues with an `edit`ed configuration from one split to the next: a line for the first
+/// difference of each kind. (The event that says so is not among them: it comes between two inputs.)
+fn reload_differences(
+    config: &MonitorConfig,
+    records: &[Record],
+    splits: &[usize],
+    edit: impl Fn(&mut MonitorConfig),
+) -> Vec<String> {
+    let (mut whole, mut reloaded) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
+    let (mut out_whole, mut out_reloaded) = (wanting_estimates(), wanting_estimates());
+    let (mut found, mut reported, mut is_edited) = (Vec::new(), [false; 3], false);
+    for (nth, record) in records.iter().enumerate() {
+        if splits.contains(&nth) {
+            let mut other = config.clone();
+            is_edited = !is_edited;
+            if is_edited {
+                edit(&mut other);
+            }
+            let done = reloaded.reconfigure(other, record.time(), &mut out_reloaded).expect("taken over");
+            assert_eq!(done.alarms_ended, 0);
+        }
+        let expected = outputs(&mut whole, record, &mut out_whole);
+        let got = outputs(&mut reloaded, record, &mut out_reloaded);
+        for kind in 0..3 {
+            if expected[kind] != got[kind] && !reported[kind] {
+                reported[kind] = true;
+                let (what, at_s) = (WHAT[kind], record.time().secs());
+                found.push(format!("{what} differ at {at_s} s\n  {:.300}\n  {:.300}", expected[kind], got[kind]));
+            }
+        }
+    }
+    let end = |monitor: &Monitor| serde_json::to_value(monitor.snapshot()).expect("a document");
+    if end(&whole) != end(&reloaded) {
+        found.push("the states at the end differ".to_owned());
+    }
+    found
+}
+
+#[test]
+fn a_reload_of_the_same_configuration_changes_nothing() {
+    for (config, records) in [paper(), pack()] {
+        assert_same(&reload_differences(&config, &records, &splits(&records, 20, false), |_| {}));
+    }
+}
+
+#[test]
+fn other_thresholds_and_periods_change_no_estimate() {
+    for (config, records) in [paper(), pack()] {
+        let found = reload_differences(&config, &records, &splits(&records, 20, false), |config| {
+            config.rules.iter_mut().for_each(|rule| rule.threshold = rule.clear);
+            config.flood.max_frames_per_s = config.flood.max_frames_per_s.saturating_add(2000);
+            config.output.as_mut().expect("sends").status_period_s *= 10.0;
+        });
+        assert!(found.iter().any(|line| line.starts_with("frames")), "the edit does something");
+        assert_same(&found.into_iter().filter(|line| line.starts_with("estimates")).collect::<Vec<_>>());
+    }
+}
+
+/// All ticks against only those at `next_due`: every frame and event must be the same, in order.
+fn ticks_may_be_left_out(config: &MonitorConfig, records: &[Record]) {
+    let (mut all, mut few) = (Monitor::new(config.clone()), Monitor::new(config.clone()));
+    let (mut out_all, mut out_few) = (wanting_estimates(), wanting_estimates());
+    let (mut given, mut skipped) = (0_u32, 0_u32);
+    for (nth, record) in (0..).zip(records) {
+        let expected = outputs(&mut all, record, &mut out_all);
+        let cares = few.next_due().is_none_or(|due| record.time() >= due);
+        if matches!(record, Record::Tick(_)) && !cares {
+            skipped += 1;
+            assert_eq!(expected, [const { String::new() }; 3], "input {nth}: a tick that was not due did something");
+            continue;
+        }
+        given += 1;
+        let got = outputs(&mut few, record, &mut out_few);
+        assert_eq!(expected, got, "input {nth} at {} s", record.time().secs());
+    }
+    assert!(skipped > given, "the test must leave ticks out: {skipped} of {}", skipped + given);
+}
+
+#[test]
+fn ticks_before_the_due_time_change_nothing_for_a_cell() {
+    let (config, records) = paper();
+    ticks_may_be_left_out(&config, &records);
+}
+
+#[test]
+fn ticks_before_the_due_time_change_nothing_for_a_pack() {
+    let (config, records) = pack();
+    ticks_may_be_left_out(&config, &records);
+}
+
+/// The paper's cell, each record changed, moved or left out.
+/// (The cut over time asleep lies between two ticks that are due: the last tick before it is one that may be left out.)
+fn edited(edit: impl Fn(f64, Record) -> Option<Record>) -> (MonitorConfig, Vec<Record>) {
+    let (config, records) = paper();
+    let records = records.into_iter().filter_map(|record| edit(record.time().secs(), record)).collect();
+    (config, records)
+}
+
+#[test]
+fn ticks_before_the_due_time_change_nothing_while_a_sensor_is_silent() {
+    let silent = |time_s: f64| (3000.0..3120.0).contains(&time_s);
+    let (config, records) =
+        edited(|time_s, record| (!(silent(time_s) && matches!(record, Record::Frame(..)))).then_some(record));
+    ticks_may_be_left_out(&config, &records);
+}
+
+#[test]
+fn ticks_before_the_due_time_change_nothing_over_time_asleep() {
+    let (config, records) = edited(|time_s, record| (!(5000.035..8600.0).contains(&time_s)).then_some(record));
+    ticks_may_be_left_out(&config, &records);
+}
+
+#[test]
+fn ticks_before_the_due_time_change_nothing_when_the_clock_is_set_back() {
+    let (config, records) = edited(|time_s, record| {
+        let back_s = if time_s >= 12_000.0 { -20.0 } else { 0.0 };
+        Some(match record {
+            Record::Frame(time, bus, frame) => Record::Frame(time.plus_secs(back_s), bus, frame),
+            Record::Tick(time) => Record::Tick(time.plus_secs(back_s)),
+        })
+    });
+    ticks_may_be_left_out(&config, &records);
+}

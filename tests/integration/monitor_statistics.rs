@@ -1,0 +1,102 @@
+//! What the core counts, and what it shows to those who look: on hand-made frames of a pack of two cells.
+
+use crate::support::rig::{Rig, learned};
+use packwatch::monitor::{BusStatistics, Downtime, Statistics, Validity};
+use packwatch::quantity::{CellIndex, Mode};
+
+#[test]
+fn readings_are_counted_by_their_outcome() {
+    let mut rig = Rig::new("");
+    rig.seconds(10);
+    // 100 frames of three kinds; every signal of them but one feeds something.
+    let before = rig.monitor.reading_counts();
+    assert_eq!((before.accepted, before.out_of_range), (600, 0));
+    assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
+    assert_eq!(rig.monitor.statistics().voltages_used, 200);
+    // Above the pack's limits, and for so long that it is reported only once.
+    rig.voltages_v[1] = Some(4.9);
+    rig.seconds(2);
+    let after = rig.monitor.reading_counts();
+    let refused = after.out_of_range + after.rate_too_high - before.out_of_range - before.rate_too_high;
+    assert_eq!((refused, after.accepted - before.accepted), (20, 100));
+    // What does not come is stale once, not with every look.
+    (rig.voltages_v, rig.temperatures_c, rig.current_a, rig.reported_soc) = ([None; 2], [None; 2], None, None);
+    rig.seconds(20);
+    assert!((1..=6).contains(&rig.monitor.reading_counts().stale), "{:?}", rig.monitor.reading_counts());
+}
+
+#[test]
+fn counts_go_on_after_a_restart() {
+    let mut rig = learned();
+    let (before, readings) = (rig.monitor.statistics().clone(), rig.monitor.reading_counts());
+    assert_eq!((before.half_cycles, before.capacity_updates, before.capacity_measurements), (2, 2, 2));
+    assert_eq!((before.alarms_raised.warning, before.restores), (2, 0));
+    rig.restart(Downtime::Seconds(3600.0));
+    rig.seconds(1);
+    let after = rig.monitor.statistics();
+    assert_eq!((after.half_cycles, after.alarms_raised.warning, after.restores), (2, 2, 1));
+    assert_eq!(after.gaps, before.gaps + 1);
+    assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
+    assert!(rig.monitor.reading_counts().accepted > readings.accepted);
+    // The difference is what was added since.
+    let added = after.since(&before);
+    assert_eq!((added.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
+    assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
+    assert_eq!(before.since(after), Statistics { buses: vec![BusStatistics::default()], ..Statistics::default() });
+}
+
+#[test]
+fn bad_commands_are_all_counted_and_reported_once_a_second() {
+    let mut rig = Rig::new("");
+    rig.seconds(1);
+    for _ in 0..5 {
+        // There is no rule of that number.
+        rig.command(0, 30, 0x7FF);
+    }
+    let reported = rig.events.iter().filter(|event| format!("{event:?}").contains("BadCommand")).count();
+    assert_eq!((reported, rig.monitor.statistics().bad_commands), (1, 5));
+}
+
+#[test]
+fn values_no_longer_known_are_not_shown() {
+    let mut rig = learned();
+    let pack = rig.monitor.pack_view();
+    assert_eq!((pack.validity, pack.mode), (Validity::Valid, Mode::Rest));
+    let voltage_v = pack.voltage_v.unwrap();
+    assert!((voltage_v - rig.voltages_v.iter().flatten().sum::<f64>()).abs() < 1e-3, "{voltage_v}");
+    assert!(pack.weakest.is_some() && pack.soh.is_some_and(|soh| soh > 0.0));
+    // One cell is silent: nothing of it is shown but what was learned, and of the pack nothing that needs it.
+    rig.voltages_v[1] = None;
+    rig.seconds(20);
+    let cells: Vec<_> = rig.monitor.cell_views().collect();
+    assert!(cells[0].voltage_v.is_some() && cells[0].soc.is_some());
+    let silent = cells[1];
+    assert_eq!((silent.cell, silent.voltage_v, silent.soc, silent.resistance_ratio), (CellIndex(1), None, None, None));
+    assert_eq!((cells[0].trusted, silent.trusted), (Some(true), None));
+    assert!(silent.capacity.is_some());
+    let pack = rig.monitor.pack_view();
+    assert_eq!((pack.validity, pack.soc, pack.voltage_v), (Validity::Unavailable, None, None));
+}
+
+#[test]
+fn the_highest_temperature_is_not_known_while_a_sensor_is_silent() {
+    let mut rig = Rig::new("");
+    rig.temperatures_c = [Some(25.0), Some(60.0)];
+    rig.seconds(3);
+    assert_eq!(rig.monitor.pack_view().temperature_max_c, Some(60.0));
+    // The hot one: what the other says is no "at most".
+    rig.temperatures_c[1] = None;
+    rig.seconds(10);
+    assert_eq!(rig.monitor.cell_views().map(|cell| cell.temperature_c).collect::<Vec<_>>(), [Some(25.0), None]);
+    assert_eq!(rig.monitor.pack_view().temperature_max_c, None);
+}
+
+#[test]
+fn nothing_is_known_before_the_first_frame() {
+    let rig = Rig::new("");
+    assert!(
+        rig.monitor.cell_views().all(|cell| cell.soc.is_none() && cell.capacity.is_none() && cell.trusted.is_none())
+    );
+    let pack = rig.monitor.pack_view();
+    assert_eq!((pack.validity, pack.soc, pack.soh, pack.weakest), (Validity::Unavailable, None, None, None));
+}

@@ -1,0 +1,381 @@
+//! The DBC that is written, in `cantools`: it loads strictly, and every frame made by the same layout decodes with it
+//! to the values that went in, within one bit, for every kind of frame, protection, identifier and cell.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use crate::support::oracle::{ask, hex, python, values};
+use packwatch::alarm::Rule;
+use packwatch::can::dbc::Database;
+use packwatch::can::e2e::{Profile, Protection};
+use packwatch::can::encode::{
+    AlarmFields, Command, CommandPlan, E2eSetting, HealthFields, LayoutBase, LayoutSettings, MessageSettings,
+    OutputPlan, SendCounters, StatusFields, layout,
+};
+use packwatch::can::{CanId, Frame, FrameKind};
+use packwatch::quantity::{CellIndex, Mode};
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::{Rng, SeedableRng};
+
+/// Frames of each message in each configuration.
+const FRAMES: usize = 40;
+
+/// Rules in the order of their numbers: inside unit to the wire's, largest value tried.
+const RULES: [(&str, f64, f64); 14] = [
+    ("CapacityLow", 1.0, 5.0),
+    ("UsableCapacityLow", 1.0, 5.0),
+    ("RechargePeriodLow", 1.0, 50_000.0),
+    ("InputMissing", 1.0, 800.0),
+    ("InputImplausible", 100.0, 1.0),
+    ("EstimateUntrusted", 1.0, 80.0),
+    ("ResistanceHigh", 100.0, 8.0),
+    ("SocLow", 100.0, 1.0),
+    ("TemperatureHigh", 1.0, 150.0),
+    ("CellImbalance", 100.0, 1.0),
+    ("RemainingLifeLow", 1.0, 5000.0),
+    ("BmsDisagrees", 100.0, 1.0),
+    ("StoreFailed", 1.0, 5000.0),
+    ("BusFault", 1.0, 5000.0),
+];
+
+/// A configuration of the matrix.
+#[derive(Debug, Clone, Copy)]
+struct Case {
+    fd: bool,
+    profile: Option<Profile>,
+    extended: bool,
+    rated_capacity_ah: f64,
+}
+
+impl Case {
+    fn all() -> Vec<Self> {
+        let mut cases = Vec::new();
+        for fd in [false, true] {
+            for profile in [None, Some(Profile::P01A), Some(Profile::P01C), Some(Profile::P05)] {
+                for extended in [false, true] {
+                    for rated_capacity_ah in [2.6, 280.0] {
+                        // Profile 5 needs FD.
+                        if fd || profile != Some(Profile::P05) {
+                            cases.push(Self { fd, profile, extended, rated_capacity_ah });
+                        }
+                    }
+                }
+            }
+        }
+        cases
+    }
+
+    fn message(&self, number: u16) -> MessageSettings {
+        let id = if self.extended {
+            CanId::Extended(0x18FF_5000 + u32::from(number))
+        } else {
+            CanId::Standard(0x200 + number)
+        };
+        let e2e = self
+            .profile
+            .map_or(E2eSetting::Off, |profile| E2eSetting::On(Protection { profile, data_id: 0x0A50 + number }));
+        MessageSettings { id: Some(id), fd: Some(self.fd), brs: Some(self.fd), period_ms: Some(250), e2e }
+    }
+
+    fn layout(&self) -> Database {
+        let settings = LayoutSettings {
+            status: self.message(1),
+            health: self.message(2),
+            alarm: self.message(3),
+            command: Some(self.message(4)),
+        };
+        layout(LayoutBase::BuiltIn { rated_capacity_ah: self.rated_capacity_ah }, &settings).unwrap()
+    }
+}
+
+/// What a consumer must read: name, value in the DBC's unit, and how far off it may be (half a step).
+type Wanted = Vec<(String, f64, f64)>;
+
+struct Maker {
+    random: ChaCha8Rng,
+    plan: OutputPlan,
+    counters: SendCounters,
+    rated_capacity_ah: f64,
+    database: Database,
+}
+
+impl Maker {
+    fn below(&mut self, limit: f64) -> f64 {
+        f64::from(self.random.next_u32()) / f64::from(u32::MAX) * limit
+    }
+
+    fn one_of(&mut self, count: u32) -> u32 {
+        self.random.next_u32() % count
+    }
+
+    /// Half the step of a signal as the layout has it, so that what is compared is the layout's own promise.
+    fn half_step(&self, name: &str) -> f64 {
+        self.database.signal(name).unwrap().1.layout.factor / 2.0
+    }
+
+    fn wanted(&self, message: &str, pairs: &[(&str, f64)]) -> Wanted {
+        let one = |(name, value): &(&str, f64)| {
+            ((*name).to_owned(), *value, self.half_step(&format!("PACKWATCH_{message}.{name}")))
+        };
+        pairs.iter().map(one).collect()
+    }
+
+    fn status(&mut self) -> (Frame, Wanted) {
+        let (soc, soc_std, mode) = (self.below(1.0), self.below(0.25), self.one_of(4));
+        let (validity, severity, alarms) = (self.one_of(4), self.one_of(4), self.one_of(62));
+        let (cell, unknown) = (self.one_of(1024), self.one_of(3));
+        let fields = StatusFields {
+            soc: Some(soc),
+            soc_std: Some(soc_std),
+            mode: Some([Mode::Unknown, Mode::Charge, Mode::Rest, Mode::Discharge][mode as usize]),
+            validity: u8::try_from(validity).unwrap(),
+            highest_severity: u8::try_from(severity).ok(),
+            active_alarms: u16::try_from(alarms).ok(),
+            limiting_cell: u16::try_from(cell).ok().map(CellIndex),
+            unknown_rules: u8::try_from(unknown).ok(),
+        };
+        let wanted = self.wanted(
+            "Status",
+            &[
+                ("Soc", 100.0 * soc),
+                ("SocStd", 100.0 * soc_std),
+                ("Mode", f64::from(mode)),
+                ("Validity", f64::from(validity)),
+                ("HighestSeverity", f64::from(severity)),
+                ("ActiveAlarms", f64::from(alarms)),
+                ("LimitingCell", f64::from(cell)),
+                ("UnknownRules", f64::from(unknown)),
+            ],
+        );
+        (self.plan.status(&fields, &mut self.counters), wanted)
+    }
+
+    fn health(&mut self, page: usize) -> (Frame, Wanted) {
+        let largest_ah = 2.0 * self.rated_capacity_ah;
+        let (capacity, std, soh) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(2.0));
+        let (period, normalised) = (self.below(60_000.0), self.below(60_000.0));
+        let (usable, usable_std, ratio) = (self.below(largest_ah), self.below(largest_ah / 4.0), self.below(4.0));
+        let (cycles, cycles_low, days) = (self.below(60_000.0), self.below(60_000.0), self.below(8_000.0));
+        let fields = HealthFields {
+            capacity_ah: Some(capacity),
+            capacity_std_ah: Some(std),
+            soh: Some(soh),
+            recharge_period_s: Some(period),
+            normalized_recharge_period_s: Some(normalised),
+            usable_capacity_ah: Some(usable),
+            usable_capacity_std_ah: Some(usable_std),
+            resistance_ratio: Some(ratio),
+            remaining_cycles: Some(cycles),
+            remaining_cycles_low: Some(cycles_low),
+            remaining_days: Some(days),
+        };
+        let mut wanted = match page {
+            0 => self.wanted("Health", &[("Capacity", capacity), ("CapacityStd", std), ("Soh", 100.0 * soh)]),
+            1 => self.wanted("Health", &[("RechargePeriod", period), ("NormalizedRechargePeriod", normalised)]),
+            2 => self.wanted(
+                "Health",
+                &[("UsableCapacity", usable), ("UsableCapacityStd", usable_std), ("ResistanceRatio", 100.0 * ratio)],
+            ),
+            _ => self.wanted(
+                "Health",
+                &[("RemainingCycles", cycles), ("RemainingCyclesLow", cycles_low), ("RemainingDays", days)],
+            ),
+        };
+        wanted.push(("Page".to_owned(), f64::from(u8::try_from(page).unwrap()), 0.0));
+        (self.plan.health(page, &fields, &mut self.counters), wanted)
+    }
+
+    fn alarm(&mut self, number: usize) -> (Frame, Wanted) {
+        let (name, scale, largest) = RULES[number - 1];
+        let largest = if name.ends_with("CapacityLow") { 2.0 * self.rated_capacity_ah } else { largest };
+        let (value, threshold) = (self.below(largest), self.below(largest));
+        let (state, severity, cell) = (self.one_of(7), 1 + self.one_of(3), self.one_of(1024));
+        let (test, acknowledged) = (self.one_of(2), self.one_of(2));
+        let rule = u8::try_from(number).unwrap();
+        let fields = AlarmFields {
+            rule,
+            state: u8::try_from(state).ok(),
+            severity: u8::try_from(severity).ok(),
+            test: test == 1,
+            acknowledged: acknowledged == 1,
+            cell: u16::try_from(cell).ok().map(CellIndex),
+            value: Some(value),
+            threshold: Some(threshold),
+        };
+        let wanted = self.wanted(
+            "Alarm",
+            &[
+                ("Rule", f64::from(rule)),
+                ("State", f64::from(state)),
+                ("Severity", f64::from(severity)),
+                ("Test", f64::from(test)),
+                ("Acknowledged", f64::from(acknowledged)),
+                ("Cell", f64::from(cell)),
+                (&format!("Value_{name}"), scale * value),
+                (&format!("Threshold_{name}"), scale * threshold),
+            ],
+        );
+        (self.plan.alarm(&fields, &mut self.counters), wanted)
+    }
+}
+
+/// The header as a consumer finds it with the DBC, against our own check of it.
+fn check_header(case: Case, number: u16, frame: &Frame, read: &HashMap<String, f64>, expected: &mut [u8; 4]) {
+    let Some(profile) = case.profile else {
+        assert!(!read.contains_key("E2eCrc") && frame.data()[..2] == [0, 0], "{case:?}");
+        return;
+    };
+    let protection = Protection { profile, data_id: 0x0A50 + number };
+    let counter = &mut expected[usize::from(number)];
+    assert_eq!(protection.verified_counter(frame.data()), Some(*counter), "{case:?}");
+    assert_eq!(read["E2eCounter"], f64::from(*counter), "{case:?}");
+    *counter = profile.next_counter(*counter);
+    if profile == Profile::P01C {
+        assert_eq!(read["E2eDataIdNibble"], 10.0, "the low nibble of 0x0A");
+    }
+}
+
+#[test]
+fn every_configuration_s_dbc_loads_strictly_and_decodes_its_frames_within_half_a_step() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("written.dbc");
+    let (mut frames, mut compared) = (0, 0);
+    let cases = Case::all();
+    for (seed, case) in (0..).zip(&cases) {
+        let database = case.layout();
+        std::fs::write(&path, database.to_dbc_bytes()).unwrap();
+        assert_eq!(Database::parse_bytes(&std::fs::read(&path).unwrap()).unwrap(), database);
+        let mut maker = Maker {
+            random: ChaCha8Rng::seed_from_u64(seed),
+            plan: OutputPlan::new(&database).unwrap(),
+            counters: SendCounters::default(),
+            rated_capacity_ah: case.rated_capacity_ah,
+            database,
+        };
+        let mut made: Vec<(u16, &str, Frame, Wanted)> = Vec::new();
+        for turn in 0..FRAMES {
+            let (frame, wanted) = maker.status();
+            made.push((1, "PACKWATCH_Status", frame, wanted));
+            let (frame, wanted) = maker.health(turn % 4);
+            made.push((2, "PACKWATCH_Health", frame, wanted));
+            let (frame, wanted) = maker.alarm(turn % 14 + 1);
+            made.push((3, "PACKWATCH_Alarm", frame, wanted));
+        }
+        let lines: Vec<_> = made.iter().map(|(_, name, frame, _)| format!("{name} {}", hex(frame.data()))).collect();
+        let answers = ask(&python, &path, &["decode", "strict"], &lines);
+        let mut expected = [0; 4];
+        for (((number, _, frame, wanted), line), answer) in made.iter().zip(&lines).zip(&answers) {
+            let read = values(line, answer);
+            let kind = if case.fd { FrameKind::Fd { brs: true, esi: false } } else { FrameKind::Classic };
+            assert_eq!((frame.kind(), frame.id()), (kind, case.message(*number).id.unwrap()));
+            for (name, value, half_step) in wanted {
+                let off = (read[name] - value).abs();
+                assert!(off <= half_step + 1e-9, "{case:?} {name}: {} for {value}", read[name]);
+            }
+            let header =
+                if case.profile.is_some() { read.keys().filter(|name| name.starts_with("E2e")).count() } else { 0 };
+            assert_eq!(read.len(), wanted.len() + header, "{case:?}: nothing but what was meant is read: {read:?}");
+            check_header(*case, *number, frame, &read, &mut expected);
+            frames += 1;
+            compared += wanted.len() + header;
+        }
+    }
+    assert_eq!(cases.len(), 28);
+    eprintln!("{} configurations, {frames} frames, {compared} values compared", cases.len());
+}
+
+#[test]
+fn a_consumer_reads_the_configuration_from_the_dbc() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("written.dbc");
+    for case in Case::all() {
+        std::fs::write(&path, case.layout().to_dbc_bytes()).unwrap();
+        let profile = case.profile.map_or("-", |profile| profile.name());
+        let wanted = (1..).zip(["Status", "Health", "Alarm", "Command"]).map(|(number, name)| {
+            let id = case.message(number).id.unwrap().raw();
+            let (extended, fd) = (u8::from(case.extended), u8::from(case.fd));
+            let length = if case.profile == Some(Profile::P05) { 12 } else { 8 };
+            let data_id = case.profile.map_or("-".to_owned(), |_| (0x0A50 + number).to_string());
+            format!("PACKWATCH_{name} {id} {extended} {fd} {fd} {length} 250 {profile} {data_id}")
+        });
+        assert_eq!(ask(&python, &path, &["about", "strict"], &[]), wanted.collect::<Vec<_>>(), "{case:?}");
+    }
+}
+
+/// `capacity_low` as the DBC writes it: `CapacityLow`.
+fn camel_case(name: &str) -> String {
+    let capital = |word: &str| word[..1].to_uppercase() + &word[1..];
+    name.split('_').map(capital).collect()
+}
+
+#[test]
+fn every_rule_is_named_in_the_value_tables_by_its_number() {
+    let text = include_str!("../../config/packwatch.dbc");
+    let dbc = Database::parse(text).unwrap();
+    let rules = Rule::ALL.map(|rule| (i64::from(rule as u8), camel_case(rule.name())));
+    for signal in ["PACKWATCH_Alarm.Rule", "PACKWATCH_Command.Rule"] {
+        let table = &dbc.signal(signal).unwrap().1.values;
+        assert_eq!(table[..rules.len()], rules, "{signal}");
+        assert_eq!(table.len(), rules.len() + 1, "{signal}: and one code for none or all");
+    }
+}
+
+#[test]
+fn a_command_that_a_consumer_encodes_with_the_dbc_is_understood() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("written.dbc");
+    for case in Case::all() {
+        let database = case.layout();
+        std::fs::write(&path, database.to_dbc_bytes()).unwrap();
+        let header = match case.profile {
+            None => String::new(),
+            Some(Profile::P01C) => " E2eCrc=0 E2eCounter=0 E2eDataIdNibble=0".to_owned(),
+            Some(Profile::P01A | Profile::P05) => " E2eCrc=0 E2eCounter=0".to_owned(),
+        };
+        let lines = [
+            format!("PACKWATCH_Command Command=clear Rule=BmsDisagrees Severity=severe Cell=95{header}"),
+            format!("PACKWATCH_Command Command=pack_replaced Rule=all Severity=all Cell=all{header}"),
+        ];
+        let answers = ask(&python, &path, &["encode", "strict"], &lines);
+        let plan = CommandPlan::new(&database).unwrap();
+        let decoded: Vec<_> =
+            answers.iter().map(|answer| plan.decode(&frame(plan.id(), case.fd, answer)).unwrap()).collect();
+        assert_eq!((decoded[0].command, decoded[0].rule, decoded[0].severity), (Command::Clear, Some(12), Some(3)));
+        assert_eq!(decoded[0].cell, Some(CellIndex(95)));
+        assert_eq!((decoded[1].command, decoded[1].rule, decoded[1].severity), (Command::PackReplaced, None, None));
+        assert_eq!(decoded[1].cell, None);
+    }
+}
+
+fn frame(id: CanId, fd: bool, hex: &str) -> Frame {
+    let byte = |place: usize| u8::from_str_radix(&hex[place..place + 2], 16).unwrap();
+    let bytes: Vec<u8> = (0..hex.len()).step_by(2).map(byte).collect();
+    if fd { Frame::fd(id, true, false, &bytes) } else { Frame::classic(id, &bytes) }.unwrap()
+}
+
+#[test]
+fn the_command_line_writes_the_dbc_of_the_configuration() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("out.dbc");
+    std::fs::write(&path, "old").unwrap();
+    let packwatch = || assert_cmd::Command::cargo_bin("packwatch").unwrap();
+    let config = root.join("config/example.toml");
+    let shown = packwatch().arg("dbc").arg("-c").arg(&config).assert().success().get_output().stdout.clone();
+    packwatch().arg("dbc").arg("-c").arg(&config).arg("-o").arg(&path).assert().success();
+    assert_eq!(std::fs::read(&path).unwrap(), shown, "an old file is replaced");
+    let written = Database::parse_bytes(&shown).unwrap();
+    assert_eq!(written, packwatch::config::load(&config).unwrap().output_layout.unwrap());
+    let silent = std::fs::read_to_string(&config).unwrap().replace("[output]", "[output]\nenabled = false");
+    let silent = silent.replace("cells/", &format!("{}/config/cells/", root.display()));
+    let silent = silent.replace("\"pack96.dbc\"", &format!("\"{}/config/pack96.dbc\"", root.display()));
+    let silent_path = folder.path().join("silent.toml");
+    std::fs::write(&silent_path, silent).unwrap();
+    let error = packwatch().arg("dbc").arg("-c").arg(&silent_path).assert().code(78).get_output().stderr.clone();
+    assert!(String::from_utf8_lossy(&error).contains("nothing is sent"), "{}", String::from_utf8_lossy(&error));
+    packwatch().args(["dbc", "-c", "none.toml"]).assert().code(78);
+    packwatch().arg("dbc").arg("-c").arg(&config).args(["-o", "/dev/full"]).assert().code(1);
+}

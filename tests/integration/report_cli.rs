@@ -1,0 +1,178 @@
+//! `packwatch report` as its user meets it: pages from a replay and from a store, plots, a real browser when there is one.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use assert_cmd::cargo::cargo_bin;
+
+fn packwatch(args: &[&str]) -> Output {
+    Command::new(cargo_bin("packwatch")).args(args).output().expect("it runs")
+}
+
+fn good(args: &[&str]) {
+    let output = packwatch(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn bad(args: &[&str]) -> String {
+    let output = packwatch(args);
+    assert!(!output.status.success(), "{args:?}: no failure");
+    String::from_utf8(output.stderr).expect("text")
+}
+
+fn config() -> String {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml").display().to_string()
+}
+
+struct Place(tempfile::TempDir);
+
+impl Place {
+    /// A cell discharged and charged a few times, as CSV.
+    fn new() -> Self {
+        let place = Self(tempfile::tempdir().expect("a folder"));
+        let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
+        let mut soc: f64 = 0.9;
+        for second in 0..7_200_u32 {
+            let current_a = if second / 900 % 2 == 0 { 2.0 } else { -2.0 };
+            soc -= current_a / 3600.0 / 2.6;
+            let voltage_v = 3.3 + 0.8 * soc - 0.05 * current_a;
+            text.push_str(&format!("{},{current_a},{voltage_v:.4},24.5\n", 1_700_000_000 + second));
+        }
+        fs::write(place.0.path().join("cell.csv"), text).expect("written");
+        place
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path().join(name).display().to_string()
+    }
+
+    fn page(&self, name: &str, args: &[&str]) -> String {
+        let out = self.path(name);
+        good(&[&["report", "-o", &out], args].concat());
+        fs::read_to_string(out).expect("a page")
+    }
+}
+
+#[test]
+fn a_replay_becomes_a_page_with_every_part_and_the_same_bytes_again() {
+    let place = Place::new();
+    let log = place.path("cell.csv");
+    let page = place.page("a.html", &["-c", &config(), &log, "--title", "cell <1>"]);
+    for part in
+        ["cell &lt;1&gt;", "State of charge in the last", "Capacity between", "Usable capacity at 2 A", "Innovation"]
+    {
+        assert!(page.contains(part), "no {part:?}");
+    }
+    for foreign in ["NaN", "<script", "http:", "https:", "url("] {
+        assert!(!page.contains(foreign), "{foreign} in the page");
+    }
+    assert_eq!(page, place.page("b.html", &["-c", &config(), &log, "--title", "cell <1>"]));
+    assert!(page.len() < 600_000, "{} bytes", page.len());
+}
+
+#[test]
+fn a_store_becomes_a_page_that_says_what_is_unknown() {
+    let place = Place::new();
+    let (log, state) = (place.path("cell.csv"), place.path("state"));
+    good(&["replay", "-c", &config(), &log, "--state", &state]);
+    let page = place.page("a.html", &["--state", &state]);
+    assert!(page.contains("Capacity between") && page.contains("Duration of each charge"));
+    assert!(page.contains("unknown: the history keeps what was learned") && page.contains("all as they were written"));
+    assert!(page.contains("rated capacity not known without -c"));
+    assert!(page.contains("No forecast of the capacity: the record does not say which capacity is the end of life"));
+    assert!(place.page("b.html", &["--state", &state, "-c", &config()]).contains("of 2 Ah rated"));
+}
+
+#[test]
+fn plots_are_files_of_both_kinds_or_the_missing_font_is_reported() {
+    let place = Place::new();
+    let (log, plots, out) = (place.path("cell.csv"), place.path("plots"), place.path("a.html"));
+    let config = config();
+    let output = packwatch(&["report", "-o", &out, "-c", &config, &log, "--plots", &plots]);
+    if !output.status.success() {
+        let printed = String::from_utf8_lossy(&output.stderr);
+        assert!(printed.contains("no font is installed"), "{printed}");
+        return;
+    }
+    let names = |ending: &str| {
+        let files = fs::read_dir(&plots).expect("a folder").map(|file| file.expect("a file").path());
+        files.filter(|path| path.extension().is_some_and(|found| found == ending)).count()
+    };
+    assert!(names("svg") >= 6 && names("svg") == names("png"), "{} and {}", names("svg"), names("png"));
+}
+
+#[test]
+fn measured_capacities_stand_beside_the_estimates_and_faults_name_their_line() {
+    let place = Place::new();
+    let (log, table) = (place.path("cell.csv"), place.path("measured.csv"));
+    fs::write(&table, "time_s,capacity_ah\n1700003000,1.9\n").expect("written");
+    let page = place.page("a.html", &["-c", &config(), &log, "--reference", &table]);
+    assert!(page.contains("reference 1.900 Ah"));
+    fs::write(&table, "time_s,capacity_ah\n1700003000,much\n").expect("written");
+    let printed = bad(&["report", "-c", &config(), &log, "--reference", &table, "-o", &place.path("b.html")]);
+    assert!(printed.contains("measured.csv:2: column capacity_ah: found \"much\", must be a number"), "{printed}");
+    assert!(bad(&["report", "-o", &place.path("b.html"), "--state", &place.path("none")]).contains("no history there"));
+    assert!(bad(&["report", "-c", &config(), &log, "-o", &log]).contains("is read, cannot be written too"));
+}
+
+#[test]
+fn a_life_is_reported_with_its_truth_and_the_remaining_life_of_the_core() {
+    let place = Place::new();
+    let [log, truth, events, state] = ["life.log", "truth.csv", "events.jsonl", "state"].map(|name| place.path(name));
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml").display().to_string();
+    let whole = ["--cycles", "8", "--truth", &truth, "--truth-period", "60"];
+    good(&[&["simulate", "paper", "-c", &config, "-o", &log][..], &whole].concat());
+    good(&["replay", "-c", &config, &log, "--events", &events, "--state", &state]);
+    let text = fs::read_to_string(&events).expect("events");
+    let printed = text.lines().map(|line| serde_json::from_str(line).expect("JSON"));
+    let mut lives = printed.filter(|event: &serde_json::Value| event["event"] == "remaining_life");
+    let last = lives.next_back().expect("a forecast");
+    let digits = |name: &str| {
+        let value = last[name].as_f64().expect("known");
+        if value < 9.95 { format!("{value:.1}") } else { format!("{value:.0}") }
+    };
+    let words = format!("{} to {} in nine of ten cases", digits("cycles_low"), digits("cycles_high"));
+    let median = format!("{} cycles<", digits("cycles"));
+    let replayed = place.page("a.html", &["-c", &config, &log, "--reference", &truth]);
+    for part in [words.as_str(), &median, "forecast, 5 to 95 %", "end of life", "true (reference)"] {
+        assert!(replayed.contains(part), "no {part:?}");
+    }
+    let stored = place.page("b.html", &["-c", &config, "--state", &state]);
+    assert!(
+        stored.contains(&words) && stored.contains(&median) && stored.contains("forecast, 5 to 95 %"),
+        "no {words:?} from the store"
+    );
+}
+
+/// A browser that is installed here.
+fn browser() -> Option<PathBuf> {
+    let folders = std::env::var_os("PATH")?;
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    std::env::split_paths(&folders).flat_map(|folder| names.map(|name| folder.join(name))).find(|path| path.is_file())
+}
+
+#[test]
+fn a_browser_finds_nothing_to_fetch_nothing_to_complain_of_and_nothing_too_wide() {
+    let Some(browser) = browser() else {
+        println!("skipped: no Chromium is installed");
+        return;
+    };
+    let place = Place::new();
+    let (log, state) = (place.path("cell.csv"), place.path("state"));
+    good(&["replay", "-c", &config(), &log, "--state", &state]);
+    let _ = place.page("replay.html", &["-c", &config(), &log]);
+    let _ = place.page("state.html", &["-c", &config(), "--state", &state]);
+    let tool = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/tools/look_at_page.py");
+    for (page, width, scheme) in
+        [("replay.html", "1280", "light"), ("replay.html", "390", "dark"), ("state.html", "390", "light")]
+    {
+        let mut command = Command::new("python3");
+        command.arg(&tool).arg(&browser).arg(place.path(page));
+        let output = command.args([width, "900", scheme]).output().expect("python3 runs");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let printed: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        let expected = serde_json::json!({ "requests": [], "messages": [], "overflow_px": 0 });
+        assert_eq!(printed, expected, "{page} at {width} pixels, {scheme}");
+    }
+}

@@ -1,0 +1,156 @@
+//! `packwatch simulate` and `packwatch demo` as their users run them.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use packwatch::io::candump::{Line, parse_line};
+
+fn config(name: &str) -> String {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config").join(name).display().to_string()
+}
+
+fn packwatch(args: &[&str]) -> Output {
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_packwatch"));
+    command.args(args).output().expect("the binary runs")
+}
+
+/// Simulates half a minute of the 96-cell day into `folder`; gives log and truth.
+fn simulate_day(folder: &Path, name: &str, seed: &str) -> (PathBuf, PathBuf) {
+    let (log, truth) = (folder.join(format!("{name}.log")), folder.join(format!("{name}.csv")));
+    let (log_text, truth_text) = (log.display().to_string(), truth.display().to_string());
+    let example = config("example.toml");
+    let output = packwatch(&[
+        "simulate",
+        "ev-day",
+        "-c",
+        &example,
+        "-o",
+        &log_text,
+        "--truth",
+        &truth_text,
+        "--seed",
+        seed,
+        "--duration",
+        "30",
+    ]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    (log, truth)
+}
+
+fn bytes(path: &Path) -> Vec<u8> {
+    std::fs::read(path).expect("the file was written")
+}
+
+#[test]
+fn a_seed_gives_the_same_bytes_and_another_seed_others() {
+    let folder = tempfile::tempdir().expect("a folder for the test");
+    let first = simulate_day(folder.path(), "first", "3");
+    let again = simulate_day(folder.path(), "again", "3");
+    let other = simulate_day(folder.path(), "other", "4");
+    assert!(bytes(&first.0) == bytes(&again.0) && bytes(&first.1) == bytes(&again.1));
+    assert!(bytes(&first.0) != bytes(&other.0));
+}
+
+#[test]
+fn log_is_candump_in_order_of_time_with_current_every_10_ms() {
+    let folder = tempfile::tempdir().expect("a folder for the test");
+    let (log, _) = simulate_day(folder.path(), "day", "1");
+    let log = bytes(&log);
+    let (mut last_ns, mut currents) = (0, 0);
+    for line in log.split(|&b| b == b'\n').filter(|line| !line.is_empty()) {
+        match parse_line(line) {
+            Ok(Line::Frame { time, frame, .. }) => {
+                assert!(time.nanos() > last_ns, "{}", String::from_utf8_lossy(line));
+                last_ns = time.nanos();
+                currents += u32::from(frame.id().raw() == 256);
+            }
+            _ => panic!("not a frame: {}", String::from_utf8_lossy(line)),
+        }
+    }
+    assert_eq!(currents, 3000);
+    assert_eq!(last_ns / 1_000_000_000, 1_700_000_029);
+}
+
+#[test]
+fn truth_has_a_row_per_cell_and_second_and_its_charge_balances() {
+    let folder = tempfile::tempdir().expect("a folder for the test");
+    let (log, truth) = (folder.path().join("p.log.gz"), folder.path().join("p.csv.gz"));
+    let (log_text, truth_text) = (log.display().to_string(), truth.display().to_string());
+    let example = config("example.toml");
+    let output = packwatch(&[
+        "simulate",
+        "paper",
+        "-c",
+        &example,
+        "-o",
+        &log_text,
+        "--truth",
+        &truth_text,
+        "--cells",
+        "2",
+        "--duration",
+        "600",
+        "--truth-period",
+        "10",
+    ]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let mut text = String::new();
+    flate2::read::GzDecoder::new(bytes(&truth).as_slice()).read_to_string(&mut text).expect("gzip of text");
+    let mut rows = csv::Reader::from_reader(text.as_bytes());
+    let head = "time_s,cell,soc,u1_v,capacity_ah,resistance_ratio,current_a,voltage_v,temperature_c";
+    assert_eq!(rows.headers().expect("a head").iter().collect::<Vec<_>>().join(","), head);
+    let rows: Vec<Vec<f64>> = rows.deserialize().collect::<Result<_, _>>().expect("numbers");
+    assert_eq!(rows.len(), 2 * 60);
+    let (first, last) = (&rows[0], &rows[rows.len() - 2]);
+    let charge_ah = first[6] * (last[0] - first[0]) / 3600.0;
+    assert!((first[2] - last[2] - charge_ah / first[4]).abs() < 1e-8);
+    let mut log_text = String::new();
+    flate2::read::GzDecoder::new(bytes(&log).as_slice()).read_to_string(&mut log_text).expect("gzip of text");
+    assert!(log_text.starts_with("(1700000000.000000000) can0 100#"), "{:?}", log_text.lines().next());
+}
+
+#[test]
+fn settings_out_of_range_are_refused_with_the_allowed_range() {
+    let example = config("example.toml");
+    for (args, code, says) in [
+        (vec!["--initial-soc", "2"], 2, "must be 0 to 1"),
+        (vec!["--noise-voltage", "nan"], 2, "must be 0 or more"),
+        (vec!["--duration", "0"], 2, "must be above 0"),
+        (vec!["--cells", "97"], 1, "has signals for 96"),
+        (vec!["--cell-period", "15"], 1, "must be a multiple"),
+    ] {
+        let mut all = vec!["simulate", "ev-day", "-c", &example, "-o", "/dev/null"];
+        all.extend(args);
+        let output = packwatch(&all);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(code), "{all:?}: {message}");
+        assert!(message.contains(says), "{all:?}: {message}");
+    }
+}
+
+#[test]
+fn a_missing_configuration_and_a_log_that_cannot_be_written_are_reported() {
+    let missing = packwatch(&["simulate", "paper", "-c", "/nowhere/pack.toml", "-o", "/dev/null"]);
+    assert_eq!(missing.status.code(), Some(78));
+    let example = config("example.toml");
+    let unwritable = packwatch(&["simulate", "paper", "-c", &example, "-o", "/nowhere/x.log", "--duration", "1"]);
+    assert_eq!(unwritable.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&unwritable.stderr).contains("/nowhere/x.log: cannot be written"));
+}
+
+#[test]
+fn demo_ends_with_both_alarms_as_decoded_frames() {
+    for seed in ["1", "2", "3"] {
+        let output = packwatch(&["demo", "--seed", seed]);
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        assert!(output.status.success(), "{text}{}", String::from_utf8_lossy(&output.stderr));
+        let last = text.lines().last().unwrap_or_default();
+        assert!(
+            last.starts_with("capacity alarm raised in cycle ") && last.contains("recharge-period alarm in cycle ")
+        );
+        let frames =
+            text.lines().filter(|line| line.starts_with('(')).filter_map(|line| parse_line(line.as_bytes()).ok());
+        assert_eq!(frames.count(), 2, "{text}");
+    }
+}

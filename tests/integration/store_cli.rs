@@ -1,0 +1,154 @@
+//! State and history as their user meets them: `replay --state`, `history`, `reset`.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Output;
+
+use assert_cmd::Command;
+use serde_json::Value;
+
+fn packwatch(args: &[&str]) -> Output {
+    let mut command = Command::cargo_bin("packwatch").expect("the binary is built");
+    // Whatever runs on this machine is not asked.
+    command.env("RUNTIME_DIRECTORY", "/nonexistent").args(args).output().expect("it runs")
+}
+
+fn good(args: &[&str]) -> String {
+    let output = packwatch(args);
+    assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).expect("text")
+}
+
+fn bad(args: &[&str]) -> String {
+    let output = packwatch(args);
+    assert_eq!(output.status.code(), Some(1), "{args:?}: {}", String::from_utf8_lossy(&output.stdout));
+    String::from_utf8(output.stderr).expect("text")
+}
+
+/// A cell discharged and charged a few times, as CSV.
+fn log(folder: &Path) -> String {
+    let mut text = String::from("time_s,current_a,voltage_v,temperature_c\n");
+    let mut soc: f64 = 0.9;
+    for second in 0..7_200_u32 {
+        let current_a = if second / 900 % 2 == 0 { 2.0 } else { -2.0 };
+        soc -= current_a / 3600.0 / 2.6;
+        let voltage_v = 3.3 + 0.8 * soc - 0.05 * current_a;
+        text.push_str(&format!("{},{current_a},{voltage_v:.4},24.5\n", 1_700_000_000 + second));
+    }
+    let path = folder.join("cell.csv");
+    fs::write(&path, text).expect("written");
+    path.display().to_string()
+}
+
+struct Place {
+    folder: tempfile::TempDir,
+}
+
+impl Place {
+    /// A state folder filled by a replay.
+    fn filled() -> Self {
+        let place = Self { folder: tempfile::tempdir().expect("a folder") };
+        let log = log(place.folder.path());
+        let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml");
+        let snapshot = place.path("end.json");
+        let config = config.display().to_string();
+        good(&["replay", "-c", &config, &log, "--state", &place.state(), "--snapshot", &snapshot]);
+        place
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.folder.path().join(name).display().to_string()
+    }
+
+    fn state(&self) -> String {
+        self.path("state")
+    }
+
+    fn database(&self) -> PathBuf {
+        self.folder.path().join("state/packwatch.db")
+    }
+
+    fn rows(&self, args: &[&str]) -> Vec<Value> {
+        let state = self.state();
+        let text = good(&[&["history", "--state", &state, "--json", "--limit", "0"], args].concat());
+        let document: Value = serde_json::from_str(&text).expect("JSON");
+        document["rows"].as_array().expect("rows").clone()
+    }
+}
+
+#[test]
+fn learned_values_of_a_replay_are_in_the_history() {
+    let place = Place::filled();
+    let state = place.state();
+    let capacities = place.rows(&["--kind", "capacity"]);
+    assert!(capacities.len() >= 5, "{capacities:?}");
+    assert!(capacities.iter().all(|row| row["kind"] == "capacity" && row["cell"] == 0 && row["pack"] == 1));
+    assert_eq!(place.rows(&["--kind", "half-cycle"]).len(), place.rows(&["--kind", "half-cycle", "--cell", "1"]).len());
+    assert!(place.rows(&["--cell", "2"]).is_empty());
+    let late = place.rows(&["--since", "1700003000"]);
+    assert!(!late.is_empty() && late.len() < place.rows(&[]).len());
+    let table = good(&["history", "--state", &state, "--limit", "3"]);
+    assert_eq!(table.lines().count(), 4, "{table}");
+    let csv = good(&["history", "--state", &state, "export", "--kind", "capacity"]);
+    assert_eq!(csv.lines().count(), capacities.len() + 1);
+    assert!(csv.starts_with("kind,seq,wall_ns,utc,time_ns,boot,pack,cell,measured_ah,"), "{csv}");
+    assert!(good(&["history", "--state", &state, "verify"]).contains("all as they were written"));
+}
+
+#[test]
+fn verify_names_the_first_row_that_was_changed() {
+    let place = Place::filled();
+    let before = fs::read(place.database()).expect("read");
+    // A capacity's bytes, found in the file and changed by a bit.
+    let rows = place.rows(&["--kind", "capacity"]);
+    let wanted = rows[2]["capacity_ah"].as_f64().expect("a number").to_be_bytes();
+    let at = before.windows(8).position(|window| window == wanted).expect("in the file");
+    let mut after = before.clone();
+    after[at + 7] ^= 1;
+    fs::write(place.database(), after).expect("written");
+    let printed = bad(&["history", "--state", &place.state(), "verify"]);
+    let row = rows[2]["seq"].as_i64().expect("a number");
+    assert!(printed.contains(&format!("row {row} (capacity) is not as it was written: expected ")), "{printed}");
+}
+
+#[test]
+fn a_replay_never_gets_into_a_history_that_exists() {
+    let place = Place::filled();
+    let log = place.path("cell.csv");
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/measured.toml").display().to_string();
+    let before = fs::read(place.database()).expect("read");
+    let printed = bad(&["replay", "-c", &config, &log, "--state", &place.state()]);
+    assert!(printed.contains("packwatch.db: exists; a replay needs a state folder of its own"), "{printed}");
+    assert_eq!(fs::read(place.database()).expect("read"), before);
+}
+
+#[test]
+fn another_pack_without_a_daemon_begins_a_new_history() {
+    let place = Place::filled();
+    let (state, socket) = (place.state(), place.path("none.sock"));
+    let reset = ["reset", "--pack-replaced", "--state", &state, "--control", &socket];
+    assert!(bad(&reset).contains("--yes"));
+    let printed = good(&[&reset[..], &["--yes"]].concat());
+    assert!(printed.contains("the history of pack 1 is closed, that of pack 2 begins"), "{printed}");
+    let mut resets = place.rows(&["--kind", "reset"]);
+    resets.retain(|row| row["reason"] != "filter_reset");
+    assert_eq!(resets.len(), 1);
+    assert_eq!((resets[0]["reason"].as_str(), resets[0]["pack"].as_i64()), (Some("pack_replaced"), Some(1)));
+    assert!(resets[0]["capacity_ah"].as_f64().is_some_and(|ah| (1.0..4.0).contains(&ah)), "{resets:?}");
+    assert!(good(&["history", "--state", &state, "verify"]).contains("all as they were written"));
+    let nowhere = place.path("nowhere");
+    let printed = bad(&["reset", "--pack-replaced", "--yes", "--state", &nowhere, "--control", &socket]);
+    assert!(printed.contains("no daemon runs, and there is no history"), "{printed}");
+}
+
+#[test]
+fn a_history_of_a_newer_program_or_none_at_all_is_said_to_be_so() {
+    let place = Place::filled();
+    let printed = bad(&["history", "--state", &place.path("nowhere")]);
+    assert!(printed.contains("no history there"), "{printed}");
+    let mut bytes = fs::read(place.database()).expect("read");
+    bytes[60..64].copy_from_slice(&99_u32.to_be_bytes());
+    fs::write(place.database(), bytes).expect("written");
+    let printed = bad(&["history", "--state", &place.state()]);
+    assert!(printed.contains("layout version 99, this program reads 1 to 2"), "{printed}");
+}

@@ -1,0 +1,7 @@
+//! Helpers that several subjects share.
+
+pub(crate) mod config_texts;
+pub(crate) mod oracle;
+pub(crate) mod rig;
+pub(crate) mod simulated_cell;
+pub(crate) mod window;

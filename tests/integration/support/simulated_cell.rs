@@ -1,0 +1,36 @@
+//! A simulated cell through the whole core in one process: truth -> sensors -> frames of the DBC -> Monitor, with the ticks
+//! of a replay. Shared by the tests that judge the estimates.
+
+use packwatch::can::encode::InputEncoder;
+use packwatch::io::ticks::Ticks;
+use packwatch::monitor::{Event, Input, Monitor, MonitorConfig, Outputs, TICK_PERIOD_MS};
+use packwatch::quantity::Timestamp;
+use packwatch::sim::{Simulation, Wiring};
+
+/// A hole in the record longer than this means that its recorder was asleep, s; there is none here.
+const SLEEP_GAP_S: f64 = 30.0;
+
+/// Runs `settings` to its end; after each moment `each` sees its time, the truth, the core, and the events of the core.
+pub(crate) fn live(
+    config: MonitorConfig,
+    settings: packwatch::sim::Settings,
+    mut each: impl FnMut(Timestamp, &Simulation, &Monitor, &[Event]),
+) {
+    let mut sim = Simulation::new(config.model.clone(), settings, Wiring::single());
+    let encoder = InputEncoder::new(&config.input);
+    let mut monitor = Monitor::new(config);
+    let (mut ticks, mut out, mut frames) = (Ticks::new(TICK_PERIOD_MS, SLEEP_GAP_S), Outputs::default(), Vec::new());
+    while let Some(moment) = sim.advance() {
+        frames.clear();
+        encoder.encode(sim.readings(), &mut frames);
+        ticks.advance(moment.time);
+        while let Some(time) = ticks.pop(monitor.next_due()) {
+            monitor.handle(Input::Tick { time }, &mut out);
+        }
+        for (bus, frame) in &frames {
+            monitor.handle(Input::Frame { time: moment.time, bus: *bus, frame }, &mut out);
+        }
+        each(moment.time, &sim, &monitor, &out.events);
+        out.clear();
+    }
+}
