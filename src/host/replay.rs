@@ -86,6 +86,9 @@ impl ReplaySettings {
     }
 }
 
+/// Called with the outputs of each input.
+pub type OutputWatch = Box<dyn FnMut(&Outputs)>;
+
 /// Files of the results.
 #[derive(Default)]
 pub struct Sinks {
@@ -96,7 +99,7 @@ pub struct Sinks {
     /// candump lines of the frames that would be sent.
     pub frames: Option<ResultFile>,
     /// Called with the outputs of each input.
-    pub watch: Option<Box<dyn FnMut(&Outputs)>>,
+    pub watch: Option<OutputWatch>,
 }
 
 /// Reason why a replay ended early.

@@ -430,7 +430,7 @@ impl ReadState {
     /// The next good row's time on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
-            match log.next() {
+            match log.next_row() {
                 Ok(RowResult::Good(row)) => {
                     self.counts.lines += 1;
                     if row.after_unknown_gap {

@@ -50,7 +50,7 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
             .change_cell_model()
             .advice("compare with the SOC the vehicle shows");
         judge.add(finding);
-    } else if let Some(last_v) = rests.last() {
+    } else if let Some(last_v) = rests.next_back() {
         let (voltage, soc) = (number(last_v), per_cent(last_v));
         judge.fine(format!("{voltage} V at rest: {soc} % by the cell model; compare with the SOC the vehicle shows"));
     } else {
