@@ -24,7 +24,7 @@
 //! | | [`service`] | the live loop: links, ticks, readiness, reload, watchdog |
 //! | | [`replay`], [`diagnosis`] | loops that are no service: recorded logs, the doctor |
 //! | `src/lab` | `lab` | fit, score, remaining life, Gaussian processes, reports, what-if, export, plots (feature `lab`) |
-//! | `src/cli` | [`cli`] | one file per command, named like it; `main.rs` only calls it |
+//! | `src/cli` | [`cli`] | one file (and folder) per command, named like it; `main.rs` only calls it |
 //!
 //! # The path of a frame
 //! `host/io/socket` receives it, `host/service/live.rs` passes it on, then [`monitor`]: `intake` (protection, flood) → `can/decode`
@@ -32,27 +32,30 @@
 //! at `host/replay.rs` instead; all after it is the same.
 //!
 //! # To change something, open
+//! Paths are below `src`, except those that begin with `/`.
+//!
 //! | change | file |
 //! | --- | --- |
-//! | a new alarm rule | `core/alarm/rule.rs` (its table row); its value comes from `core/monitor/watch.rs` or `publisher.rs` |
-//! | when an alarm is raised, latched, cleared | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
+//! | a new alarm rule | `core/alarm/rule.rs` (its table row); values that follow from inputs come from `core/monitor/watch.rs`, learned ones from `core/monitor/learning.rs` |
+//! | debounce, hysteresis, latch of an alarm | `core/alarm/machine.rs` (states), `core/alarm/limit.rs` (thresholds) |
 //! | a new event | `core/monitor/event.rs` |
-//! | a value in a sent frame | `config/packwatch.dbc`, `core/can/encode/output.rs` |
-//! | an end-to-end profile | `core/can/e2e.rs` (sender), `core/can/e2e/receiver.rs` |
+//! | a value in a sent frame | `/config/packwatch.dbc` (written by hand, compiled in), then `core/can/encode/output.rs` |
+//! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs` |
-//! | a configuration key | `host/config/keys.rs` |
-//! | a status field | `host/status/document.rs`; its column on screen: `cli/status` |
+//! | a configuration key | its table in `host/config/keys/` (`input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |
+//! | a status field | `host/status/document.rs` (type), `host/status/collect.rs` (value); on screen: `cli/status` |
 //! | a metric | `host/status/metrics.rs` |
 //! | a history table or column | `host/store/schema.rs`, `host/store/rows.rs` |
 //! | a command over the control socket | `host/control/protocol.rs` |
 //! | a log format | `host/io/log.rs`; lines of candump: `host/io/candump.rs` |
-//! | a column of estimates or exports | `host/replay/rows.rs`; Parquet and CSV: `lab/fleet/export/columns.rs` |
+//! | a column of `replay --estimates` | `host/replay/rows.rs` |
+//! | a column of `export` (Parquet, CSV) | `lab/fleet/export/columns.rs` |
 //! | a finding of the doctor | `core/doctor/judge` |
 //! | a section or plot of the report | `lab/report/html.rs`, `lab/report/pictures.rs` |
-//! | a command or its options | `cli/COMMAND.rs` |
+//! | a command or its options | `cli/COMMAND.rs`, or `cli/COMMAND/args.rs` where that exists |
 //!
 //! # Invariants
 //! * `src/core` and `src/regress` never read a clock, a file or a socket and never log: the same inputs give the same outputs, byte

@@ -46,6 +46,22 @@ pub(crate) struct Args {
     /// Slow discharge from full (C/20 or so), once per temperature: the OCV is its discharge branch with a smooth correction
     #[arg(long, value_name = "FILE")]
     ocv: Vec<PathBuf>,
+    #[command(flatten)]
+    grid: GridArgs,
+    /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
+    #[arg(long, value_name = "N", conflicts_with_all = ["ocv", "capacity"])]
+    first_cycles: Option<usize>,
+    /// Plot of the residuals to write
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Size and breakpoints of the model.
+#[derive(Debug, clap::Args)]
+struct GridArgs {
     /// RC branches [default: 2, for an ageing cell 1]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=MAX_BRANCHES as i64))]
     branches: Option<u8>,
@@ -58,15 +74,6 @@ pub(crate) struct Args {
     /// SOC nodes: how many (evenly spaced), or a rising list from 0 to 1 [default: 15 with a slow test, 25 for an ageing cell, else 24; closer near both ends]
     #[arg(long, value_name = "N|S,..", value_parser = soc_nodes)]
     soc_nodes: Option<SocNodes>,
-    /// An ageing cell: use parts up to this number only, anchored at full charges and at the discharges' knees
-    #[arg(long, value_name = "N", conflicts_with_all = ["ocv", "capacity"])]
-    first_cycles: Option<usize>,
-    /// Plot of the residuals to write
-    #[arg(long, value_name = "FILE.svg")]
-    plot: Option<PathBuf>,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
 }
 
 /// SOC breakpoints as checked on the command line.
@@ -86,12 +93,12 @@ fn soc_nodes(text: &str) -> Result<SocNodes, String> {
 
 /// Runs the command.
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    for (key, list) in [("--tau", &args.tau), ("--temperatures", &args.temperatures)] {
+    for (key, list) in [("--tau", &args.grid.tau), ("--temperatures", &args.grid.temperatures)] {
         if let Some([a, b]) = list.as_ref().and_then(|list| list.array_windows().find(|[a, b]| a >= b)) {
             return Err(Failure::new(format!("{key}: {b} follows {a}, must rise")));
         }
     }
-    if args.tau.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
+    if args.grid.tau.as_ref().is_some_and(|tau| tau.len() > MAX_BRANCHES) {
         return Err(Failure::new(format!("--tau: more than {MAX_BRANCHES} values, one per branch")));
     }
     let begin = Instant::now();
@@ -118,10 +125,10 @@ fn request(args: &Args) -> FitRequest {
         voltage_max_v: args.voltage_max,
         ageing_shift: args.ageing_shift,
         ocv: args.ocv.clone(),
-        branches: args.branches.map(usize::from),
-        tau_s: args.tau.clone(),
-        temperature_c: args.temperatures.clone(),
-        soc: args.soc_nodes.as_ref().map(|nodes| nodes.0.clone()),
+        branches: args.grid.branches.map(usize::from),
+        tau_s: args.grid.tau.clone(),
+        temperature_c: args.grid.temperatures.clone(),
+        soc: args.grid.soc_nodes.as_ref().map(|nodes| nodes.0.clone()),
         first_cycles: args.first_cycles,
         files: args.files.clone(),
     }

@@ -8,7 +8,6 @@ use std::io;
 use std::path::Path;
 
 use super::Failure;
-
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;

@@ -15,7 +15,7 @@ use crate::io::result_file::check_place;
 use crate::lab;
 use crate::lab::report::{self, Data, Origin, PageContext};
 use crate::monitor::Monitor;
-use crate::replay::{self, OutputWatch, ReplaySettings, ReplaySummary, Sinks};
+use crate::replay::{self, ReplaySettings, ReplaySummary, Sinks};
 use crate::store::HistoryReader;
 
 /// Arguments of `report`.
@@ -121,7 +121,7 @@ fn of_replay(args: &Args, config: &Config) -> Result<(Data, Provenance), Failure
         out.estimates.iter().for_each(|estimate| data.take_estimate(estimate));
         out.events.iter().for_each(|event| data.take_event(event));
     });
-    let sinks = Sinks { watch: Some(OutputWatch(watch)), ..Sinks::default() };
+    let sinks = Sinks { watch: Some(watch), ..Sinks::default() };
     let bar = Bar::new(&args.logs);
     let monitor = Monitor::new(config.monitor.clone());
     let settings = ReplaySettings::plain(args.input.sleep_gap, config.interface_names());

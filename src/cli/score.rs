@@ -32,7 +32,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     bar.clear();
     let scores = scores.map_err(failure)?;
     let report = report::ScoreReport { config: &config, settings: &settings, cases: &cases, scores: &scores };
-    unless_closed(if args.json { report.json() } else { report.table() })
+    unless_closed(if args.output.json { report.json() } else { report.table() })
 }
 
 /// Loads the configuration, with the cell model of --cell in place of its own.
@@ -72,35 +72,35 @@ fn settings(args: &Args, config: &Config) -> Result<ScoreSettings, Failure> {
             config.path.display()
         )));
     }
-    if let Some(load) = args.load {
+    if let Some(load) = args.life.load {
         let taper_current_a =
             monitor.health.usable.map_or(monitor.model.rated_capacity_ah / 20.0, |u| u.taper_current_a);
         let (current_a, temperature_c, cutoff_v) = (load.current_a, load.temperature_c, load.cutoff_v);
         monitor.health.usable = Some(UsableConfig { current_a, temperature_c, cutoff_v, taper_current_a });
     }
-    if !args.cycles.is_empty() && monitor.health.usable.is_none() {
+    if !args.life.cycles.is_empty() && monitor.health.usable.is_none() {
         return Err(Failure::new(
             "no load for the usable capacity: --cycles needs --load CURRENT,TEMPERATURE,CUTOFF or a [usable] table",
         ));
     }
     Ok(ScoreSettings {
-        truth_capacity_ah: args.truth_capacity.unwrap_or(monitor.model.capacity_ah),
+        truth_capacity_ah: args.statistics.truth_capacity.unwrap_or(monitor.model.capacity_ah),
         monitor,
-        remove: args.remove,
-        settle_s: args.settle,
-        soc_std: args.soc_std.map(|points| points / 100.0),
-        capacity_std: args.capacity_std.map(|percent| percent / 100.0),
-        sleep_gap_s: args.sleep_gap,
-        threshold_ah: args.threshold,
-        skip_cycles: args.skip_cycles,
-        window: args.window,
-        plots: args.plot.clone(),
+        remove: args.starts.remove,
+        settle_s: args.statistics.settle,
+        soc_std: args.starts.soc_std.map(|points| points / 100.0),
+        capacity_std: args.starts.capacity_std.map(|percent| percent / 100.0),
+        sleep_gap_s: args.statistics.sleep_gap,
+        threshold_ah: args.life.threshold,
+        skip_cycles: args.life.skip_cycles,
+        window: args.life.window,
+        plots: args.output.plot.clone(),
     })
 }
 
 fn jobs(args: &Args) -> Result<Vec<ScoreJob>, Failure> {
     let names = short_names(&args.files);
-    let tables = args.cycles.iter().map(|path| CycleTable::read(path).map(Some));
+    let tables = args.life.cycles.iter().map(|path| CycleTable::read(path).map(Some));
     let tables: Result<Vec<_>, _> = tables.collect();
     let mut tables = tables.map_err(failure)?;
     tables.resize(args.files.len(), None);
@@ -111,12 +111,16 @@ fn jobs(args: &Args) -> Result<Vec<ScoreJob>, Failure> {
 impl Args {
     /// Every combination, in the order of the lists.
     fn cases(&self) -> Vec<Case> {
-        let seeds = if self.window.is_some() { self.seed.iter().map(|&seed| Some(seed)).collect() } else { vec![None] };
+        let seeds = if self.life.window.is_some() {
+            self.life.seed.iter().map(|&seed| Some(seed)).collect()
+        } else {
+            vec![None]
+        };
         let mut cases = Vec::new();
-        for start in &self.start {
-            for error in &self.told {
-                for &capacity_error_percent in &self.capacity_error {
-                    for &current_offset_a in &self.current_offset {
+        for start in &self.starts.start {
+            for error in &self.starts.soc_error {
+                for &capacity_error_percent in &self.starts.capacity_error {
+                    for &current_offset_a in &self.starts.current_offset {
                         cases.extend(seeds.iter().map(|&seed| Case {
                             start: (*start).into(),
                             soc_error_points: error.0,

@@ -88,6 +88,16 @@ impl InvalidState {
         Self::unless((0.0..=1e20).contains(&found), what, found, "0 to 1e20")
     }
 
+    /// Applies [`Self::unless_number`] to all; the error is the first one.
+    pub fn unless_numbers(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
+        all.into_iter().try_for_each(|found| Self::unless_number(what, found))
+    }
+
+    /// Applies [`Self::unless_natural`] to all; the error is the first one.
+    pub fn unless_naturals(what: &'static str, all: impl IntoIterator<Item = f64>) -> Result<(), Self> {
+        all.into_iter().try_for_each(|found| Self::unless_natural(what, found))
+    }
+
     /// Rejects numbers at or near 0 as well, so that the caller can divide by the square.
     pub fn unless_positive(what: &'static str, found: f64) -> Result<(), Self> {
         Self::unless((1e-40..=1e20).contains(&found), what, found, "1e-40 to 1e20")
@@ -194,10 +204,11 @@ pub struct Reading {
 }
 
 /// Operating mode: sign of the current after dead band, hysteresis and minimum duration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Mode {
     /// No current reading yet, or it is stale.
+    #[default]
     Unknown,
     /// Current negative beyond the dead band.
     Charge,

@@ -36,8 +36,8 @@ use summary::{note_event, peak_memory_kib};
 /// Records between two looks at the clock for the progress report.
 const REPORT_EVERY: usize = 4096;
 
-/// Settings of a replay.
-#[derive(Debug)]
+/// Settings of a replay; by default all of it, as fast as possible, with nothing stored.
+#[derive(Debug, Default)]
 pub struct ReplaySettings {
     /// Times real time; `None` = as fast as possible.
     pub speed: Option<f64>,
@@ -55,7 +55,7 @@ pub struct ReplaySettings {
     pub restore: Option<Snapshot>,
     /// How old it is; `None` = as the journal says, or else its stamp.
     pub away: Option<Downtime>,
-    /// Where state and history are kept, as the daemon keeps them.
+    /// Store of state and history, as the daemon writes it.
     pub store: Option<Recorder>,
     /// Names of the interfaces, for the frames that would be sent.
     pub interfaces: Vec<String>,
@@ -64,18 +64,7 @@ pub struct ReplaySettings {
 impl ReplaySettings {
     /// Settings from start to end, as fast as possible, with nothing stored.
     pub fn plain(sleep_gap_s: f64, interfaces: Vec<String>) -> Self {
-        Self {
-            speed: None,
-            from: None,
-            until: None,
-            sleep_gap_s,
-            snapshot: false,
-            snapshot_at: None,
-            restore: None,
-            away: None,
-            store: None,
-            interfaces,
-        }
+        Self { sleep_gap_s, interfaces, ..Self::default() }
     }
 
     /// Whether every record is replayed as fast as possible and no state is stored.
@@ -97,8 +86,11 @@ impl ReplaySettings {
     }
 }
 
+/// Called with the outputs of each input.
+pub type OutputWatch = Box<dyn FnMut(&Outputs)>;
+
 /// Files of the results.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub struct Sinks {
     /// CSV, a row per estimate.
     pub estimates: Option<ResultFile>,
@@ -106,17 +98,8 @@ pub struct Sinks {
     pub events: Option<ResultFile>,
     /// candump lines of the frames that would be sent.
     pub frames: Option<ResultFile>,
-    /// Observer of all outputs.
+    /// Called with the outputs of each input.
     pub watch: Option<OutputWatch>,
-}
-
-/// Called with the outputs of each input.
-pub struct OutputWatch(pub Box<dyn FnMut(&Outputs)>);
-
-impl std::fmt::Debug for OutputWatch {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("OutputWatch")
-    }
 }
 
 /// Reason why a replay ended early.
@@ -142,7 +125,7 @@ pub enum ReplayError {
     },
 }
 
-/// For the progress bar.
+/// Progress of a replay.
 #[derive(Debug, Clone, Copy)]
 pub struct ReplayProgress {
     /// Bytes of the logs read.
@@ -383,7 +366,7 @@ impl Replay {
         if out.is_empty() && self.sinks.watch.is_none() && self.pace.speed.is_none() {
             return Ok(());
         }
-        if let Some(OutputWatch(watch)) = &mut self.sinks.watch {
+        if let Some(watch) = &mut self.sinks.watch {
             watch(out);
         }
         if let Some(file) = &mut self.sinks.estimates {

@@ -86,12 +86,6 @@ impl MeasuredFile {
         Ok(Self { path: path.to_owned(), parts })
     }
 
-    /// File name without folders and endings, for tables and plots.
-    pub fn short_name(&self) -> String {
-        let name = self.path.file_name().unwrap_or_default().to_string_lossy();
-        name.split('.').next().unwrap_or_default().to_owned()
-    }
-
     /// Rows of all parts.
     pub fn rows(&self) -> usize {
         self.parts.iter().map(MeasuredPart::len).sum()
@@ -149,7 +143,6 @@ mod tests {
         assert_eq!((file.parts.len(), file.rows()), (2, 3));
         assert_eq!((file.parts[1].key.as_str(), file.parts[1].kind.as_str()), ("4", "discharge"));
         assert!(file.parts[0].voltage_v[1].is_nan() && file.parts[0].temperature_c[0].is_nan());
-        assert_eq!(file.short_name(), "cell");
     }
 
     #[test]

@@ -8,7 +8,7 @@
 //! Half the interval is factor x spread x standard deviation. Held-out rows are not used. Too few rows give the Gaussian
 //! interval.
 
-use super::kd_tree::Tree;
+use super::kd_tree::KdTree;
 use super::scale::StandardisedRows;
 
 /// Nominal coverage of the interval.
@@ -16,7 +16,7 @@ pub(super) const LEVEL: f64 = 0.95;
 /// Half width of the Gaussian interval of that level, in standard deviations.
 pub(super) const GAUSSIAN: f64 = 1.959_963_984_540_054;
 /// Rows that are left out, one at a time; the factor's own standard error is then below 1 %.
-pub(super) const ROWS: usize = 8000;
+pub(super) const CALIBRATION_ROWS: usize = 8000;
 /// Most rows of the spread at a row; otherwise a twentieth of them.
 const MOST_NEAR: usize = 200;
 /// Fewest rows of the spread at a row; with fewer it is 1 everywhere.
@@ -33,7 +33,7 @@ pub(super) struct Calibration {
     pub ratios: Vec<f64>,
     near: usize,
     mean: f64,
-    tree: Option<Tree>,
+    tree: Option<KdTree>,
 }
 
 impl Calibration {
@@ -47,7 +47,8 @@ impl Calibration {
         let near = (ratios.len() / 20).min(MOST_NEAR);
         let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
         let inputs: Vec<f64> = rows.iter().flat_map(|row| data.row(*row as usize).to_vec()).collect();
-        let tree = (near >= FEWEST_NEAR && mean > 0.0).then(|| Tree::new(&inputs, &inverse_deviations(&inputs, data)));
+        let tree =
+            (near >= FEWEST_NEAR && mean > 0.0).then(|| KdTree::new(&inputs, &inverse_deviations(&inputs, data)));
         let mut calibration = Self { factor: GAUSSIAN, rows, ratios, near, mean, tree };
         let d = data.dimensions;
         let relative = |(k, ratio): (usize, &f64)| ratio / calibration.spread(&inputs[k * d..][..d], Some(k));

@@ -28,7 +28,7 @@ use rayon::prelude::*;
 use super::basis::Coefficients;
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
-use super::kd_tree::Tree;
+use super::kd_tree::KdTree;
 use super::linear_algebra::{cholesky, dot, parallelism, solve_lower, solve_upper};
 use super::pairs::{BLOCK_PAIRS, by_column, cross, squares};
 use super::plan::{Plan, Values, Work};
@@ -77,7 +77,7 @@ pub(super) fn choose(data: &StandardisedRows, metric: &[f64], count: usize, seed
     first.sort_unstable();
     let mut points: Vec<f64> = first.iter().flat_map(|row| data.row(*row).to_vec()).collect();
     for _ in 0..MEANS_PASSES {
-        let tree = Tree::new(&points, metric);
+        let tree = KdTree::new(&points, metric);
         let nearest: Vec<u32> =
             data.inputs.par_chunks(d).with_min_len(64).map(|row| tree.nearest(row, 1, count, None)[0]).collect();
         let (mut sums, mut members) = (vec![0.0; points.len()], vec![0.0; count]);

@@ -12,7 +12,7 @@ const LEAF_ROWS: usize = 16;
 
 /// A tree over rows, numbered from 0.
 #[derive(Debug, Clone)]
-pub(super) struct Tree {
+pub(super) struct KdTree {
     weights: Vec<f64>,
     /// Weighted inputs, rows in the order of the leaves.
     points: Vec<f64>,
@@ -52,7 +52,7 @@ impl NearestHeap {
     }
 }
 
-impl Tree {
+impl KdTree {
     /// A tree over rows of `weights.len()` inputs.
     pub(super) fn new(inputs: &[f64], weights: &[f64]) -> Self {
         let d = weights.len();
@@ -145,7 +145,7 @@ mod tests {
         };
         let inputs: Vec<f64> = (0..3 * 700).map(|_| draw()).collect();
         let weights = [1.0, 0.3, 2.0];
-        let tree = Tree::new(&inputs, &weights);
+        let tree = KdTree::new(&inputs, &weights);
         let square =
             |a: &[f64], b: &[f64]| -> f64 { (0..3).map(|k| (a[k] * weights[k] - b[k] * weights[k]).powi(2)).sum() };
         for (query, before) in [(3, 700), (500, 500), (20, 20), (699, 350), (0, 0)] {
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn equal_rows_do_not_recurse_without_end() {
-        let tree = Tree::new(&[1.0; 5000], &[1.0]);
+        let tree = KdTree::new(&[1.0; 5000], &[1.0]);
         assert_eq!(tree.nearest(&[1.0], 3, 5000, Some(1)), [0, 2, 3]);
     }
 }

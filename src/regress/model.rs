@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::basis::Basis;
-use super::calibration::{Calibration, ROWS};
+use super::calibration::{CALIBRATION_ROWS, Calibration};
 use super::error::RegressionError;
 use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
@@ -219,7 +219,8 @@ impl<'a> FitJob<'a> {
                 max_iterations: self.settings.max_iterations,
                 log_likelihood_per_row: f64::NEG_INFINITY,
             };
-            let rows = self.data.len().min(self.search_rows());
+            let is_sampled = matches!(self.settings.form, Form::Nearest { .. });
+            let rows = self.data.len().min(if is_sampled { SEARCH_ROWS } else { usize::MAX });
             let found = self.one_search(start, &mut SearchMonitor { watcher, progress, rows })?;
             best = match (best, found) {
                 (Some(old), Some(new)) if new.value < old.value => Some(new),
@@ -228,10 +229,6 @@ impl<'a> FitJob<'a> {
             };
         }
         best.map(|best| (best.x, best.iterations)).ok_or(RegressionError::NotPositiveDefinite { jitter: jitter::LAST })
-    }
-
-    fn search_rows(&self) -> usize {
-        if matches!(self.settings.form, Form::Nearest { .. }) { SEARCH_ROWS } else { usize::MAX }
     }
 
     /// One search; chooses neighbours or inducing points again until the metric is stable.
@@ -318,7 +315,7 @@ impl<'a> FitJob<'a> {
         let outcome = FitOutcome { log_likelihood: -value, jitter, iterations };
         let mut calibration = Calibration::none();
         if self.settings.calibrate {
-            let rows = evenly_spaced(posterior.data().len(), ROWS);
+            let rows = evenly_spaced(posterior.data().len(), CALIBRATION_ROWS);
             let left_out = self.pool.install(|| posterior.left_out(&rows, noise_variance))?;
             let ratios = left_out.into_iter().map(|(residual, variance)| residual.abs() / variance.sqrt()).collect();
             calibration = Calibration::new(posterior.data(), rows, ratios);

@@ -25,7 +25,7 @@ use rayon::prelude::*;
 use super::basis::Coefficients;
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
-use super::kd_tree::Tree;
+use super::kd_tree::KdTree;
 use super::plan::{Plan, Values, Work};
 use super::scale::StandardisedRows;
 
@@ -66,7 +66,7 @@ struct ConditionalFactor {
 impl ConditionalFactors {
     /// Neighbours of the given rows among the rows before each.
     pub(super) fn new(data: &StandardisedRows, rows: Vec<u32>, metric: &[f64], neighbours: usize) -> Self {
-        let tree = Tree::new(&data.inputs, metric);
+        let tree = KdTree::new(&data.inputs, metric);
         let of = |row: &u32| tree.nearest(data.row(*row as usize), neighbours, *row as usize, None);
         let neighbours = rows.par_iter().with_min_len(CHUNK).map(of).collect();
         Self { rows, neighbours }
@@ -313,7 +313,7 @@ pub(super) struct Posterior {
     pub values: Values,
     pub coefficients: Coefficients,
     pub neighbours: usize,
-    tree: Tree,
+    tree: KdTree,
 }
 
 impl Posterior {
@@ -325,7 +325,7 @@ impl Posterior {
         neighbours: usize,
     ) -> Self {
         let values = plan.values(theta);
-        let tree = Tree::new(&data.inputs, &plan.metric(&values));
+        let tree = KdTree::new(&data.inputs, &plan.metric(&values));
         Self { data, plan, values, coefficients, neighbours, tree }
     }
 

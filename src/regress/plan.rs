@@ -270,17 +270,12 @@ fn product_adjoints(at: usize, children: &[usize], work: &mut Work) {
 /// Squared distances in units of the length scales.
 fn distances(inverse_squares: &[f64], squares: &[f64], out: &mut [f64]) {
     let count = out.len();
+    out.fill(0.0);
     Arch::new().dispatch(|| {
         for (d, weight) in inverse_squares.iter().enumerate() {
             let stripe = &squares[d * count..][..count];
-            if d == 0 {
-                for (total, square) in out.iter_mut().zip(stripe) {
-                    *total = weight * square;
-                }
-            } else {
-                for (total, square) in out.iter_mut().zip(stripe) {
-                    *total += weight * square;
-                }
+            for (total, square) in out.iter_mut().zip(stripe) {
+                *total += weight * square;
             }
         }
     });

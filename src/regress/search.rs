@@ -16,32 +16,22 @@ use super::settings::{FitProgress, ProgressCallback};
 /// Decrease of the negative log likelihood per row below which a search ends, twice in succession.
 const CONVERGED_PER_ROW: f64 = 5e-6;
 
-/// Lowest and highest value of a parameter, in standardised units, before the logarithm.
-fn bounds(role: ParameterRole) -> (f64, f64) {
+/// Bounds of a parameter and range of its random starts, in standardised units, before the logarithm.
+fn ranges(role: ParameterRole) -> [(f64, f64); 2] {
     match role {
-        ParameterRole::Length => (1e-4, 1e4),
-        ParameterRole::Alpha => (1e-2, 1e3),
+        ParameterRole::Length => [(1e-4, 1e4), (0.05, 5.0)],
+        ParameterRole::Alpha => [(1e-2, 1e3), (0.2, 5.0)],
         // A larger value acts as a mean function, along a ridge that slows the search.
-        ParameterRole::Signal => (1e-3, 2e1),
-        // Keeps the matrix of a smooth kernel positive definite under rounding.
-        ParameterRole::Noise => (1e-4, 1e1),
-    }
-}
-
-/// Range of a random start.
-fn start_range(role: ParameterRole) -> (f64, f64) {
-    match role {
-        ParameterRole::Length => (0.05, 5.0),
-        ParameterRole::Alpha => (0.2, 5.0),
-        ParameterRole::Signal => (0.3, 3.0),
-        ParameterRole::Noise => (0.03, 0.8),
+        ParameterRole::Signal => [(1e-3, 2e1), (0.3, 3.0)],
+        // A lower bound that keeps the matrix of a smooth kernel positive definite under rounding.
+        ParameterRole::Noise => [(1e-4, 1e1), (0.03, 0.8)],
     }
 }
 
 /// Logarithms of bounds; `spread` is the standard deviation of the inputs (1 when they are standardised).
 pub(super) fn log_bounds(plan: &Plan, spread: f64) -> (Vec<f64>, Vec<f64>) {
     let of = |parameter: &Parameter| {
-        let (low, high) = bounds(parameter.role);
+        let [(low, high), _] = ranges(parameter.role);
         let unit = if parameter.role == ParameterRole::Length { spread } else { 1.0 };
         ((low * unit).ln(), (high * unit).ln())
     };
@@ -65,7 +55,7 @@ pub(super) fn random_start(plan: &Plan, spread: f64, seed: u64, k: usize) -> Vec
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     random.set_stream(k as u64);
     let mut of = |parameter: &Parameter| {
-        let (low, high) = start_range(parameter.role);
+        let [_, (low, high)] = ranges(parameter.role);
         let unit = if parameter.role == ParameterRole::Length { spread } else { 1.0 };
         let part: f64 = random.random();
         ((low * unit).ln()) * (1.0 - part) + (high * unit).ln() * part

@@ -284,9 +284,9 @@ fn settings_out_of_range_are_rejected() {
 fn numbers_too_large_to_square_are_rejected() {
     for form in [Form::Exact, Form::Nearest { neighbours: 30 }, Form::Inducing { points: 40 }] {
         let model = fitted(form, |_| ());
-        let told = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
+        let predicted = model.predict(&[1.0, 1.0, 1e160, 0.0]).map(|all| all[1]);
         // Either so distant that the prior applies, or rejected by row.
-        match told {
+        match predicted {
             Ok(one) => assert!(one.mean.is_finite() && one.function_variance > 0.0, "{form:?}: {one:?}"),
             Err(fault) => assert!(fault.to_string().starts_with("inputs of row 2 = [1e160, 0.0]"), "{fault}"),
         }

@@ -162,7 +162,7 @@ fn options_that_make_no_sense_for_each_log_are_refused_by_name() {
     let same_name = inner.join("trip0.log").display().to_string();
     fs::write(&same_name, "").expect("written");
     let out = folder.path().join("out").display().to_string();
-    assert!(refused(&[&same_name, "--events", &out], 1).contains("would take the place of those of"));
+    assert!(refused(&[&same_name, "--events", &out], 1).contains("would replace those of"));
     let onto_itself = refused(&["--estimates", &folder.path().display().to_string()], 1);
     assert!(onto_itself.contains("is read, cannot be written too"), "{onto_itself}");
     assert!(stdout_of(&replay(&[&log, &other, "-j", "2"]).code(2)).is_empty(), "--jobs needs --each");

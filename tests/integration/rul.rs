@@ -3,13 +3,14 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::support::simulated_cell;
 use packwatch::config;
 use packwatch::health::Axis;
 use packwatch::lab::rul::{self, History, HistoryScore, MeasuredCapacity, Threshold};
 use packwatch::monitor::EventKind;
 use packwatch::quantity::CellIndex;
 use packwatch::sim::{Scenario, Settings};
+
+use crate::support::simulated_cell;
 
 /// Parts of the life at which forecasts are made.
 const AT: [f64; 5] = [0.4, 0.5, 0.6, 0.7, 0.8];

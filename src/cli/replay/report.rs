@@ -20,7 +20,7 @@ const MAX_SHOWN_CELLS: usize = 16;
 pub(crate) struct Bar(ProgressBar);
 
 impl Bar {
-    /// For logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
+    /// A bar for logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
     pub(crate) fn new(logs: &[PathBuf]) -> Self {
         Self(bar(logs, ProgressDrawTarget::stderr_with_hz(5)))
     }

@@ -54,74 +54,102 @@ pub(crate) struct Args {
     /// Cell model, instead of the configuration's
     #[arg(long, value_name = "MODEL.toml")]
     pub(crate) cell: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) starts: StartArgs,
+    #[command(flatten)]
+    pub(crate) statistics: StatisticsArgs,
+    #[command(flatten)]
+    pub(crate) life: LifeArgs,
+    #[command(flatten)]
+    pub(crate) output: OutputArgs,
+}
 
+/// Starts of the estimator.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Starts")]
+pub(crate) struct StartArgs {
     /// Where in each file the estimator starts
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "full", help_heading = "Starts")]
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "full")]
     pub(crate) start: Vec<Start>,
     /// Part of the full charge already taken out where a start in the middle begins
-    #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction, help_heading = "Starts")]
+    #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction)]
     pub(crate) remove: f64,
     /// Error of the initial SOC given to the estimator, points (-20: 20 points below the truth); "none": no SOC is given and
     /// it starts from its first voltage
-    #[arg(long, value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
-          allow_hyphen_values = true, help_heading = "Starts")]
-    pub(crate) told: Vec<InitialSocError>,
-    /// Standard deviation of the initial SOC, points; when not given, as large as --told and 5 at least
-    #[arg(long, value_name = "POINTS", value_parser = percent_above_0, help_heading = "Starts")]
+    #[arg(long = "told", value_name = "POINTS", value_delimiter = ',', default_value = "none", value_parser = initial_soc_error,
+          allow_hyphen_values = true)]
+    pub(crate) soc_error: Vec<InitialSocError>,
+    /// Standard deviation of the initial SOC, points; when not given, as large as the error and 5 at least
+    #[arg(long, value_name = "POINTS", value_parser = percent_above_0)]
     pub(crate) soc_std: Option<f64>,
     /// Error of the capacity the estimator starts with, percent of the model's
     #[arg(long, value_name = "PERCENT", value_delimiter = ',', default_value = "0", value_parser = capacity_error,
-          allow_hyphen_values = true, help_heading = "Starts")]
+          allow_hyphen_values = true)]
     pub(crate) capacity_error: Vec<f64>,
     /// Standard deviation that goes with it, percent of the model's; the configuration's when not given
-    #[arg(long, value_name = "PERCENT", value_parser = percent_above_0, help_heading = "Starts")]
+    #[arg(long, value_name = "PERCENT", value_parser = percent_above_0)]
     pub(crate) capacity_std: Option<f64>,
     /// Offset of the current sensor, A: added to every measured current before the estimator sees it
     #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = finite,
-          allow_hyphen_values = true, help_heading = "Starts")]
+          allow_hyphen_values = true)]
     pub(crate) current_offset: Vec<f64>,
+}
 
+/// Truth and statistics.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Truth and statistics")]
+pub(crate) struct StatisticsArgs {
     /// Time after the start without statistics: 600, 600s, 10min or 1h
-    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration, help_heading = "Truth and statistics")]
+    #[arg(long, value_name = "TIME", default_value = "10min", value_parser = duration)]
     pub(crate) settle: f64,
     /// Charge from full to empty that the truth is stated in, Ah; the cell model's capacity_ah when not given
-    #[arg(long, value_name = "AH", value_parser = above_0, help_heading = "Truth and statistics")]
+    #[arg(long, value_name = "AH", value_parser = above_0)]
     pub(crate) truth_capacity: Option<f64>,
     /// A gap in a file longer than this means that the recorder was asleep, s
-    #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0, help_heading = "Truth and statistics")]
+    #[arg(long, value_name = "S", default_value_t = 90.0, value_parser = above_0)]
     pub(crate) sleep_gap: f64,
+}
 
+/// Lives of cells.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Cell lives")]
+pub(crate) struct LifeArgs {
     /// Table of published capacities (cycle, type, start, capacity_ah_source), one per file in the files' order
-    #[arg(long, value_name = "TABLE.csv", help_heading = "Cell lives")]
+    #[arg(long, value_name = "TABLE.csv")]
     pub(crate) cycles: Vec<PathBuf>,
     /// Load at which the table's capacities were measured, A, degrees C, V: 2,24,2.7; the configuration's [usable] when not given
-    #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load, help_heading = "Cell lives")]
+    #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load)]
     pub(crate) load: Option<Load>,
     /// Report the first discharge below this capacity, Ah
-    #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0, help_heading = "Cell lives")]
+    #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0)]
     pub(crate) threshold: f64,
     /// Discharges before the statistics of the capacity begin
-    #[arg(long, value_name = "N", default_value_t = 10, help_heading = "Cell lives")]
+    #[arg(long, value_name = "N", default_value_t = 10)]
     pub(crate) skip_cycles: usize,
     /// Each half-cycle is seen only in a random window of this part of its charge: 0.4,0.7
-    #[arg(long, value_name = "LEAST,MOST", value_parser = window, help_heading = "Cell lives")]
+    #[arg(long, value_name = "LEAST,MOST", value_parser = window)]
     pub(crate) window: Option<(f64, f64)>,
     /// Seeds of the windows
-    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1", help_heading = "Cell lives")]
+    #[arg(long, value_name = "N", value_delimiter = ',', default_value = "1")]
     pub(crate) seed: Vec<u64>,
+}
 
+/// Output.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Output")]
+pub(crate) struct OutputArgs {
     /// Print the scores as JSON
-    #[arg(long, help_heading = "Output")]
+    #[arg(long)]
     pub(crate) json: bool,
     /// Write an SVG per file and case into this folder
-    #[arg(long, value_name = "FOLDER", help_heading = "Output")]
+    #[arg(long, value_name = "FOLDER")]
     pub(crate) plot: Option<PathBuf>,
 }
 
 impl Args {
     /// Checks the arguments that depend on each other.
     pub(super) fn check(&self) -> Result<(), Failure> {
-        let (files, tables) = (self.files.len(), self.cycles.len());
+        let (files, tables) = (self.files.len(), self.life.cycles.len());
         if tables != 0 && tables != files {
             return Err(Failure::new(format!(
                 "--cycles given {tables} times for {files} files, must be once per file"

@@ -234,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_told_when_it_begins_and_with_its_count_when_it_ends() {
+    fn a_flood_is_reported_when_it_begins_and_with_its_count_when_it_ends() {
         let mut gate = gate(100, 1);
         assert_eq!(taken(&mut gate, 0, 0, 15), 10);
         gate.poll(Timestamp::from_secs(0.9));

@@ -10,7 +10,7 @@
 //! Time without listening is no fault of the sender: after sleep, a restart of the program or a step of the clock the
 //! receivers wait for a first frame again ([`Guards::restart`]). For the same reason a snapshot keeps the counts and not
 //! the counters: the sender has continued in the meantime, so a stored counter would reject good frames, or accept an old
-//! one that happens to follow it.
+//! one that follows it by chance.
 
 use serde::{Deserialize, Serialize};
 

@@ -62,6 +62,24 @@ impl ScalarGaussian {
     }
 }
 
+/// Updates N states `x` and their covariance `p` with an innovation.
+///
+/// `ph` is the covariance of the states with the measurement; the gain is `ph` / `innovation_variance`.
+pub fn update_states<const N: usize>(
+    x: &mut [f64; N],
+    p: &mut [[f64; N]; N],
+    ph: &[f64; N],
+    innovation: f64,
+    innovation_variance: f64,
+) {
+    for i in 0..N {
+        x[i] += ph[i] / innovation_variance * innovation;
+        for (j, ph_j) in ph.iter().enumerate() {
+            p[i][j] -= ph[i] * ph_j / innovation_variance;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

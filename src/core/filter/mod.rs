@@ -7,5 +7,5 @@ pub mod linear;
 pub mod simd;
 pub mod unscented;
 
-pub use linear::{Measurement, ScalarGaussian};
+pub use linear::{Measurement, ScalarGaussian, update_states};
 pub use unscented::{FilterError, Gaussian, MeasurementNoise, SigmaPointWeights, Update};

@@ -13,7 +13,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::CapacityConfig;
-use crate::filter::{Measurement, ScalarGaussian};
+use crate::filter::{Measurement, ScalarGaussian, update_states};
 use crate::quantity::InvalidState;
 
 /// Random walk of the offset in a full cycle, part of its first standard deviation: sensors drift with temperature.
@@ -56,17 +56,17 @@ impl DriftFilter {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_capacity("a learned capacity", self.x[C])?;
         let all = self.x.iter().chain(self.p.iter().flatten());
-        all.copied().try_for_each(|x| InvalidState::unless_number("a number beside a learned capacity", x))?;
+        InvalidState::unless_numbers("a number of a learned capacity's filter", all.copied())?;
         InvalidState::unless_positive("the variance of a learned capacity", self.p[C][C])?;
         for i in 0..N {
-            InvalidState::unless_natural("a variance beside a learned capacity", self.p[i][i])?;
+            InvalidState::unless_natural("a variance of a learned capacity's filter", self.p[i][i])?;
             for j in 0..i {
                 let (covariance, most) = (self.p[i][j], (self.p[i][i] * self.p[j][j]).sqrt());
                 // The stored numbers are rounded.
                 let fits = covariance.abs() <= most * (1.0 + 1e-5) && (covariance - self.p[j][i]).abs() <= most * 1e-5;
                 InvalidState::unless(
                     fits,
-                    "a covariance beside a learned capacity",
+                    "a covariance of a learned capacity's filter",
                     covariance,
                     "what its variances allow",
                 )?;
@@ -81,12 +81,7 @@ impl DriftFilter {
         let ph: [f64; N] = std::array::from_fn(|i| self.p[i][C] + by_offset * self.p[i][OFFSET]);
         let innovation_variance = z.variance + ph[C] + by_offset * ph[OFFSET];
         let innovation = z.value - self.x[C];
-        for i in 0..N {
-            self.x[i] += ph[i] / innovation_variance * innovation;
-            for (j, ph_j) in ph.iter().enumerate() {
-                self.p[i][j] -= ph[i] * ph_j / innovation_variance;
-            }
-        }
+        update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
     }
 
     /// Predicts over a half-cycle of `cycles` full cycles, of which `charged` count as fade; `capacity_variance` is the

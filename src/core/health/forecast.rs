@@ -30,6 +30,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 use self::distribution::Crossing;
+use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
 /// Standard deviation of the logarithm of the rate per square root of capacity lost (part of the reference): over a
@@ -263,9 +264,7 @@ impl Forecast {
         InvalidState::unless_capacity("the reference of the remaining life", self.reference_ah)?;
         InvalidState::unless_natural("the use of the remaining life", self.used)?;
         InvalidState::unless_natural("the shared variance of the remaining life", self.shared_variance)?;
-        let [cycles, days] = self.recent;
-        InvalidState::unless_natural("the recent use of the remaining life", cycles.min(days))?;
-        InvalidState::unless_natural("the recent use of the remaining life", cycles.max(days))?;
+        InvalidState::unless_naturals("the recent use of the remaining life", self.recent)?;
         for i in 0..N {
             InvalidState::unless_number("a state of the remaining life", self.x[i])?;
             InvalidState::unless_natural("a variance of the remaining life", self.p[i][i])?;
@@ -388,12 +387,7 @@ impl Forecast {
         let innovation = reading.capacity_ah / self.reference_ah - self.x[LEVEL] - self.x[RECOVERY];
         let miss = innovation / MAX_MISS_DEVIATIONS;
         let innovation_variance = (ph[LEVEL] + ph[RECOVERY] + noise).max(miss * miss);
-        for i in 0..N {
-            self.x[i] += ph[i] / innovation_variance * innovation;
-            for (j, ph_j) in ph.iter().enumerate() {
-                self.p[i][j] -= ph[i] * ph_j / innovation_variance;
-            }
-        }
+        update_states(&mut self.x, &mut self.p, &ph, innovation, innovation_variance);
         self.shared_variance = reading.shared_variance_ah2 / scale;
         self.readings = self.readings.saturating_add(1);
     }

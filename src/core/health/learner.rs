@@ -88,9 +88,8 @@ impl CellMark {
     }
 
     fn check(&self) -> Result<(), InvalidState> {
-        for number in [self.load_v, self.temperature_integral, self.temperature_s] {
-            InvalidState::unless_number("a load or temperature at a half-cycle's end", number)?;
-        }
+        let numbers = [self.load_v, self.temperature_integral, self.temperature_s];
+        InvalidState::unless_numbers("a load or temperature at a half-cycle's end", numbers)?;
         let Some(soc) = self.soc else { return Ok(()) };
         InvalidState::unless_number("the SOC at a half-cycle's end", soc.mean)?;
         InvalidState::unless_natural("its variance", soc.variance)
@@ -319,9 +318,8 @@ impl Learner {
         self.drift.iter().try_for_each(DriftFilter::check)?;
         InvalidState::unless_natural("the time at rest", self.rest_s)?;
         let marks = [&self.start, &self.candidate].into_iter().flatten();
-        marks
-            .clone()
-            .try_for_each(|mark| InvalidState::unless_number("the charge at a half-cycle's end", mark.charge_as))?;
+        let charges_as = marks.clone().map(|mark| mark.charge_as);
+        InvalidState::unless_numbers("the charge at a half-cycle's end", charges_as)?;
         marks.flat_map(|mark| &mark.cells).chain(&self.totals).try_for_each(CellMark::check)
     }
 

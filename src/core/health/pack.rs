@@ -66,7 +66,7 @@ impl PackState {
     pub fn check(&self) -> Result<(), InvalidState> {
         InvalidState::unless_number("the pack's SOC", self.soc)?;
         let natural = [self.soc_std, self.capacity_ah, self.capacity_std_ah];
-        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("the pack's capacity or a deviation", x))
+        InvalidState::unless_naturals("the pack's capacity or a deviation", natural)
     }
 }
 

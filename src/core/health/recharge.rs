@@ -104,7 +104,7 @@ impl RechargeTimer {
     pub fn check(&self) -> Result<(), InvalidState> {
         let (low, high) = self.range.unwrap_or_default();
         let all = [self.last.map_or(0.0, |(_, soc)| soc), low, high, self.raw_s.unwrap_or(0.0)];
-        all.into_iter().try_for_each(|x| InvalidState::unless_number("a SOC or time of the charge under way", x))
+        InvalidState::unless_numbers("a SOC or time of the charge under way", all)
     }
 
     /// Moves stored stamps onto another clock.

@@ -36,16 +36,10 @@ pub struct TransitionOutcome {
 }
 
 /// The detector.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct TransitionDetector {
     mode: Mode,
     candidate: Option<ModeCandidate>,
-}
-
-impl Default for TransitionDetector {
-    fn default() -> Self {
-        Self { mode: Mode::Unknown, candidate: None }
-    }
 }
 
 impl TransitionDetector {

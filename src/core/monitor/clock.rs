@@ -10,6 +10,9 @@ use crate::quantity::Timestamp;
 pub(super) const ASLEEP_S: f64 = 5.0;
 const ASLEEP_NS: i64 = (ASLEEP_S * 1e9) as i64;
 
+/// Period of the work that only watches the clock (staleness, debounce), s.
+pub(super) const HOUSEKEEPING_S: f64 = 0.1;
+
 /// The clock of one monitor.
 #[derive(Debug, Default)]
 pub(super) struct Clock {

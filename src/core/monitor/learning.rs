@@ -7,7 +7,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::estimation::{end_state, resistance};
-use super::life::CellLife;
+use super::life::PackLife;
 use super::publisher::{Publisher, learned};
 use super::{EventKind, MonitorConfig};
 use crate::alarm::{Observation, Rule};
@@ -33,6 +33,7 @@ pub(super) struct Learning {
     pub(super) config: HealthConfig,
     pub(super) state: LearningState,
     pub(super) cells: Vec<CellHealth>,
+    pub(super) lives: PackLife,
     /// Half-cycles of the change of mode at hand, kept for their memory.
     half_cycles: Vec<HalfCycle>,
 }
@@ -53,7 +54,7 @@ pub(super) struct LearningState {
 }
 
 /// Health of one cell.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct CellHealth {
     /// SOC that the last full charge left; 1 until there was one.
     pub(super) full_soc: f64,
@@ -62,13 +63,11 @@ pub(super) struct CellHealth {
     pub(super) usable: Option<ScalarGaussian>,
     /// Resistance relative to new after the last discharge.
     pub(super) discharge_resistance: Option<ScalarGaussian>,
-    pub(super) life: CellLife,
 }
 
-impl CellHealth {
-    fn new(model: &CellModel, config: &HealthConfig) -> Self {
-        let life = CellLife::new(model, config);
-        Self { full_soc: 1.0, tapered: false, usable: None, discharge_resistance: None, life }
+impl Default for CellHealth {
+    fn default() -> Self {
+        Self { full_soc: 1.0, tapered: false, usable: None, discharge_resistance: None }
     }
 }
 
@@ -101,7 +100,8 @@ impl Learning {
         Self {
             config: config.health,
             state: LearningState::new(&config.health, cells, initial_capacity),
-            cells: vec![CellHealth::new(&config.model, &config.health); cells],
+            cells: vec![CellHealth::default(); cells],
+            lives: PackLife::new(&config.model, &config.health, cells),
             half_cycles: Vec::new(),
         }
     }
@@ -110,7 +110,8 @@ impl Learning {
     pub(super) fn forget(&mut self, bank: &EstimatorBank) {
         let initial_capacity = CellEstimator::new(bank.config()).capacity();
         self.state = LearningState::new(&self.config, self.cells.len(), initial_capacity);
-        self.cells.fill(CellHealth::new(bank.model(), &self.config));
+        self.cells.fill(CellHealth::default());
+        self.lives = PackLife::new(bank.model(), &self.config, self.cells.len());
     }
 
     /// Charge, rest or discharge.
@@ -139,7 +140,7 @@ impl Learning {
         let mut half_cycles = std::mem::take(&mut self.half_cycles);
         let rated_ah = bank.model().rated_capacity_ah;
         self.state.learner.complete(&self.config.transition, rated_ah, change.from, &mut half_cycles);
-        let was_life_known = self.pack_remaining_life().is_some();
+        let was_life_known = self.lives.of_pack().is_some();
         let since_before_s = self.state.learned_at.map(|before| to.now.since(before));
         let mut is_measured = false;
         for (index, half_cycle) in half_cycles.iter().enumerate() {
@@ -151,7 +152,7 @@ impl Learning {
         if !half_cycles.is_empty() {
             self.state.learner.finish();
             self.state.learned_at = Some(to.now);
-            self.publish_life(was_life_known, is_measured, to);
+            self.lives.publish(was_life_known, is_measured, to);
             half_cycles.clear();
         }
         self.half_cycles = half_cycles;
@@ -170,16 +171,16 @@ impl Learning {
         bank: &mut EstimatorBank,
         to: &mut Publisher<'_>,
     ) -> bool {
-        let Self { config, state: LearningState { learner, .. }, cells, .. } = self;
-        let health = &mut cells[index];
+        let Self { config, state: LearningState { learner, .. }, cells, lives, .. } = self;
+        let (health, life) = (&mut cells[index], &mut lives.cells[index]);
         if bank.soc(index).is_none() {
-            health.life.learn(bank.model(), config, half_cycle, since_before_s, None);
+            life.learn(bank.model(), config, half_cycle, since_before_s, None);
             return false;
         }
         let mut estimator = bank.cell(index);
         let update = learner.learn(bank.model(), &config.capacity, index, &mut estimator, half_cycle);
         bank.put(index, &estimator);
-        health.life.learn(bank.model(), config, half_cycle, since_before_s, Some(&update));
+        life.learn(bank.model(), config, half_cycle, since_before_s, Some(&update));
         if half_cycle.mode == Mode::Charge && health.tapered {
             health.full_soc = half_cycle.end_soc.unwrap_or(health.full_soc);
         }
@@ -311,7 +312,7 @@ impl Learning {
         let capacity = self.weakest_capacity();
         let usable = self.cells.iter().filter_map(|cell| cell.usable).min_by(|a, b| a.mean.total_cmp(&b.mean));
         let log_resistance = (0..self.cells.len()).map(|cell| bank.log_resistance(cell).mean).max_by(f64::total_cmp);
-        let life = self.pack_remaining_life().map(|(_, life)| life);
+        let life = self.lives.of_pack().map(|(_, life)| life);
         let cycles = life.and_then(|life| life.cycles);
         HealthFields {
             capacity_ah: capacity.map(|c| c.mean),

@@ -5,7 +5,6 @@
 //! shared part of the deviation.
 
 use super::EventKind;
-use super::learning::{CellHealth, Learning};
 use super::publisher::Publisher;
 use crate::alarm::{Observation, Rule};
 use crate::cell::CellModel;
@@ -70,51 +69,61 @@ impl CellLife {
     }
 }
 
-impl Learning {
+/// The lives of all cells.
+#[derive(Debug)]
+pub(super) struct PackLife {
+    pub(super) cells: Vec<CellLife>,
+}
+
+impl PackLife {
+    pub(super) fn new(model: &CellModel, config: &HealthConfig, cells: usize) -> Self {
+        Self { cells: vec![CellLife::new(model, config); cells] }
+    }
+
     /// Remaining life of a cell, or why it is not known.
-    pub(super) fn remaining_life(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
-        self.cells.get(cell.index()).map_or(Err(InsufficientData::Readings { found: 0 }), |cell| cell.life.remaining)
+    pub(super) fn of_cell(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
+        self.cells.get(cell.index()).map_or(Err(InsufficientData::Readings { found: 0 }), |cell| cell.remaining)
     }
 
     /// The cell whose life ends first, and when; `None` until every cell's is known.
-    pub(super) fn pack_remaining_life(&self) -> Option<(CellIndex, RemainingLife)> {
-        let all_known = self.cells.iter().all(|cell| cell.life.cycles().is_some());
-        self.shortest_life().filter(|_| all_known)
+    pub(super) fn of_pack(&self) -> Option<(CellIndex, RemainingLife)> {
+        let all_known = self.cells.iter().all(|cell| cell.cycles().is_some());
+        self.shortest().filter(|_| all_known)
     }
 
     /// The cell whose life ends first, among those whose life is known.
-    fn shortest_life(&self) -> Option<(CellIndex, RemainingLife)> {
-        let median = |cell: &CellHealth| cell.life.cycles().map(|cycles| cycles.median);
+    fn shortest(&self) -> Option<(CellIndex, RemainingLife)> {
+        let median = |cell: &CellLife| cell.cycles().map(|cycles| cycles.median);
         let known = (0..).map(CellIndex).zip(&self.cells).filter_map(|(index, cell)| Some((median(cell)?, index)));
         let (_, cell) = known.min_by(|a, b| a.0.total_cmp(&b.0))?;
-        Some((cell, self.cells[cell.index()].life.remaining.ok()?))
+        Some((cell, self.cells[cell.index()].remaining.ok()?))
     }
 
     /// Publishes the remaining life after a half-cycle: while it is known, and once when it no longer is. `is_new`: some
     /// cell's capacity was measured.
-    pub(super) fn publish_life(&self, was_known: bool, is_new: bool, to: &mut Publisher<'_>) {
-        let life = self.pack_remaining_life();
+    pub(super) fn publish(&self, was_known: bool, is_new: bool, to: &mut Publisher<'_>) {
+        let life = self.of_pack();
         if was_known || life.is_some() {
             to.event(life_event(life));
         }
-        self.observe_life(is_new, to);
+        self.observe(is_new, to);
     }
 
     /// Restates the lives for another end of life. The alarm value is unknown until new thresholds are set.
-    pub(super) fn restate_lives(&mut self, to: &mut Publisher<'_>) {
-        let before = self.pack_remaining_life();
-        self.cells.iter_mut().for_each(|cell| cell.life.restate(&self.config));
+    pub(super) fn restate(&mut self, config: &HealthConfig, to: &mut Publisher<'_>) {
+        let before = self.of_pack();
+        self.cells.iter_mut().for_each(|cell| cell.restate(config));
         to.observe(Rule::RemainingLifeLow, None, Observation::default());
-        let life = self.pack_remaining_life();
+        let life = self.of_pack();
         if before != life {
             to.event(life_event(life));
         }
     }
 
     /// Passes the shortest life to its rule: while some cell's life is not known the pack's may be shorter, never longer.
-    pub(super) fn observe_life(&self, is_new: bool, to: &mut Publisher<'_>) {
-        let is_bound = self.pack_remaining_life().is_none();
-        let cycles = self.shortest_life().and_then(|(_, life)| life.cycles);
+    pub(super) fn observe(&self, is_new: bool, to: &mut Publisher<'_>) {
+        let is_bound = self.of_pack().is_none();
+        let cycles = self.shortest().and_then(|(_, life)| life.cycles);
         let value = cycles.map_or(Observation::default(), |cycles| {
             let std = (cycles.median - cycles.low) / LOW_DEVIATIONS;
             Observation { is_bound, is_new, ..Observation::new(Some(cycles.median)).with_std(std) }

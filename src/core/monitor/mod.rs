@@ -8,11 +8,11 @@
 //!          readings  samples     estimates     health      alarms      frames
 //! ```
 //!
-//! * [`intake`]: flood limit, end-to-end check, commands, interfaces; [`sampling`]: signals, pack identity;
-//! * [`batch`], [`estimation`]: one filter step per sample; [`learning`], [`life`]: half-cycles, capacity, recharge, life;
-//! * [`watch`], [`alarming`], [`publisher`]: values of the rules, and what follows from their alarms;
-//! * [`sender`], [`j1939`]: cyclic frames, alarm frames, trouble codes;
-//! * [`stages`] wires all of these; [`clock`], [`snapshot`], [`reconfigure`], [`statistics`], [`view`] go with the whole.
+//! * `intake`: flood limit, end-to-end check, commands, interfaces; `sampling`: signals, pack identity;
+//! * `batch`, `estimation`: one filter step per sample; `learning`, `life`: half-cycles, capacity, recharge, life;
+//! * `watch`, `alarming`, `publisher`: values of the rules, and what follows from their alarms;
+//! * `sender`, `j1939`: cyclic frames, alarm frames, trouble codes;
+//! * `stages` wires all of these; `clock`, `snapshot`, `reconfigure`, `statistics`, `view` go with the whole.
 
 mod alarming;
 mod batch;
@@ -37,11 +37,10 @@ mod statistics;
 mod view;
 mod watch;
 
-use clock::{ASLEEP_S, Clock, TimeJump};
+use clock::{ASLEEP_S, Clock, HOUSEKEEPING_S, TimeJump};
 use intake::Intake;
 use snapshot::{Beginning, PendingRestore};
 use stages::Stages;
-use watch::HOUSEKEEPING_S;
 
 use crate::can::Frame;
 use crate::quantity::{BusIndex, Reading, Timestamp};

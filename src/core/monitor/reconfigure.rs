@@ -74,7 +74,7 @@ impl Monitor {
             publisher.observe(Rule::RechargePeriodLow, None, period);
         }
         if old.health.end_of_life_ah != config.health.end_of_life_ah {
-            learning.observe_life(true, &mut publisher);
+            learning.lives.observe(true, &mut publisher);
         }
         publisher.update_trouble_codes();
         let alarms = u32::try_from(alarms_ended).unwrap_or(u32::MAX);
@@ -116,7 +116,7 @@ impl Monitor {
             learning.restate_recharge(&old.recharge);
         }
         if old.end_of_life_ah != new.end_of_life_ah {
-            learning.restate_lives(&mut publisher);
+            learning.lives.restate(&new, &mut publisher);
         }
         if old.usable == new.usable {
             return;

@@ -214,7 +214,7 @@ impl Stages {
             tapered: health.tapered,
             usable: health.usable,
             discharge_resistance: health.discharge_resistance,
-            forecast: Some(health.life.forecast.clone()),
+            forecast: Some(learning.lives.cells[cell].forecast.clone()),
             updated_in_round: estimation.batch.has_reported(cell),
         }
     }
@@ -224,7 +224,8 @@ impl Stages {
         let Self { sampling, estimation, learning, .. } = self;
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in snapshot.cells.iter().enumerate() {
-            learning.cells[index] = cell.health(estimation.bank.model(), &learning.config);
+            learning.cells[index] = cell.health();
+            learning.lives.cells[index] = cell.life(estimation.bank.model(), &learning.config);
             if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
                 estimation.bank.put(index, &estimator);
             }
@@ -312,15 +313,14 @@ impl StoredCell {
         InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
     }
 
-    fn health(&self, model: &CellModel, config: &HealthConfig) -> CellHealth {
+    fn health(&self) -> CellHealth {
+        let Self { full_soc, tapered, usable, discharge_resistance, .. } = *self;
+        CellHealth { full_soc, tapered, usable, discharge_resistance }
+    }
+
+    fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {
         let forecast = self.forecast.clone();
-        CellHealth {
-            full_soc: self.full_soc,
-            tapered: self.tapered,
-            usable: self.usable,
-            discharge_resistance: self.discharge_resistance,
-            life: forecast.map_or_else(|| CellLife::new(model, config), |forecast| CellLife::restore(forecast, config)),
-        }
+        forecast.map_or_else(|| CellLife::new(model, config), |forecast| CellLife::restore(forecast, config))
     }
 }
 

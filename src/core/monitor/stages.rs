@@ -4,12 +4,12 @@
 //! input at hand.
 
 use super::alarming::Alarming;
+use super::clock::HOUSEKEEPING_S;
 use super::estimation::Estimation;
 use super::learning::Learning;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
-use super::watch::HOUSEKEEPING_S;
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
 use crate::alarm::{AlarmInput, Observation};
 use crate::can::encode::StatusFields;

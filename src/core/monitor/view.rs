@@ -159,12 +159,12 @@ impl Monitor {
     /// # Errors
     /// While too little is known.
     pub fn remaining_life(&self, cell: CellIndex) -> Result<RemainingLife, InsufficientData> {
-        self.stages.learning.remaining_life(cell)
+        self.stages.learning.lives.of_cell(cell)
     }
 
     /// The cell whose life ends first, and when; `None` until every cell's is known.
     pub fn pack_remaining_life(&self) -> Option<(CellIndex, RemainingLife)> {
-        self.stages.learning.pack_remaining_life()
+        self.stages.learning.lives.of_pack()
     }
 
     /// The alarm engine, with the raised alarms.
@@ -197,7 +197,7 @@ impl Monitor {
             capacity: has_learned.then(|| learning.capacity(cell.index())),
             usable_capacity: learning.cells[cell.index()].usable.filter(|_| has_learned),
             resistance_ratio: soc.map(|_| estimation.resistance(cell.index())),
-            remaining_life: learning.remaining_life(cell),
+            remaining_life: learning.lives.of_cell(cell),
             trusted: soc.map(|_| estimation.is_trusted(cell.index())),
         }
     }
@@ -233,7 +233,7 @@ impl Monitor {
                 .zip(health.usable_capacity_std_ah)
                 .map(|(mean, std)| ScalarGaussian::from_std(mean, std)),
             soh: health.soh,
-            remaining_life: learning.pack_remaining_life(),
+            remaining_life: learning.lives.of_pack(),
             recharge_period_s: learning.state.recharge_period_s,
             normalised_recharge_period: learning.state.normalised_recharge,
             reported_soc: sampler.reported(Channel::ReportedSoc, now),

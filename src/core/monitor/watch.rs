@@ -5,6 +5,7 @@
 //! compared once, and all are only shown, once a second.
 
 use super::alarming::take_show_due;
+use super::clock::HOUSEKEEPING_S;
 use super::publisher::learned;
 use super::stages::Stages;
 use super::{EventKind, Outputs};
@@ -12,9 +13,6 @@ use crate::alarm::{AlarmInput, Observation, Rule};
 use crate::filter::ScalarGaussian;
 use crate::quantity::{CellIndex, Channel, Timestamp};
 use crate::sample::CellSample;
-
-/// Period of the work that only watches the clock (staleness, debounce), s.
-pub(super) const HOUSEKEEPING_S: f64 = 0.1;
 
 /// Values of the two rules about an input.
 #[derive(Debug, Clone, Copy)]
@@ -309,6 +307,6 @@ impl Stages {
         if let Some(period) = period {
             publisher.observe(Rule::RechargePeriodLow, None, Observation { is_new: false, ..period });
         }
-        learning.observe_life(false, &mut publisher);
+        learning.lives.observe(false, &mut publisher);
     }
 }

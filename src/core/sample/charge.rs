@@ -79,8 +79,7 @@ impl ChargeCounter {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let ChargeTotals { charge_as, unmeasured_s, flowing_s, discharging_s } = self.totals;
         let all = [charge_as, unmeasured_s, flowing_s, discharging_s, self.current_a.unwrap_or(0.0)];
-        all.into_iter()
-            .try_for_each(|found| InvalidState::unless_number("the counted charge, a time or its current", found))
+        InvalidState::unless_numbers("the counted charge, a time or its current", all)
     }
 
     fn passed_s(&self, time: Timestamp) -> f64 {

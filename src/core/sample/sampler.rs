@@ -49,8 +49,8 @@ impl CellSample {
     /// The first impossible number.
     pub fn check(&self) -> Result<(), InvalidState> {
         let known = [self.current_a, self.temperature_c].into_iter().flatten();
-        let mut numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
-        numbers.try_for_each(|found| InvalidState::unless_number("a sample that waits for its step", found))
+        let numbers = [self.voltage_v, self.charge_as, self.unmeasured_s].into_iter().chain(known);
+        InvalidState::unless_numbers("a sample that waits for its step", numbers)
     }
 }
 
@@ -64,7 +64,7 @@ pub struct SignalChange {
 }
 
 /// State of a [`Sampler`] for storing.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct SamplerState {
     signals: Vec<Signal>,
     charge: ChargeCounter,
@@ -143,31 +143,20 @@ impl Sampler {
     /// A sampler before its first reading.
     pub fn new(config: SampleConfig) -> Self {
         let sensors = config.sensor_of_cell.iter().flatten().map(|sensor| sensor.index() + 1).max().unwrap_or(0);
-        let voltages = match config.voltage_source {
-            VoltageSource::Cells => usize::from(config.cells),
-            VoltageSource::PackTotal { .. } => 1,
+        let (voltages, own_voltages) = match config.voltage_source {
+            VoltageSource::Cells => (usize::from(config.cells), usize::from(config.cells)),
+            VoltageSource::PackTotal { .. } => (1, 0),
         };
         let channels = channels(&config, sensors);
-        let state = SamplerState {
-            signals: vec![Signal::default(); channels.len()],
-            charge: ChargeCounter::default(),
-            began: None,
-            latest: Timestamp::ZERO,
-            unused_readings: 0,
-            counts: ReadingCounts::default(),
-        };
+        let state = SamplerState { signals: vec![Signal::default(); channels.len()], ..SamplerState::default() };
         let flow_a = FLOW_SHARE * config.current.min.abs().max(config.current.max.abs());
         let first = 1 + sensors;
-        let cell_voltages = match config.voltage_source {
-            VoltageSource::Cells => first..first + voltages,
-            VoltageSource::PackTotal { .. } => first..first,
-        };
         Self {
             config,
             channels,
             sensors,
             voltages,
-            cell_voltages,
+            cell_voltages: first..first + own_voltages,
             flow_a,
             state,
             next_stale: None,
@@ -519,18 +508,9 @@ impl Sampler {
     /// Divisor from a reading to a cell's value: a total voltage is shared by the cells in series.
     #[inline]
     fn divisor(&self, channel: Channel) -> f64 {
-        match (channel, self.config.voltage_source) {
-            (Channel::PackVoltage, VoltageSource::PackTotal { series }) => f64::from(series.max(1)),
-            (Channel::PackVoltage, VoltageSource::Cells)
-            | (
-                Channel::Current
-                | Channel::Temperature(_)
-                | Channel::CellVoltage(_)
-                | Channel::ReportedSoc
-                | Channel::ReportedSoh
-                | Channel::PackIdentity,
-                _,
-            ) => 1.0,
+        match self.config.voltage_source {
+            VoltageSource::PackTotal { series } if channel == Channel::PackVoltage => f64::from(series.max(1)),
+            VoltageSource::PackTotal { .. } | VoltageSource::Cells => 1.0,
         }
     }
 

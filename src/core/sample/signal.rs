@@ -167,7 +167,7 @@ impl Signal {
     pub(super) fn check(&self) -> Result<(), InvalidState> {
         let values = [self.good, self.refused].into_iter().flatten().map(|stamped| stamped.value);
         let others = [self.rests_since_s, self.rests_at.unwrap_or(0.0), self.bad_share];
-        values.chain(others).try_for_each(|found| InvalidState::unless_number("a signal", found))
+        InvalidState::unless_numbers("a signal", values.chain(others))
     }
 
     pub(super) fn rebase(&mut self, by_nanos: i64) {

@@ -16,12 +16,12 @@ const DEFAULT_HYSTERESIS: f64 = 0.02;
 pub(super) struct RatedCell {
     /// Capacity on the label, Ah.
     pub capacity_ah: f64,
-    /// What the reference charger needs for the recharge window of a cell with that capacity, s.
+    /// Time the reference charger needs for the recharge window of a cell with that capacity, s.
     pub recharge_period_s: f64,
 }
 
 impl RatedCell {
-    /// From the rated capacity and the recharge window.
+    /// Makes it of the rated capacity and the recharge window.
     pub(super) fn new(capacity_ah: f64, recharge: &Recharge) -> Self {
         let recharge = recharge.config(capacity_ah);
         let window = recharge.to_soc - recharge.from_soc;

@@ -55,17 +55,17 @@ section! {
 
 section! {
     /// A branch of a resistor and a capacitor in parallel, 1 to 3 of them.
-    BranchTables at "tables.branches" {
+    BranchTables at "tables.branches" gives Branch, |keys| {
         /// Resistance of a new cell.
-        r_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required;
+        r_ohm: Vec<Vec<f64>>, "ohm", Above(0.0, INF), Required => r_ohm: Table { values: keys.r_ohm.clone() };
         /// Capacitance.
-        c_farad: Vec<Vec<f64>>, "F", Above(0.0, INF), Required;
+        c_farad: Vec<Vec<f64>>, "F", Above(0.0, INF), Required => c_farad: Table { values: keys.c_farad.clone() };
     }
 }
 
 section! {
     /// The thermal model of one cell; without it there is no fallback for a stale temperature.
-    ThermalKeys at "thermal" {
+    ThermalKeys at "thermal" gives Thermal, |keys| {
         /// Heat capacity.
         heat_capacity_j_per_k: f64, "J/K", Above(0.0, 1e9), Required;
         /// Thermal resistance to the surroundings.
@@ -95,7 +95,7 @@ pub fn load(path: &Path) -> Result<CellModel, ConfigFaults> {
     model.filter(|_| faults.is_empty()).ok_or_else(|| ConfigFaults(faults.into_lines()))
 }
 
-/// As [`load`], through `read`; faults are noted beside those of other files.
+/// As [`load`], through `read`; faults are noted with those of other files.
 pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<CellModel> {
     let text = read_text(path, read, faults)?;
     let document = Document::parse(&path.display().to_string(), &text, faults);
@@ -112,11 +112,10 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     check_tables(&tables, faults);
     check_branch_count(&tables.place, written, faults);
     check_branches(&tables, &branches, faults);
-    Some(model(head?, tables, branches, thermal))
+    Some(model(head?, tables, &branches, thermal.as_ref()))
 }
 
-fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Option<ThermalKeys>) -> CellModel {
-    let branch = |b: BranchTables| Branch { r_ohm: Table { values: b.r_ohm }, c_farad: Table { values: b.c_farad } };
+fn model(head: Head, tables: Tables, branches: &[BranchTables], thermal: Option<&ThermalKeys>) -> CellModel {
     CellModel {
         name: head.name,
         rated_capacity_ah: head.rated_capacity_ah,
@@ -128,12 +127,9 @@ fn model(head: Head, tables: Tables, branches: Vec<BranchTables>, thermal: Optio
         ocv_ageing_shift: head.ocv_ageing_shift,
         ocv_v: Table { values: tables.ocv_v },
         r0_ohm: Table { values: tables.r0_ohm },
-        branches: branches.into_iter().map(branch).collect(),
+        branches: branches.iter().map(BranchTables::config).collect(),
         voltage_error_v: tables.voltage_error_v.map(|values| Table { values }),
-        thermal: thermal.map(|t| Thermal {
-            heat_capacity_j_per_k: t.heat_capacity_j_per_k,
-            resistance_k_per_w: t.resistance_k_per_w,
-        }),
+        thermal: thermal.map(|keys| keys.config()),
     }
 }
 

@@ -1,15 +1,14 @@
 //! Commands from the bus: `[commands]` to the plan that reads them and the guard that checks them.
 
 use super::document::Faults;
-use super::keys::{Commands, Output};
-use super::resolve::ResolvedSignal;
+use super::keys::Output;
+use super::resolve::{ResolvedSignal, check_no_input};
 use super::tables::RawTables;
 use crate::can::dbc::{Database, FrameFormat};
 use crate::can::e2e::CheckConfig;
 use crate::can::encode::CommandPlan;
 use crate::can::guard::GuardConfig;
 use crate::monitor::{CommandConfig, OutputConfig};
-use crate::quantity::BusIndex;
 
 /// The plan that reads commands and the guard that checks them; `None` = commands are off, or faults are noted.
 pub(super) fn commands(
@@ -34,34 +33,19 @@ pub(super) fn commands(
         keys.place.fault(faults, "e2e", "must be \"1A\", \"1C\" or \"5\": commands are never taken unprotected");
         return None;
     };
-    check_id(keys, &plan, bus, output, found, faults);
-    if output.plan.protections().iter().flatten().any(|other| other.data_id == protection.data_id) {
-        keys.place.fault(faults, "data_id", "must differ from those of the frames that are sent");
-    }
-    let is_fd = database.messages.iter().any(|m| m.id == plan.id() && m.format != FrameFormat::Classic);
-    if let Some(interface) = raw.interfaces.get(bus.index()).filter(|interface| is_fd && !interface.fd) {
-        keys.place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
-    }
-    let check = CheckConfig { max_delta_counter_init: keys.max_delta_counter, ..CheckConfig::new(protection) };
-    let guard = GuardConfig { bus, id: plan.id(), check, cycle_time_s: None };
-    Some((CommandConfig { bus, plan }, guard))
-}
-
-/// Notes an identifier that another frame has on the same interface.
-fn check_id(
-    keys: &Commands,
-    plan: &CommandPlan,
-    bus: BusIndex,
-    output: &OutputConfig,
-    found: &[ResolvedSignal<'_>],
-    faults: &mut Faults,
-) {
     let id = plan.id();
     if output.buses.contains(&bus) && output.plan.ids().contains(&id) {
         keys.place.fault(faults, "id", &format!("must not be that of a frame that is sent, {id}"));
     }
-    if let Some(input) = found.iter().find(|input| input.bus == bus && input.message.id == id) {
-        let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
-        keys.place.fault(faults, "id", &what);
+    check_no_input(&keys.place, id, &[bus], found, faults);
+    if output.plan.protections().iter().flatten().any(|other| other.data_id == protection.data_id) {
+        keys.place.fault(faults, "data_id", "must differ from those of the frames that are sent");
     }
+    let is_fd = database.messages.iter().any(|m| m.id == plan.id() && m.format != FrameFormat::Classic);
+    if is_fd {
+        raw.check_fd(&keys.place, &[bus], faults);
+    }
+    let check = CheckConfig { max_delta_counter_init: keys.max_delta_counter, ..CheckConfig::new(protection) };
+    let guard = GuardConfig { bus, id: plan.id(), check, cycle_time_s: None };
+    Some((CommandConfig { bus, plan }, guard))
 }

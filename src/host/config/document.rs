@@ -13,7 +13,7 @@ const MAX_QUOTE: usize = 48;
 /// Faults of syntax listed one by one; a file with more is of another kind.
 const MAX_SYNTAX_FAULTS: usize = 10;
 
-/// Everything found wrong, in files of any kind.
+/// Faults found so far, in files of any kind.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
     list: Vec<(String, usize, String)>,
@@ -28,7 +28,7 @@ impl Faults {
         }
     }
 
-    /// How many faults there are.
+    /// Number of faults.
     pub(crate) fn len(&self) -> usize {
         self.list.len()
     }
@@ -118,20 +118,20 @@ impl<'t> Document<'t> {
         shorten(&words.join(" "))
     }
 
-    /// Whether the table at `span` is written `{ ... }`.
-    pub(super) fn is_inline(&self, span: &Range<usize>) -> bool {
-        self.source.get(span.clone()).is_some_and(|text| text.starts_with('{'))
+    /// The found text of a fault at `span`, which is within `value`.
+    pub(super) fn found(&self, value: &Spanned<DeValue<'_>>, span: &Range<usize>) -> String {
+        let is_inline = self.source.get(value.span()).is_some_and(|text| text.starts_with('{'));
+        if value.get_ref().is_table() && !is_inline { "a table".to_owned() } else { self.quote(span) }
     }
 
     /// The place of a table: its path for people, its line, and where its keys stand.
     pub(super) fn place(&self, path: &str, line: usize, table: &DeTable<'_>) -> TablePlace {
         let spot = |(key, value): (&Spanned<_>, &Spanned<DeValue<'_>>)| {
             let key: &Spanned<std::borrow::Cow<'_, str>> = key;
-            let found = match value.get_ref() {
-                DeValue::Table(_) if !self.is_inline(&value.span()) => "a table".to_owned(),
-                _ => self.quote(&value.span()),
-            };
-            (key.get_ref().to_string(), KeyPlace { line: self.line(&key.span()), found })
+            (
+                key.get_ref().to_string(),
+                KeyPlace { line: self.line(&key.span()), found: self.found(value, &value.span()) },
+            )
         };
         TablePlace { file: self.file.clone(), path: path.to_owned(), line, spots: table.iter().map(spot).collect() }
     }
@@ -152,7 +152,7 @@ struct KeyPlace {
     found: String,
 }
 
-/// Where a table stands, so that a later check can still name file, line, key and found.
+/// Place of a table in its file, with which a later check can name file, line, key and found.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TablePlace {
     /// File as people named it.

@@ -43,7 +43,7 @@ pub(crate) enum PositiveCurrent {
     Discharge,
 }
 
-/// Where the capacity measurement of a half-cycle comes from.
+/// Method that measures the capacity in a half-cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum MethodKey {
     /// Charge over the swing between the SOCs that the voltages give.

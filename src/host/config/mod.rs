@@ -68,7 +68,7 @@ pub(crate) use tables::RawTables;
 /// A configuration that cannot be wrong.
 #[derive(Debug, Clone)]
 pub struct Config {
-    /// Where it was read from.
+    /// The configuration file.
     pub path: PathBuf,
     /// CAN interfaces; a `BusIndex` counts in this order.
     pub interfaces: Vec<InterfaceConfig>,

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::describe::OutputUse;
 use super::document::Faults;
 use super::keys::{Commands, E2eKey, FrameKeys, Output};
-use super::resolve::{ResolvedSignal, read_dbc};
+use super::resolve::{ResolvedSignal, check_no_input, read_dbc};
 use super::tables::RawTables;
 use super::{ReadFile, beside};
 
@@ -54,7 +54,9 @@ pub(super) fn output(
     let buses = buses(raw, keys);
     check_ids(&frames, &plan, &buses, found, faults);
     check_data_ids(&frames, &plan, faults);
-    check_interfaces(raw, &frames, &plan, &buses, faults);
+    for (_, frame) in plan.formats().iter().zip(&frames).filter(|(format, _)| **format != FrameFormat::Classic) {
+        raw.check_fd(frame.place, &buses, faults);
+    }
     let [status_period_s, health_period_s, alarm_period_s] = plan.cycle_times_ms().map(|ms| f64::from(ms) / 1000.0);
     Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
 }
@@ -133,10 +135,7 @@ fn check_ids(
             let what = format!("{} and {} frame would both be {id}, must differ", FRAMES[index], FRAMES[other]);
             frame.place.fault(faults, "id", &what);
         }
-        if let Some(input) = found.iter().find(|f| buses.contains(&f.bus) && f.message.id == *id) {
-            let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
-            frame.place.fault(faults, "id", &what);
-        }
+        check_no_input(frame.place, *id, buses, found, faults);
     }
 }
 
@@ -149,26 +148,6 @@ fn check_data_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, faults: &mut F
             let what =
                 format!("{} and {} frame would both have {data_id:#X}, must differ", FRAMES[index], FRAMES[other]);
             frame.place.fault(faults, "data_id", &what);
-        }
-    }
-}
-
-/// Notes an FD frame on an interface without FD.
-fn check_interfaces(
-    raw: &RawTables,
-    frames: &[FrameKeys<'_>; 3],
-    plan: &OutputPlan,
-    buses: &[BusIndex],
-    faults: &mut Faults,
-) {
-    for (format, frame) in plan.formats().iter().zip(frames) {
-        if *format == FrameFormat::Classic {
-            continue;
-        }
-        let interfaces = buses.iter().filter_map(|bus| raw.interfaces.get(bus.index()));
-        for interface in interfaces.filter(|interface| !interface.fd) {
-            let what = format!("must have fd = true on interface {} too", interface.name);
-            frame.place.fault(faults, "fd", &what);
         }
     }
 }

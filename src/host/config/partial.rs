@@ -1,4 +1,4 @@
-//! As much of a configuration as can be read, with all its faults: for `packwatch doctor`.
+//! The readable part of a configuration and all its faults, for `packwatch doctor`.
 
 use std::path::Path;
 

@@ -7,12 +7,13 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::convert::{DbcRanges, UNLIMITED};
-use super::document::Faults;
+use super::document::{Faults, TablePlace};
 use super::keys::{PositiveCurrent, SignalSource};
 use super::pattern::Pattern;
 use super::schema::did_you_mean;
 use super::tables::RawTables;
 use super::{ReadFile, beside};
+use crate::can::CanId;
 use crate::can::dbc::{Database, Message, Signal};
 use crate::can::decode::{Binding, InputMap};
 use crate::can::signal::LayoutFault;
@@ -110,7 +111,7 @@ struct Search<'s, 'd> {
     found: Vec<ResolvedSignal<'d>>,
 }
 
-/// Where a name was found.
+/// A signal that matches a name, with its file and message.
 type SignalMatch<'d> = (&'d str, &'d Message, &'d Signal);
 
 impl<'d> Search<'_, 'd> {
@@ -237,6 +238,20 @@ pub(super) fn channel_words(channel: Channel) -> String {
         Channel::ReportedSoc => "reported SOC".to_owned(),
         Channel::ReportedSoh => "reported SOH".to_owned(),
         Channel::PackIdentity => "pack identity".to_owned(),
+    }
+}
+
+/// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
+pub(super) fn check_no_input(
+    place: &TablePlace,
+    id: CanId,
+    buses: &[BusIndex],
+    found: &[ResolvedSignal<'_>],
+    faults: &mut Faults,
+) {
+    if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
+        let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
+        place.fault(faults, "id", &what);
     }
 }
 

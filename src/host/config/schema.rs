@@ -26,9 +26,9 @@ pub(crate) enum Presence {
 /// One key.
 #[derive(Debug)]
 pub(crate) struct Key {
-    /// As written.
+    /// Name in the file.
     pub name: &'static str,
-    /// What it means.
+    /// Meaning.
     pub about: &'static str,
     /// Unit, or empty.
     pub unit: &'static str,
@@ -75,7 +75,7 @@ impl Key {
 pub(crate) trait Section: Sized {
     /// Dotted path; empty for the top of the file.
     const PATH: &'static str;
-    /// What the table is for.
+    /// Purpose of the table.
     const ABOUT: &'static str;
     /// Its keys.
     const KEYS: &'static [Key];
@@ -90,7 +90,7 @@ pub(crate) struct SectionInfo {
     pub path: &'static str,
     /// Whether it is written `[[path]]`, any number of times.
     pub many: bool,
-    /// What the table is for.
+    /// Purpose of the table.
     pub about: &'static str,
     /// Its keys; `None` = any key (notes for people).
     pub keys: Option<&'static [Key]>,
@@ -262,7 +262,7 @@ macro_rules! tables {
                 self.written.get(S::PATH).copied().unwrap_or_default()
             }
 
-            /// Where each table stands.
+            /// Place of each table.
             pub(crate) fn places(&self) -> impl Iterator<Item = &$crate::config::document::TablePlace> {
                 std::iter::empty() $( .chain(self.$field.iter().map(|keys| &keys.place)) )+
             }
@@ -299,10 +299,7 @@ impl TableReader<'_> {
                     ValueFault::Range(_) => key.must_be_in_range(),
                 };
                 let (ValueFault::Type(span) | ValueFault::Range(span)) = wrong;
-                let found = match value.get_ref() {
-                    DeValue::Table(_) if !self.document.is_inline(&value.span()) => "a table".to_owned(),
-                    _ => self.document.quote(&span),
-                };
+                let found = self.document.found(value, &span);
                 let text = format!("{} = {found}, {what}", self.place.key(key.name));
                 self.faults.add(&self.document.file, self.document.line(&span), text);
                 None

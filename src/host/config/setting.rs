@@ -53,10 +53,22 @@ pub(crate) enum ValueFault {
     Range(Range<usize>),
 }
 
+/// `found`, or a fault that the value has another type.
+pub(crate) fn typed<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
+    found.ok_or_else(|| ValueFault::Type(value.span()))
+}
+
+/// `found`, or a fault that the value is out of range.
+pub(crate) fn in_range<T>(value: &Spanned<DeValue<'_>>, found: Option<T>) -> Result<T, ValueFault> {
+    found.ok_or_else(|| ValueFault::Range(value.span()))
+}
+
 /// A type a key may have.
 pub(crate) trait Setting: Sized {
     /// The type in words.
     const KIND: &'static str;
+    /// A list of the type in words.
+    const LIST_KIND: &'static str = "a list";
     /// The words it may be, when it is a choice.
     const CHOICES: &'static [&'static str] = &[];
     /// Reads and checks a value.
@@ -84,23 +96,20 @@ impl Setting for bool {
     const KIND: &'static str = "true or false";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
-        match value.get_ref() {
-            DeValue::Boolean(value) => Ok(*value),
-            _ => Err(ValueFault::Type(value.span())),
-        }
+        typed(value, value.get_ref().as_bool())
     }
 }
 
 impl Setting for f64 {
     const KIND: &'static str = "a number";
+    const LIST_KIND: &'static str = "a list of numbers";
 
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
-        let number = match value.get_ref() {
-            DeValue::Float(float) => float.as_str().parse::<f64>().map_err(|_| ValueFault::Type(value.span()))?,
-            DeValue::Integer(integer) => whole(integer).ok_or_else(|| ValueFault::Range(value.span()))? as f64,
-            _ => return Err(ValueFault::Type(value.span())),
+        let number = match value.get_ref().as_integer() {
+            Some(integer) => in_range(value, whole(integer))? as f64,
+            None => typed(value, value.get_ref().as_float().and_then(|float| float.as_str().parse().ok()))?,
         };
-        if allowed.has(number) { Ok(number) } else { Err(ValueFault::Range(value.span())) }
+        in_range(value, Some(number).filter(|&number| allowed.has(number)))
     }
 }
 
@@ -109,21 +118,16 @@ fn whole(integer: &DeInteger<'_>) -> Option<i128> {
     i128::from_str_radix(integer.as_str(), integer.radix()).ok()
 }
 
-fn read_whole<T: TryFrom<i128>>(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<T, ValueFault> {
-    let DeValue::Integer(integer) = value.get_ref() else {
-        return Err(ValueFault::Type(value.span()));
-    };
-    let number = whole(integer).filter(|&number| allowed.has(number as f64));
-    number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| ValueFault::Range(value.span()))
-}
-
 macro_rules! whole_numbers {
     ($($type:ty),+) => {$(
         impl Setting for $type {
             const KIND: &'static str = "a whole number";
+            const LIST_KIND: &'static str = "a list of whole numbers";
 
             fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
-                read_whole(value, allowed)
+                let number = whole(typed(value, value.get_ref().as_integer())?);
+                let number = number.filter(|&number| allowed.has(number as f64));
+                in_range(value, number.and_then(|number| Self::try_from(number).ok()))
             }
         }
     )+};
@@ -132,40 +136,25 @@ whole_numbers!(u8, u16, u32, u64);
 
 impl Setting for String {
     const KIND: &'static str = "a text";
+    const LIST_KIND: &'static str = "a list of texts";
 
     fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
-        match value.get_ref() {
-            DeValue::String(text) if *allowed == ValueRange::NotEmpty && text.trim().is_empty() => {
-                Err(ValueFault::Range(value.span()))
-            }
-            DeValue::String(text) => Ok(text.to_string()),
-            _ => Err(ValueFault::Type(value.span())),
-        }
+        let text = typed(value, value.get_ref().as_str())?;
+        let is_good = *allowed != ValueRange::NotEmpty || !text.trim().is_empty();
+        in_range(value, is_good.then(|| text.to_owned()))
     }
 }
 
-macro_rules! lists {
-    ($($type:ty, $kind:literal;)+) => {$(
-        impl Setting for Vec<$type> {
-            const KIND: &'static str = $kind;
+impl<T: Setting> Setting for Vec<T> {
+    const KIND: &'static str = T::LIST_KIND;
+    const LIST_KIND: &'static str = "a list of lists of numbers";
 
-            fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
-                match value.get_ref() {
-                    DeValue::Array(items) if *allowed == ValueRange::NotEmpty && items.is_empty() => {
-                        Err(ValueFault::Range(value.span()))
-                    }
-                    DeValue::Array(items) => items.iter().map(|item| <$type>::read(item, allowed)).collect(),
-                    _ => Err(ValueFault::Type(value.span())),
-                }
-            }
-        }
-    )+};
-}
-lists! {
-    String, "a list of texts";
-    u64, "a list of whole numbers";
-    f64, "a list of numbers";
-    Vec<f64>, "a list of lists of numbers";
+    fn read(value: &Spanned<DeValue<'_>>, allowed: &ValueRange) -> Result<Self, ValueFault> {
+        let items = typed(value, value.get_ref().as_array())?;
+        let is_good = *allowed != ValueRange::NotEmpty || !items.is_empty();
+        in_range(value, is_good.then_some(()))?;
+        items.iter().map(|item| T::read(item, allowed)).collect()
+    }
 }
 
 /// Cell numbers as people write them: `"1-12, 15"`, counted from 1.
@@ -187,10 +176,7 @@ impl Setting for CellRanges {
     const KIND: &'static str = "cell numbers from 1, like \"1-12, 15\"";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
-        match value.get_ref() {
-            DeValue::String(text) => Self::parse(text).ok_or_else(|| ValueFault::Type(value.span())),
-            _ => Err(ValueFault::Type(value.span())),
-        }
+        typed(value, value.get_ref().as_str().and_then(Self::parse))
     }
 }
 
@@ -205,13 +191,11 @@ macro_rules! choice {
                 value: &toml::Spanned<toml::de::DeValue<'_>>,
                 _: &$crate::config::setting::ValueRange,
             ) -> Result<Self, $crate::config::setting::ValueFault> {
-                match value.get_ref() {
-                    toml::de::DeValue::String(text) => match text.as_ref() {
-                        $($word => Ok($value),)+
-                        _ => Err($crate::config::setting::ValueFault::Range(value.span())),
-                    },
-                    _ => Err($crate::config::setting::ValueFault::Type(value.span())),
-                }
+                let choice = match $crate::config::setting::typed(value, value.get_ref().as_str())? {
+                    $($word => Some($value),)+
+                    _ => None,
+                };
+                $crate::config::setting::in_range(value, choice)
             }
         }
     };

@@ -1,5 +1,6 @@
 //! The tables of a configuration file as they are read: one line per table.
 
+use super::document::{Faults, TablePlace};
 use super::keys::{
     Alarm, Capacity, CellVoltageInput, Commands, CurrentInput, CurrentLimits, Estimator, Input, Interface, J1939,
     Output, OutputAlarm, OutputHealth, OutputStatus, Pack, PackIdentityInput, PackVoltageInput, ProtectedInput,
@@ -73,7 +74,15 @@ impl RawTables {
         names.join(" or ")
     }
 
-    /// What is configured of the signal of a channel.
+    /// Notes an FD frame on interfaces without FD, at the key `fd` of its table.
+    pub(super) fn check_fd(&self, place: &TablePlace, buses: &[BusIndex], faults: &mut Faults) {
+        let interfaces = buses.iter().filter_map(|bus| self.interfaces.get(bus.index()));
+        for interface in interfaces.filter(|interface| !interface.fd) {
+            place.fault(faults, "fd", &format!("must have fd = true on interface {} too", interface.name));
+        }
+    }
+
+    /// The configured signal of a channel.
     pub(crate) fn source(&self, channel: Channel) -> Option<SignalSource<'_>> {
         match channel {
             Channel::Current => self.current.as_ref().map(|keys| keys.source()),
@@ -86,7 +95,7 @@ impl RawTables {
         }
     }
 
-    /// What is configured of all signals, with `[input.cell_voltage]` once, for the first cell.
+    /// All configured signals, `[input.cell_voltage]` once, for the first cell.
     pub(super) fn sources(&self) -> impl Iterator<Item = (Channel, SignalSource<'_>)> {
         let sensors = (0..).take(self.temperatures.len()).map(|index| Channel::Temperature(SensorIndex(index)));
         let others = [

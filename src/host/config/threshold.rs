@@ -3,7 +3,7 @@
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-use super::setting::{Setting, ValueFault, ValueRange};
+use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
 use crate::alarm::Comparison;
 
 /// A value to compare with: in the rule's unit, or relative.
@@ -29,11 +29,8 @@ impl Level {
             return f64::read(value, allowed).map(Self::Absolute);
         };
         let percent = text.trim().strip_suffix('%').and_then(|number| number.trim().parse::<f64>().ok());
-        match percent {
-            None => Err(ValueFault::Type(value.span())),
-            Some(percent) if (0.0..=1000.0).contains(&percent) => Ok(Self::Relative(percent / 100.0)),
-            Some(_) => Err(ValueFault::Range(value.span())),
-        }
+        let percent = typed(value, percent)?;
+        in_range(value, (0.0..=1000.0).contains(&percent).then_some(Self::Relative(percent / 100.0)))
     }
 }
 
@@ -44,10 +41,8 @@ impl Setting for Threshold {
         let DeValue::Table(table) = value.get_ref() else {
             return Level::read(value, allowed).map(|set| Self { set, clear: None });
         };
-        if table.iter().any(|(key, _)| !matches!(key.get_ref().as_ref(), "set" | "clear")) {
-            return Err(ValueFault::Type(value.span()));
-        }
-        let set = table.get("set").ok_or_else(|| ValueFault::Type(value.span()))?;
+        let has_others = table.iter().any(|(key, _)| !matches!(key.get_ref().as_ref(), "set" | "clear"));
+        let set = typed(value, table.get("set").filter(|_| !has_others))?;
         let clear = table.get("clear").map(|clear| Level::read(clear, allowed)).transpose()?;
         Ok(Self { set: Level::read(set, allowed)?, clear })
     }
@@ -57,17 +52,17 @@ impl Setting for Comparison {
     const KIND: &'static str = "\"mean\", or { probability = ... } above 0 and below 1";
 
     fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
-        match value.get_ref() {
-            DeValue::String(text) if text.as_ref() == "mean" => Ok(Self::Mean),
-            DeValue::Table(table) if table.len() == 1 => {
-                probability(table).ok_or_else(|| ValueFault::Type(value.span()))
-            }
-            _ => Err(ValueFault::Type(value.span())),
-        }
+        let comparison = match value.get_ref() {
+            DeValue::String(text) => (text.as_ref() == "mean").then_some(Self::Mean),
+            DeValue::Table(table) => probability(table),
+            _ => None,
+        };
+        typed(value, comparison)
     }
 }
 
 fn probability(table: &DeTable<'_>) -> Option<Comparison> {
-    let level = f64::read(table.get("probability")?, &ValueRange::Any).ok()?;
+    let level = table.get("probability").filter(|_| table.len() == 1)?;
+    let level = f64::read(level, &ValueRange::Any).ok()?;
     (level > 0.0 && level < 1.0).then_some(Comparison::Probability(level))
 }

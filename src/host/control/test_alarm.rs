@@ -163,7 +163,7 @@ impl MonitoredChannel {
     /// Reads all received frames.
     fn read_all(&mut self, rule: Rule) {
         while self.report.error.is_none() {
-            match self.listener.next() {
+            match self.listener.next_frame() {
                 Ok(None) => break,
                 Ok(Some((time, frame))) => self.take(rule, time, &frame),
                 Err(error) => self.report.error = Some(error.to_string()),

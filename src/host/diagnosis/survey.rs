@@ -1,4 +1,4 @@
-//! What a configuration expects of the buses, also of one that is not good: the [`Plan`] of the doctor.
+//! The [`Plan`] of the doctor: what a configuration expects of the buses, even if it has faults.
 //!
 //! In: the configuration file. Out: the plan, every fault as [`config::load`](crate::config::load) reports it, and where
 //! each key stands. A configuration of which no signal can be found in a DBC file is refused.
@@ -22,7 +22,7 @@ const USUAL_AH: f64 = 50.0;
 /// The readable part of a configuration, as the doctor needs it.
 #[derive(Debug)]
 pub struct Survey {
-    /// What is expected of the buses.
+    /// Expectations of the buses.
     pub plan: Plan,
     /// The signals that were found.
     pub input: InputMap,

@@ -66,13 +66,13 @@ pub enum Line<'a> {
     Other,
 }
 
-/// Where and why a line breaks the grammar.
+/// Position and reason at which a line breaks the grammar.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("column {column}: expected {expected}")]
 pub struct LineError {
     /// Byte position in the line, from 1.
     pub column: usize,
-    /// What the grammar allows there.
+    /// Input that the grammar allows there.
     pub expected: &'static str,
 }
 
@@ -408,7 +408,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// How many decimals a written stamp has.
+/// Decimals of a written stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StampDigits {
     /// Six, as `candump -L` (the rest is cut off).

@@ -90,7 +90,7 @@ impl CsvLog {
     ///
     /// # Errors
     /// The source fails.
-    pub fn next(&mut self) -> Result<RowResult, TableError> {
+    pub fn next_row(&mut self) -> Result<RowResult, TableError> {
         let Some(row) = self.table.next_row()? else { return Ok(RowResult::End) };
         self.values.clear();
         let time_text = row.bytes(self.time_column).unwrap_or_default();

@@ -61,7 +61,7 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    /// For these interfaces, in the order of the configuration.
+    /// A log for these interfaces, in the order of the configuration.
     pub fn new(interfaces: Vec<String>) -> Self {
         let sums = vec![InterfaceSums::default(); interfaces.len()];
         Self { interfaces, sums }

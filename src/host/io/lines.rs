@@ -74,12 +74,6 @@ pub struct Lines {
     ended: bool,
 }
 
-impl std::fmt::Debug for Lines {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Lines").field("number", &self.number).finish_non_exhaustive()
-    }
-}
-
 impl Lines {
     /// Lines of `source`.
     pub fn new(source: Box<dyn Read>) -> Self {

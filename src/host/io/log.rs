@@ -53,16 +53,10 @@ pub struct LogOptions {
     pub interfaces: Vec<String>,
     /// A bad line ends the reading.
     pub strict: bool,
-    /// For CSV logs.
+    /// How CSV logs are read.
     pub csv: CsvOptions,
-    /// For CSV logs.
+    /// Encodes rows of CSV logs.
     pub encode_row: RowEncoder,
-}
-
-impl std::fmt::Debug for LogOptions {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LogOptions").field("interfaces", &self.interfaces).finish_non_exhaustive()
-    }
 }
 
 /// Counts of what was read, and of what became no record.
@@ -436,7 +430,7 @@ impl ReadState {
     /// The next good row's time on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
-            match log.next() {
+            match log.next_row() {
                 Ok(RowResult::Good(row)) => {
                     self.counts.lines += 1;
                     if row.after_unknown_gap {

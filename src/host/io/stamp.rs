@@ -47,28 +47,22 @@ fn parse_iso(date: &str, time: &str) -> Option<Timestamp> {
     let mut parts = time.splitn(3, ':');
     let (hour, minute) = (number(parts.next()?)?, number(parts.next()?)?);
     let seconds = parts.next().map_or(Some(Timestamp::ZERO), |s| parse_exact(s.as_bytes()))?;
-    let sensible = (1..=9999).contains(&year) && (1..=12).contains(&month) && (1..=days_in(year, month)).contains(&day);
-    if !sensible || hour > 23 || minute > 59 || !(0..61_000_000_000).contains(&seconds.nanos()) {
+    let days = days_from_epoch(year, month, day);
+    let is_date = (1..=9999).contains(&year) && date_of(days) == (year, month, day);
+    if !is_date || hour > 23 || minute > 59 || !(0..61_000_000_000).contains(&seconds.nanos()) {
         return None;
     }
-    let whole = days_from_epoch(year, month, day) * 86_400 + hour * 3600 + minute * 60;
+    let whole = days * 86_400 + hour * 3600 + minute * 60;
     Some(seconds.plus_nanos(whole.checked_mul(1_000_000_000)?))
 }
 
+/// At most nine digits, so that no calculation overflows.
 fn number(text: &str) -> Option<i64> {
-    text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
+    (text.len() <= 9 && text.bytes().all(|b| b.is_ascii_digit())).then(|| text.parse().ok())?
 }
 
-fn days_in(year: i64, month: i64) -> i64 {
-    match month {
-        4 | 6 | 9 | 11 => 30,
-        2 if year % 4 == 0 && (year % 100 != 0 || year % 400 == 0) => 29,
-        2 => 28,
-        _ => 31,
-    }
-}
-
-/// Days from 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years).
+/// Days from 1970-01-01 in the Gregorian calendar (years counted from March, in eras of 400 years). A date that does not
+/// exist gives the days of another one.
 fn days_from_epoch(year: i64, month: i64, day: i64) -> i64 {
     let shifted = if month <= 2 { year - 1 } else { year };
     let (era, of_era) = (shifted.div_euclid(400), shifted.rem_euclid(400));

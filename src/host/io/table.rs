@@ -17,7 +17,7 @@ use crate::quantity::Timestamp;
 /// Columns at whose values time starts again, where the user names none.
 pub const PART_COLUMNS: [&str; 3] = ["cycle", "segment", "ref"];
 
-/// What is allowed where a point in time is read.
+/// Allowed forms of a point in time.
 const STAMP: &str = "like 2008-04-02T13:08:17.921 or seconds";
 
 /// A table that cannot be read or a field that cannot be used, with its place.

@@ -23,7 +23,7 @@ pub struct Ticks {
     limit_ns: i64,
     /// Latest record; `None` before the first and after [`Ticks::sleep`].
     latest_ns: Option<i64>,
-    /// Where ticks continue once those before the hole are popped.
+    /// Time at which ticks continue once those before the hole are popped.
     wake_ns: Option<i64>,
 }
 

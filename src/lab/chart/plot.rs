@@ -59,6 +59,16 @@ impl Layer {
     pub fn new(label: &str, ink: Ink, shape: Shape) -> Self {
         Self { label: label.to_owned(), ink, shape }
     }
+
+    /// A line of (x, y).
+    pub fn line(label: &str, ink: Ink, points: impl IntoIterator<Item = (f64, f64)>) -> Self {
+        Self::new(label, ink, Shape::Line(points.into_iter().collect()))
+    }
+
+    /// A band of (x, lower, upper).
+    pub fn band(label: &str, ink: Ink, points: impl IntoIterator<Item = (f64, f64, f64)>) -> Self {
+        Self::new(label, ink, Shape::Band(points.into_iter().collect()))
+    }
 }
 
 /// One pair of axes.

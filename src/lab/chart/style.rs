@@ -84,7 +84,7 @@ pub fn variables() -> String {
     ) + &classes()
 }
 
-/// The classes alone, light, without variables, for programs without support for variables.
+/// The classes alone, light, without variables, for viewers without style sheet variables.
 pub(super) fn fixed() -> String {
     COLOURS.iter().fold(classes(), |text, (name, light, _)| text.replace(&format!("var(--{name})"), light))
 }

@@ -3,8 +3,7 @@
 use std::path::Path;
 
 use super::FitOutcome;
-
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, Shape};
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture};
 use crate::error::LabError;
 use crate::ident::pass::residuals;
 
@@ -41,7 +40,7 @@ fn panel(outcome: &FitOutcome, number: usize) -> Picture {
         title: format!("{name}: RMSE {:.1} mV", 1e3 * file.residual.rmse_v),
         x: Axis::number("time, h"),
         y: Axis::number("measured - model, mV"),
-        layers: vec![Layer::new("", Ink::Blue, Shape::Line(points))],
+        layers: vec![Layer::line("", Ink::Blue, points)],
         ..Chart::default()
     })
 }

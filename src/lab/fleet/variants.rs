@@ -1,8 +1,8 @@
 //! `--set KEY=V1,V2`: other values in a configuration, and the grid of all their combinations.
 //!
-//! In: the configuration's text and choices. Out: one checked configuration per combination, the one as written first, and
-//! which of them can share a replay: those that differ in nothing but `[[alarm]]` tables (of `input_missing` aside: how
-//! long a silence counts is judged before the alarms see it). A combination that is no valid configuration is left out
+//! Input: the configuration's text and choices. Output: one checked configuration per combination, the one as written first, and
+//! which of them can share a replay: those that differ in `[[alarm]]` tables only (except those of
+//! `input_missing`: its time-outs act before the alarms). A combination that is no valid configuration is left out
 //! and reported.
 //!
 //! Keys: `RULE.info`, `.warning`, `.severe` (each also with `.set` or `.clear`), `RULE.threshold` for the gravest severity

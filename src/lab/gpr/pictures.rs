@@ -60,17 +60,13 @@ fn slug(text: &str) -> String {
     joined.chars().take(100).collect()
 }
 
-fn points(label: &str, ink: Ink, all: impl Iterator<Item = (f64, f64)>) -> Layer {
+fn points(label: &str, ink: Ink, all: impl IntoIterator<Item = (f64, f64)>) -> Layer {
     let point = |(x, y)| Point { x, y, ..Point::default() };
-    Layer::new(label, ink, Shape::Points(all.map(point).collect()))
-}
-
-fn line(label: &str, ink: Ink, all: impl Iterator<Item = (f64, f64)>) -> Layer {
-    Layer::new(label, ink, Shape::Line(all.collect()))
+    Layer::new(label, ink, Shape::Points(all.into_iter().map(point).collect()))
 }
 
 fn band(all: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
-    Layer::new("95 % interval", Ink::Blue, Shape::Band(all.collect()))
+    Layer::band("95 % interval", Ink::Blue, all)
 }
 
 fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
@@ -90,8 +86,8 @@ fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
         x: Axis::number(&format!("measured {}", table::label(output))),
         y: Axis::number(&format!("predicted {}", table::label(output))),
         layers: vec![
-            points(&label, Ink::Blue, pairs.into_iter()),
-            line("equal", Ink::Plain, ends.into_iter().map(|end| (end, end))),
+            points(&label, Ink::Blue, pairs),
+            Layer::line("equal", Ink::Plain, ends.into_iter().map(|end| (end, end))),
         ],
         ..Chart::default()
     }
@@ -111,7 +107,7 @@ fn stretch(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
         y: Axis::number(&table::label(output)),
         layers: vec![
             band(rows.clone().map(|row| (row as f64 + 1.0, at(row).low_95, at(row).high_95))),
-            line("predicted", Ink::Blue, rows.clone().map(|row| (row as f64 + 1.0, at(row).mean))),
+            Layer::line("predicted", Ink::Blue, rows.clone().map(|row| (row as f64 + 1.0, at(row).mean))),
             points("measured", Ink::Orange, rows.clone().map(|row| (row as f64 + 1.0, truth[row]))),
         ],
         ..Chart::default()
@@ -155,8 +151,8 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
         y: Axis::number(&table::label(&output.name)),
         layers: vec![
             band(now.into_iter().chain(fan)),
-            line("measured", Ink::Plain, rows.map(|row| (x(row), value(row)))),
-            line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
+            Layer::line("measured", Ink::Plain, rows.map(|row| (x(row), value(row)))),
+            Layer::line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
         ],
         ..Chart::default()
     }
@@ -171,9 +167,9 @@ fn growth(output: &OutputForecast) -> Chart {
         x: Axis::number("rows ahead"),
         y: Axis::number(&format!("RMSE, {}", table::label(&output.name).split(", ").nth(1).unwrap_or(""))),
         layers: vec![
-            line("persistence", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
-            line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
-            line(
+            Layer::line("persistence", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
+            Layer::line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
+            Layer::line(
                 "half of the mean 95 % interval",
                 Ink::Green,
                 over(&|h| h.score.map(|s| s.mean_width_95 / 2.0)).into_iter(),
@@ -191,7 +187,7 @@ fn coverage(output: &OutputForecast) -> Chart {
         y: Axis::number("inside, %").within(0.0, 100.0),
         layers: vec![
             Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
-            line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
+            Layer::line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
         ],
         ..Chart::default()
     }
@@ -208,12 +204,12 @@ fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
         y: Axis::number(&table::label(&output.name)),
         layers: vec![
             band(all().map(|(row, p)| (for_row(*row), p.low_95, p.high_95))),
-            line(
+            Layer::line(
                 "measured",
                 Ink::Plain,
                 all().map(|(row, _)| (for_row(*row), data.row(row + horizon.steps)[output.column])),
             ),
-            line("forecast", Ink::Blue, all().map(|(row, p)| (for_row(*row), p.mean))),
+            Layer::line("forecast", Ink::Blue, all().map(|(row, p)| (for_row(*row), p.mean))),
         ],
         ..Chart::default()
     }

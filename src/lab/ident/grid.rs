@@ -1,6 +1,6 @@
 //! The grid of the tables and the place of a SOC and a temperature in it.
 //!
-//! The same rules as [`CellModel::place`](crate::cell::CellModel::place): along SOC linear (the OCV continues beyond 0 and 1, everything else
+//! The same rules as [`CellModel::grid_position`](crate::cell::CellModel::grid_position): along SOC linear (the OCV continues beyond 0 and 1, everything else
 //! holds its edge value); along temperature the OCV and time constants linear, resistances by Arrhenius' law; outside the
 //! temperature range the nearest edge holds.
 

@@ -44,7 +44,7 @@ pub enum ThermalFitError {
 /// Fits both; `energy_wh` = what the cell stores.
 ///
 /// # Errors
-/// No discharge warms enough, or the answer is no cell's.
+/// No discharge warms enough, or the result is not credible for a cell.
 pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, ThermalFitError> {
     let thermal = medians(records, tables).ok_or(ThermalFitError::NoWarming)?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;

@@ -5,9 +5,9 @@
 
 use std::collections::BTreeMap;
 
+use super::context::PageContext;
 use super::data::{CapacityRecord, Data};
-use super::{PageContext, pictures};
-
+use super::limits::threshold;
 use crate::alarm::Rule;
 use crate::health::{Axis, CapacityReading, Forecast, InsufficientData, Remaining, RemainingLife, Usage};
 
@@ -49,7 +49,7 @@ pub(super) struct Outlook {
 /// Capacity at the end of life, Ah: as configured, else the mildest limit of the record's alarms.
 pub(super) fn end_of_life_ah(data: &Data, context: &PageContext<'_>) -> Option<f64> {
     let configured = context.config.map(|config| config.monitor.health.end_of_life_ah);
-    configured.or_else(|| pictures::threshold(data, context, Rule::CapacityLow))
+    configured.or_else(|| threshold(data, context, Rule::CapacityLow))
 }
 
 /// The outlook of the cell whose life ends first, or why there is none.

@@ -2,9 +2,10 @@
 
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 
+use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::pictures::{self, NOT_STORED};
-use super::{PageContext, forecast, summary};
+use super::{forecast, summary};
 use crate::chart::{Picture, Size, variables};
 use crate::config::Config;
 
@@ -268,7 +269,7 @@ fn alarms(data: &Data, pictures: &[(String, Picture)]) -> Markup {
     }
 }
 
-/// A table of the first [`MAX_ROWS`] rows; says how many there are.
+/// A table of the first [`MAX_ROWS`] rows with a note on their total number.
 fn table(names: &[&str], rows: impl Iterator<Item = Vec<String>>, count: usize) -> Markup {
     html! {
         div.scroll {

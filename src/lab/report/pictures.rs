@@ -1,12 +1,18 @@
 //! The report's pictures, each with the name of its file.
 
+use std::path::Path;
+
+use super::context::PageContext;
 use super::data::{Data, Origin};
 use super::forecast::{self, Outlook};
+use super::limits::thresholds;
 use super::series::{self, CellStep};
+use super::summary;
 use super::trace::{OF_95, TraceBin};
-use super::{PageContext, summary};
 use crate::alarm::Rule;
-use crate::chart::{Axis, Chart, Heat, Ink, Layer, Picture, Point, Scale, Shape, Span, StateBand, StateBands};
+use crate::chart::{
+    self, Axis, Chart, Format, Heat, Ink, Layer, Picture, PlotError, Point, Scale, Shape, Span, StateBand, StateBands,
+};
 
 /// Why a replay-only picture is missing from a report of a store.
 pub(super) const NOT_STORED: &str =
@@ -19,6 +25,19 @@ const MAX_HOLE_S: f64 = 100.0;
 const MAX_HOLE_BINS: usize = 3;
 /// The last half-cycles get their own picture when they are at most this part of the record.
 const MAX_RECENT: f64 = 0.9;
+
+/// Writes every picture of the report into a folder, as SVG and PNG; gives how many pictures.
+///
+/// # Errors
+/// A file cannot be written, or there is no font for the words of a PNG.
+pub fn write_plots(folder: &Path, data: &Data, context: &PageContext<'_>) -> Result<usize, PlotError> {
+    let pictures = all(data, context);
+    for (name, picture) in &pictures {
+        chart::write(&folder.join(format!("{name}.svg")), picture, Format::Svg)?;
+        chart::write(&folder.join(format!("{name}.png")), picture, Format::Png)?;
+    }
+    Ok(pictures.len())
+}
 
 /// Returns every picture that has data, with the name of its file.
 pub(super) fn all(data: &Data, context: &PageContext<'_>) -> Vec<(String, Picture)> {
@@ -74,29 +93,6 @@ impl TimeAxis {
     fn x(&self, time_s: f64) -> f64 {
         (time_s - self.zero_s) / self.unit_s
     }
-}
-
-/// The mildest threshold of a rule, as configured, else as its alarms say.
-pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
-    thresholds(data, context, rule).first().map(|(value, _)| *value)
-}
-
-/// Every threshold of a rule with its severity, the mildest first.
-fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
-    let mut all: Vec<(f64, String)> = match context.config {
-        Some(config) => {
-            let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
-            rules.map(|row| (row.threshold, row.severity.name().to_owned())).collect()
-        }
-        None => {
-            let rows = data.alarms.iter().filter(|row| row.rule == rule.name());
-            rows.filter_map(|row| Some((row.threshold?, row.severity.clone()))).collect()
-        }
-    };
-    let rank = |severity: &str| ["info", "warning", "severe"].iter().position(|known| *known == severity);
-    all.sort_by(|a, b| rank(&a.1).cmp(&rank(&b.1)).then(a.0.total_cmp(&b.0)));
-    all.dedup();
-    all
 }
 
 fn levels(data: &Data, context: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
@@ -169,10 +165,9 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let clock = TimeAxis::of(data);
     let bins = filled(life.iter());
     let words = if data.cells() > 1 { "estimate, lowest to highest cell" } else { "estimate" };
-    let mut layers =
-        vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&bins, &clock, |bin| bin.soc_band, 100.0)))];
+    let mut layers = vec![Layer::band("95 % interval", Ink::Blue, range(&bins, &clock, |bin| bin.soc_band, 100.0))];
     layers.extend(true_soc(context, &clock, data.ends_s()?));
-    layers.push(Layer::new(words, Ink::Blue, Shape::Line(zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0)))));
+    layers.push(Layer::line(words, Ink::Blue, zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0))));
     Some(Picture::Chart(Chart {
         title: "State of charge over the whole record".to_owned(),
         description: format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s()),
@@ -191,14 +186,13 @@ fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     }
     let clock = TimeAxis::between(data, moments.first()?.0, moments.last()?.0);
     let soc = range(&moments, &clock, |bin| bin.soc, 100.0);
-    let mut layers =
-        vec![Layer::new("95 % interval", Ink::Blue, Shape::Band(range(&moments, &clock, |bin| bin.soc_band, 100.0)))];
+    let mut layers = vec![Layer::band("95 % interval", Ink::Blue, range(&moments, &clock, |bin| bin.soc_band, 100.0))];
     layers.extend(true_soc(context, &clock, (moments.first()?.0, moments.last()?.0)));
     if data.cells() > 1 {
-        layers.push(Layer::new("highest cell", Ink::Green, Shape::Line(soc.iter().map(|p| (p.0, p.2)).collect())));
-        layers.push(Layer::new("lowest cell", Ink::Blue, Shape::Line(soc.iter().map(|p| (p.0, p.1)).collect())));
+        layers.push(Layer::line("highest cell", Ink::Green, soc.iter().map(|p| (p.0, p.2))));
+        layers.push(Layer::line("lowest cell", Ink::Blue, soc.iter().map(|p| (p.0, p.1))));
     } else {
-        layers.push(Layer::new("estimate", Ink::Blue, Shape::Line(zigzag(&soc))));
+        layers.push(Layer::line("estimate", Ink::Blue, zigzag(&soc)));
     }
     Some(Picture::Chart(Chart {
         title: "State of charge in the last half-cycles".to_owned(),
@@ -213,13 +207,13 @@ fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
 fn worst(data: &Data, clock: &TimeAxis, steps: &[CellStep], ink: Ink, name: &str) -> Vec<Layer> {
     let interval =
         steps.iter().map(|s| (clock.x(s.time_s), s.worst.0 - OF_95 * s.worst.1, s.worst.0 + OF_95 * s.worst.1));
-    let mut layers = vec![Layer::new("95 % interval", ink, Shape::Band(interval.collect()))];
+    let mut layers = vec![Layer::band("95 % interval", ink, interval)];
     if data.cells() > 1 {
         let range = steps.iter().map(|s| (clock.x(s.time_s), s.range.0, s.range.1));
-        layers.push(Layer::new("all cells", Ink::Grey, Shape::Band(range.collect())));
+        layers.push(Layer::band("all cells", Ink::Grey, range));
     }
     let name = if data.cells() > 1 { format!("{name} cell") } else { "estimate".to_owned() };
-    layers.push(Layer::new(&name, ink, Shape::Line(steps.iter().map(|s| (clock.x(s.time_s), s.worst.0)).collect())));
+    layers.push(Layer::line(&name, ink, steps.iter().map(|s| (clock.x(s.time_s), s.worst.0))));
     layers
 }
 
@@ -240,8 +234,8 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     }
     layers.extend(worst(data, &clock, &steps, Ink::Blue, "weakest"));
     if !fan.is_empty() {
-        let band = fan.iter().map(|p| (clock.x(p.time_s), p.low_ah, p.high_ah)).collect();
-        layers.push(Layer::new("forecast, 5 to 95 %, and its median", Ink::Purple, Shape::Band(band)));
+        let band = fan.iter().map(|p| (clock.x(p.time_s), p.low_ah, p.high_ah));
+        layers.push(Layer::band("forecast, 5 to 95 %, and its median", Ink::Purple, band));
         let median = fan.iter().map(|p| (clock.x(p.time_s), p.median_ah)).collect();
         layers.push(Layer::new("", Ink::Purple, Shape::Dashed(median)));
     }
@@ -345,9 +339,9 @@ fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let normalised = || data.recharges.iter().filter_map(|row| Some((clock.x(row.time_s), row.normalised_s?)));
     if normalised().count() > 0 {
         let band = normalised().map(|(x, (mean, std))| (x, minutes(mean - OF_95 * std), minutes(mean + OF_95 * std)));
-        layers.push(Layer::new("95 % interval", Ink::Green, Shape::Band(band.collect())));
+        layers.push(Layer::band("95 % interval", Ink::Green, band));
         let line = normalised().map(|(x, (mean, _))| (x, minutes(mean)));
-        layers.push(Layer::new("normalised to the reference charger", Ink::Green, Shape::Line(line.collect())));
+        layers.push(Layer::line("normalised to the reference charger", Ink::Green, line));
     }
     let point = |time_s: f64, seconds: f64| Point {
         x: clock.x(time_s),
@@ -410,7 +404,7 @@ fn temperature(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     if let Some(life) = &data.trace.life {
         let bins = filled(life.iter());
         let band = range(&bins, &clock, |bin| bin.temperature_c, 1.0);
-        layers.push(Layer::new("lowest to highest", Ink::Orange, Shape::Line(zigzag(&band))));
+        layers.push(Layer::line("lowest to highest", Ink::Orange, zigzag(&band)));
     }
     let means = series::temperatures(data);
     if !means.is_empty() && layers.is_empty() {
@@ -510,7 +504,7 @@ fn innovation(data: &Data) -> Option<Picture> {
         description: "Lowest and highest innovation over the cells, mV".to_owned(),
         x: clock.axis,
         y: Axis::number("mV"),
-        layers: vec![Layer::new("lowest to highest", Ink::Grey, Shape::Line(zigzag(&band)))],
+        layers: vec![Layer::line("lowest to highest", Ink::Grey, zigzag(&band))],
     }))
 }
 
@@ -522,7 +516,7 @@ fn coverage(data: &Data) -> Option<Picture> {
     // From 80 % where nothing lies lower.
     let lowest = if line.iter().all(|point| point.1 > 80.0) { 80.0 } else { 0.0 };
     let layers = vec![
-        Layer::new("within their own 95 % interval", Ink::Blue, Shape::Line(line)),
+        Layer::line("within their own 95 % interval", Ink::Blue, line),
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
     Some(Picture::Chart(Chart {

@@ -2,9 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use super::context::PageContext;
 use super::data::{AlarmRecord, Data, Origin};
 use super::forecast::Outlook;
-use super::{PageContext, forecast, series};
+use super::{forecast, series};
 use crate::alarm::{Rule, Severity};
 use crate::io::stamp::format_utc;
 use crate::quantity::Timestamp;

@@ -61,7 +61,7 @@ struct UseCounter {
 }
 
 impl MeasuredCapacity {
-    /// What passed since another.
+    /// Returns the use since another reading.
     pub fn since(&self, before: &Self) -> Usage {
         Usage {
             cycles: self.cycles - before.cycles,

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::life::{DischargeScore, LifeScore};
 use super::soc::SocSample;
 use super::{Case, STD_OF_95, Start};
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError, Shape};
+use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError};
 
 /// Draws the run and gives the file's path.
 pub(super) fn draw(
@@ -40,14 +40,10 @@ pub(super) fn describe(case: &Case, separator: &str) -> String {
     words.join(separator)
 }
 
-fn line(label: &str, ink: Ink, points: impl Iterator<Item = (f64, f64)>) -> Layer {
-    Layer::new(label, ink, Shape::Line(points.collect()))
-}
-
 fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
     // (x, middle, half of the interval)
-    let points = points.map(|(x, middle, half)| (x, middle - half, middle + half)).collect();
-    Layer::new("95 % interval", Ink::Orange, Shape::Band(points))
+    let points = points.map(|(x, middle, half)| (x, middle - half, middle + half));
+    Layer::band("95 % interval", Ink::Orange, points)
 }
 
 fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
@@ -58,8 +54,8 @@ fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
         y: Axis::number("SOC, %").within(-10.0, 110.0),
         layers: vec![
             band(samples.iter().map(|s| (s.time_s / 3600.0, 100.0 * s.soc, s.half_width_points()))),
-            line("truth", Ink::Plain, over(|s| 100.0 * s.truth)),
-            line("estimate", Ink::Orange, over(|s| 100.0 * s.soc)),
+            Layer::line("truth", Ink::Plain, over(|s| 100.0 * s.truth)),
+            Layer::line("estimate", Ink::Orange, over(|s| 100.0 * s.soc)),
         ],
         ..Chart::default()
     }
@@ -75,7 +71,7 @@ fn error_panel(samples: &[SocSample]) -> Chart {
         y: Axis::number("SOC error, points").within(-reach, reach),
         layers: vec![
             band(samples.iter().map(|s| (s.time_s / 3600.0, 0.0, inside(s.half_width_points())))),
-            line(
+            Layer::line(
                 "estimate - truth",
                 Ink::Orange,
                 samples.iter().map(|s| (s.time_s / 3600.0, inside(s.error_points()))),
@@ -99,8 +95,8 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         "usable capacity, Ah",
         vec![
             band(each.iter().map(|d| (number(d), d.usable_ah, STD_OF_95 * d.usable_std_ah))),
-            line("published", Ink::Plain, each.iter().filter_map(|d| Some((number(d), d.truth_ah?)))),
-            line("estimate", Ink::Orange, each.iter().map(|d| (number(d), d.usable_ah))),
+            Layer::line("published", Ink::Plain, each.iter().filter_map(|d| Some((number(d), d.truth_ah?)))),
+            Layer::line("estimate", Ink::Orange, each.iter().map(|d| (number(d), d.usable_ah))),
         ],
     );
     let capacity = panel(
@@ -108,7 +104,7 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         "capacity, Ah",
         vec![
             band(each.iter().map(|d| (number(d), d.capacity_ah, STD_OF_95 * d.capacity_std_ah))),
-            line("estimate", Ink::Blue, each.iter().map(|d| (number(d), d.capacity_ah))),
+            Layer::line("estimate", Ink::Blue, each.iter().map(|d| (number(d), d.capacity_ah))),
         ],
     );
     let resistance = panel(
@@ -116,7 +112,7 @@ fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
         "resistance, times new",
         vec![
             band(each.iter().map(|d| (number(d), d.resistance_ratio, STD_OF_95 * d.resistance_ratio_std))),
-            line("estimate", Ink::Green, each.iter().map(|d| (number(d), d.resistance_ratio))),
+            Layer::line("estimate", Ink::Green, each.iter().map(|d| (number(d), d.resistance_ratio))),
         ],
     );
     [usable, capacity, resistance]

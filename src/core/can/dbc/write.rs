@@ -46,7 +46,7 @@ impl Database {
     pub fn to_dbc_bytes(&self) -> Vec<u8> {
         let text = self.to_dbc();
         let latin: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        // Latin-1 bytes that happen to be valid UTF-8 would be read as UTF-8.
+        // Latin-1 bytes that are valid UTF-8 too would be read as UTF-8.
         latin
             .filter(|bytes| text.is_ascii() || std::str::from_utf8(bytes).is_err())
             .unwrap_or_else(|| text.into_bytes())

@@ -75,7 +75,7 @@ pub(crate) fn nested() -> InputMap {
 }
 
 #[test]
-fn every_message_is_told_with_no_fewer_groups_than_pages() {
+fn every_message_is_listed_with_no_fewer_groups_than_pages() {
     let both = InputMap::new([map().bindings(), nested().bindings()].concat());
     let found: Vec<_> = both.messages().map(|(bus, id, groups)| (bus.0, id.to_string(), groups)).collect();
     assert_eq!(found, [(0, "100".to_owned(), 1), (0, "101".to_owned(), 3), (0, "00000101".to_owned(), 4)]);
@@ -180,7 +180,7 @@ fn the_configured_range_holds_after_scale_and_offset_with_both_ends() {
 }
 
 #[test]
-fn a_configured_code_for_not_available_counts_beside_the_range() {
+fn a_configured_code_for_not_available_counts_in_addition_to_the_range() {
     let binding = Binding { not_available: vec![0, 0xFFFE], ..bind("Cells.Cell3", cell(2)) };
     let map = InputMap::new(vec![binding]);
     let value = |low, high| readings(&map, 0, &Frame::classic(CELLS, &[1, low, high]).unwrap())[0].1;
@@ -189,7 +189,7 @@ fn a_configured_code_for_not_available_counts_beside_the_range() {
 }
 
 #[test]
-fn codes_for_not_available_are_told_at_the_ends_of_the_range_and_amid_it() {
+fn codes_for_not_available_are_recognised_at_the_ends_and_in_the_middle_of_the_range() {
     let value = |not_available: Vec<u64>, code: i8| {
         let layout = SignalLayout { length_bits: 8, value_type: ValueType::Signed, ..SELECTOR };
         let binding = Binding { not_available, plan: layout.plan().unwrap(), ..bind("Pack.Temperature", sensor(0)) };

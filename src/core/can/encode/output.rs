@@ -246,7 +246,10 @@ impl OutputPlan {
     }
 }
 
-fn value_of<T>(signals: &[(&str, fn(&T) -> Option<f64>)], fields: &T, name: &str) -> Option<f64> {
+/// Name of a signal and how its value is taken from the fields of a message.
+type SignalValue<T> = (&'static str, fn(&T) -> Option<f64>);
+
+fn value_of<T>(signals: &[SignalValue<T>], fields: &T, name: &str) -> Option<f64> {
     signals.iter().find(|(signal, _)| *signal == name).and_then(|(_, value)| value(fields))
 }
 

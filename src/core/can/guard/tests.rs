@@ -47,13 +47,13 @@ fn only_the_protected_message_of_that_interface_is_checked() {
     assert_eq!(guards.check(at(0), BUS, &frame(0)), Some(Status::Initial));
     assert_eq!(guards.check(at(0), BusIndex(1), &frame(1)), None);
     assert_eq!(guards.check(at(0), BUS, &Frame::classic(CanId::Extended(0x100), &[0; 8]).unwrap()), None);
-    assert_eq!(guards.check(at(0), BUS, &Frame::remote(ID, 8).unwrap()), None, "asks for data, carries none");
+    assert_eq!(guards.check(at(0), BUS, &Frame::remote(ID, 8).unwrap()), None, "requests data, carries none");
     assert_eq!(guards.check(at(0), BUS, &frame(1)), Some(Status::Ok));
     assert_eq!(Guards::default().check(at(0), BUS, &frame(0)), None);
 }
 
 #[test]
-fn a_failing_message_is_told_once_and_once_when_it_is_back() {
+fn a_failing_message_is_reported_once_and_once_when_it_is_back() {
     let mut guards = guards(None);
     [frame(0), frame(1)].iter().for_each(|frame| assert!(guards.check(at(0), BUS, frame).is_some()));
     assert_eq!(changes(&mut guards), [], "a first frame is no failure");
@@ -129,7 +129,7 @@ fn after_time_asleep_nothing_was_missed_and_the_first_frame_is_initial() {
 }
 
 #[test]
-fn a_message_that_failed_before_a_restart_is_told_when_it_is_back() {
+fn a_message_that_failed_before_a_restart_is_reported_when_it_is_back() {
     let mut guards = guards(None);
     guards.check(at(0), BUS, &damaged());
     guards.restart();

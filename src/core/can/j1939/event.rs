@@ -15,7 +15,7 @@ pub enum NodeEvent {
     },
     /// Another node took the address; no codes are sent any more.
     AddressLost {
-        /// Its NAME; this node's own when two nodes are configured alike.
+        /// Its NAME; this node's own when two nodes have the same configuration.
         to: Name,
     },
     /// Another node claimed the address and must give way.

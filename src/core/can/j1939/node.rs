@@ -248,7 +248,7 @@ impl Node {
         let is_cyclic = self.next_dm1 <= now;
         let has_changed = self.codes.change_due().is_some_and(|due| due <= now);
         if (is_cyclic || has_changed) && self.can_start(now, PGN_DM1) {
-            // On time, the next one keeps the cycle; otherwise a new cycle begins now.
+            // On time, the next one keeps the cycle; after a change a new cycle begins now.
             let next = self.next_dm1.plus_nanos(DM1_PERIOD_NS);
             self.next_dm1 = if is_cyclic && now < next { next } else { now.plus_nanos(DM1_PERIOD_NS) };
             self.send_dm1(now, out);

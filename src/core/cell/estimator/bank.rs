@@ -73,11 +73,10 @@ impl EstimatorBank {
             2 => FilterArrays::Two(FilterArray::new(model, blocks)),
             _ => FilterArrays::Three(FilterArray::new(model, blocks)),
         };
-        let memory = CellEstimator::new(config).memory;
-        let cell = CellSlot { memory, has_filter: false };
+        let cell = CellSlot { memory: Memory::new(config), has_filter: false };
         let idle = StepResult { update: None, reset: false };
         let mut bank = Self {
-            constants: each_array!(&filters, x => x.constants(model, config)),
+            constants: KernelConstants::new(model, config),
             model: model.clone(),
             config: *config,
             filters,
@@ -197,9 +196,7 @@ impl EstimatorBank {
 
     /// State of charge of the emptiest and the fullest cell; `None` when a cell's is unknown or from before a downtime.
     pub fn extremes(&self) -> Option<(ScalarGaussian, ScalarGaussian)> {
-        let is_present =
-            |cell: &CellSlot| cell.has_filter && !cell.memory.is_unseen && cell.memory.downtime_std_if_any().is_none();
-        if !self.cells.iter().all(is_present) {
+        if !self.cells.iter().all(|cell| cell.has_filter && !cell.memory.is_carried_over()) {
             return None;
         }
         let (lowest, highest) = each_array!(&self.filters, x => x.extremes(self.cells.len()))?;
@@ -225,7 +222,7 @@ impl EstimatorBank {
         self.cell(cell).branch_v()
     }
 
-    /// Mean normalised innovation squared: [`CellEstimator::mean_nis`].
+    /// Mean normalised innovation squared over the consistency window: about 1 or less when the filter is consistent.
     #[inline]
     pub fn mean_nis(&self, cell: usize) -> f64 {
         let (block, lane) = (cell / WIDTH, cell % WIDTH);
@@ -253,8 +250,7 @@ impl EstimatorBank {
 
     /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
     pub fn is_carried_over(&self, cell: usize) -> bool {
-        let CellSlot { memory, .. } = &self.cells[cell];
-        memory.is_unseen || memory.downtime_std_if_any().is_some()
+        self.cells[cell].memory.is_carried_over()
     }
 
     /// Voltage that the load of the last minutes drops in the settled cell, V; 0 before the first voltage.

@@ -202,17 +202,6 @@ impl CellEstimator {
         }
     }
 
-    /// Mean normalised innovation squared over the consistency window: about 1 or less when the filter is
-    /// consistent.
-    pub fn mean_nis(&self) -> f64 {
-        self.memory.mean_nis
-    }
-
-    /// Temperature that the filter uses, degrees C.
-    pub fn temperature_c(&self) -> Option<f64> {
-        self.memory.temperature_c
-    }
-
     /// Notes a sleep: until a voltage has been used, the SOC is the one from before.
     pub fn note_sleep(&mut self) {
         self.memory.is_unseen = self.filter.is_some();
@@ -222,11 +211,6 @@ impl CellEstimator {
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
         let most = config.away_use_per_s * downtime_s;
         self.memory.downtime_std = (self.memory.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
-    }
-
-    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
-    pub fn is_carried_over(&self) -> bool {
-        self.memory.is_unseen || self.memory.downtime_std_if_any().is_some()
     }
 }
 

@@ -64,6 +64,7 @@ fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
 }
 
 /// Predicts over the measured and the unmeasured time of a step.
+#[inline]
 pub(super) fn predict<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,
@@ -123,6 +124,7 @@ fn propagate<const N: usize>(
 }
 
 /// Updates with a voltage reading.
+#[inline]
 pub(super) fn update<const N: usize>(
     x: &mut Gaussian<N>,
     model: &CellModel,

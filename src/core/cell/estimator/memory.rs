@@ -82,6 +82,7 @@ impl Memory {
     }
 
     /// Time that counts as new information in the present reading, s: all of it under load, a decreasing part at rest.
+    #[inline]
     pub(super) fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         let elapsed_s = step.measured_s + step.unmeasured_s;
         if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
@@ -94,6 +95,7 @@ impl Memory {
     }
 
     /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
+    #[inline]
     pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
         if step.measured_s > 0.0 {
@@ -110,11 +112,19 @@ impl Memory {
     }
 
     /// Standard deviation of the SOC change during downtime until a voltage has been used; `None` when it is negligible.
+    #[inline]
     pub(super) fn downtime_std_if_any(&self) -> Option<f64> {
         (self.downtime_std > NEGLIGIBLE_STD).then_some(self.downtime_std)
     }
 
+    /// Whether the SOC is still the one from before a downtime or sleep: no voltage has been used since.
+    #[inline]
+    pub(super) fn is_carried_over(&self) -> bool {
+        self.is_unseen || self.downtime_std_if_any().is_some()
+    }
+
     /// Consistency monitor: exponentially forgotten mean of the normalised innovation squared.
+    #[inline]
     pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
         let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency_window_s);
@@ -133,6 +143,7 @@ impl Memory {
     }
 
     /// Whether the filter must restart: too many consecutive readings were beyond the gate.
+    #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
         let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
         long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
@@ -158,11 +169,10 @@ impl Memory {
         for variance in [self.capacity.variance, self.log_resistance.variance] {
             InvalidState::unless_positive("a variance a cell's reset keeps", variance)?;
         }
-        for signed in [self.temperature_c.unwrap_or(0.0), self.last_current_a] {
-            InvalidState::unless_number("a cell's last temperature or current", signed)?;
-        }
+        let signed = [self.temperature_c.unwrap_or(0.0), self.last_current_a];
+        InvalidState::unless_numbers("a cell's last temperature or current", signed)?;
         let natural = [self.load_a, self.mean_nis, self.information_s, self.rest_s, self.downtime_std, self.rejected_s];
-        natural.into_iter().try_for_each(|x| InvalidState::unless_natural("a cell's load, consistency or a time", x))
+        InvalidState::unless_naturals("a cell's load, consistency or a time", natural)
     }
 }
 

@@ -64,8 +64,8 @@ impl CellState {
     /// The first number that is out of range.
     pub fn check(&self) -> Result<(), InvalidState> {
         self.memory.check()?;
-        self.mean.iter().try_for_each(|&x| InvalidState::unless_number("a mean of a cell's filter", x))?;
-        self.covariance.iter().try_for_each(|&x| InvalidState::unless_number("a covariance of a cell's filter", x))?;
+        InvalidState::unless_numbers("a mean of a cell's filter", self.mean.iter().copied())?;
+        InvalidState::unless_numbers("a covariance of a cell's filter", self.covariance.iter().copied())?;
         let size = self.mean.len();
         let variances = self.covariance.iter().step_by(size + 1);
         variances.copied().try_for_each(|x| InvalidState::unless_positive("a variance of a cell's filter", x))?;

@@ -17,16 +17,19 @@ pub(super) const CAPACITY: usize = 2;
 /// Index of the first branch voltage in the state.
 pub(super) const BRANCHES: usize = 3;
 
+#[inline]
 pub(super) fn square(x: f64) -> f64 {
     x * x
 }
 
 /// A SOC variance grown by `by`, at most to that of an unknown SOC.
+#[inline]
 pub(super) fn widened(variance: f64, by: f64) -> f64 {
     variance.max((variance + by).min(UNKNOWN_SOC_VARIANCE))
 }
 
 /// Mean and variance of state `i`.
+#[inline]
 pub(super) fn marginal<const N: usize>(x: &Gaussian<N>, i: usize) -> ScalarGaussian {
     ScalarGaussian { mean: x.mean[i], variance: x.covariance[(i, i)] }
 }

@@ -195,7 +195,7 @@ fn without_a_sensor_the_thermal_model_warms_the_cell() {
         let step = CellStep { temperature_c: None, ..truth.step(&model, 2.0, 1.0) };
         estimator.step(&model, &config, &step);
     }
-    let warmed_c = estimator.temperature_c().expect("known") - 25.0;
+    let warmed_c = estimator.memory.temperature_c.expect("known") - 25.0;
     assert!((0.2..5.0).contains(&warmed_c), "{warmed_c}");
 }
 

@@ -13,8 +13,8 @@ use crate::quantity::BusIndex;
 /// A pack's current stays below this many times its capacity.
 pub(super) const MAX_C_RATE: f64 = 30.0;
 
-/// A slope's size is judged when the current explains this share of the voltage's changes: noise in the current makes it
-/// too small otherwise.
+/// A slope's size is judged when the current explains this share of the voltage's changes: below it, noise in the current
+/// makes the slope too small.
 pub(super) const EXPLAINED: f64 = 0.8;
 
 /// A configured signal with the statistics of its values.

@@ -20,7 +20,7 @@ pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
 fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) {
     let temperature_c = judge.temperature_c();
     let [empty_v, full_v] = [0.0, 1.0].map(|soc| model.ocv_v(&model.grid_position(soc, temperature_c)));
-    let rests = judge.doctor.fast_response().rests.iter().map(|rest| rest.end_v);
+    let mut rests = judge.doctor.fast_response().rests.iter().map(|rest| rest.end_v);
     let highest = rests.clone().fold(f64::NAN, f64::max);
     let lowest = rests.clone().fold(f64::NAN, f64::min);
     let per_cent = |voltage_v: f64| percent(model.soc_of_ocv(voltage_v, temperature_c).clamp(0.0, 1.0));
@@ -50,7 +50,7 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
             .change_cell_model()
             .advice("compare with the SOC the vehicle shows");
         judge.add(finding);
-    } else if let Some(last_v) = rests.last() {
+    } else if let Some(last_v) = rests.next_back() {
         let (voltage, soc) = (number(last_v), per_cent(last_v));
         judge.fine(format!("{voltage} V at rest: {soc} % by the cell model; compare with the SOC the vehicle shows"));
     } else {

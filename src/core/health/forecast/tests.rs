@@ -143,18 +143,18 @@ fn any_readings_leave_a_usable_covariance() {
 
 #[test]
 fn a_first_reading_without_information_delays_the_forecast_by_one_reading() {
-    let told_after = |first_variance_ah2: f64| {
+    let forecast_after = |first_variance_ah2: f64| {
         let mut forecast = Forecast::new(Axis::Cycles, 2.0);
-        let told = (0..200).find(|&efc| {
+        let first = (0..200).find(|&efc| {
             let variance_ah2 = if efc == 0 { first_variance_ah2 } else { 1e-5 };
             let capacity_ah = 2.0 - 0.002 * f64::from(efc) + if efc == 0 { -0.3 } else { 0.0 };
             let passed = if efc == 0 { Usage::default() } else { passed(1.0) };
             forecast.update(passed, Some(CapacityReading { capacity_ah, variance_ah2, shared_variance_ah2: 0.0 }));
             forecast.remaining(1.5).is_ok()
         });
-        told.expect("told before 200 cycles")
+        first.expect("a forecast before 200 cycles")
     };
-    let (good, weak) = (told_after(1e-5), told_after(4.0));
+    let (good, weak) = (forecast_after(1e-5), forecast_after(4.0));
     assert!(weak <= good + 5, "{good} {weak}");
 }
 

@@ -182,16 +182,16 @@ fn silence_turns_each_signal_stale_once_at_its_own_age() {
     let mut bench = Bench::new(config());
     bench.ok(0.0, Channel::Current, 1.0);
     bench.ok(0.0, CELL, 3.7);
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for tenth in 0..=400 {
         let now = f64::from(tenth) / 10.0;
         bench.sampler.poll(at(now), &mut bench.changes);
-        told.extend(bench.changes.drain(..).map(|change| (now, change.channel, change.state)));
+        reported.extend(bench.changes.drain(..).map(|change| (now, change.channel, change.state)));
     }
     let stale = Err(Fault::Stale);
     let never_heard = Channel::CellVoltage(CellIndex(1));
     assert_eq!(
-        told,
+        reported,
         [(2.1, Channel::Current, stale), (5.1, CELL, stale), (5.1, never_heard, stale), (30.1, SENSOR, stale)]
     );
     assert!(bench.ok(41.0, CELL, 3.7).is_some());

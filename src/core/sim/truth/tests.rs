@@ -66,7 +66,7 @@ fn temperature_settles_where_losses_equal_cooling() {
 }
 
 #[test]
-fn cut_off_current_gives_the_voltage_asked_for() {
+fn cut_off_current_gives_the_requested_voltage() {
     let mut pack = plain_pack();
     pack.step(-2.0, 300.0);
     let current = pack.current_at_highest_a(4.2);

@@ -8,7 +8,7 @@ use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Any, Between};
 use crate::health::{CapacityConfig, CapacityMethod, RechargeAlarm, RechargeConfig, TransitionConfig, UsableConfig};
 
-/// Of 365.25 / 12 days.
+/// A month of 365.25 / 12 days.
 const SECONDS_PER_MONTH: f64 = 2_629_800.0;
 
 section! {

@@ -54,7 +54,7 @@ struct Interface {
     name: u64,
     /// The bytes of a word that these are.
     mask: u64,
-    /// How many they are.
+    /// Number of these bytes.
     len: u8,
     bus: BusIndex,
 }
@@ -83,12 +83,12 @@ pub(crate) struct FastLineParser {
     shift_ns: i64,
     /// The first twelve bytes of the last line, up to the decimal point, as two words that overlap.
     head: [u64; 2],
-    /// That second, moved.
+    /// That second, shifted, ns.
     second_ns: i64,
 }
 
 impl FastLineParser {
-    /// For interfaces of these names, in the order of their numbers.
+    /// A parser for interfaces of these names, in the order of their numbers.
     pub(crate) fn new(interfaces: &[String]) -> Self {
         let mut lines = Self { interfaces: Vec::new(), shift_ns: 0, head: NO_HEAD, second_ns: 0 };
         lines.know(interfaces);
@@ -228,7 +228,7 @@ fn number<const UNIT: u64>(digits: u64) -> u64 {
     fours.wrapping_mul((10_000 * UNIT) << 32 | UNIT) >> 32
 }
 
-/// What a hex digit adds to a standard identifier in the first, second and third place; above all identifiers for what is none.
+/// Value of a hex digit in the first, second and third place of a standard identifier; above all identifiers for other bytes.
 static ID_DIGITS: [[u16; 256]; 3] = {
     let mut table = [[u16::MAX; 256]; 3];
     let mut byte = 0;

@@ -97,7 +97,7 @@ fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<Ahea
     }
 }
 
-/// How many bytes of the block were filled, and how the source ended, if it did.
+/// Fills a block; returns the number of bytes, and the end of the source, if it was reached.
 fn fill(source: &mut impl Read, block: &mut [u8]) -> (usize, Option<io::Result<()>>) {
     let mut count = 0;
     while count < block.len() {

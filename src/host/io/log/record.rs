@@ -114,7 +114,7 @@ impl Record {
 pub struct Batch {
     /// All slots.
     pub(super) slots: Box<[Record]>,
-    /// How many of them are filled.
+    /// Number of filled slots.
     pub(super) len: usize,
     pub(super) carries_ticks: bool,
 }

@@ -43,7 +43,7 @@ impl CanListener {
     ///
     /// # Errors
     /// When the interface went down or away.
-    pub fn next(&mut self) -> io::Result<Option<(Timestamp, Frame)>> {
+    pub fn next_frame(&mut self) -> io::Result<Option<(Timestamp, Frame)>> {
         loop {
             while let Some(received) = self.received.get(self.taken) {
                 self.taken += 1;

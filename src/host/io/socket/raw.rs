@@ -122,10 +122,10 @@ impl RawSocket {
         Self::open_filtered(config, &filters(config.ids, config.patterns))
     }
 
-    /// As [`RawSocket::open`], for every identifier there is.
+    /// As [`RawSocket::open`], for every identifier.
     ///
     /// # Errors
-    /// As there.
+    /// Those of [`RawSocket::open`].
     pub(super) fn open_all(interface: &str) -> io::Result<Self> {
         let receive_buffer_bytes = DEFAULT_RECEIVE_BUFFER_BYTES;
         let config = RawConfig { interface, fd: true, ids: &[], patterns: &[], receive_buffer_bytes };

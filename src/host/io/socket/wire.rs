@@ -6,7 +6,7 @@ use crate::can::{CanId, Frame, FrameKind};
 pub(super) const CLASSIC_BYTES: usize = 16;
 /// Bytes of `struct canfd_frame`.
 pub(super) const FD_BYTES: usize = 72;
-/// Where the payload begins in both.
+/// Offset of the payload in both.
 const DATA_AT: usize = 8;
 
 /// Identifier bit: 29-bit identifier.
@@ -32,7 +32,7 @@ pub(super) enum Wire {
     Frame(Frame),
     /// An error frame; its class bits.
     Error(u32),
-    /// Nothing a kernel should send: wrong size, impossible length.
+    /// Invalid bytes: wrong size or impossible length.
     Malformed,
 }
 

@@ -13,7 +13,7 @@ use crate::status::document::{
 };
 
 /// The document of a pack. Of several cells, the last one is silent and the one before it is not trusted.
-pub fn sample(cells: u16) -> StatusDocument {
+pub(crate) fn sample(cells: u16) -> StatusDocument {
     let mut latency = Latency::default();
     [40e-6, 80e-6, 80e-6, 300e-6, 3e-3].into_iter().for_each(|seconds| latency.record(seconds));
     let time = Timestamp::from_secs(1_800_000_000.0);

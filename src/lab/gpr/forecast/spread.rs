@@ -61,7 +61,7 @@ impl Spread {
         self.factor * self.at(&scaled(features, &self.units), None)
     }
 
-    /// Spread at a (scaled) window; `but` leaves out what is near a row.
+    /// Spread at a (scaled) window; `but` leaves out windows near a row.
     fn at(&self, window: &[f64], but: Option<(usize, usize)>) -> f64 {
         if self.rows.len() < FEWEST || self.mean <= 0.0 {
             return 1.0;

@@ -31,7 +31,7 @@ fn shipped_files_read_back_equal() {
 }
 
 #[test]
-fn bytes_are_one_per_character_unless_that_would_be_read_otherwise() {
+fn bytes_are_latin_1_unless_that_would_be_read_as_utf_8() {
     let with_comment = |comment: &str| Database { comment: Some(comment.to_owned()), ..Default::default() };
     assert!(with_comment("\u{b0}C").to_dbc_bytes().windows(2).any(|bytes| bytes == b"\xB0C"));
     for comment in ["plain", "\u{b0}C", "\u{c3}\u{a9}", "\u{20ac} and \u{b0}"] {
@@ -100,7 +100,7 @@ fn hangings() -> impl Strategy<Value = Hanging> {
     (condition, any::<bool>())
 }
 
-/// Signals with their names and conditions; nesting is kept below what is taken for a loop.
+/// Signals with their names and conditions; nesting stays below the limit for a loop.
 fn assemble(parts: Vec<(Signal, Hanging)>) -> Vec<Signal> {
     let mut made: Vec<Signal> = Vec::new();
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {

@@ -19,9 +19,9 @@ enum State {
     Silent,
 }
 
-/// What may come.
+/// Input of the receiver.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum What {
+enum Input {
     NoFrame,
     Short,
     Damaged,
@@ -33,8 +33,16 @@ enum What {
 }
 
 const STATES: [State; 4] = [State::Waiting, State::Following, State::Syncing, State::Silent];
-const EVENTS: [What; 8] =
-    [What::NoFrame, What::Short, What::Damaged, What::Invalid15, What::Same, What::Next, What::OneLost, What::TooFar];
+const EVENTS: [Input; 8] = [
+    Input::NoFrame,
+    Input::Short,
+    Input::Damaged,
+    Input::Invalid15,
+    Input::Same,
+    Input::Next,
+    Input::OneLost,
+    Input::TooFar,
+];
 
 fn config(profile: Profile, sync: u8) -> CheckConfig {
     let protection = Protection { profile, data_id: 0x0123 };
@@ -57,20 +65,20 @@ fn frame(config: &CheckConfig, counter: u8) -> [u8; 8] {
     payload
 }
 
-fn happens(receiver: &mut Receiver, config: &CheckConfig, what: What) -> Status {
+fn apply(receiver: &mut Receiver, config: &CheckConfig, what: Input) -> Status {
     let counter = match what {
-        What::NoFrame => return receiver.no_new_data(config, 1),
-        What::Short => return receiver.check(config, &[0]),
-        What::Damaged => {
+        Input::NoFrame => return receiver.no_new_data(config, 1),
+        Input::Short => return receiver.check(config, &[0]),
+        Input::Damaged => {
             let mut payload = frame(config, LAST + 1);
             payload[5] ^= 1;
             return receiver.check(config, &payload);
         }
-        What::Invalid15 => return receiver.check(config, &counter_15(config)),
-        What::Same => LAST,
-        What::Next => LAST + 1,
-        What::OneLost => LAST + 2,
-        What::TooFar => LAST + 7,
+        Input::Invalid15 => return receiver.check(config, &counter_15(config)),
+        Input::Same => LAST,
+        Input::Next => LAST + 1,
+        Input::OneLost => LAST + 2,
+        Input::TooFar => LAST + 7,
     };
     receiver.check(config, &frame(config, counter))
 }
@@ -90,15 +98,15 @@ fn counter_15(config: &CheckConfig) -> [u8; 8] {
     payload
 }
 
-/// What AUTOSAR's check says, `sync` = SyncCounterInit; and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated, Sync) after.
-fn wanted(profile: Profile, state: State, what: What, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
+/// Input AUTOSAR's check says, `sync` = SyncCounterInit; and (LastValidCounter, MaxDeltaCounter, NoNewOrRepeated, Sync) after.
+fn wanted(profile: Profile, state: State, what: Input, sync: u8) -> (Status, (Option<u8>, u8, u8, u8)) {
+    use Input::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
     use State::{Following, Silent, Syncing, Waiting};
-    use What::{Damaged, Invalid15, Next, NoFrame, OneLost, Same, Short, TooFar};
     let before = in_state(state);
     let (last, grown) = (before.last_valid, before.max_delta + 1);
     let (repeated, syncing) = (before.no_new_or_repeated, before.sync);
     let at = |step: u8| Some(LAST + step);
-    // A silence too long asks for the synchronisation, and this frame is the first of it.
+    // A silence too long requires the synchronisation, and this frame is the first of it.
     let left = sync.saturating_sub(1);
     let after_silence = |normal| if sync > 0 { Status::Sync } else { normal };
     match (state, what) {
@@ -131,7 +139,7 @@ fn every_pair_of_state_and_event_is_as_in_the_standard() {
             .flat_map(|(s, t)| EVENTS.map(|e| (s, t, e)))
         {
             let mut receiver = in_state(state);
-            let status = happens(&mut receiver, &config(profile, sync), what);
+            let status = apply(&mut receiver, &config(profile, sync), what);
             let after = (receiver.last_valid, receiver.max_delta, receiver.no_new_or_repeated, receiver.sync);
             assert_eq!(
                 (status, after),
@@ -165,7 +173,7 @@ fn profile_1_without_a_synchronisation_waits_until_the_sender_comes_round() {
 }
 
 #[test]
-fn profile_5_goes_on_from_a_counter_that_jumped() {
+fn profile_5_continues_from_a_counter_that_jumped() {
     let config = config(Profile::P05, 0);
     let mut receiver = in_state(State::Following);
     let statuses = [100, 101, 102].map(|counter| receiver.check(&config, &frame(&config, counter)));

@@ -161,7 +161,7 @@ fn lengths_that_a_frame_or_a_profile_does_not_have_are_refused() {
 }
 
 #[test]
-fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
+fn a_long_message_of_an_own_dbc_is_sent_in_fd_frames() {
     let own = Database::parse(&TEXT.replace("PACKWATCH_Status: 8", "PACKWATCH_Status: 12")).unwrap();
     let made = layout(LayoutBase::Own(&own), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].format, FrameFormat::Fd { brs: false });
@@ -169,14 +169,14 @@ fn a_long_message_of_an_own_dbc_goes_out_in_fd_frames() {
 }
 
 #[test]
-fn a_frame_without_a_cycle_time_gets_the_usual_one_and_consumers_are_told() {
+fn a_frame_without_a_cycle_time_gets_the_default_one_in_the_dbc() {
     let text = TEXT.replace("BA_ \"GenMsgCycleTime\" BO_ 1712 100;\n", "");
     let made = layout(LayoutBase::Own(&Database::parse(&text).unwrap()), &LayoutSettings::default()).unwrap();
     assert_eq!(made.messages[0].cycle_time_ms, Some(1000));
 }
 
 #[test]
-fn settings_that_do_not_fit_are_all_told_with_their_keys() {
+fn settings_that_do_not_fit_are_all_reported_with_their_keys() {
     let wrong = LayoutSettings {
         status: MessageSettings { brs: Some(true), ..Default::default() },
         health: on(Profile::P01C, 0x1000),

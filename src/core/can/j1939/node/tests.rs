@@ -286,7 +286,7 @@ fn an_unknown_request_is_refused_when_it_is_for_us_alone() {
 }
 
 #[test]
-fn whoever_asks_hears_who_has_the_address() {
+fn a_request_for_claims_is_answered_with_the_address() {
     for to in [ADDRESS, GLOBAL_ADDRESS] {
         let mut bench = Bench::claimed();
         bench.receive(&request(PGN_ADDRESS_CLAIMED, to));
@@ -407,7 +407,7 @@ fn losing_the_address_stops_everything_even_within_a_transfer() {
 }
 
 #[test]
-fn a_weaker_contender_is_answered_and_dm1_goes_on() {
+fn a_weaker_contender_is_answered_and_dm1_continues() {
     let mut bench = Bench::claimed();
     bench.receive(&claim_of(101));
     bench.run_to(1300);
@@ -441,7 +441,7 @@ fn a_code_active_during_the_address_claim_is_sent() {
 }
 
 #[test]
-fn frames_that_are_no_business_of_ours_do_nothing() {
+fn frames_for_other_nodes_are_ignored() {
     let mut bench = Bench::claimed();
     bench.receive(&frame(0x18EE_FF00 | u32::from(OTHER), &name(1).to_bytes()));
     bench.receive(&Frame::classic(CanId::Standard(0x7FF), &[0; 8]).unwrap());

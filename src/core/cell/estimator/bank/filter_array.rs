@@ -9,7 +9,6 @@ use nalgebra::{SMatrix, SVector};
 use super::input::{BlockInput, CellSlot, WIDTH};
 use super::kernel::{self, DecayFactors, FilterState, INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, REST_S, at};
 use super::tables::{LineCache, Tables};
-use crate::cell::config::EstimatorConfig;
 use crate::cell::estimator::filter::Filter;
 use crate::cell::estimator::memory::Memory;
 use crate::cell::estimator::state_vector::CAPACITY;
@@ -100,10 +99,6 @@ impl<const N: usize, const T: usize, const W: usize> FilterArray<N, T, W> {
             blocks: vec![state; blocks],
             step_time: StepTime { time_s: f64::NAN, decay: DecayFactors::NONE },
         }
-    }
-
-    pub(super) fn constants(&self, model: &CellModel, config: &EstimatorConfig) -> KernelConstants {
-        KernelConstants::new::<N>(model, config)
     }
 
     /// Steps every block that has inputs. Cells whose steps were made are no longer present afterwards.

@@ -22,6 +22,7 @@ pub(super) struct CellSlot {
 
 impl CellSlot {
     /// Whether a step that measured the current all the time can be an ordinary one.
+    #[inline]
     pub(super) fn is_ordinary(&self) -> bool {
         self.has_filter && self.memory.rejected == 0 && self.memory.downtime_std_if_any().is_none()
     }

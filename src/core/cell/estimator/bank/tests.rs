@@ -47,8 +47,8 @@ impl Pack {
         Self { model: model.clone(), dice: Dice(0x2545_F491_4F6C_DD1D), cells, current_a: 1.0, temperature_c: 20.0 }
     }
 
-    /// The steps of one round; a few cells are missing from some.
-    fn round(&mut self, time: u32) -> Vec<(usize, CellStep)> {
+    /// The steps of one time; a few cells are missing from some.
+    fn steps(&mut self, time: u32) -> Vec<(usize, CellStep)> {
         let dt_s = if time.is_multiple_of(7) { 0.25 } else { 1.0 };
         let low = self.cells.iter().any(|cell| cell.soc < 0.1);
         let high = self.cells.iter().any(|cell| cell.soc > 0.9);
@@ -108,7 +108,7 @@ fn step(bank: &mut EstimatorBank, steps: &[(usize, CellStep)]) {
     bank.step();
 }
 
-/// The small model with so many branches.
+/// The small model with `branches` branches.
 fn model(branches: usize) -> CellModel {
     let mut model = small_model();
     let slower = |by: f64| {
@@ -128,7 +128,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
     let mut pack = Pack::new(model, CELLS);
     let (mut soc, mut learned, mut accepted, mut resets) = (0.0_f64, 0.0_f64, 0, 0);
     for time in 0..rounds {
-        let steps = pack.round(time);
+        let steps = pack.steps(time);
         step(&mut bank, &steps);
         for (cell, step) in &steps {
             let estimator = &mut readable[*cell];
@@ -144,7 +144,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
             learned = learned
                 .max(near(bank.capacity(*cell), estimator.capacity()))
                 .max(near(bank.log_resistance(*cell), estimator.log_resistance()))
-                .max((bank.mean_nis(*cell) - estimator.mean_nis()).abs());
+                .max((bank.mean_nis(*cell) - estimator.memory.mean_nis).abs());
             for (ours, theirs) in bank.branch_v(*cell).into_iter().zip(estimator.branch_v()) {
                 learned = learned.max(if ours.is_nan() && theirs.is_nan() { 0.0 } else { (ours - theirs).abs() });
             }
@@ -208,7 +208,7 @@ fn a_cells_estimate_does_not_depend_on_other_cells() {
     let mut alone: Vec<_> = (0..11).map(|_| EstimatorBank::new(&model, &config, 1)).collect();
     let mut pack = Pack::new(&model, 11);
     for time in 0..3000 {
-        let steps = pack.round(time);
+        let steps = pack.steps(time);
         // In two parts, the second backwards.
         let (first, second) = steps.split_at(steps.len() / 3);
         step(&mut together, first);
@@ -231,7 +231,7 @@ fn a_cell_in_another_interval_finds_its_temperature_after_its_rows_were_replaced
     for time in 0..4500 {
         // One cell keeps its temperature, the other has more temperatures than the cache.
         let at = |cell: usize| if cell == 0 { 20.0 } else { 0.01 * f64::from(time) };
-        let mut steps = pack.round(time);
+        let mut steps = pack.steps(time);
         steps.iter_mut().for_each(|(cell, step)| step.temperature_c = Some(at(*cell)));
         step(&mut together, &steps);
         step(&mut alone, &steps[..1]);
@@ -246,7 +246,7 @@ fn an_estimator_put_into_the_bank_is_returned_unchanged() {
     let (model, config) = (model(3), config());
     let mut bank = EstimatorBank::new(&model, &config, 9);
     let mut pack = Pack::new(&model, 9);
-    (0..50).for_each(|time| step(&mut bank, &pack.round(time)));
+    (0..50).for_each(|time| step(&mut bank, &pack.steps(time)));
     let before = bank.cell(4).snapshot();
     let other = bank.cell(7);
     bank.put(4, &other);

@@ -1,4 +1,4 @@
-//! What holds whatever happens to a node.
+//! Properties of the node for any sequence of inputs.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Something that may happen to a node.
+/// An input of the node.
 #[derive(Debug, Clone)]
 enum Act {
     Wait(u16),
@@ -106,7 +106,7 @@ proptest! {
     }
 
     #[test]
-    fn whatever_happens_the_node_keeps_its_promises(acts in proptest::collection::vec(act(), 1..120)) {
+    fn the_node_keeps_its_promises_for_any_input(acts in proptest::collection::vec(act(), 1..120)) {
         let sent_ids = NodeConfig { name: name(100), address: ADDRESS }.sent_ids();
         let mut bench = Bench::new();
         for act in &acts {

@@ -93,7 +93,7 @@ fn predict_branch<const L: usize, const N: usize, const W: usize>(
     parts.odd[1] = gain * ratios.second[0] + decay * l[1][i];
     parts.even[1] = gain * ratios.second[1];
     parts.odd[2] = decay * l[2][i];
-    let noise = here.tau_s * (0.5 * c.branch_variance_per_s) * (one - here.exact.square());
+    let noise = here.tau_s * (0.5 * c.process.branch_per_s) * (one - here.exact.square());
     BranchPrediction { centre_v, decay, noise, parts }
 }
 
@@ -119,12 +119,12 @@ pub(super) fn predict<const L: usize, const N: usize, const T: usize, const W: u
     let (mut mean, mut p) = (x.mean, x.covariance);
     mean[0] = x.mean[0] - moved + soc_shift;
     let capacity_column = [l[0][CAPACITY], l[1][CAPACITY], l[2][CAPACITY]];
-    let soc_noise = dt * c.soc_variance_per_s + moved.abs() * c.charge_variance_per_soc;
+    let soc_noise = dt * c.process.soc_per_s + moved.abs() * c.process.soc_per_charge;
     p[at(0, 0)] = sum(soc.odd, soc.odd) + sum(soc.even, soc.even) + soc_shift.square() * c.excess + soc_noise;
     p[at(LOG_RESISTANCE, 0)] = soc.odd[0] * l[0][LOG_RESISTANCE] + soc.odd[1] * l[1][LOG_RESISTANCE];
     p[at(CAPACITY, 0)] = sum(soc.odd, capacity_column);
     let log_resistance = at(LOG_RESISTANCE, LOG_RESISTANCE);
-    p[log_resistance] = p[log_resistance] + dt.at_most(MAX_WALK_S) * c.log_resistance_variance_per_s;
+    p[log_resistance] = p[log_resistance] + dt.at_most(MAX_WALK_S) * c.process.log_resistance_per_s;
     let mut done = [(OddEvenParts::NONE, Lanes::splat(0.0)); N];
     for i in BRANCHES..N {
         let branch = predict_branch(c, input, &table_points, &l, (i, x.mean[i], drive, &ratios));

@@ -5,7 +5,7 @@
 use std::array::from_fn;
 
 use crate::cell::config::{Discretisation, EstimatorConfig};
-use crate::cell::estimator::state_vector::square;
+use crate::cell::estimator::state_vector::{BRANCHES, square};
 use crate::cell::model::CellModel;
 use crate::filter::simd::{Lanes, Mask};
 
@@ -103,18 +103,8 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     /// beta - alpha^2.
     pub(super) excess: f64,
     pub(super) euler: bool,
-    pub(super) soc_variance_per_s: f64,
-    pub(super) charge_variance_per_soc: f64,
-    pub(super) branch_variance_per_s: f64,
-    pub(super) log_resistance_variance_per_s: f64,
-    pub(super) sensor_variance: f64,
-    /// One-second variance of the model's error, V^2, where the tables state none.
-    pub(super) model_variance: f64,
-    pub(super) drop_variance: f64,
-    pub(super) load_variance: f64,
-    pub(super) gate_variance: f64,
-    pub(super) gate_soc_variance: f64,
-    pub(super) gate_limit: f64,
+    pub(super) process: ProcessVariances,
+    pub(super) reading: ReadingVariances,
     pub(super) rest_current_a: f64,
     pub(super) load_memory_s: f64,
     pub(super) max_information_s: f64,
@@ -123,23 +113,54 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     pub(super) new_capacity_ah: f64,
 }
 
+/// Variances that the states gain.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ProcessVariances {
+    pub(super) soc_per_s: f64,
+    pub(super) soc_per_charge: f64,
+    pub(super) branch_per_s: f64,
+    pub(super) log_resistance_per_s: f64,
+}
+
+/// Variances of a voltage reading, V^2, and its gate.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ReadingVariances {
+    pub(super) sensor: f64,
+    /// One-second variance of the model's error, where the tables state none.
+    pub(super) model: f64,
+    /// Per square of the voltage drop, over one second.
+    pub(super) drop: f64,
+    /// Per square of the load's voltage, over one second.
+    pub(super) load: f64,
+    pub(super) gate: f64,
+    /// Per square of the slope of the open-circuit voltage.
+    pub(super) gate_soc: f64,
+    /// Largest test ratio.
+    pub(super) gate_limit: f64,
+}
+
 impl KernelConstants {
-    pub(in crate::cell::estimator::bank) fn new<const N: usize>(model: &CellModel, config: &EstimatorConfig) -> Self {
+    pub(in crate::cell::estimator::bank) fn new(model: &CellModel, config: &EstimatorConfig) -> Self {
+        let states = BRANCHES + model.branches.len();
         Self {
-            scale: (square(config.alpha) * (N as f64 + config.kappa)).sqrt(),
+            scale: (square(config.alpha) * (states as f64 + config.kappa)).sqrt(),
             excess: config.beta - square(config.alpha),
             euler: config.discretisation == Discretisation::Euler,
-            soc_variance_per_s: square(config.soc_noise_per_sqrt_s),
-            charge_variance_per_soc: square(config.charge_noise_per_sqrt_soc),
-            branch_variance_per_s: square(config.branch_noise_v_per_sqrt_s),
-            log_resistance_variance_per_s: square(config.log_resistance_noise_per_sqrt_s),
-            sensor_variance: square(config.voltage_noise_v),
-            model_variance: square(config.model_error_v_sqrt_s),
-            drop_variance: square(config.drop_error_sqrt_s),
-            load_variance: square(config.load_error_sqrt_s),
-            gate_variance: square(config.voltage_noise_v) + square(config.gate_model_error_v),
-            gate_soc_variance: square(config.gate_soc_error),
-            gate_limit: square(config.gate_sigma),
+            process: ProcessVariances {
+                soc_per_s: square(config.soc_noise_per_sqrt_s),
+                soc_per_charge: square(config.charge_noise_per_sqrt_soc),
+                branch_per_s: square(config.branch_noise_v_per_sqrt_s),
+                log_resistance_per_s: square(config.log_resistance_noise_per_sqrt_s),
+            },
+            reading: ReadingVariances {
+                sensor: square(config.voltage_noise_v),
+                model: square(config.model_error_v_sqrt_s),
+                drop: square(config.drop_error_sqrt_s),
+                load: square(config.load_error_sqrt_s),
+                gate: square(config.voltage_noise_v) + square(config.gate_model_error_v),
+                gate_soc: square(config.gate_soc_error),
+                gate_limit: square(config.gate_sigma),
+            },
             rest_current_a: config.rest_current_a,
             load_memory_s: config.load_memory_s,
             max_information_s: config.max_information_s,

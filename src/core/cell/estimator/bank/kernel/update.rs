@@ -71,7 +71,7 @@ impl<const L: usize> PredictedVoltage<L> {
         let base_variance = if tables.has_error() {
             table_points[0].one(ERROR_V).square() * ERROR_WINDOW_S
         } else {
-            Lanes::splat(c.model_variance)
+            Lanes::splat(c.reading.model)
         };
         Self { centre_v, parts, slope_v, lost_v: drop_v + branches_v, base_variance, settled_ohm }
     }
@@ -149,11 +149,10 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
 
     // Measurement noise: see `noise::VoltageReading`.
     let load_v = predicted.settled_ohm * ratio * x.memory[LOAD_A];
-    let model =
-        predicted.base_variance + predicted.lost_v.square() * c.drop_variance + load_v.square() * c.load_variance;
-    let total = variance + (model / information_s + c.sensor_variance);
+    let model = predicted.base_variance + predicted.lost_v.square() * c.reading.drop + load_v.square() * c.reading.load;
+    let total = variance + (model / information_s + c.reading.sensor);
     let innovation_v = input.voltage_v - (predicted.centre_v + shift_v);
-    let gate = variance + (predicted.slope_v.square() * c.gate_soc_variance + c.gate_variance);
+    let gate = variance + (predicted.slope_v.square() * c.reading.gate_soc + c.reading.gate);
     let test_ratio = innovation_v.square() / gate;
 
     let inverse = total.reciprocal();
@@ -166,7 +165,7 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
             }
         }
     }
-    let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.gate_limit);
+    let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.reading.gate_limit);
     StepOutcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
 }
 

@@ -1,0 +1,19 @@
+//! Title, configuration, reference and provenance of a page.
+
+use super::reference::Reference;
+use crate::config::Config;
+
+/// Content of a page in addition to the data.
+#[derive(Debug, Default)]
+pub struct PageContext<'a> {
+    /// Title of the page.
+    pub title: String,
+    /// Thresholds, rated capacity; `None` = not known.
+    pub config: Option<&'a Config>,
+    /// The configuration file's text, for the page's end.
+    pub config_text: Option<String>,
+    /// Measured or true values.
+    pub reference: Reference,
+    /// Lines of the provenance: name and value.
+    pub provenance: Vec<(String, String)>,
+}

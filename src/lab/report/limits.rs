@@ -1,0 +1,28 @@
+//! Limits of the alarms: as configured, else as the record's alarms name them.
+
+use super::context::PageContext;
+use super::data::Data;
+use crate::alarm::Rule;
+
+/// The mildest threshold of a rule, as configured, else as its alarms say.
+pub(super) fn threshold(data: &Data, context: &PageContext<'_>, rule: Rule) -> Option<f64> {
+    thresholds(data, context, rule).first().map(|(value, _)| *value)
+}
+
+/// Every threshold of a rule with its severity, the mildest first.
+pub(super) fn thresholds(data: &Data, context: &PageContext<'_>, rule: Rule) -> Vec<(f64, String)> {
+    let mut all: Vec<(f64, String)> = match context.config {
+        Some(config) => {
+            let rules = config.monitor.rules.iter().filter(|row| row.rule == rule);
+            rules.map(|row| (row.threshold, row.severity.name().to_owned())).collect()
+        }
+        None => {
+            let rows = data.alarms.iter().filter(|row| row.rule == rule.name());
+            rows.filter_map(|row| Some((row.threshold?, row.severity.clone()))).collect()
+        }
+    };
+    let rank = |severity: &str| ["info", "warning", "severe"].iter().position(|known| *known == severity);
+    all.sort_by(|a, b| rank(&a.1).cmp(&rank(&b.1)).then(a.0.total_cmp(&b.0)));
+    all.dedup();
+    all
+}
