@@ -142,7 +142,7 @@ struct AlarmReader {
 impl AlarmReader {
     fn new(message: &Message) -> Option<Self> {
         let plan = |name| message.signal(name).and_then(|signal| signal.layout.plan().ok());
-        Some(Self { rule: plan("Rule")?, state: plan("AlarmState")?, test: plan("Test")? })
+        Some(Self { rule: plan("Rule")?, state: plan("State")?, test: plan("Test")? })
     }
 
     /// Rule, state and marker; `None` = the frame is too short, or the number of its rule is too high.
