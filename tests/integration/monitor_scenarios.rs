@@ -430,7 +430,7 @@ fn a_half_cycle_that_ends_right_after_a_restart_is_learned() {
 #[test]
 fn wide_capacity_start() {
     let mut c = load("paper.toml");
-    c.estimator.initial_capacity_std_ah = 1.5;
+    c.estimator.initial.capacity_std_ah = 1.5;
     let mut b = Bench::new(c, 0.95);
     b.run(2.6, 1200);
 

@@ -221,8 +221,8 @@ impl Rig {
 fn configuration() -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
-    config.estimator.initial_capacity_ah = 2.0;
-    config.estimator.initial_capacity_std_ah = 0.4;
+    config.estimator.initial.capacity_ah = 2.0;
+    config.estimator.initial.capacity_std_ah = 0.4;
     config.health.capacity.noise_ah_per_cycle = 0.004 * RATED_AH;
     (config.health.recharge.from_soc, config.health.recharge.to_soc) = (0.3, 0.9);
     config.health.recharge.reference_current_a = RATED_AH / 2.0;

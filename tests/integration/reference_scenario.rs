@@ -44,11 +44,11 @@ fn configuration() -> MonitorConfig {
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
     let scale = CAPACITY_AH / config.model.capacity_ah;
     enlarge(&mut config.model, scale);
-    config.estimator.initial_capacity_ah *= scale;
-    config.estimator.initial_capacity_std_ah *= scale;
-    config.estimator.rest_current_a *= scale;
+    config.estimator.initial.capacity_ah *= scale;
+    config.estimator.initial.capacity_std_ah *= scale;
+    config.estimator.gap.rest_current_a *= scale;
     config.health.capacity.noise_ah_per_cycle = NOISE_AH_PER_CYCLE;
-    config.estimator.model_error_v_sqrt_s = MODEL_ERROR_V_SQRT_S;
+    config.estimator.voltage.model_error_v_sqrt_s = MODEL_ERROR_V_SQRT_S;
     config.health.transition.dead_band_a *= scale;
     config.health.transition.hysteresis_a *= scale;
     config.sample.current.min = -100.0;

@@ -21,46 +21,85 @@ pub enum CapacityState {
 /// Checked settings of the estimator. Noises are densities: per square root of a second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct EstimatorConfig {
+    /// Spread of the sigma points.
+    pub points: SigmaPointSettings,
+    /// Exact or Euler.
+    pub discretisation: Discretisation,
+    /// Joint or held capacity.
+    pub capacity_state: CapacityState,
+    /// State of a cell without any history.
+    pub initial: InitialState,
+    /// Noise of the states while the current is measured.
+    pub process: ProcessNoise,
+    /// Possible change of the SOC without measurement.
+    pub gap: GapSettings,
+    /// Error of a voltage reading against the cell model.
+    pub voltage: VoltageError,
+    /// Rejection of outliers.
+    pub gate: GateSettings,
+    /// Check of the innovations against their covariance.
+    pub consistency: ConsistencySettings,
+}
+
+/// Spread and weights of the sigma points.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SigmaPointSettings {
     /// Sigma point spread alpha, (0, 1].
     pub alpha: f64,
     /// Prior knowledge of the distribution, 2 for Gaussian.
     pub beta: f64,
     /// Secondary scaling.
     pub kappa: f64,
-    /// Exact or Euler.
-    pub discretisation: Discretisation,
-    /// Joint or held capacity.
-    pub capacity_state: CapacityState,
+}
+
+/// State that a filter starts from, with its uncertainty.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InitialState {
     /// SOC to start from; `None` = from the first voltage through the OCV curve.
-    pub initial_soc: Option<f64>,
+    pub soc: Option<f64>,
     /// Standard deviation of the first SOC, fraction.
-    pub initial_soc_std: f64,
+    pub soc_std: f64,
     /// Standard deviation of the first branch voltages, V.
-    pub initial_branch_std_v: f64,
+    pub branch_std_v: f64,
     /// Capacity to start from, Ah.
-    pub initial_capacity_ah: f64,
+    pub capacity_ah: f64,
     /// Its standard deviation, Ah.
-    pub initial_capacity_std_ah: f64,
+    pub capacity_std_ah: f64,
     /// Standard deviation of ln(resistance relative to new) at the start.
-    pub initial_log_resistance_std: f64,
+    pub log_resistance_std: f64,
+}
+
+/// Densities of the process noise while the current is measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProcessNoise {
     /// SOC process noise, fraction per sqrt(s).
-    pub soc_noise_per_sqrt_s: f64,
+    pub soc_per_sqrt_s: f64,
     /// SOC process noise per charge moved, fraction per sqrt(SOC): errors of the current reading.
-    pub charge_noise_per_sqrt_soc: f64,
+    pub charge_per_sqrt_soc: f64,
     /// Branch voltage process noise, V per sqrt(s).
-    pub branch_noise_v_per_sqrt_s: f64,
+    pub branch_v_per_sqrt_s: f64,
     /// ln(resistance) process noise, per sqrt(s).
-    pub log_resistance_noise_per_sqrt_s: f64,
+    pub log_resistance_per_sqrt_s: f64,
+}
+
+/// Possible change of the SOC while the current is not measured.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GapSettings {
     /// SOC process noise while the current is not measured, fraction per sqrt(s).
-    pub gap_noise_per_sqrt_s: f64,
+    pub noise_per_sqrt_s: f64,
     /// Largest self-discharge, fraction of SOC per s.
     pub self_discharge_per_s: f64,
     /// Largest rate at which the cell may be used or charged while the program does not run, fraction of SOC per s.
     pub away_use_per_s: f64,
     /// A current above this next to a gap may have continued through the gap; below it the cell rested. A per cell.
     pub rest_current_a: f64,
+}
+
+/// Error of a voltage reading against the cell model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VoltageError {
     /// White part of a voltage reading's error, V (sensor noise), per sample.
-    pub voltage_noise_v: f64,
+    pub noise_v: f64,
     /// Slow model error as information per second: standard deviation of a 1 s average, V. Used where the cell model
     /// states no error of its own.
     pub model_error_v_sqrt_s: f64,
@@ -72,17 +111,27 @@ pub struct EstimatorConfig {
     pub load_memory_s: f64,
     /// Longest time that one voltage reading stands for, s: readings further apart count no more than this.
     pub max_information_s: f64,
+}
+
+/// Rejection of outliers among the voltage readings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GateSettings {
     /// Gate: a voltage innovation beyond this many standard deviations is rejected.
-    pub gate_sigma: f64,
+    pub sigma: f64,
     /// Model error of a single reading, V (standard deviation). Used by the gate and the consistency monitor, where the
     /// information-per-second variance would accept every reading at high sample rates.
-    pub gate_model_error_v: f64,
+    pub model_error_v: f64,
     /// Model error of a single reading along the OCV curve, fraction of SOC.
-    pub gate_soc_error: f64,
+    pub soc_error: f64,
     /// The filter restarts from the voltage after every reading has been beyond the gate for this time, s.
     pub lost_after_s: f64,
+}
+
+/// Check of the innovations against their covariance.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ConsistencySettings {
     /// Window of the consistency monitor, s.
-    pub consistency_window_s: f64,
+    pub window_s: f64,
     /// Mean normalised innovation squared above which the estimate is not trusted.
-    pub consistency_limit: f64,
+    pub limit: f64,
 }

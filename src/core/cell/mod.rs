@@ -9,7 +9,10 @@ pub mod config;
 pub mod estimator;
 pub mod model;
 
-pub use config::{CapacityState, Discretisation, EstimatorConfig};
+pub use config::{
+    CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
+    ProcessNoise, SigmaPointSettings, VoltageError,
+};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,

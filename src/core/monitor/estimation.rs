@@ -152,7 +152,7 @@ impl Estimation {
 
     /// Judges a cell's innovations; whether it is trusted, when that has changed.
     pub(super) fn judge_trust(&mut self, cell: CellIndex) -> Option<bool> {
-        let is_trusted = self.bank.mean_nis(cell.index()) <= self.bank.config().consistency_limit;
+        let is_trusted = self.bank.mean_nis(cell.index()) <= self.bank.config().consistency.limit;
         if is_trusted == self.trusted[cell.index()] {
             return None;
         }

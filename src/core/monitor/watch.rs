@@ -243,7 +243,7 @@ impl Stages {
         self.estimation.all_trusted() && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
-            worst <= bank.config().consistency_limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
+            worst <= bank.config().consistency.limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
         }
     }
 

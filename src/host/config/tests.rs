@@ -107,7 +107,7 @@ fn a_good_file_becomes_settings_with_defaults() {
     assert_eq!(config.interfaces, [InterfaceConfig { name: "can0".to_owned(), fd: false }]);
     assert_eq!((monitor.sample.cells, monitor.sample.voltage_source), (4, VoltageSource::Cells));
     assert_eq!(monitor.sample.sensor_of_cell, [Some(SensorIndex(0)); 4]);
-    assert_eq!((monitor.estimator.initial_capacity_ah, monitor.estimator.initial_capacity_std_ah), (1.9, 0.19));
+    assert_eq!((monitor.estimator.initial.capacity_ah, monitor.estimator.initial.capacity_std_ah), (1.9, 0.19));
     let recharge = monitor.health.recharge;
     assert_eq!((recharge.from_soc, recharge.to_soc, recharge.reference_current_a), (0.3, 0.9, 1.0), "C/2 of 2 Ah");
     assert_eq!((recharge.min_coverage, recharge.alarm_on), (0.5, RechargeAlarm::Raw));
@@ -223,8 +223,8 @@ fn numbers_may_be_hex_or_have_underscores() {
     let output =
         "[output.status]\nid = 0x5_00\n[estimator]\nconsistency_window_s = 1_000\nvoltage_noise_v = 1_0.0e-1_0\n";
     let config = good(&format!("{PACK}{output}"));
-    assert_eq!(config.monitor.estimator.consistency_window_s, 1000.0);
-    assert_eq!(config.monitor.estimator.voltage_noise_v, 1e-9);
+    assert_eq!(config.monitor.estimator.consistency.window_s, 1000.0);
+    assert_eq!(config.monitor.estimator.voltage.noise_v, 1e-9);
 }
 
 /// Each edit of the good file (from, to) and the whole of what is said about it.

@@ -172,14 +172,14 @@ fn configure(job: &ScoreJob, case: &Case, settings: &ScoreSettings, truth: f64) 
                 100.0 * initial
             )));
         }
-        estimator.initial_soc = Some(initial.clamp(0.0, 1.0));
-        estimator.initial_soc_std = settings.initial_soc_std(points);
+        estimator.initial.soc = Some(initial.clamp(0.0, 1.0));
+        estimator.initial.soc_std = settings.initial_soc_std(points);
     }
     if case.capacity_error_percent != 0.0 {
-        estimator.initial_capacity_ah = config.model.capacity_ah * (1.0 + case.capacity_error_percent / 100.0);
+        estimator.initial.capacity_ah = config.model.capacity_ah * (1.0 + case.capacity_error_percent / 100.0);
     }
     if let Some(std) = settings.capacity_std {
-        estimator.initial_capacity_std_ah = std * config.model.capacity_ah;
+        estimator.initial.capacity_std_ah = std * config.model.capacity_ah;
     }
     Ok(config)
 }

@@ -195,7 +195,7 @@ impl Life {
 
     fn peer(&self, method: (Method, f64), swings: &[(f64, Source)]) -> Vec<ScalarGaussian> {
         let e = &self.config.estimator;
-        let start = ScalarGaussian::from_std(e.initial_capacity_ah, e.initial_capacity_std_ah);
+        let start = ScalarGaussian::from_std(e.initial.capacity_ah, e.initial.capacity_std_ah);
         let times_s = self.reported.iter().map(|reported| reported.time_s);
         let capacities = follow(&self.config.model, &self.config.health.capacity, method, start, swings, times_s);
         self.reported.iter().zip(capacities).map(|(reported, capacity)| self.made_usable(reported, capacity)).collect()

@@ -40,8 +40,8 @@ struct Life {
 fn configuration(start: f64, held: bool) -> MonitorConfig {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/paper.toml");
     let mut config = config::load(&path).unwrap_or_else(|faults| panic!("{}", faults.0.join("\n"))).monitor;
-    config.estimator.initial_capacity_ah = start * NEW_AH;
-    config.estimator.initial_capacity_std_ah = START_STD * NEW_AH;
+    config.estimator.initial.capacity_ah = start * NEW_AH;
+    config.estimator.initial.capacity_std_ah = START_STD * NEW_AH;
     if held {
         config.estimator.capacity_state = CapacityState::Held;
         config.health.capacity.method = CapacityMethod::Nominal { swing: 0.6, variance_ah2: 1e9 };
@@ -95,7 +95,7 @@ impl Life {
     /// Of each peer in turn on these swings.
     fn peers(&self, config: &MonitorConfig, swings: &[(f64, Source)]) -> Vec<(Score, f64)> {
         let start =
-            ScalarGaussian::from_std(config.estimator.initial_capacity_ah, config.estimator.initial_capacity_std_ah);
+            ScalarGaussian::from_std(config.estimator.initial.capacity_ah, config.estimator.initial.capacity_std_ah);
         PEERS
             .iter()
             .map(|&(_, method, gamma)| {

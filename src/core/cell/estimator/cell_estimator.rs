@@ -62,7 +62,7 @@ impl CellEstimator {
         self.memory.last_current_a = step.current_a.unwrap_or(self.memory.last_current_a);
         let downtime_std = self.memory.downtime_std_if_any();
         let (Some(current_a), Some(filter)) = (step.current_a, &mut self.filter) else { return Ok(None) };
-        let information_s = self.memory.information_s.clamp(1e-3, config.max_information_s);
+        let information_s = self.memory.information_s.clamp(1e-3, config.voltage.max_information_s);
         let load_a = self.memory.load_a;
         let temperature = model.temperature_position(temperature_c);
         let reading = VoltageReading { voltage_v: step.voltage_v, current_a, load_a, temperature, information_s };
@@ -84,15 +84,15 @@ impl CellEstimator {
         }
         self.memory.reset_unusable(config);
         let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
-        let configured = config.initial_soc.filter(|_| first);
+        let configured = config.initial.soc.filter(|_| first);
         let soc = configured.unwrap_or_else(|| {
             let guess = model.grid_position(0.5, temperature_c);
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
             model.soc_of_ocv(step.voltage_v + load_v, temperature_c)
         });
-        let soc = ScalarGaussian { mean: soc, variance: square(config.initial_soc_std).max(KNOWN_VARIANCE) };
-        let branch_variance = square(config.initial_branch_std_v).max(KNOWN_VARIANCE);
+        let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
+        let branch_variance = square(config.initial.branch_std_v).max(KNOWN_VARIANCE);
         let kept = LearnedState {
             log_resistance: self.memory.log_resistance,
             capacity: self.memory.capacity,
@@ -104,8 +104,8 @@ impl CellEstimator {
             _ => Filter::Three(initial_state(soc, branch_variance, &kept)),
         });
         // Trust returns through the window, not by a restart.
-        self.memory.mean_nis = self.memory.mean_nis.min(config.consistency_limit * std::f64::consts::E);
-        (self.memory.information_s, self.memory.downtime_std) = (config.max_information_s, 0.0);
+        self.memory.mean_nis = self.memory.mean_nis.min(config.consistency.limit * std::f64::consts::E);
+        (self.memory.information_s, self.memory.downtime_std) = (config.voltage.max_information_s, 0.0);
         (self.memory.rejected, self.memory.rejected_s) = (0, 0.0);
     }
 
@@ -209,7 +209,7 @@ impl CellEstimator {
 
     /// Adds a downtime of `downtime_s`: widens the SOC by the charge that may have been moved, in either direction.
     pub fn note_downtime(&mut self, config: &EstimatorConfig, downtime_s: f64) {
-        let most = config.away_use_per_s * downtime_s;
+        let most = config.gap.away_use_per_s * downtime_s;
         self.memory.downtime_std = (self.memory.downtime_std + most / 3.0_f64.sqrt()).min(1.0);
     }
 }

@@ -70,7 +70,7 @@ fn used_prior<const N: usize>(x: &Gaussian<N>, config: &EstimatorConfig, downtim
     }
     used.covariance[(0, 0)] = soc_variance;
     for i in BRANCHES..N {
-        used.covariance[(i, i)] += square(config.initial_branch_std_v);
+        used.covariance[(i, i)] += square(config.initial.branch_std_v);
     }
     used
 }

@@ -60,7 +60,7 @@ pub(super) fn initial_state<const N: usize>(
 }
 
 fn spread<const N: usize>(config: &EstimatorConfig) -> SigmaPointWeights {
-    SigmaPointWeights::new(N, config.alpha, config.beta, config.kappa)
+    SigmaPointWeights::new(N, config.points.alpha, config.points.beta, config.points.kappa)
 }
 
 /// Predicts over the measured and the unmeasured time of a step.
@@ -75,8 +75,8 @@ pub(super) fn predict<const N: usize>(
 ) -> Result<(), FilterError> {
     if step.measured_s > 0.0 || step.charge_as != 0.0 {
         let moved_soc = step.charge_as.abs() / (3600.0 * x.mean[CAPACITY]);
-        let variance = square(config.soc_noise_per_sqrt_s) * step.measured_s
-            + square(config.charge_noise_per_sqrt_soc) * moved_soc;
+        let variance = square(config.process.soc_per_sqrt_s) * step.measured_s
+            + square(config.process.charge_per_sqrt_soc) * moved_soc;
         propagate(x, model, config, temperature_c, step.measured_s, step.charge_as)?;
         x.covariance[(0, 0)] += variance;
     }
@@ -84,9 +84,9 @@ pub(super) fn predict<const N: usize>(
         // The current of that time is unknown: 0 is assumed, but a load next to the gap may have continued through it.
         propagate(x, model, config, temperature_c, step.unmeasured_s, 0.0)?;
         let load_soc = gap_load_a * step.unmeasured_s / (3600.0 * x.mean[CAPACITY]);
-        let load_std = if gap_load_a > config.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
-        let variance = square(config.gap_noise_per_sqrt_s) * step.unmeasured_s
-            + square(config.self_discharge_per_s * step.unmeasured_s)
+        let load_std = if gap_load_a > config.gap.rest_current_a { load_soc.min(MAX_GAP_LOAD_STD) } else { 0.0 };
+        let variance = square(config.gap.noise_per_sqrt_s) * step.unmeasured_s
+            + square(config.gap.self_discharge_per_s * step.unmeasured_s)
             + square(load_std) / 3.0;
         x.covariance[(0, 0)] = widened(x.covariance[(0, 0)], variance);
     }

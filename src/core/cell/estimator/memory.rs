@@ -71,7 +71,7 @@ impl Memory {
             last_current_a: 0.0,
             load_a: 0.0,
             mean_nis: 0.0,
-            information_s: config.max_information_s,
+            information_s: config.voltage.max_information_s,
             rest_s: 0.0,
             downtime_std: 0.0,
             is_unseen: false,
@@ -85,7 +85,7 @@ impl Memory {
     #[inline]
     pub(super) fn new_information_s(&mut self, config: &EstimatorConfig, step: &CellStep) -> f64 {
         let elapsed_s = step.measured_s + step.unmeasured_s;
-        if step.charge_as.abs() > config.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
+        if step.charge_as.abs() > config.gap.rest_current_a * step.measured_s || step.unmeasured_s > 0.0 {
             self.rest_s = 0.0;
             return elapsed_s;
         }
@@ -97,7 +97,7 @@ impl Memory {
     /// Updates the load's low-pass. A gap with a load next to it counts as the heaviest usual load.
     #[inline]
     pub(super) fn update_load(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
-        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.load_memory_s);
+        let keep = |elapsed_s: f64| libm::exp(-elapsed_s / config.voltage.load_memory_s);
         if step.measured_s > 0.0 {
             let mean_a = step.charge_as.abs() / step.measured_s;
             self.load_a = mean_a + (self.load_a - mean_a) * keep(step.measured_s);
@@ -105,7 +105,7 @@ impl Memory {
         if step.unmeasured_s > 0.0 {
             self.load_a *= keep(step.unmeasured_s);
             let adjacent_a = self.last_current_a.abs().max(step.current_a.unwrap_or(0.0).abs());
-            if adjacent_a > config.rest_current_a {
+            if adjacent_a > config.gap.rest_current_a {
                 self.load_a = self.load_a.max(adjacent_a).max(model.rated_capacity_ah * GAP_LOAD_PER_H);
             }
         }
@@ -127,7 +127,7 @@ impl Memory {
     #[inline]
     pub(super) fn record_update(&mut self, config: &EstimatorConfig, step: &CellStep, update: &Update) {
         let elapsed_s = step.measured_s + step.unmeasured_s;
-        let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency_window_s);
+        let forget = -libm::expm1(-elapsed_s.max(1e-3) / config.consistency.window_s);
         self.mean_nis += forget * (update.test_ratio - self.mean_nis);
         if update.accepted {
             (self.information_s, self.rejected, self.rejected_s) = (0.0, 0, 0.0);
@@ -145,7 +145,7 @@ impl Memory {
     /// Whether the filter must restart: too many consecutive readings were beyond the gate.
     #[inline]
     pub(super) fn has_lost_cell(&self, config: &EstimatorConfig) -> bool {
-        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.lost_after_s;
+        let long_enough = self.rejected >= MIN_REJECTED && self.rejected_s >= config.gate.lost_after_s;
         long_enough || (self.rejected_after_gap && self.rejected >= MIN_REJECTED_AFTER_GAP)
     }
 
@@ -184,12 +184,12 @@ pub(super) fn check_log_resistance(log_resistance: f64) -> Result<(), InvalidSta
 /// Configured initial capacity (Ah) and ln(resistance).
 fn configured(config: &EstimatorConfig) -> (ScalarGaussian, ScalarGaussian) {
     let capacity_variance = match config.capacity_state {
-        CapacityState::Joint => square(config.initial_capacity_std_ah),
+        CapacityState::Joint => square(config.initial.capacity_std_ah),
         CapacityState::Held => KNOWN_VARIANCE,
     };
-    let log_variance = square(config.initial_log_resistance_std);
+    let log_variance = square(config.initial.log_resistance_std);
     (
-        ScalarGaussian { mean: config.initial_capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
+        ScalarGaussian { mean: config.initial.capacity_ah, variance: capacity_variance.max(KNOWN_VARIANCE) },
         ScalarGaussian { mean: 0.0, variance: log_variance.max(KNOWN_VARIANCE) },
     )
 }

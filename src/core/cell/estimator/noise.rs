@@ -31,9 +31,9 @@ pub(super) fn process<const N: usize>(
         // Noise fed into a decaying branch: bounded by tau/2 however long the step.
         let half_tau_s = 0.5 * model.branch_tau_s(i - BRANCHES, position);
         let effective_s = half_tau_s * -libm::expm1(-dt_s / half_tau_s);
-        q[(i, i)] = square(config.branch_noise_v_per_sqrt_s) * effective_s;
+        q[(i, i)] = square(config.process.branch_v_per_sqrt_s) * effective_s;
     }
-    q[(LOG_RESISTANCE, LOG_RESISTANCE)] = square(config.log_resistance_noise_per_sqrt_s) * dt_s.min(MAX_WALK_S);
+    q[(LOG_RESISTANCE, LOG_RESISTANCE)] = square(config.process.log_resistance_per_sqrt_s) * dt_s.min(MAX_WALK_S);
     q
 }
 
@@ -61,17 +61,17 @@ impl VoltageReading {
         let load_v = model.settled_ohm(&position) * ratio * self.load_a;
         let base_v_sqrt_s = model
             .voltage_error_v(&position)
-            .map_or(config.model_error_v_sqrt_s, |error_v| error_v * ERROR_WINDOW_S.sqrt());
+            .map_or(config.voltage.model_error_v_sqrt_s, |error_v| error_v * ERROR_WINDOW_S.sqrt());
         let model_variance = square(base_v_sqrt_s)
-            + square(config.drop_error_sqrt_s * drop_v)
-            + square(config.load_error_sqrt_s * load_v);
-        let sensor_variance = square(config.voltage_noise_v);
+            + square(config.voltage.drop_error_sqrt_s * drop_v)
+            + square(config.voltage.load_error_sqrt_s * load_v);
+        let sensor_variance = square(config.voltage.noise_v);
         MeasurementNoise {
             variance: sensor_variance + model_variance / self.information_s,
             gate_variance: sensor_variance
-                + square(config.gate_model_error_v)
-                + square(config.gate_soc_error * slope_v),
-            gate_sigma: config.gate_sigma,
+                + square(config.gate.model_error_v)
+                + square(config.gate.soc_error * slope_v),
+            gate_sigma: config.gate.sigma,
         }
     }
 }

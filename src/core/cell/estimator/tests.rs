@@ -6,42 +6,47 @@ use super::state_vector::UNKNOWN_SOC_VARIANCE;
 use super::{CellEstimator, CellStep};
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::model::tests::small_model;
-use crate::cell::{CapacityState, CellModel, Discretisation, EstimatorConfig};
+use crate::cell::{
+    CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
+    InitialState, ProcessNoise, SigmaPointSettings, VoltageError,
+};
 use crate::filter::ScalarGaussian;
 
 pub(crate) fn config() -> EstimatorConfig {
     EstimatorConfig {
-        alpha: 1.0,
-        beta: 2.0,
-        kappa: 0.0,
+        points: SigmaPointSettings { alpha: 1.0, beta: 2.0, kappa: 0.0 },
         discretisation: Discretisation::Exact,
         capacity_state: CapacityState::Joint,
-        initial_soc: None,
-        initial_soc_std: 0.3,
-        initial_branch_std_v: 0.05,
-        initial_capacity_ah: 2.0,
-        initial_capacity_std_ah: 0.2,
-        initial_log_resistance_std: 0.2,
-        soc_noise_per_sqrt_s: 3e-5,
-        charge_noise_per_sqrt_soc: 3e-3,
-        branch_noise_v_per_sqrt_s: 1e-3,
-        log_resistance_noise_per_sqrt_s: 3e-4,
-        gap_noise_per_sqrt_s: 1.5e-5,
-        self_discharge_per_s: 1e-8,
-        away_use_per_s: 0.0,
-        rest_current_a: 0.04,
-        voltage_noise_v: 0.005,
-        model_error_v_sqrt_s: 0.15,
-        drop_error_sqrt_s: 0.3,
-        load_error_sqrt_s: 0.5,
-        load_memory_s: 1200.0,
-        max_information_s: 100.0,
-        gate_sigma: 5.0,
-        gate_model_error_v: 0.06,
-        gate_soc_error: 0.02,
-        lost_after_s: 30.0,
-        consistency_window_s: 600.0,
-        consistency_limit: 4.0,
+        initial: InitialState {
+            soc: None,
+            soc_std: 0.3,
+            branch_std_v: 0.05,
+            capacity_ah: 2.0,
+            capacity_std_ah: 0.2,
+            log_resistance_std: 0.2,
+        },
+        process: ProcessNoise {
+            soc_per_sqrt_s: 3e-5,
+            charge_per_sqrt_soc: 3e-3,
+            branch_v_per_sqrt_s: 1e-3,
+            log_resistance_per_sqrt_s: 3e-4,
+        },
+        gap: GapSettings {
+            noise_per_sqrt_s: 1.5e-5,
+            self_discharge_per_s: 1e-8,
+            away_use_per_s: 0.0,
+            rest_current_a: 0.04,
+        },
+        voltage: VoltageError {
+            noise_v: 0.005,
+            model_error_v_sqrt_s: 0.15,
+            drop_error_sqrt_s: 0.3,
+            load_error_sqrt_s: 0.5,
+            load_memory_s: 1200.0,
+            max_information_s: 100.0,
+        },
+        gate: GateSettings { sigma: 5.0, model_error_v: 0.06, soc_error: 0.02, lost_after_s: 30.0 },
+        consistency: ConsistencySettings { window_s: 600.0, limit: 4.0 },
     }
 }
 
@@ -123,7 +128,8 @@ fn the_sample_rate_does_not_change_the_result() {
 
 #[test]
 fn a_start_thirty_points_wrong_recovers() {
-    let config = EstimatorConfig { initial_soc: Some(0.6), ..config() };
+    let mut config = config();
+    config.initial.soc = Some(0.6);
     let (mut estimator, mut truth) = (CellEstimator::new(&config), truth());
     cycle(&mut estimator, &config, &mut truth, 1.0, 0.5);
     assert!((soc(&estimator).mean - truth.soc).abs() < 0.02, "{:?} {}", soc(&estimator), truth.soc);

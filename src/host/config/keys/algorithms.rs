@@ -2,7 +2,10 @@
 //! of its algorithm; what a key means where it is not written stands next to the key.
 
 use super::{DEVIATION, MethodKey, Pack, TEMPERATURE_C};
-use crate::cell::{CapacityState, CellModel, Discretisation, EstimatorConfig};
+use crate::cell::{
+    CapacityState, CellModel, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings,
+    InitialState, ProcessNoise, SigmaPointSettings, VoltageError,
+};
 use crate::config::schema::Presence::{Default, Optional, Required};
 use crate::config::schema::section;
 use crate::config::setting::ValueRange::{Above, Any, Between};
@@ -13,7 +16,7 @@ const SECONDS_PER_MONTH: f64 = 2_629_800.0;
 
 section! {
     /// The unscented Kalman filter of each cell. Noises are densities, per square root of a second, so that the sample rate does not change the result.
-    Estimator at "estimator" gives EstimatorConfig, |keys, pack: &Pack, model: &CellModel| {
+    Estimator at "estimator" {
         /// Spread of the sigma points.
         alpha: f64, "", Above(0.0, 1.0), Default("1.0");
         /// Prior knowledge of the distribution; 2 for a Gaussian one.
@@ -43,14 +46,11 @@ section! {
         /// Process noise of the SOC while no current is measured (asleep).
         gap_noise_per_sqrt_s: f64, "fraction/sqrt(s)", DEVIATION, Default("1.5e-5");
         /// Self-discharge of a cell in a month: the deviation of the SOC grows with the time without measurement (asleep, off).
-        self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03")
-            => self_discharge_per_s: keys.self_discharge_per_month / SECONDS_PER_MONTH;
+        self_discharge_per_month: f64, "fraction", Between(0.0, 1.0), Default("0.03");
         /// Charge or discharge that is possible in an hour while the program does not run. The first voltage after that time shows whether it happened; until then the deviation of the SOC covers it. 0: the cells are certainly not used.
-        away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5")
-            => away_use_per_s: keys.away_use_per_h / 3600.0;
+        away_use_per_h: f64, "fraction", Between(0.0, 100.0), Default("0.5");
         /// A current up to this is rest; a larger one next to a gap may have flowed during the gap. Without it: the rated capacity over 50 h (C/50), per cell.
-        rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional
-            => rest_current_a: keys.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0);
+        rest_current_a: Option<f64>, "A", Between(0.0, 1e6), Optional;
         /// Standard deviation of the voltage sensor's noise.
         voltage_noise_v: f64, "V", Above(0.0, 10.0), Default("0.005");
         /// Slow error of the cell model: standard deviation of its average over one second. More samples per second add no information beyond this. A `voltage_error_v` of the cell model replaces it.
@@ -75,16 +75,53 @@ section! {
         consistency_window_s: f64, "s", Above(0.0, 1e9), Default("600.0");
         /// Mean normalised innovation squared above which an estimate is not to be trusted (1 = as expected).
         consistency_limit: f64, "", Above(0.0, 1e9), Default("4.0");
-    } and {
-        initial_capacity_ah: pack.initial_capacity_ah(model),
-        initial_capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * pack.initial_capacity_ah(model)),
     }
 }
 
-impl Pack {
-    /// Capacity of a cell to start from, Ah.
-    fn initial_capacity_ah(&self, model: &CellModel) -> f64 {
-        self.initial_capacity_ah.unwrap_or(model.capacity_ah)
+impl Estimator {
+    /// The parameters these keys stand for.
+    pub(crate) fn config(&self, pack: &Pack, model: &CellModel) -> EstimatorConfig {
+        let initial_ah = pack.initial_capacity_ah.unwrap_or(model.capacity_ah);
+        EstimatorConfig {
+            points: SigmaPointSettings { alpha: self.alpha, beta: self.beta, kappa: self.kappa },
+            discretisation: self.discretisation,
+            capacity_state: self.capacity_state,
+            initial: InitialState {
+                soc: self.initial_soc,
+                soc_std: self.initial_soc_std,
+                branch_std_v: self.initial_branch_std_v,
+                capacity_ah: initial_ah,
+                capacity_std_ah: pack.initial_capacity_std_ah.unwrap_or(0.1 * initial_ah),
+                log_resistance_std: self.initial_log_resistance_std,
+            },
+            process: ProcessNoise {
+                soc_per_sqrt_s: self.soc_noise_per_sqrt_s,
+                charge_per_sqrt_soc: self.charge_noise_per_sqrt_soc,
+                branch_v_per_sqrt_s: self.branch_noise_v_per_sqrt_s,
+                log_resistance_per_sqrt_s: self.log_resistance_noise_per_sqrt_s,
+            },
+            gap: GapSettings {
+                noise_per_sqrt_s: self.gap_noise_per_sqrt_s,
+                self_discharge_per_s: self.self_discharge_per_month / SECONDS_PER_MONTH,
+                away_use_per_s: self.away_use_per_h / 3600.0,
+                rest_current_a: self.rest_current_a.unwrap_or(model.rated_capacity_ah / 50.0),
+            },
+            voltage: VoltageError {
+                noise_v: self.voltage_noise_v,
+                model_error_v_sqrt_s: self.model_error_v_sqrt_s,
+                drop_error_sqrt_s: self.drop_error_sqrt_s,
+                load_error_sqrt_s: self.load_error_sqrt_s,
+                load_memory_s: self.load_memory_s,
+                max_information_s: self.max_information_s,
+            },
+            gate: GateSettings {
+                sigma: self.gate_sigma,
+                model_error_v: self.gate_model_error_v,
+                soc_error: self.gate_soc_error,
+                lost_after_s: self.lost_after_s,
+            },
+            consistency: ConsistencySettings { window_s: self.consistency_window_s, limit: self.consistency_limit },
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use super::*;
 use crate::cell::Table;
 use crate::cell::circuit::{self, BranchAt};
-use crate::cell::config::{CapacityState, Discretisation};
+use crate::cell::config::{CapacityState, Discretisation, SigmaPointSettings};
 use crate::cell::estimator::tests::config;
 use crate::cell::model::tests::small_model;
 
@@ -186,7 +186,7 @@ fn every_setting_that_changes_the_filter_changes_the_kernel() {
     };
     let held = EstimatorConfig { capacity_state: CapacityState::Held, ..config() };
     let euler = EstimatorConfig { discretisation: Discretisation::Euler, ..config() };
-    let spread = EstimatorConfig { alpha: 0.3, beta: 1.0, kappa: 2.0, ..config() };
+    let spread = EstimatorConfig { points: SigmaPointSettings { alpha: 0.3, beta: 1.0, kappa: 2.0 }, ..config() };
     let cases = [
         (&aged, config()),
         (&own_error, config()),
@@ -255,5 +255,5 @@ fn an_estimator_put_into_the_bank_is_returned_unchanged() {
     bank.change(4, |estimator| estimator.hold_capacity(1.23));
     assert_eq!((bank.capacity(4).mean, bank.capacity(7)), (1.23, other.capacity()));
     bank.put(4, &CellEstimator::new(&config));
-    assert_eq!((bank.soc(4), bank.capacity(4).mean), (None, config.initial_capacity_ah));
+    assert_eq!((bank.soc(4), bank.capacity(4).mean), (None, config.initial.capacity_ah));
 }

@@ -38,7 +38,7 @@ fn under_load_and_after_a_gap_all_time_counts_and_the_rest_starts_again() {
     let mut memory = Memory::new(&config);
     let fresh_s = memory.new_information_s(&config, &step(0.0, 10.0, 0.0));
     memory.new_information_s(&config, &step(0.0, 7200.0, 0.0));
-    let late_s = memory.new_information_s(&config, &step(config.rest_current_a, 10.0, 0.0));
+    let late_s = memory.new_information_s(&config, &step(config.gap.rest_current_a, 10.0, 0.0));
     assert!(late_s < 0.15 * fresh_s, "{late_s} {fresh_s}");
     for interruption in [step(1.0, 10.0, 0.0), step(-1.0, 10.0, 0.0), step(0.0, 0.0, 10.0)] {
         assert_eq!(memory.new_information_s(&config, &interruption), 10.0);
@@ -55,7 +55,7 @@ fn the_load_decays_exponentially_in_both_directions() {
         for _ in 0..60 {
             memory.update_load(&model, &config, &step(current_a, 10.0, 0.0));
         }
-        let keep = libm::exp(-600.0 / config.load_memory_s);
+        let keep = libm::exp(-600.0 / config.voltage.load_memory_s);
         assert!(near(memory.load_a, 2.0 + (0.5 - 2.0) * keep), "{}", memory.load_a);
     }
 }
@@ -65,7 +65,7 @@ fn a_gap_next_to_a_load_counts_as_the_heaviest_usual_load_and_a_gap_at_rest_as_r
     let (config, model) = (config(), small_model());
     let mut memory = Memory::new(&config);
     memory.load_a = 0.5;
-    memory.update_load(&model, &config, &step(0.0, 0.0, config.load_memory_s));
+    memory.update_load(&model, &config, &step(0.0, 0.0, config.voltage.load_memory_s));
     assert!(near(memory.load_a, 0.5 * libm::exp(-1.0)), "{}", memory.load_a);
     memory.update_load(&model, &config, &step(1.0, 0.0, 60.0));
     assert_eq!(memory.load_a, model.rated_capacity_ah * GAP_LOAD_PER_H);

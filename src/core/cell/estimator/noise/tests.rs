@@ -14,15 +14,15 @@ fn the_resistance_does_not_walk_through_a_long_step_and_branches_settle() {
     let (config, model) = (config(), small_model());
     let position = model.grid_position(0.5, 25.0);
     let q = process::<4>(&model, &config, &position, 1e6);
-    assert!(near(q[(1, 1)], square(config.log_resistance_noise_per_sqrt_s) * MAX_WALK_S));
-    assert!(near(q[(3, 3)], square(config.branch_noise_v_per_sqrt_s) * 0.5 * model.branch_tau_s(0, &position)));
+    assert!(near(q[(1, 1)], square(config.process.log_resistance_per_sqrt_s) * MAX_WALK_S));
+    assert!(near(q[(3, 3)], square(config.process.branch_v_per_sqrt_s) * 0.5 * model.branch_tau_s(0, &position)));
     assert_eq!((q[(0, 0)], q[(2, 2)]), (0.0, 0.0));
 }
 
 #[test]
 fn the_variance_of_a_reading_sums_sensor_model_drop_and_load() {
     let (mut config, mut model) = (config(), small_model());
-    config.voltage_noise_v = 0.0;
+    config.voltage.noise_v = 0.0;
     let mut x = Gaussian::<4> { mean: nalgebra::SVector::zeros(), covariance: SMatrix::identity() };
     (x.mean[0], x.mean[3], x.mean[2]) = (0.5, 0.05, 2.0);
     let of = |model: &CellModel, load_a: f64, current_a: f64, information_s: f64| {

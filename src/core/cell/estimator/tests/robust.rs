@@ -37,7 +37,7 @@ impl Bench {
     fn new(soc: f64, initial: Option<(f64, f64)>, slow_ohm: f64, offset_a: f64) -> Self {
         let mut config = config();
         if let Some((soc, std)) = initial {
-            (config.initial_soc, config.initial_soc_std) = (Some(soc), std);
+            (config.initial.soc, config.initial.soc_std) = (Some(soc), std);
         }
         let truth = Truth { soc, branch_v: 0.0, capacity_ah: 2.0, ratio: 1.1 };
         let estimator = CellEstimator::new(&config);
@@ -128,7 +128,7 @@ fn the_interval_covers_the_error_in_a_rest_that_still_relaxes() {
         // The slow branch has relaxed: the voltage is the open-circuit voltage, and the estimate has converged to it.
         assert!(bench.error_points().abs() < 0.5, "{current_a} A: {}", bench.error_points());
         // Ten hours of rest count as 1000 s x ln 37 under load, not as ten hours.
-        let least = 100.0 * STD_OF_95 * bench.config.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
+        let least = 100.0 * STD_OF_95 * bench.config.voltage.model_error_v_sqrt_s / 1.2 / libm::sqrt(3600.0);
         assert!(bench.half_width_points() > least, "{current_a} A: {} {least}", bench.half_width_points());
     }
 }
