@@ -25,22 +25,23 @@ const TABLE: &[(&str, &[&str], Core)] = &[
     ("doctor", &["quantity", "can", "sample", "cell", "monitor"], Core::Pure),
     ("ident", &["quantity", "filter", "regress", "cell"], Core::Pure),
     ("config", CORE, Core::Shell),
-    ("io", MODULES.split_at(11).0, Core::Shell),
-    ("logging", MODULES.split_at(12).0, Core::Shell),
-    ("control", MODULES.split_at(13).0, Core::Shell),
-    ("store", MODULES.split_at(14).0, Core::Shell),
-    ("status", MODULES.split_at(14).0, Core::Shell),
-    ("service", MODULES.split_at(16).0, Core::Shell),
-    ("exporter", MODULES.split_at(17).0, Core::Shell),
-    ("replay", MODULES.split_at(17).0, Core::Shell),
-    ("diagnosis", MODULES.split_at(17).0, Core::Shell),
+    ("token_bucket", &["quantity"], Core::Shell),
+    ("io", MODULES.split_at(12).0, Core::Shell),
+    ("logging", MODULES.split_at(13).0, Core::Shell),
+    ("control", MODULES.split_at(14).0, Core::Shell),
+    ("store", MODULES.split_at(15).0, Core::Shell),
+    ("status", MODULES.split_at(15).0, Core::Shell),
+    ("service", MODULES.split_at(17).0, Core::Shell),
+    ("exporter", MODULES.split_at(18).0, Core::Shell),
+    ("replay", MODULES.split_at(18).0, Core::Shell),
+    ("diagnosis", MODULES.split_at(18).0, Core::Shell),
     ("lab", BELOW_LAB, Core::Shell),
     ("cli", &MODULES, Core::Shell),
     ("main", &["cli"], Core::Shell),
 ];
 
 /// The modules of `src/core` and `src/host`, lowest first, then those of the lab.
-const MODULES: [&str; 23] = [
+const MODULES: [&str; 24] = [
     "quantity",
     "filter",
     "can",
@@ -52,6 +53,7 @@ const MODULES: [&str; 23] = [
     "sim",
     "doctor",
     "config",
+    "token_bucket",
     "io",
     "logging",
     "control",
@@ -66,7 +68,7 @@ const MODULES: [&str; 23] = [
     "lab",
 ];
 const CORE: &[&str] = MODULES.split_at(10).0;
-const BELOW_LAB: &[&str] = MODULES.split_at(22).0;
+const BELOW_LAB: &[&str] = MODULES.split_at(23).0;
 /// Crates under `src`, and the module that stands for the whole crate in the table, if one does.
 const CRATES: [(&str, Option<&str>); 4] =
     [("core", None), ("host", None), ("lab", Some("lab")), ("regress", Some("regress"))];
