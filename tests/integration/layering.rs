@@ -363,7 +363,8 @@ fn the_table_names_the_modules_that_the_crates_declare() {
     let mut declared = vec!["regress".to_owned(), "ident".to_owned(), "lab".to_owned(), "main".to_owned()];
     for lib in ["lib.rs", "core/lib.rs", "host/lib.rs"] {
         let source = std::fs::read_to_string(src.join(lib)).expect("a lib.rs");
-        let names = source.lines().filter_map(|line| line.strip_prefix("pub mod ")?.strip_suffix(';'));
+        let names =
+            source.lines().filter_map(|line| line.trim_start_matches("pub ").strip_prefix("mod ")?.strip_suffix(';'));
         declared.extend(names.map(str::to_owned));
     }
     declared.sort_unstable();
