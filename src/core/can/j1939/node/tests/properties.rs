@@ -50,12 +50,13 @@ fn lamp_of(number: u8) -> Lamp {
 fn perform(bench: &mut Bench, act: &Act) {
     match act {
         Act::Wait(ms) => {
-            // As a driver that sleeps until something is due.
-            let end = bench.now_ms + i64::from(*ms);
-            while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end)) {
-                bench.now_ms = bench.now_ms.max(due.nanos().saturating_add(999_999) / 1_000_000);
+            // As a driver that sleeps until something is due, and polls at most once a tick (here 1 ms), as the busy one does.
+            let (end, mut next_tick) = (bench.now_ms + i64::from(*ms), bench.now_ms);
+            while let Some(due) = bench.node.next_due().filter(|due| *due <= at(end) && next_tick <= end) {
+                bench.now_ms = next_tick.max(due.nanos().saturating_add(999_999) / 1_000_000);
                 bench.node.poll(at(bench.now_ms), &mut bench.out);
                 bench.take();
+                next_tick = bench.now_ms + 1;
             }
             bench.now_ms = end;
         }
