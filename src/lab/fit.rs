@@ -18,6 +18,7 @@ pub use toml::text;
 use super::measured::MeasuredFile;
 use crate::cell::Thermal;
 use crate::error::LabError;
+use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
 use crate::ident::fit::{FitSettings, FittedTables, Residual};
 use crate::ident::grid::Grid;
@@ -41,6 +42,9 @@ const AGEING_SOC_NODES: [f64; 25] = [
 ];
 /// Starting time constants by number of branches, s.
 const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
+
+/// Temperature of the half-cell potentials, degrees C.
+const ELECTRODES_C: f64 = 25.0;
 
 /// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given. A prior, not a result: no
 /// fit of a new cell determines it. 0 = the curve shrinks evenly, 1 = pure loss of lithium. The value was
@@ -111,6 +115,8 @@ pub struct FitOutcome {
     pub capacity_ah: f64,
     /// Lowest and highest voltage, V.
     pub voltage_v: (f64, f64),
+    /// Electrodes, unless a shift of the curve is given or none fit.
+    pub electrodes: Option<FittedElectrodes>,
     /// Thermal parameters where the data determine them.
     pub thermal: Option<Thermal>,
     /// Standard deviation of the model's error averaged over 100 s, V, in node order.
@@ -146,7 +152,12 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
+    let electrodes = match request.ageing_shift {
+        Some(_) => None,
+        None => electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)),
+    };
     let mut outcome = FitOutcome {
+        electrodes,
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
         thermal: thermal.ok(),
@@ -159,7 +170,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         fit: fitted,
     };
     outcome.notes.extend(thermal.err().map(|error| error.to_string()));
-    add_notes(&mut outcome);
+    add_notes(request, &mut outcome);
     Ok(outcome)
 }
 
@@ -247,7 +258,12 @@ fn by_file(
     files.iter().enumerate().map(of_file).collect()
 }
 
-fn add_notes(outcome: &mut FitOutcome) {
+fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
+    if outcome.electrodes.is_none() && request.ageing_shift.is_none() {
+        let what =
+            "no known electrodes fit the open-circuit curve within 25 mV: how it ages is not known, see --ageing-shift";
+        outcome.notes.push(what.to_owned());
+    }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {
         outcome.notes.push(format!("{outliers} rows left out: no voltage this cell can have"));

@@ -41,7 +41,7 @@ impl BranchAt {
     }
 }
 
-/// Terminal voltage under `current_a` with the branches' voltages summed in `branches_v`.
+/// Terminal voltage of a new cell under `current_a` with the branches' voltages summed in `branches_v`.
 pub fn terminal_v(
     model: &CellModel,
     position: &GridPosition,
@@ -52,21 +52,20 @@ pub fn terminal_v(
     model.ocv_v(position) - branches_v - model.r0_ohm(position) * resistance_ratio * current_a
 }
 
-/// Terminal voltage of a cell at `state` = (SOC, resistance ratio, capacity in Ah) whose open-circuit curve has shifted
-/// with the lost capacity ([`CellModel::ocv_soc`]).
+/// Terminal voltage under `current_a` of an aged cell at `state` = (SOC, resistance ratio, capacity in Ah) with the branches'
+/// voltages summed in `branches_v`. The open-circuit curve changes linearly with the capacity round `segment`
+/// ([`CellModel::aged_ocv_v`]).
 pub fn aged_terminal_v(
     model: &CellModel,
     state: (f64, f64, f64),
+    segment: usize,
     temperature: &TemperaturePosition,
     branches_v: f64,
     current_a: f64,
 ) -> f64 {
     let (soc, resistance_ratio, capacity_ah) = state;
     let position = model.grid_position_at(temperature, soc);
-    if model.ocv_ageing_shift == 0.0 {
-        return terminal_v(model, &position, resistance_ratio, branches_v, current_a);
-    }
-    let ocv_v = model.ocv_v(&model.grid_position_at(temperature, model.ocv_soc(soc, capacity_ah)));
+    let ocv_v = model.aged_ocv_v(&position, segment, capacity_ah);
     ocv_v - branches_v - model.r0_ohm(&position) * resistance_ratio * current_a
 }
 

@@ -17,8 +17,8 @@
 //! Effect: the sample rate does not change the result.
 //!
 //! Noise of a step and of a reading (deviation 4): [`noise`].
-//! Deviation 5: the OCV curve shifts with lost capacity ([`CellModel::ocv_soc`]), where the model has such a shift. Effect:
-//! the top and the bottom of an aged cell's curve give the same capacity.
+//! Deviation 5: the OCV curve changes with lost capacity ([`AgedOcv`](crate::cell::AgedOcv)), where the model says how.
+//! Effect: the top and the bottom of an aged cell's curve give the same capacity.
 //!
 //! Use of the cell while the program does not run (deviation 6): [`downtime`].
 //!

@@ -4,15 +4,19 @@
 //! C). Out: SOC, resistance ratio, capacity (Ah) and branch voltages (V), each with its standard deviation. Readings
 //! beyond the gate change no estimate.
 
+pub mod aged_ocv;
 pub mod circuit;
 pub mod config;
+pub mod electrodes;
 pub mod estimator;
 pub mod model;
 
+pub use aged_ocv::AgedOcv;
 pub use config::{
     CapacityState, ConsistencySettings, Discretisation, EstimatorConfig, GapSettings, GateSettings, InitialState,
     ProcessNoise, SigmaPointSettings, VoltageError,
 };
+pub use electrodes::{Electrodes, NegativeMaterial, PositiveMaterial};
 pub use estimator::{CellEstimator, CellState, CellStep, EstimatorBank, StepResult};
 pub use model::{
     Branch, CellModel, ERROR_WINDOW_S, GridPosition, MAX_BRANCHES, Table, TemperaturePosition, Thermal, arrhenius,

@@ -11,6 +11,8 @@
 //! between nodes whose resistances differ the product of two interpolated values is up to twice that of either node.
 //! Effect: none where both are constant.
 
+use super::aged_ocv::{AgedOcv, OffsetLine};
+
 /// Most RC branches a model may have.
 pub const MAX_BRANCHES: usize = 3;
 
@@ -78,8 +80,8 @@ pub struct CellModel {
     pub temperature_c: Vec<f64>,
     /// Open-circuit voltage, V.
     pub ocv_v: Table,
-    /// How far the open-circuit curve shifts as capacity is lost, see [`CellModel::ocv_soc`]; 0 = the curve only shrinks.
-    pub ocv_ageing_shift: f64,
+    /// How the open-circuit curve changes with lost capacity.
+    pub aged_ocv: AgedOcv,
     /// Series resistance, ohm.
     pub r0_ohm: Table,
     /// RC branches, 1 to [`MAX_BRANCHES`].
@@ -173,23 +175,31 @@ impl CellModel {
         self.ocv_v.at(position, position.beyond_s, position.temperature.along_t)
     }
 
-    /// SOC at which a new cell has the open-circuit voltage of a cell of `capacity_ah` at `soc`.
-    ///
-    /// An ageing cell does not lose its charge evenly over the curve: lithium bound elsewhere shifts the anode against
-    /// the cathode, so the top keeps its ampere-hours and the bottom loses them. s' = s + a s (1 - s) with
-    /// a = shift * (1 - C / C_new); a shift of 1 would keep the slope over ampere-hours at SOC 1 exactly, 0 shrinks evenly.
-    pub fn ocv_soc(&self, soc: f64, capacity_ah: f64) -> f64 {
-        let lost = self.ocv_ageing_shift * (1.0 - capacity_ah / self.capacity_ah);
-        // Beyond +-1 the curve would fold; beyond its ends the curve is unchanged.
-        let inside = soc.clamp(0.0, 1.0);
-        soc + lost.clamp(-0.9, 0.9) * inside * (1.0 - inside)
+    /// Open-circuit voltage of a cell that has aged to a capacity, V. `segment` is that of the capacity round which the
+    /// change of the curve is linear ([`AgedOcv::segment`]).
+    pub fn aged_ocv_v(&self, position: &GridPosition, segment: usize, capacity_ah: f64) -> f64 {
+        let [from, to] = [self.soc[position.s], self.soc[position.s + 1]];
+        let soc = from + position.beyond_s * (to - from);
+        self.ocv_v(position) + self.offset(position, segment).at(soc, capacity_ah)
     }
 
-    /// Slope of the open-circuit voltage over SOC, V per unit of SOC.
-    pub fn ocv_slope_v(&self, position: &GridPosition) -> f64 {
+    /// Slope of the open-circuit voltage of an aged cell over SOC, V per unit of SOC.
+    pub fn ocv_slope_v(&self, position: &GridPosition, capacity_ah: f64) -> f64 {
         let rise = |t: usize| self.ocv_v.values[t][position.s + 1] - self.ocv_v.values[t][position.s];
         position.temperature.between(position.temperature.along_t, rise)
             / (self.soc[position.s + 1] - self.soc[position.s])
+            + self.offset(position, self.aged_ocv.segment(capacity_ah)).slope_v(capacity_ah)
+    }
+
+    fn offset(&self, position: &GridPosition, segment: usize) -> OffsetLine {
+        self.aged_ocv.line(&self.soc, segment, position.s)
+    }
+
+    /// Standard deviation of an aged cell's open-circuit voltage by the unknown mix of its losses, V; `None` = unknown.
+    pub fn aged_ocv_error_v(&self, position: &GridPosition, capacity_ah: f64) -> Option<f64> {
+        let [low, high] = [position.s, position.s + 1].map(|s| self.aged_ocv.error_v(s, capacity_ah));
+        let (low, high) = low.zip(high)?;
+        Some(low + position.along_s * (high - low))
     }
 
     /// Series resistance of a new cell, ohm.
@@ -223,14 +233,17 @@ impl CellModel {
         (0..self.branches.len()).fold(self.r0_ohm(position), |sum, i| sum + self.branch_r_ohm(i, position))
     }
 
-    /// SOC whose open-circuit voltage is `voltage_v`, by bisection over [-0.5, 1.5]; outside, the nearest end.
+    /// SOC at which a new cell has an open-circuit voltage, by bisection over [-0.5, 1.5]; outside, the nearest end.
     pub fn soc_of_ocv(&self, voltage_v: f64, temperature_c: f64) -> f64 {
-        self.soc_of_ocv_at(&self.temperature_position(temperature_c), voltage_v)
+        self.soc_of_aged_ocv(&self.temperature_position(temperature_c), self.capacity_ah, voltage_v)
     }
 
-    /// SOC of an open-circuit voltage at a temperature with a known position, see [`Self::soc_of_ocv`].
-    pub fn soc_of_ocv_at(&self, temperature: &TemperaturePosition, voltage_v: f64) -> f64 {
-        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.grid_position_at(temperature, soc)))
+    /// SOC at which a cell that has aged to a capacity has an open-circuit voltage, see [`Self::soc_of_ocv`].
+    pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
+        let segment = self.aged_ocv.segment(capacity_ah);
+        falling_crossing(-0.5, 1.5, |soc| {
+            voltage_v - self.aged_ocv_v(&self.grid_position_at(temperature, soc), segment, capacity_ah)
+        })
     }
 }
 
@@ -262,7 +275,7 @@ pub(crate) mod tests {
             voltage_max_v: 4.2,
             soc: vec![0.0, 0.5, 1.0],
             temperature_c: vec![0.0, 40.0],
-            ocv_ageing_shift: 0.0,
+            aged_ocv: AgedOcv::default(),
             ocv_v: table([[3.0, 3.6, 4.2], [3.0, 3.7, 4.2]]),
             r0_ohm: table([[0.08, 0.06, 0.06], [0.04, 0.03, 0.03]]),
             branches: vec![Branch {
@@ -319,27 +332,18 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn lost_capacity_bends_the_curve_between_its_ends_only() {
+    fn an_aged_cells_voltage_and_slope_agree_and_invert() {
         let mut model = small_model();
-        assert_eq!(model.ocv_soc(0.4, 1.0), 0.4); // no shift: the curve only shrinks
-        model.ocv_ageing_shift = 0.8;
-        assert_eq!(model.ocv_soc(0.4, 2.0), 0.4); // a new cell
-        for soc in [-0.2, 0.0, 1.0, 1.3] {
-            assert_eq!(model.ocv_soc(soc, 1.5), soc);
-        }
-        // A quarter lost: a = 0.8 x 0.25 = 0.2.
-        assert!((model.ocv_soc(0.5, 1.5) - (0.5 + 0.2 * 0.25)).abs() < 1e-12);
-        let slope_at_full = (1.0 - model.ocv_soc(1.0 - 1e-6, 1.5)) / 1e-6;
-        assert!((slope_at_full - 0.8).abs() < 1e-5, "{slope_at_full}");
-    }
-
-    #[test]
-    fn the_shifted_curve_rises_at_every_capacity() {
-        let mut model = small_model();
-        model.ocv_ageing_shift = 5.0;
-        for capacity_ah in [0.1, 1.0, 2.0, 3.0, 9.0] {
-            let at = |i: i32| model.ocv_soc(f64::from(i) / 100.0, capacity_ah);
-            assert!((-10..110).all(|i| at(i + 1) > at(i)), "{capacity_ah} Ah");
+        model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, |soc| 3.0 + soc);
+        let (segment, temperature) = (model.aged_ocv.segment(1.5), model.temperature_position(17.0));
+        let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), segment, 1.5);
+        // A quarter lost moves the middle by 0.8 x 0.25 x 0.25 of SOC.
+        let new_v = model.ocv_v(&model.grid_position(0.5, 17.0));
+        assert!((at(0.5) - new_v - 0.05).abs() < 1e-12);
+        for soc in [-0.1, 0.1, 0.45, 0.7, 1.05] {
+            let slope_v = model.ocv_slope_v(&model.grid_position(soc, 17.0), 1.5);
+            assert!(((at(soc + 1e-6) - at(soc)) / 1e-6 - slope_v).abs() < 1e-6, "{soc}");
+            assert!((model.soc_of_aged_ocv(&temperature, 1.5, at(soc)) - soc).abs() < 1e-9, "{soc}");
         }
     }
 }

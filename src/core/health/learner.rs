@@ -339,9 +339,13 @@ fn end_variance_ah2(model: &CellModel, config: &CapacityConfig, half_cycle: &Hal
     let temperature_c = half_cycle.mean_temperature_c.unwrap_or(25.0);
     let lost = 1.0 - capacity_ah / model.capacity_ah;
     let soc_variance = ends.iter().fold(0.0, |sum, end| {
-        let slope_v = model.ocv_slope_v(&model.grid_position(end.soc, temperature_c));
+        let position = model.grid_position(end.soc, temperature_c);
+        let slope_v = model.ocv_slope_v(&position, capacity_ah);
         let volts = libm::hypot(config.end_error_v, config.end_load_error * end.load_v) / slope_v;
-        let shape = config.ageing_shift_error * lost * end.soc * (1.0 - end.soc);
+        let shape = match model.aged_ocv_error_v(&position, capacity_ah) {
+            Some(error_v) => error_v / slope_v,
+            None => config.ageing_shift_error * lost * end.soc * (1.0 - end.soc),
+        };
         sum + volts * volts + shape * shape
     });
     let swing = (half_cycle.charge_ah / capacity_ah).max(MIN_WEIGHED_SWING);

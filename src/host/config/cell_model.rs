@@ -6,12 +6,18 @@
 
 use std::path::Path;
 
+use toml::Spanned;
+use toml::de::DeValue;
+
 use super::document::{Document, Faults, TablePlace};
-use super::schema::Presence::{Default, Optional, Required};
+use super::schema::Presence::{Optional, Required};
 use super::schema::{SchemaReader, Section as _, SectionInfo, section};
-use super::setting::ValueRange::{Above, Between, NotEmpty};
+use super::setting::ValueRange::{Above, Any, Between, NotEmpty};
+use super::setting::{Setting, ValueFault, ValueRange, in_range, typed};
 use super::{ConfigFaults, ReadFile, read_text};
-use crate::cell::{Branch, CellModel, MAX_BRANCHES, Table, Thermal};
+use crate::cell::{
+    AgedOcv, Branch, CellModel, Electrodes, MAX_BRANCHES, NegativeMaterial, PositiveMaterial, Table, Thermal,
+};
 
 const INF: f64 = f64::INFINITY;
 
@@ -28,8 +34,8 @@ section! {
         rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
         /// Charge of a new cell from full to empty open-circuit voltage.
         capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
-        /// How far the open-circuit curve shifts as the cell loses capacity: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
-        ocv_ageing_shift: f64, "", Between(0.0, 1.0), Default("0.0");
+        /// How far the open-circuit curve shifts as the cell loses capacity, where `[electrodes]` does not say it: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
+        ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional;
         /// Lowest voltage under load.
         voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
         /// Highest voltage under charge.
@@ -64,6 +70,52 @@ section! {
 }
 
 section! {
+    /// The electrodes of the new cell, as `packwatch fit` finds them: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a part of its most.
+    ElectrodesKeys at "electrodes" gives Electrodes, |keys| {
+        /// Material of the positive electrode.
+        positive: PositiveMaterial, "", Any, Required;
+        /// Material of the negative electrode.
+        negative: NegativeMaterial, "", Any, Required;
+        /// Lithium content of the positive electrode of the empty and of the full cell.
+        positive_content: Vec<f64>, "fraction", Between(0.0, 1.0), Required => positive_content: ends(&keys.positive_content);
+        /// Lithium content of the negative electrode of the empty and of the full cell.
+        negative_content: Vec<f64>, "fraction", Between(0.0, 1.0), Required => negative_content: ends(&keys.negative_content);
+    }
+}
+
+/// Names of the materials in a cell model.
+macro_rules! material {
+    ($material:ty) => {
+        impl Setting for $material {
+            const KIND: &'static str = "one of";
+            const CHOICES: &'static [&'static str] = &names(&<$material>::ALL);
+
+            fn read(value: &Spanned<DeValue<'_>>, _: &ValueRange) -> Result<Self, ValueFault> {
+                let name = typed(value, value.get_ref().as_str())?;
+                in_range(value, Self::ALL.iter().find(|(_, known)| *known == name).map(|(material, _)| *material))
+            }
+        }
+    };
+}
+material!(PositiveMaterial);
+material!(NegativeMaterial);
+
+const fn names<T, const N: usize>(all: &[(T, &'static str); N]) -> [&'static str; N] {
+    let mut names = [""; N];
+    let mut k = 0;
+    while k < N {
+        names[k] = all[k].1;
+        k += 1;
+    }
+    names
+}
+
+/// The first and the last value; the number of values is checked before.
+fn ends(values: &[f64]) -> [f64; 2] {
+    [values.first().copied().unwrap_or(f64::NAN), values.last().copied().unwrap_or(f64::NAN)]
+}
+
+section! {
     /// The thermal model of one cell; without it there is no fallback for a stale temperature.
     ThermalKeys at "thermal" gives Thermal, |keys| {
         /// Heat capacity.
@@ -82,6 +134,7 @@ pub(super) const SECTIONS: &[SectionInfo] = &[
     ),
     SectionInfo::one::<Tables>(),
     SectionInfo::many::<BranchTables>(),
+    SectionInfo::one::<ElectrodesKeys>(),
     SectionInfo::one::<ThermalKeys>(),
 ];
 
@@ -103,6 +156,7 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     let head = reader.one::<Head>();
     let tables = reader.one::<Tables>();
     let branches = reader.many::<BranchTables>();
+    let electrodes = reader.optional::<ElectrodesKeys>();
     let thermal = reader.optional::<ThermalKeys>();
     let written = reader.count(BranchTables::PATH);
     if let Some(head) = &head {
@@ -112,10 +166,57 @@ pub(super) fn load_with(path: &Path, read: ReadFile<'_>, faults: &mut Faults) ->
     check_tables(&tables, faults);
     check_branch_count(&tables.place, written, faults);
     check_branches(&tables, &branches, faults);
-    Some(model(head?, tables, &branches, thermal.as_ref()))
+    let head = head?;
+    let aged_ocv = aged_ocv(&head, &tables, electrodes.as_ref(), faults);
+    Some(model(head, tables, aged_ocv, &branches, thermal.as_ref()))
 }
 
-fn model(head: Head, tables: Tables, branches: &[BranchTables], thermal: Option<&ThermalKeys>) -> CellModel {
+/// How the open-circuit curve ages; notes what no cell can have. Only sound tables are used.
+fn aged_ocv(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, faults: &mut Faults) -> AgedOcv {
+    if !faults.is_empty() {
+        return AgedOcv::default();
+    }
+    let Some(keys) = electrodes else {
+        // The curve of the middle temperature stands for all.
+        let ocv_v = &tables.ocv_v[tables.temperature_c.len() / 2];
+        let shift = head.ocv_ageing_shift.unwrap_or(0.0);
+        return AgedOcv::of_shift(shift, &tables.soc, head.capacity_ah, |soc| interpolated(&tables.soc, ocv_v, soc));
+    };
+    if head.ocv_ageing_shift.is_some() {
+        head.place.fault(faults, "ocv_ageing_shift", "must not be given together with [electrodes]");
+    }
+    for (key, [empty, full], rises) in [
+        ("positive_content", ends(&keys.positive_content), false),
+        ("negative_content", ends(&keys.negative_content), true),
+    ] {
+        let count = if key == "positive_content" { keys.positive_content.len() } else { keys.negative_content.len() };
+        if count != 2 || empty == full || (full > empty) != rises {
+            let what =
+                format!("must be two numbers, empty and full, the {} first", if rises { "lower" } else { "higher" });
+            keys.place.fault(faults, key, &what);
+        }
+    }
+    if !faults.is_empty() {
+        return AgedOcv::default();
+    }
+    AgedOcv::of_electrodes(&keys.config(), &tables.soc, head.capacity_ah).unwrap_or_else(|| {
+        keys.place.note(faults, "positive_content", "these electrodes allow no aged cell");
+        AgedOcv::default()
+    })
+}
+
+fn interpolated(x: &[f64], y: &[f64], at: f64) -> f64 {
+    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
+    y[k] + (y[k + 1] - y[k]) * (at - x[k]) / (x[k + 1] - x[k])
+}
+
+fn model(
+    head: Head,
+    tables: Tables,
+    aged_ocv: AgedOcv,
+    branches: &[BranchTables],
+    thermal: Option<&ThermalKeys>,
+) -> CellModel {
     CellModel {
         name: head.name,
         rated_capacity_ah: head.rated_capacity_ah,
@@ -124,7 +225,7 @@ fn model(head: Head, tables: Tables, branches: &[BranchTables], thermal: Option<
         voltage_max_v: head.voltage_max_v,
         soc: tables.soc,
         temperature_c: tables.temperature_c,
-        ocv_ageing_shift: head.ocv_ageing_shift,
+        aged_ocv,
         ocv_v: Table { values: tables.ocv_v },
         r0_ohm: Table { values: tables.r0_ohm },
         branches: branches.iter().map(BranchTables::config).collect(),

@@ -2,7 +2,8 @@
 
 use std::fmt::Write as _;
 
-use super::{AGEING_SHIFT, FitOutcome, FitRequest};
+use super::{AGEING_SHIFT, FitOutcome, FitRequest, FittedElectrodes};
+use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
 
 /// Returns the whole file.
 pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
@@ -10,6 +11,9 @@ pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
     head(&mut out, request, outcome);
     provenance(&mut out, request, outcome);
     tables(&mut out, outcome);
+    if let Some(found) = &outcome.electrodes {
+        electrodes(&mut out, found);
+    }
     if let Some(thermal) = &outcome.thermal {
         line(&mut out, "\n[thermal]");
         line(&mut out, &format!("heat_capacity_j_per_k = {:.2}", thermal.heat_capacity_j_per_k));
@@ -33,11 +37,30 @@ fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     line(out, &format!("name = {}", quoted(&request.name)));
     line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
     line(out, &format!("capacity_ah = {:.4}", outcome.capacity_ah));
-    if let Some(shift) = request.ageing_shift.or(request.first_cycles.map(|_| AGEING_SHIFT)) {
+    let unknown = outcome.electrodes.is_none() && request.first_cycles.is_some();
+    if let Some(shift) = request.ageing_shift.or(unknown.then_some(AGEING_SHIFT)) {
         line(out, &format!("ocv_ageing_shift = {shift}"));
     }
     line(out, &format!("voltage_min_v = {}", outcome.voltage_v.0));
     line(out, &format!("voltage_max_v = {}", outcome.voltage_v.1));
+}
+
+fn electrodes(out: &mut String, found: &FittedElectrodes) {
+    let Electrodes { positive, negative, positive_content, negative_content } = found.electrodes;
+    let positive = PositiveMaterial::ALL.iter().find(|(material, _)| *material == positive).map_or("", |m| m.1);
+    let negative = NegativeMaterial::ALL.iter().find(|(material, _)| *material == negative).map_or("", |m| m.1);
+    line(
+        out,
+        &format!(
+            "\n# Fit the open-circuit curve within {:.1} mV. Contents: empty and full cell.",
+            1e3 * found.residual_v
+        ),
+    );
+    line(out, "[electrodes]");
+    line(out, &format!("positive = \"{positive}\"\nnegative = \"{negative}\""));
+    for (key, [empty, full]) in [("positive_content", positive_content), ("negative_content", negative_content)] {
+        line(out, &format!("{key} = [{empty:.4}, {full:.4}]"));
+    }
 }
 
 fn provenance(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {

@@ -348,6 +348,16 @@ impl FittedTables {
         rows.map(of_row).sum::<f64>() / self.grid.temperature_c.len() as f64
     }
 
+    /// Open-circuit voltage, V, of the temperature row nearest `temperature_c`.
+    pub fn ocv_v(&self, soc: f64, temperature_c: f64) -> f64 {
+        let distance = |t: usize| (self.grid.temperature_c[t] - temperature_c).abs();
+        let rows = 0..self.grid.temperature_c.len();
+        let row = rows.min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
+        let at = self.grid.place(soc, self.grid.temperature_c[row]);
+        let values = &self.tables.ocv_v[row * self.grid.soc.len()..][..self.grid.soc.len()];
+        values[at.s] + at.beyond_s * (values[at.s + 1] - values[at.s])
+    }
+
     /// The model's resistance once all branches have settled, ohm, at a place.
     pub fn settled_ohm(&self, place: &GridPoint) -> f64 {
         let corners = self.grid.resistance_corners(place);

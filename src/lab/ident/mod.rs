@@ -7,6 +7,7 @@
 
 pub mod ageing;
 pub mod anchor;
+pub mod electrodes;
 pub mod error_table;
 pub mod fit;
 pub mod grid;

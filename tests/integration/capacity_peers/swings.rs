@@ -98,12 +98,9 @@ pub(crate) fn charge_variance(config: &CapacityConfig, charge_ah: f64, duration_
 
 /// The SOC whose open-circuit voltage an aged cell shares with a new one at `new_soc`.
 fn aged_soc(model: &CellModel, new_soc: f64, capacity_ah: f64) -> f64 {
-    let (mut low, mut high) = (-0.5, 1.5);
-    for _ in 0..40 {
-        let middle = 0.5 * (low + high);
-        if model.ocv_soc(middle, capacity_ah) < new_soc { low = middle } else { high = middle }
-    }
-    0.5 * (low + high)
+    const ANY_C: f64 = 25.0;
+    let voltage_v = model.ocv_v(&model.grid_position(new_soc, ANY_C));
+    model.soc_of_aged_ocv(&model.temperature_position(ANY_C), capacity_ah, voltage_v)
 }
 
 /// Which readings make the ends.
@@ -220,7 +217,7 @@ impl Circuit {
         load_v += current_a * model.r0_ohm(&place) * resistance_ratio;
         let new_soc = model.soc_of_ocv(voltage_v + load_v, temperature_c);
         let volts = config.end_error_v.hypot(config.end_load_error * load_v).hypot(0.25 * VOLTAGE_NOISE_V);
-        let deviation = volts / model.ocv_slope_v(&model.grid_position(new_soc, temperature_c));
+        let deviation = volts / model.ocv_slope_v(&model.grid_position(new_soc, temperature_c), model.capacity_ah);
         self.last = Some(*reading);
         Point {
             time_s,

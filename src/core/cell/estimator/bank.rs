@@ -48,9 +48,9 @@ pub struct EstimatorBank {
 /// The filters of a pack, by number of branches.
 #[derive(Debug, Clone)]
 enum FilterArrays {
-    One(FilterArray<4, 10, 10>),
-    Two(FilterArray<5, 15, 14>),
-    Three(FilterArray<6, 21, 18>),
+    One(FilterArray<4, 10, 12>),
+    Two(FilterArray<5, 15, 16>),
+    Three(FilterArray<6, 21, 20>),
 }
 
 /// Runs an expression for the pack's number of branches.

@@ -89,7 +89,8 @@ impl CellEstimator {
             let guess = model.grid_position(0.5, temperature_c);
             let load_v =
                 model.r0_ohm(&guess) * libm::exp(self.memory.log_resistance.mean) * step.current_a.unwrap_or(0.0);
-            model.soc_of_ocv(step.voltage_v + load_v, temperature_c)
+            let temperature = model.temperature_position(temperature_c);
+            model.soc_of_aged_ocv(&temperature, self.memory.capacity.mean, step.voltage_v + load_v)
         });
         let soc = ScalarGaussian { mean: soc, variance: square(config.initial.soc_std).max(KNOWN_VARIANCE) };
         let branch_variance = square(config.initial.branch_std_v).max(KNOWN_VARIANCE);

@@ -21,7 +21,7 @@ use nalgebra::SMatrix;
 
 use super::filter::update;
 use super::noise::VoltageReading;
-use super::state_vector::{BRANCHES, LOG_RESISTANCE, square, widened};
+use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square, widened};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::CellModel;
 use crate::filter::{FilterError, Gaussian, Update};
@@ -45,7 +45,7 @@ pub(super) fn update_after_downtime<const N: usize>(
         * model.r0_ohm(&model.grid_position_at(&reading.temperature, before_soc))
         * libm::exp(x.mean[LOG_RESISTANCE]);
     let reach = 3.0_f64.sqrt() * downtime_std;
-    let soc = model.soc_of_ocv_at(&reading.temperature, reading.voltage_v + drop_v);
+    let soc = model.soc_of_aged_ocv(&reading.temperature, x.mean[CAPACITY], reading.voltage_v + drop_v);
     // Every SOC within reach is as likely: the prior is centred where the voltage is, so that the curve is linear there.
     used.mean[0] = soc.clamp(before_soc - reach, before_soc + reach);
     let by_used = update(&mut used, model, config, reading)?;

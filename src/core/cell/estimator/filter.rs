@@ -131,10 +131,11 @@ pub(super) fn update<const N: usize>(
     config: &EstimatorConfig,
     reading: &VoltageReading,
 ) -> Result<Update, FilterError> {
+    let segment = model.aged_ocv.segment(x.mean[CAPACITY]);
     let h = |x: &SVector<f64, N>| {
         let branches_v: f64 = (BRANCHES..N).fold(0.0, |sum, i| sum + x[i]);
         let state = (x[0], libm::exp(x[LOG_RESISTANCE]), x[CAPACITY]);
-        circuit::aged_terminal_v(model, state, &reading.temperature, branches_v, reading.current_a)
+        circuit::aged_terminal_v(model, state, segment, &reading.temperature, branches_v, reading.current_a)
     };
     x.update(&spread::<N>(config), reading.voltage_v, h, &reading.noise(x, model, config))
 }

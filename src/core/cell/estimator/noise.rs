@@ -11,7 +11,7 @@
 
 use nalgebra::SMatrix;
 
-use super::state_vector::{BRANCHES, LOG_RESISTANCE, square};
+use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square};
 use crate::cell::config::EstimatorConfig;
 use crate::cell::model::{CellModel, ERROR_WINDOW_S, GridPosition, TemperaturePosition};
 use crate::filter::{Gaussian, MeasurementNoise};
@@ -55,7 +55,7 @@ impl VoltageReading {
         config: &EstimatorConfig,
     ) -> MeasurementNoise {
         let position = model.grid_position_at(&self.temperature, x.mean[0]);
-        let slope_v = model.ocv_slope_v(&position);
+        let slope_v = model.ocv_slope_v(&position, x.mean[CAPACITY]);
         let ratio = libm::exp(x.mean[LOG_RESISTANCE]);
         let drop_v = (BRANCHES..N).fold(model.r0_ohm(&position) * ratio * self.current_a, |sum, i| sum + x.mean[i]);
         let load_v = model.settled_ohm(&position) * ratio * self.load_a;

@@ -64,7 +64,8 @@ impl Truth {
         let branch = BranchAt::new(model, 0, &position, self.ratio);
         self.branch_v = branch.voltage_after(Discretisation::Exact, self.branch_v, current_a, dt_s);
         self.soc = circuit::soc_after(self.soc, current_a * dt_s, self.capacity_ah);
-        let position = model.grid_position(self.soc, 25.0);
+        let state = (self.soc, self.ratio, self.capacity_ah);
+        let (segment, temperature) = (model.aged_ocv.segment(self.capacity_ah), model.temperature_position(25.0));
         CellStep {
             measured_s: dt_s,
             charge_as: current_a * dt_s,
@@ -72,7 +73,7 @@ impl Truth {
             current_a: Some(current_a),
             temperature_c: Some(25.0),
             ambient_c: 25.0,
-            voltage_v: circuit::terminal_v(model, &position, self.ratio, self.branch_v, current_a),
+            voltage_v: circuit::aged_terminal_v(model, state, segment, &temperature, self.branch_v, current_a),
         }
     }
 }

@@ -15,7 +15,7 @@ pub(crate) fn plain_model(capacity_ah: f64) -> CellModel {
         voltage_max_v: 4.2,
         soc: vec![0.0, 0.1, 0.5, 0.9, 1.0],
         temperature_c: vec![25.0],
-        ocv_ageing_shift: 0.0,
+        aged_ocv: crate::cell::AgedOcv::default(),
         ocv_v: Table { values: vec![vec![3.0, 3.45, 3.7, 4.08, 4.19]] },
         r0_ohm: flat(0.03 / k),
         branches: vec![Branch { r_ohm: flat(0.02 / k), c_farad: flat(2000.0 * k) }],

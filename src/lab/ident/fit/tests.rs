@@ -79,7 +79,7 @@ fn truth() -> CellModel {
         capacity_ah: CAPACITY_AH,
         voltage_min_v: 2.7,
         voltage_max_v: 4.2,
-        ocv_ageing_shift: 0.0,
+        aged_ocv: crate::cell::AgedOcv::default(),
         voltage_error_v: None,
         thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
     }

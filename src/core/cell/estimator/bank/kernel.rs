@@ -30,7 +30,7 @@ use update::update;
 
 use super::tables::{LineCache, Tables};
 use crate::cell::estimator::memory::REST_REPEATS_S;
-use crate::cell::estimator::state_vector::LOG_RESISTANCE;
+use crate::cell::estimator::state_vector::{CAPACITY, LOG_RESISTANCE};
 use crate::filter::simd::Lanes;
 
 /// One ordinary step.
@@ -46,6 +46,7 @@ pub(super) fn step<const L: usize, const N: usize, const T: usize, const W: usiz
     let ratio = before.mean[LOG_RESISTANCE].exp();
     let (mean, covariance, has_factor) = predict(tables, cache, c, before, input, ratio);
     let mut x = FilterState { mean, covariance, memory: before.memory };
+    tables.refresh_capacities(cache, &x.mean[CAPACITY]);
     let information_s = update_memory(c, &mut x, input);
     let mut outcome = update(tables, cache, c, &mut x, input, ratio, information_s);
     x.memory[INFORMATION_S] = Lanes::splat(0.0);

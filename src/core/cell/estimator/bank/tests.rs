@@ -1,11 +1,11 @@
 //! The kernel against the readable filter, and a cell in a pack against the same cell alone.
 
 use super::*;
-use crate::cell::Table;
 use crate::cell::circuit::{self, BranchAt};
 use crate::cell::config::{CapacityState, Discretisation, SigmaPointSettings};
 use crate::cell::estimator::tests::config;
 use crate::cell::model::tests::small_model;
+use crate::cell::{AgedOcv, Table};
 
 /// A generator of numbers in [0, 1) with a fixed seed.
 struct Dice(u64);
@@ -86,7 +86,8 @@ impl Pack {
         let state = (cell.soc, cell.ratio, cell.capacity_ah);
         let branches_v = cell.branch_v.iter().sum();
         let temperature = self.model.temperature_position(temperature_c);
-        let truth_v = circuit::aged_terminal_v(&self.model, state, &temperature, branches_v, current_a);
+        let segment = self.model.aged_ocv.segment(state.2);
+        let truth_v = circuit::aged_terminal_v(&self.model, state, segment, &temperature, branches_v, current_a);
         let outlier_v = if dice.roll() < 1e-3 { 0.8 } else { 0.0 };
         let lost = time % 4000 > 3900 && index == 1;
         let step = CellStep {
@@ -173,7 +174,11 @@ fn soc_agrees_with_the_readable_filter_within_1e_9_over_100_000_steps() {
 #[test]
 fn every_setting_that_changes_the_filter_changes_the_kernel() {
     let plain = model(2);
-    let aged = CellModel { ocv_ageing_shift: 0.6, ..plain.clone() };
+    let aged = {
+        let new_v = |soc: f64| plain.ocv_v(&plain.grid_position(soc, 25.0));
+        let aged_ocv = AgedOcv::of_shift(0.6, &plain.soc, plain.capacity_ah, new_v);
+        CellModel { aged_ocv, ..plain.clone() }
+    };
     let own_error =
         CellModel { voltage_error_v: Some(Table { values: vec![vec![0.01, 0.004, 0.02]; 2] }), ..plain.clone() };
     let one_temperature = {

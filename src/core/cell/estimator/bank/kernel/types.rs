@@ -109,8 +109,6 @@ pub(in crate::cell::estimator::bank) struct KernelConstants {
     pub(super) load_memory_s: f64,
     pub(super) max_information_s: f64,
     pub(super) consistency_window_s: f64,
-    pub(super) ocv_ageing_shift: f64,
-    pub(super) new_capacity_ah: f64,
 }
 
 /// Variances that the states gain.
@@ -165,8 +163,6 @@ impl KernelConstants {
             load_memory_s: config.voltage.load_memory_s,
             max_information_s: config.voltage.max_information_s,
             consistency_window_s: config.consistency.window_s,
-            ocv_ageing_shift: model.ocv_ageing_shift,
-            new_capacity_ah: model.capacity_ah,
         }
     }
 }

@@ -37,18 +37,14 @@ impl<const L: usize> PredictedVoltage<L> {
         l: &[[Lanes<L>; N]; COLUMNS],
         ratio: Lanes<L>,
     ) -> Self {
-        let reach = l[0][0] * c.scale;
-        let mut parts = OddEvenParts::NONE;
-        let aged = (c.ocv_ageing_shift != 0.0).then(|| aged_voltages(tables, cache, c, x, l, &mut parts));
+        let (reach, capacity_ah) = (l[0][0] * c.scale, x.mean[CAPACITY]);
+        let reach_ah = l[0][CAPACITY] * c.scale;
         let table_points = tables.table_points(cache, x.mean[0], reach);
         let ratios = ResistanceRatios::new(c, l);
-        let (mut ocv_v, slope_v, r0_ohm) = table_points[0].ocv_and_r0();
-        let (plus_v, _, plus_ohm) = table_points[1].ocv_and_r0();
-        let (minus_v, _, minus_ohm) = table_points[2].ocv_and_r0();
-        let mut side_v = [plus_v, minus_v];
-        if let Some(aged) = aged {
-            (ocv_v, side_v) = aged;
-        }
+        let (ocv_v, slope_v, r0_ohm) = table_points[0].ocv_and_r0(capacity_ah);
+        let (plus_v, _, plus_ohm) = table_points[1].ocv_and_r0(capacity_ah + reach_ah);
+        let (minus_v, _, minus_ohm) = table_points[2].ocv_and_r0(capacity_ah - reach_ah);
+        let per_ah_v = table_points[0].ocv_per_ah();
         let mut settled_ohm = r0_ohm;
         let mut branches_v = Lanes::splat(0.0);
         let mut branches = [Lanes::splat(0.0); COLUMNS];
@@ -61,13 +57,14 @@ impl<const L: usize> PredictedVoltage<L> {
         }
         let drop_v = r0_ohm * ratio * input.current_a;
         let centre_v = ocv_v - branches_v - drop_v;
-        let plus = side_v[0] - plus_ohm * ratio * ratios.first[0] * input.current_a;
-        let minus = side_v[1] - minus_ohm * ratio * ratios.first[1] * input.current_a;
+        let plus = plus_v - plus_ohm * ratio * ratios.first[0] * input.current_a;
+        let minus = minus_v - minus_ohm * ratio * ratios.first[1] * input.current_a;
+        let mut parts = OddEvenParts::NONE;
         parts.put(c, 0, plus, minus, centre_v + branches_v);
         parts.odd[0] = parts.odd[0] - branches[0];
-        parts.odd[1] = parts.odd[1] - branches[1] - drop_v * ratios.second[0];
-        parts.even[1] = parts.even[1] - drop_v * ratios.second[1];
-        parts.odd[2] = parts.odd[2] - branches[2];
+        parts.odd[1] = per_ah_v * l[1][CAPACITY] - branches[1] - drop_v * ratios.second[0];
+        parts.even[1] = -(drop_v * ratios.second[1]);
+        parts.odd[2] = per_ah_v * l[2][CAPACITY] - branches[2];
         let base_variance = if tables.has_error() {
             table_points[0].one(ERROR_V).square() * ERROR_WINDOW_S
         } else {
@@ -75,40 +72,6 @@ impl<const L: usize> PredictedVoltage<L> {
         };
         Self { centre_v, parts, slope_v, lost_v: drop_v + branches_v, base_variance, settled_ohm }
     }
-}
-
-/// Open-circuit voltages of aged cells at the centre and the first pair, V; sets the parts of the other pairs, which differ
-/// in capacity.
-#[inline(always)]
-fn aged_voltages<const L: usize, const N: usize, const T: usize, const W: usize>(
-    tables: &mut Tables<W>,
-    cache: &LineCache<L, W>,
-    c: &KernelConstants,
-    x: &FilterState<L, N, T>,
-    l: &[[Lanes<L>; N]; COLUMNS],
-    parts: &mut OddEvenParts<L>,
-) -> (Lanes<L>, [Lanes<L>; 2]) {
-    let (soc, capacity) = (x.mean[0], x.mean[CAPACITY]);
-    let reach = l[0][0] * c.scale;
-    let reach_ah = [l[0][CAPACITY] * c.scale, l[1][CAPACITY] * c.scale, l[2][CAPACITY] * c.scale];
-    let places = [
-        (soc, capacity),
-        (soc + reach, capacity + reach_ah[0]),
-        (soc - reach, capacity - reach_ah[0]),
-        (soc, capacity + reach_ah[1]),
-        (soc, capacity - reach_ah[1]),
-        (soc, capacity + reach_ah[2]),
-        (soc, capacity - reach_ah[2]),
-    ];
-    // A loop instead of seven copies of the look-up: few models have an ageing shift.
-    let mut voltages = [Lanes::splat(0.0); 7];
-    for (voltage, (soc, capacity_ah)) in voltages.iter_mut().zip(places) {
-        *voltage = aged_ocv_v(tables, cache, c, soc, capacity_ah);
-    }
-    let [centre_v, plus, minus, plus_1, minus_1, plus_2, minus_2] = voltages;
-    parts.put(c, 1, plus_1, minus_1, centre_v);
-    parts.put(c, 2, plus_2, minus_2, centre_v);
-    (centre_v, [plus, minus])
 }
 
 /// The measurement update. Moves `x` in every lane; the outcome marks the usable ones.
@@ -167,20 +130,4 @@ pub(super) fn update<const L: usize, const N: usize, const T: usize, const W: us
     }
     let is_usable = is_positive & total.above_number(0.0) & !test_ratio.above_number(c.reading.gate_limit);
     StepOutcome { is_usable, innovation_v, innovation_variance: total, test_ratio }
-}
-
-/// Open-circuit voltage of a cell that has aged to a capacity, V, see [`crate::cell::CellModel::ocv_soc`].
-#[inline(always)]
-fn aged_ocv_v<const L: usize, const W: usize>(
-    tables: &mut Tables<W>,
-    cache: &LineCache<L, W>,
-    c: &KernelConstants,
-    soc: Lanes<L>,
-    capacity_ah: Lanes<L>,
-) -> Lanes<L> {
-    let one = Lanes::splat(1.0);
-    let lost = (one - capacity_ah / c.new_capacity_ah) * c.ocv_ageing_shift;
-    let inside = soc.at_least(0.0).at_most(1.0);
-    let soc = soc + lost.at_least(-0.9).at_most(0.9) * inside * (one - inside);
-    tables.ocv_v(cache, &soc)
 }

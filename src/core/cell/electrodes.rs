@@ -1,0 +1,342 @@
+//! The two electrodes of a cell: open-circuit voltage as the difference of two half-cell potentials, new and aged.
+//!
+//! V(z) = U_p(y) - U_n(x): x and y are the lithium contents (stoichiometry, 0 to 1) of the negative and the positive
+//! electrode, both linear in the charge. With the electrodes' capacities Q_n, Q_p and the cyclable lithium n, all relative
+//! to the new cell's capacity: Q_p y + Q_n x = n. A cell is full and empty where V reaches the voltages at which it was
+//! when new; its capacity is Q_n (x_full - x_empty).
+//!
+//! An ageing cell loses lithium (n falls) and active material of either electrode (Q_n, Q_p fall): Birkl et al., J. Power
+//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. Which lithium the lost material takes along
+//! need not be known: it moves n alone, and n follows from the capacity.
+//!
+//! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
+//! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve.
+
+use super::model::falling_crossing;
+
+/// Smallest distance of a lithium content from 0 and 1, where the half-cell functions diverge.
+const EDGE: f64 = 1e-4;
+
+/// Least and greatest cyclable lithium in the search for a capacity, relative to the new cell's.
+const LITHIUM_RANGE: (f64, f64) = (0.05, 1.2);
+
+/// Half-cell potential of a positive electrode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PositiveMaterial {
+    /// LiNi0.8Mn0.1Co0.1O2: Chen et al., J. Electrochem. Soc. 167 (2020) 080534.
+    Nmc811,
+    /// LiNi0.5Mn0.3Co0.2O2: Mohtat et al., J. Electrochem. Soc. 167 (2020) 110561.
+    Nmc532,
+    /// LiNiCoAlO2: Kim et al., J. Electrochem. Soc. 158 (2011) A955.
+    Nca,
+    /// LiNiCoO2: Ecker et al., J. Electrochem. Soc. 162 (2015) A1836.
+    Nco,
+    /// LiCoO2: Doyle, thesis, Berkeley 1995, as in Newman's Dualfoil.
+    Lco,
+    /// LiMn2O4: Doyle et al., J. Electrochem. Soc. 143 (1996) 1890.
+    Lmo,
+    /// LiFePO4: Afshar et al., arXiv 1709.03970 (2017).
+    Lfp,
+}
+
+/// Half-cell potential of a negative electrode.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NegativeMaterial {
+    /// Graphite with silicon oxide: Chen et al., J. Electrochem. Soc. 167 (2020) 080534.
+    GraphiteSiox,
+    /// Graphite: Ecker et al., J. Electrochem. Soc. 162 (2015) A1836.
+    Graphite,
+    /// Graphite with sharp stages: Mohtat et al., J. Electrochem. Soc. 167 (2020) 110561.
+    GraphiteStaged,
+    /// Mesocarbon microbeads: Newman's Dualfoil.
+    Mcmb,
+}
+
+impl PositiveMaterial {
+    /// Every material, with its name in a cell model.
+    pub const ALL: [(Self, &'static str); 7] = [
+        (Self::Nmc811, "nmc811"),
+        (Self::Nmc532, "nmc532"),
+        (Self::Nca, "nca"),
+        (Self::Nco, "nco"),
+        (Self::Lco, "lco"),
+        (Self::Lmo, "lmo"),
+        (Self::Lfp, "lfp"),
+    ];
+
+    /// Potential against lithium, V, at a lithium content.
+    pub fn potential_v(self, y: f64) -> f64 {
+        use libm::{exp, pow, tanh};
+        match self {
+            Self::Nmc811 => {
+                -0.8090 * y + 4.4875 - 0.0428 * tanh(18.5138 * (y - 0.5542)) - 17.7326 * tanh(15.7890 * (y - 0.3117))
+                    + 17.5842 * tanh(15.9308 * (y - 0.3120))
+            }
+            Self::Nmc532 => {
+                polynomial(&[4.3452, -1.6518, 1.6225, -2.0843, 3.5146, -2.2166], y)
+                    - 0.5623e-4 * exp(109.451 * y - 100.006)
+            }
+            Self::Nca => {
+                let shape =
+                    [11.8058, -66.3691, 264.427, -554.774, 621.3475, -344.566, 81.246, -23.488, 15.056, -2.222, 1.638];
+                polynomial(&shape, y) - 0.61386 * exp(5.8201 * pow(y, 136.4))
+            }
+            Self::Nco => {
+                -2.35211 * y - 0.0747061 * tanh(31.886 * (y - 0.0219921)) + 6.34984 * tanh(2.66395 * (y - 0.174352))
+                    - 0.640243 * tanh(5.48623 * (y - 0.439245))
+                    - 3.82383 * tanh(4.12167 * (y - 0.176187))
+                    - 0.0542123 * tanh(18.2919 * (y - 0.762272))
+                    + 4.23285
+            }
+            Self::Lco => {
+                let y = 1.062 * y;
+                2.16216 + 0.07645 * tanh(30.834 - 54.4806 * y) + 2.1581 * tanh(52.294 - 50.294 * y)
+                    - 0.14169 * tanh(11.0923 - 19.8543 * y)
+                    + 0.2051 * tanh(1.4684 - 5.4888 * y)
+                    + 0.2531 * tanh((0.56478 - y) / 0.1316)
+                    - 0.02167 * tanh((y - 0.525) / 0.006)
+            }
+            Self::Lmo => {
+                let near_full = (0.998_432 - y).max(EDGE);
+                4.19829 + 0.0565661 * tanh(8.60942 - 14.5546 * y)
+                    - 0.0275479 * (pow(near_full, -0.492465) - 1.90111)
+                    - 0.157123 * exp(-0.04738 * pow(y, 8.0))
+                    + 0.810239 * exp(-40.0 * (y - 0.133875))
+            }
+            Self::Lfp => 3.4077 - 0.020269 * y + 0.5 * exp(-150.0 * y) - 0.9 * exp(-30.0 * (1.0 - y)),
+        }
+    }
+}
+
+impl NegativeMaterial {
+    /// Every material, with its name in a cell model.
+    pub const ALL: [(Self, &'static str); 4] = [
+        (Self::GraphiteSiox, "graphite_siox"),
+        (Self::Graphite, "graphite"),
+        (Self::GraphiteStaged, "graphite_staged"),
+        (Self::Mcmb, "mcmb"),
+    ];
+
+    /// Potential against lithium, V, at a lithium content.
+    pub fn potential_v(self, x: f64) -> f64 {
+        use libm::{exp, tanh};
+        match self {
+            Self::GraphiteSiox => {
+                1.9793 * exp(-39.3631 * x) + 0.2482
+                    - 0.0909 * tanh(29.8538 * (x - 0.1234))
+                    - 0.04478 * tanh(14.9159 * (x - 0.2769))
+                    - 0.0205 * tanh(30.4444 * (x - 0.6103))
+            }
+            Self::Graphite => {
+                0.716502 * exp(-369.028 * x) + 0.12193 * exp(-35.6478 * (x - 0.0530947))
+                    - 0.0189193 * tanh(21.1967 * (x - 0.196176))
+                    - 0.0169644 * tanh(27.1365 * (x - 0.312832))
+                    - 0.0199313 * tanh(28.5697 * (x - 0.614221))
+                    - 0.931153 * exp(36.328 * (x - 1.10743))
+                    + 0.140031
+            }
+            Self::GraphiteStaged => {
+                0.063 + 0.8 * exp(-75.0 * (x + 0.001))
+                    - 0.0120 * tanh((x - 0.127) / 0.016)
+                    - 0.0118 * tanh((x - 0.155) / 0.016)
+                    - 0.0035 * tanh((x - 0.220) / 0.020)
+                    - 0.0095 * tanh((x - 0.190) / 0.013)
+                    - 0.0145 * tanh((x - 0.490) / 0.020)
+                    - 0.0800 * tanh((x - 1.030) / 0.055)
+            }
+            Self::Mcmb => {
+                0.194 + 1.5 * exp(-120.0 * x) + 0.0351 * tanh((x - 0.286) / 0.083)
+                    - 0.0045 * tanh((x - 0.849) / 0.119)
+                    - 0.035 * tanh((x - 0.9233) / 0.05)
+                    - 0.0147 * tanh((x - 0.5) / 0.034)
+                    - 0.102 * tanh((x - 0.194) / 0.142)
+                    - 0.022 * tanh((x - 0.9) / 0.0164)
+                    - 0.011 * tanh((x - 0.124) / 0.0226)
+                    + 0.0155 * tanh((x - 0.105) / 0.029)
+            }
+        }
+    }
+}
+
+fn polynomial(coefficients: &[f64], x: f64) -> f64 {
+    coefficients.iter().rev().fold(0.0, |sum, c| sum * x + c)
+}
+
+/// The electrodes of a new cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Electrodes {
+    /// Positive material.
+    pub positive: PositiveMaterial,
+    /// Negative material.
+    pub negative: NegativeMaterial,
+    /// Lithium content of the positive electrode of the empty and of the full cell; falls.
+    pub positive_content: [f64; 2],
+    /// Lithium content of the negative electrode of the empty and of the full cell; rises.
+    pub negative_content: [f64; 2],
+}
+
+/// Active material lost, as a fraction of the new electrode's.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LostMaterial {
+    /// Of the negative electrode.
+    pub negative: f64,
+    /// Of the positive electrode.
+    pub positive: f64,
+}
+
+/// An aged cell of these electrodes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AgedElectrodes {
+    electrodes: Electrodes,
+    negative_capacity: f64,
+    positive_capacity: f64,
+    lithium: f64,
+    /// Lithium content of the negative electrode, empty and full.
+    negative_content: [f64; 2],
+}
+
+impl Electrodes {
+    /// Open-circuit voltage of the new cell, V.
+    pub fn voltage_v(&self, soc: f64) -> f64 {
+        let between = |[empty, full]: [f64; 2]| (empty + soc * (full - empty)).clamp(EDGE, 1.0 - EDGE);
+        self.positive.potential_v(between(self.positive_content))
+            - self.negative.potential_v(between(self.negative_content))
+    }
+
+    /// Capacities of the new electrodes, negative and positive, and cyclable lithium, relative to the cell's capacity.
+    fn new_contents(&self) -> [f64; 3] {
+        let negative = 1.0 / (self.negative_content[1] - self.negative_content[0]);
+        let positive = 1.0 / (self.positive_content[0] - self.positive_content[1]);
+        [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
+    }
+
+    /// The cell that has lost this material and so much lithium that this part of the capacity is left; `None` when there
+    /// is no such cell.
+    pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
+        let [negative, positive, new_lithium] = self.new_contents();
+        let cell = |lithium: f64| {
+            let mut cell = AgedElectrodes {
+                electrodes: *self,
+                negative_capacity: negative * (1.0 - lost.negative),
+                positive_capacity: positive * (1.0 - lost.positive),
+                lithium,
+                negative_content: [0.0; 2],
+            };
+            cell.negative_content = [0.0, 1.0].map(|soc| cell.content_at(self.voltage_v(soc)));
+            cell
+        };
+        let least = LITHIUM_RANGE.0 * new_lithium;
+        // More lithium than the electrodes hold at their best balance lowers the capacity again.
+        let most = most_capable(least, LITHIUM_RANGE.1 * new_lithium, |lithium| cell(lithium).capacity());
+        let found = cell(falling_crossing(least, most, |lithium| capacity - cell(lithium).capacity()));
+        ((found.capacity() - capacity).abs() < 1e-6).then_some(found)
+    }
+}
+
+/// Where a function with one maximum between `low` and `high` has it, by golden section.
+fn most_capable(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
+    const GOLDEN: f64 = 0.618_033_988_749_894_8;
+    for _ in 0..40 {
+        let (a, b) = (high - GOLDEN * (high - low), low + GOLDEN * (high - low));
+        if f(a) < f(b) { low = a } else { high = b }
+    }
+    0.5 * (low + high)
+}
+
+impl AgedElectrodes {
+    /// Voltage at a lithium content of the negative electrode, V; rises with it.
+    fn voltage_at(&self, x: f64) -> f64 {
+        let y = (self.lithium - self.negative_capacity * x) / self.positive_capacity;
+        let inside = |content: f64| content.clamp(EDGE, 1.0 - EDGE);
+        self.electrodes.positive.potential_v(inside(y)) - self.electrodes.negative.potential_v(inside(x))
+    }
+
+    /// Lithium content of the negative electrode at which the cell has this voltage.
+    fn content_at(&self, voltage_v: f64) -> f64 {
+        let low = ((self.lithium - self.positive_capacity) / self.negative_capacity).max(EDGE);
+        let high = (self.lithium / self.negative_capacity).min(1.0 - EDGE);
+        falling_crossing(low, high, |x| voltage_v - self.voltage_at(x))
+    }
+
+    /// Capacity relative to the new cell's.
+    pub fn capacity(&self) -> f64 {
+        self.negative_capacity * (self.negative_content[1] - self.negative_content[0])
+    }
+
+    /// Open-circuit voltage, V.
+    pub fn voltage_v(&self, soc: f64) -> f64 {
+        let [empty, full] = self.negative_content;
+        self.voltage_at(empty + soc * (full - empty))
+    }
+
+    /// Cyclable lithium lost, as a fraction of the new cell's.
+    pub fn lithium_lost(&self) -> f64 {
+        1.0 - self.lithium / self.electrodes.new_contents()[2]
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// The LG M50 of Chen et al. (2020), as fitted to its slow discharge.
+    pub(crate) const M50: Electrodes = Electrodes {
+        positive: PositiveMaterial::Nmc811,
+        negative: NegativeMaterial::GraphiteSiox,
+        positive_content: [0.8531, 0.2679],
+        negative_content: [0.0335, 0.9107],
+    };
+
+    #[test]
+    fn materials_fall_with_their_lithium_content() {
+        // Functions fitted to measurements rise by a few millivolts somewhere.
+        let falls = |potential_v: &dyn Fn(f64) -> f64| {
+            (1..=90).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
+        };
+        assert!(NegativeMaterial::ALL.iter().all(|(material, _)| falls(&|x| material.potential_v(x))));
+        // The polynomial of NCA holds from 0.3 on, the function of LCO from 0.4 on.
+        for (material, from) in PositiveMaterial::ALL.map(|(material, _)| match material {
+            PositiveMaterial::Nca => (material, 0.3),
+            PositiveMaterial::Lco => (material, 0.42),
+            _ => (material, 0.15),
+        }) {
+            assert!(falls(&|y| material.potential_v(y.max(from))), "{material:?}");
+        }
+    }
+
+    #[test]
+    fn an_unaged_cell_is_the_new_one() {
+        let same = M50.aged(LostMaterial::default(), 1.0).expect("a cell");
+        assert!(same.lithium_lost().abs() < 1e-6, "{same:?}");
+        for k in 0..=20 {
+            let soc = f64::from(k) / 20.0;
+            assert!((same.voltage_v(soc) - M50.voltage_v(soc)).abs() < 1e-6, "{soc}");
+        }
+    }
+
+    #[test]
+    fn proportional_loss_of_everything_keeps_the_curve() {
+        let lost = LostMaterial { negative: 0.2, positive: 0.2 };
+        let aged = M50.aged(lost, 0.8).expect("a cell");
+        assert!((aged.lithium_lost() - 0.2).abs() < 1e-6, "{aged:?}");
+        assert!((0..=10).map(|k| 0.1 * f64::from(k)).all(|z| (aged.voltage_v(z) - M50.voltage_v(z)).abs() < 1e-6));
+    }
+
+    #[test]
+    fn lost_lithium_alone_slides_the_electrodes_and_keeps_both_ends() {
+        let aged = M50.aged(LostMaterial::default(), 0.8).expect("a cell");
+        assert!((aged.capacity() - 0.8).abs() < 1e-6);
+        for end in [0.0, 1.0] {
+            assert!((aged.voltage_v(end) - M50.voltage_v(end)).abs() < 1e-6);
+        }
+        // The graphite's last stage comes at a lower SOC; the positive electrode is emptier all along.
+        assert!(aged.voltage_v(0.5) - M50.voltage_v(0.5) > 0.03, "{}", aged.voltage_v(0.5) - M50.voltage_v(0.5));
+        assert!((0..100).all(|k| aged.voltage_v(0.01 * f64::from(k + 1)) > aged.voltage_v(0.01 * f64::from(k))));
+    }
+
+    #[test]
+    fn a_loss_that_leaves_no_such_cell_has_no_curve() {
+        assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
+        assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
+    }
+}

@@ -1,0 +1,127 @@
+//! Finds the electrodes of a new cell in its open-circuit curve: materials and lithium contents at empty and at full.
+//!
+//! In: OCV, V, over SOC, fraction. Out: the pair of materials that fits best, with its residual, V. Each pair is fitted by
+//! damped Gauss-Newton steps over the four contents, with a weak prior of what commercial cells have: a curve without
+//! stages leaves the size of an electrode open. Lee et al., J. Electrochem. Soc. 167 (2020) 090509, on what can be identified.
+
+use nalgebra::{Matrix4, Vector4};
+
+use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
+
+/// Points of the curve that are compared.
+const POINTS: u32 = 51;
+/// Deviation of a half-cell potential from a cell's own, V: materials of one name differ.
+const MATERIAL_V: f64 = 0.01;
+/// The same below [`LOW_SOC`], where curves fall steeply.
+const LOW_SOC_V: f64 = 0.03;
+const LOW_SOC: f64 = 0.05;
+/// Mean and standard deviation of the contents [negative empty, negative full, positive empty, positive full].
+const PRIOR: [(f64, f64); 4] = [(0.02, 0.03), (0.88, 0.12), (0.92, 0.10), (0.32, 0.12)];
+/// Bounds of the same contents.
+const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (0.005, 0.6)];
+/// Steps of the fit; it settles within 20.
+const STEPS: usize = 60;
+/// Residual above which no pair is accepted, V: the library does not have the cell's materials.
+pub const MAX_RESIDUAL_V: f64 = 0.025;
+
+/// The electrodes found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FittedElectrodes {
+    /// Materials and contents.
+    pub electrodes: Electrodes,
+    /// Root mean square of the residual above [`LOW_SOC`], V.
+    pub residual_v: f64,
+}
+
+/// The pair of materials that fits a curve best; `None` when none fits within [`MAX_RESIDUAL_V`].
+pub fn identify(ocv_v: impl Fn(f64) -> f64) -> Option<FittedElectrodes> {
+    let curve: Vec<(f64, f64)> =
+        (0..POINTS).map(|k| f64::from(k) / f64::from(POINTS - 1)).map(|soc| (soc, ocv_v(soc))).collect();
+    let pairs = PositiveMaterial::ALL.iter().flat_map(|p| NegativeMaterial::ALL.iter().map(move |n| (p.0, n.0)));
+    let fits = pairs.map(|pair| fit_pair(&curve, pair));
+    let (electrodes, _) = fits.min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let inner: Vec<f64> = curve
+        .iter()
+        .filter(|(soc, _)| *soc >= LOW_SOC)
+        .map(|&(soc, v)| (v - electrodes.voltage_v(soc)).powi(2))
+        .collect();
+    let residual_v = (inner.iter().sum::<f64>() / inner.len() as f64).sqrt();
+    (residual_v <= MAX_RESIDUAL_V).then_some(FittedElectrodes { electrodes, residual_v })
+}
+
+fn electrodes((positive, negative): (PositiveMaterial, NegativeMaterial), contents: &Vector4<f64>) -> Electrodes {
+    Electrodes {
+        positive,
+        negative,
+        positive_content: [contents[2], contents[3]],
+        negative_content: [contents[0], contents[1]],
+    }
+}
+
+/// The best contents of a pair, and its cost.
+fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) -> (Electrodes, f64) {
+    let residuals = |x: &Vector4<f64>| {
+        let cell = electrodes(pair, x);
+        let volts = curve
+            .iter()
+            .map(move |&(soc, v)| (v - cell.voltage_v(soc)) / if soc < LOW_SOC { LOW_SOC_V } else { MATERIAL_V });
+        let prior = PRIOR.iter().zip(x.iter()).map(|((mean, std), x)| (mean - x) / std).collect::<Vec<f64>>();
+        volts.chain(prior).collect::<Vec<f64>>()
+    };
+    let cost = |r: &[f64]| r.iter().map(|r| r * r).sum::<f64>();
+    let mut x = Vector4::from(PRIOR.map(|(mean, _)| mean));
+    let mut r = residuals(&x);
+    let mut damping = 1e-2;
+    for _ in 0..STEPS {
+        let columns: Vec<Vec<f64>> = (0..4)
+            .map(|k| {
+                let step = 1e-5;
+                let mut moved = x;
+                moved[k] += step;
+                residuals(&moved).iter().zip(&r).map(|(a, b)| (a - b) / step).collect()
+            })
+            .collect();
+        let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let normal = Matrix4::from_fn(|i, j| dot(&columns[i], &columns[j]) * if i == j { 1.0 + damping } else { 1.0 });
+        let gradient = Vector4::from_fn(|i, _| dot(&columns[i], &r));
+        let Some(inverse) = normal.try_inverse() else { break };
+        let mut next = x - inverse * gradient;
+        next.iter_mut().zip(BOUNDS).for_each(|(x, (low, high))| *x = x.clamp(low, high));
+        let trial = residuals(&next);
+        if cost(&trial) < cost(&r) {
+            (x, r) = (next, trial);
+            damping = (damping * 0.3_f64).max(1e-9);
+        } else {
+            damping *= 10.0;
+        }
+    }
+    (electrodes(pair, &x), cost(&r))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cells_own_materials_and_contents_are_found() {
+        for (positive, _) in PositiveMaterial::ALL.into_iter().filter(|(p, _)| *p != PositiveMaterial::Lfp) {
+            let cell = Electrodes {
+                positive,
+                negative: NegativeMaterial::GraphiteSiox,
+                positive_content: [0.9, 0.45],
+                negative_content: [0.03, 0.85],
+            };
+            let found = identify(|soc| cell.voltage_v(soc)).expect("a fit");
+            let FittedElectrodes { electrodes, residual_v } = found;
+            assert_eq!((electrodes.positive, electrodes.negative), (positive, cell.negative), "{found:?}");
+            assert!(residual_v < 1e-3, "{found:?}");
+            assert!((electrodes.negative_content[1] - 0.85).abs() < 0.02, "{found:?}");
+            assert!((electrodes.positive_content[1] - 0.45).abs() < 0.02, "{found:?}");
+        }
+    }
+
+    #[test]
+    fn a_curve_of_no_known_materials_has_no_electrodes() {
+        assert_eq!(identify(|soc| 2.0 + 2.2 * soc), None);
+    }
+}
