@@ -20,8 +20,8 @@ use crate::cell::Thermal;
 use crate::error::LabError;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
-use crate::ident::fit::{FitSettings, FittedTables, Residual};
-use crate::ident::grid::Grid;
+use crate::ident::fit::{FitSettings, FittedTables, OcvCurve, Residual};
+use crate::ident::grid::{Grid, interpolate};
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{error_table, fit, thermal};
@@ -33,8 +33,16 @@ const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// SOC breakpoints where slow tests give the OCV's shape.
+/// First SOC breakpoints where slow tests give the OCV's shape; more are put where that bends ([`curvature_nodes`]).
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
+/// Largest error of the SOC read from the interpolated OCV of a slow test, fraction: below the noise of good sensors.
+const NODE_ERROR_SOC: f64 = 0.003;
+/// Error of the voltage below which no breakpoint is added, V: below a good sensor's step.
+const NODE_ERROR_V: f64 = 0.001;
+/// Most SOC breakpoints.
+const MAX_NODES: usize = 41;
+/// Least distance of SOC breakpoints.
+const NODE_GAP: f64 = 0.01;
 /// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
@@ -152,10 +160,9 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let by_kind = request.first_cycles.map(|_| prepared.by_kind(&records, &fitted));
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
-    let electrodes = match request.ageing_shift {
-        Some(_) => None,
-        None => electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)),
-    };
+    // The curve of full discharges under load is too coarse.
+    let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
+    let electrodes = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
     let mut outcome = FitOutcome {
         electrodes,
         capacity_ah: prepared.capacity_ah,
@@ -207,14 +214,13 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
         (None, branches) => TAU_S[branches.unwrap_or(if ageing { 1 } else { 2 }) - 1].to_vec(),
     };
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
-    let slow_test = !prepared.ocv.is_empty();
-    let (default_soc, deviations): (&[f64], _) = match (ageing, slow_test) {
-        (true, _) => (&AGEING_SOC_NODES, PriorDeviations::AGEING),
-        (false, true) => (&SLOW_TEST_SOC_NODES, PriorDeviations::SLOW_TEST),
-        (false, false) => (&SOC_NODES, PriorDeviations::FREE_OCV),
+    let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
+        (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
+        (false, Some(test)) => (curvature_nodes(test), PriorDeviations::SLOW_TEST),
+        (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
     Ok(FitSettings {
-        grid: Grid { soc: request.soc.clone().unwrap_or_else(|| default_soc.to_vec()), temperature_c },
+        grid: Grid { soc: request.soc.clone().unwrap_or(default_soc), temperature_c },
         tau_s,
         voltage_v: prepared.voltage_v,
         ocv: prepared.ocv.clone(),
@@ -222,6 +228,27 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
         empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
         deviations,
     })
+}
+
+/// SOC breakpoints between which the curve of a slow test is straight: one after the other where the SOC read from the
+/// interpolated curve errs most.
+fn curvature_nodes(test: &OcvCurve) -> Vec<f64> {
+    let mut nodes = SLOW_TEST_SOC_NODES.to_vec();
+    let ocv_v = |soc: f64| interpolate(&test.soc, &test.voltage_v, soc);
+    while nodes.len() < MAX_NODES {
+        let worst = (1..100).map(|k| f64::from(k) / 100.0).filter_map(|soc| {
+            let s = nodes.partition_point(|&node| node <= soc) - 1;
+            let (from, to) = (nodes[s], nodes[s + 1]);
+            let (from_v, to_v) = (ocv_v(from), ocv_v(to));
+            let error_v = (ocv_v(soc) - from_v - (to_v - from_v) * (soc - from) / (to - from)).abs();
+            let error_soc = error_v * (to - from) / (to_v - from_v).max(1e-6);
+            let fits = soc - from >= NODE_GAP && to - soc >= NODE_GAP;
+            (fits && error_v > NODE_ERROR_V && error_soc > NODE_ERROR_SOC).then_some((error_soc, soc, s + 1))
+        });
+        let Some((_, soc, at)) = worst.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
+        nodes.insert(at, soc);
+    }
+    nodes
 }
 
 /// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
@@ -259,10 +286,14 @@ fn by_file(
 }
 
 fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
-    if outcome.electrodes.is_none() && request.ageing_shift.is_none() {
+    if let Some(found) = &outcome.electrodes {
+        let (positive, negative) = found.electrodes.names();
+        outcome.notes.push(format!("electrodes {positive} and {negative}, within {:.1} mV", 1e3 * found.residual_v));
+    } else if !request.ocv.is_empty() && request.ageing_shift.is_none() {
+        let most_mv = 1e3 * electrodes::MAX_RESIDUAL_V;
         let what =
-            "no known electrodes fit the open-circuit curve within 25 mV: how it ages is not known, see --ageing-shift";
-        outcome.notes.push(what.to_owned());
+            format!("no known electrodes within {most_mv} mV: the curve ages by ocv_ageing_shift = {AGEING_SHIFT}");
+        outcome.notes.push(what);
     }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
     if outliers > 0 {

@@ -33,6 +33,8 @@ pub enum PositiveMaterial {
     Nco,
     /// LiCoO2: Doyle, thesis, Berkeley 1995, as in Newman's Dualfoil.
     Lco,
+    /// LiCoO2: Ramadass et al., J. Electrochem. Soc. 151 (2004) A196.
+    LcoRamadass,
     /// LiMn2O4: Doyle et al., J. Electrochem. Soc. 143 (1996) 1890.
     Lmo,
     /// LiFePO4: Afshar et al., arXiv 1709.03970 (2017).
@@ -48,18 +50,23 @@ pub enum NegativeMaterial {
     Graphite,
     /// Graphite with sharp stages: Mohtat et al., J. Electrochem. Soc. 167 (2020) 110561.
     GraphiteStaged,
+    /// Graphite of a cell with NCA: Kim et al., J. Electrochem. Soc. 158 (2011) A955.
+    GraphiteKim,
     /// Mesocarbon microbeads: Newman's Dualfoil.
     Mcmb,
+    /// Mesocarbon microbeads: Ramadass et al., J. Electrochem. Soc. 151 (2004) A196.
+    McmbRamadass,
 }
 
 impl PositiveMaterial {
     /// Every material, with its name in a cell model.
-    pub const ALL: [(Self, &'static str); 7] = [
+    pub const ALL: [(Self, &'static str); 8] = [
         (Self::Nmc811, "nmc811"),
         (Self::Nmc532, "nmc532"),
         (Self::Nca, "nca"),
         (Self::Nco, "nco"),
         (Self::Lco, "lco"),
+        (Self::LcoRamadass, "lco_ramadass"),
         (Self::Lmo, "lmo"),
         (Self::Lfp, "lfp"),
     ];
@@ -96,6 +103,11 @@ impl PositiveMaterial {
                     + 0.2531 * tanh((0.56478 - y) / 0.1316)
                     - 0.02167 * tanh((y - 0.525) / 0.006)
             }
+            Self::LcoRamadass => {
+                let above = [-4.656, 88.669, -401.119, 342.909, -462.471, 433.434];
+                let below = [-1.0, 18.933, -79.532, 37.311, -73.083, 95.96];
+                polynomial(&above, y * y) / polynomial(&below, y * y)
+            }
             Self::Lmo => {
                 let near_full = (0.998_432 - y).max(EDGE);
                 4.19829 + 0.0565661 * tanh(8.60942 - 14.5546 * y)
@@ -110,11 +122,13 @@ impl PositiveMaterial {
 
 impl NegativeMaterial {
     /// Every material, with its name in a cell model.
-    pub const ALL: [(Self, &'static str); 4] = [
+    pub const ALL: [(Self, &'static str); 6] = [
         (Self::GraphiteSiox, "graphite_siox"),
         (Self::Graphite, "graphite"),
         (Self::GraphiteStaged, "graphite_staged"),
+        (Self::GraphiteKim, "graphite_kim"),
         (Self::Mcmb, "mcmb"),
+        (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
     /// Potential against lithium, V, at a lithium content.
@@ -143,6 +157,23 @@ impl NegativeMaterial {
                     - 0.0095 * tanh((x - 0.190) / 0.013)
                     - 0.0145 * tanh((x - 0.490) / 0.020)
                     - 0.0800 * tanh((x - 1.030) / 0.055)
+            }
+            Self::GraphiteKim => {
+                0.124 + 1.5 * exp(-70.0 * x)
+                    - 0.0351 * tanh((x - 0.286) / 0.083)
+                    - 0.0045 * tanh((x - 0.9) / 0.119)
+                    - 0.035 * tanh((x - 0.99) / 0.05)
+                    - 0.0147 * tanh((x - 0.5) / 0.034)
+                    - 0.102 * tanh((x - 0.194) / 0.142)
+                    - 0.022 * tanh((x - 0.98) / 0.0164)
+                    - 0.011 * tanh((x - 0.124) / 0.0226)
+                    + 0.0155 * tanh((x - 0.105) / 0.029)
+            }
+            Self::McmbRamadass => {
+                0.7222 + 0.1387 * x + 0.029 * libm::sqrt(x) - 0.0172 / x
+                    + 0.0019 / (x * libm::sqrt(x))
+                    + 0.2808 * exp(0.90 - 15.0 * x)
+                    - 0.7984 * exp(0.4465 * x - 0.4108)
             }
             Self::Mcmb => {
                 0.194 + 1.5 * exp(-120.0 * x) + 0.0351 * tanh((x - 0.286) / 0.083)
@@ -196,6 +227,13 @@ pub struct AgedElectrodes {
 }
 
 impl Electrodes {
+    /// Names of the positive and the negative material in a cell model.
+    pub fn names(&self) -> (&'static str, &'static str) {
+        let positive = PositiveMaterial::ALL.iter().find(|(material, _)| *material == self.positive);
+        let negative = NegativeMaterial::ALL.iter().find(|(material, _)| *material == self.negative);
+        (positive.map_or("", |found| found.1), negative.map_or("", |found| found.1))
+    }
+
     /// Open-circuit voltage of the new cell, V.
     pub fn voltage_v(&self, soc: f64) -> f64 {
         let between = |[empty, full]: [f64; 2]| (empty + soc * (full - empty)).clamp(EDGE, 1.0 - EDGE);
@@ -294,10 +332,10 @@ pub(crate) mod tests {
             (1..=90).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
         };
         assert!(NegativeMaterial::ALL.iter().all(|(material, _)| falls(&|x| material.potential_v(x))));
-        // The polynomial of NCA holds from 0.3 on, the function of LCO from 0.4 on.
+        // The polynomial of NCA holds from 0.3 on, the functions of LCO from 0.45 on.
         for (material, from) in PositiveMaterial::ALL.map(|(material, _)| match material {
             PositiveMaterial::Nca => (material, 0.3),
-            PositiveMaterial::Lco => (material, 0.42),
+            PositiveMaterial::Lco | PositiveMaterial::LcoRamadass => (material, 0.45),
             _ => (material, 0.15),
         }) {
             assert!(falls(&|y| material.potential_v(y.max(from))), "{material:?}");

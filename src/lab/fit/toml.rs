@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 use super::{AGEING_SHIFT, FitOutcome, FitRequest, FittedElectrodes};
-use crate::cell::{Electrodes, NegativeMaterial, PositiveMaterial};
+use crate::cell::Electrodes;
 
 /// Returns the whole file.
 pub fn text(request: &FitRequest, outcome: &FitOutcome) -> String {
@@ -37,7 +37,7 @@ fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     line(out, &format!("name = {}", quoted(&request.name)));
     line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
     line(out, &format!("capacity_ah = {:.4}", outcome.capacity_ah));
-    let unknown = outcome.electrodes.is_none() && request.first_cycles.is_some();
+    let unknown = outcome.electrodes.is_none() && (request.first_cycles.is_some() || !request.ocv.is_empty());
     if let Some(shift) = request.ageing_shift.or(unknown.then_some(AGEING_SHIFT)) {
         line(out, &format!("ocv_ageing_shift = {shift}"));
     }
@@ -46,9 +46,8 @@ fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
 }
 
 fn electrodes(out: &mut String, found: &FittedElectrodes) {
-    let Electrodes { positive, negative, positive_content, negative_content } = found.electrodes;
-    let positive = PositiveMaterial::ALL.iter().find(|(material, _)| *material == positive).map_or("", |m| m.1);
-    let negative = NegativeMaterial::ALL.iter().find(|(material, _)| *material == negative).map_or("", |m| m.1);
+    let Electrodes { positive_content, negative_content, .. } = found.electrodes;
+    let (positive, negative) = found.electrodes.names();
     line(
         out,
         &format!(
