@@ -10,13 +10,20 @@
 //!
 //! where the second holds at most at p = 0.5: an alarm is cleared by a value that is at the clear threshold or better,
 //! never by doubt that has grown. As the clear threshold is on the healthy side of the set threshold, the second
-//! probability is the larger one: no value is both. With p = 0.5 this is the plain comparison. A value without a standard deviation where one is needed is
-//! not to be judged.
+//! probability is the larger one: no value is both. With p = 0.5 this is the plain comparison. A value without a standard
+//! deviation where one is needed is not to be judged.
+//!
+//! A learned value (a capacity, a resistance, a life) does not recover by itself: an estimate that wanders about its
+//! threshold must not clear its alarm. With `when = "mean"` it is healthy only while P(truth beyond the clear threshold)
+//! is at most 0.05 as well.
 
 use super::{Direction, Rule, Severity};
 
 /// Highest probability of being beyond the clear threshold that clears.
 const CLEAR_LEVEL: f64 = 0.5;
+
+/// Highest probability of being beyond the clear threshold that clears an alarm of a learned value.
+const LEARNED_CLEAR_LEVEL: f64 = 0.05;
 
 /// How a value is compared with a threshold.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -102,7 +109,10 @@ impl LimitCheck {
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
         let (is_beyond, is_healthy) = match rule.when {
-            Comparison::Mean => (set < 0.0, clear >= 0.0),
+            Comparison::Mean => {
+                let is_sure = std.is_none_or(|std| probability_beyond(clear, std) <= LEARNED_CLEAR_LEVEL);
+                (set < 0.0, clear >= 0.0 && (is_sure || !rule.rule.spec().is_learned))
+            }
             Comparison::Probability(level) => {
                 let (Some(beyond), Some(std)) = (probability, std) else { return (Self::Unknown, None) };
                 (beyond > level, probability_beyond(clear, std) <= level.min(CLEAR_LEVEL))
@@ -184,9 +194,21 @@ mod tests {
     fn half_probability_is_the_mean_rule() {
         for step in -20..20 {
             let value = 1.4 + 0.013 * f64::from(step) + 1e-6;
-            let by_mean = check(&low(Comparison::Mean), value, Some(0.07));
-            assert_eq!(check(&low(Comparison::Probability(0.5)), value, Some(0.07)), by_mean, "{value}");
+            let not_learned = |when| RuleConfig { rule: Rule::SocLow, ..low(when) };
+            let by_mean = check(&not_learned(Comparison::Mean), value, Some(0.07));
+            assert_eq!(check(&not_learned(Comparison::Probability(0.5)), value, Some(0.07)), by_mean, "{value}");
         }
+    }
+
+    #[test]
+    fn a_learned_value_clears_when_it_is_surely_healthy() {
+        let rule = low(Comparison::Mean);
+        assert_eq!(check(&rule, 1.4 - 1e-9, Some(0.1)), LimitCheck::Beyond);
+        // 1.645 standard deviations: 95 %.
+        assert_eq!(check(&rule, 1.5 + 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
+        assert_eq!(check(&rule, 1.5 + 0.1 * 1.65, Some(0.1)), LimitCheck::Healthy);
+        let soc = RuleConfig { rule: Rule::SocLow, ..rule };
+        assert_eq!(check(&soc, 1.5, Some(0.1)), LimitCheck::Healthy);
     }
 
     #[test]
