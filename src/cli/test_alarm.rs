@@ -120,7 +120,7 @@ fn push_notes(text: &mut String, report: &ChannelReport) {
     let others = [
         (observed.foreign, "test frames of other rules"),
         (observed.unreadable, "frames that could not be read"),
-        (u64::from(report.dropped), "frames lost by this computer before they were seen"),
+        (report.dropped, "frames lost by this computer before they were seen"),
     ];
     for (count, what) in others.into_iter().filter(|(count, _)| *count > 0) {
         let _ = writeln!(text, "  meanwhile {count} {what}");

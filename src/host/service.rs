@@ -29,7 +29,8 @@ use super::status::document::ConfigFile;
 use super::store::StateSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::socket::{Link, LinkConfig, LinkMessage, LinkOutput};
+use crate::io::log::Record;
+use crate::io::socket::{Link, LinkConfig, LinkOutput};
 use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
@@ -40,7 +41,7 @@ use reload::Reload;
 use status_publisher::StatusPublisher;
 pub(super) use stop::Stop;
 
-/// LinkMessage frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
+/// Frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
 /// Threads for work that would block the loop: reading a configuration, long answers. More would only wait for the disk.
@@ -160,7 +161,7 @@ impl Service {
         ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
-    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Record>) -> (JoinSet<()>, Vec<LinkOutput>) {
         let mut links = JoinSet::new();
         let mut outputs = Vec::new();
         for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {

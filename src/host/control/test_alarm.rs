@@ -20,9 +20,10 @@ use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
-use crate::io::socket::CanListener;
-use crate::monitor::{Command, J1939Config};
-use crate::quantity::Timestamp;
+use crate::io::log::Record;
+use crate::io::socket::Tap;
+use crate::monitor::{BusEvent, Command, J1939Config};
+use crate::quantity::{BusIndex, Timestamp};
 
 /// Period of reading the sockets; stamps are the kernel's, so nothing depends on it.
 const READ_PERIOD: Duration = Duration::from_millis(10);
@@ -48,7 +49,7 @@ pub struct ChannelReport {
     /// Statuses of the end-to-end check of all frames; `None` = they are not protected.
     pub protection: Option<StatusCounts>,
     /// Frames the kernel dropped.
-    pub dropped: u32,
+    pub dropped: u64,
     /// Why listening ended early.
     pub error: Option<String>,
 }
@@ -154,7 +155,7 @@ impl AlarmReader {
 
 /// One channel during the test.
 struct MonitoredChannel {
-    listener: CanListener,
+    tap: Tap,
     reader: ChannelReader,
     report: ChannelReport,
 }
@@ -162,14 +163,21 @@ struct MonitoredChannel {
 impl MonitoredChannel {
     /// Reads all received frames.
     fn read_all(&mut self, rule: Rule) {
+        let mut received = Vec::new();
         while self.report.error.is_none() {
-            match self.listener.next_frame() {
-                Ok(None) => break,
-                Ok(Some((time, frame))) => self.take(rule, time, &frame),
+            match self.tap.next(BusIndex(0), &mut received) {
+                Ok(true) => {}
+                Ok(false) => break,
                 Err(error) => self.report.error = Some(error.to_string()),
             }
         }
-        self.report.dropped = self.listener.dropped();
+        for record in &received {
+            match record {
+                Record::Frame { time, frame, .. } => self.take(rule, *time, frame),
+                Record::Bus { event: BusEvent::Dropped { frames }, .. } => self.report.dropped += frames,
+                _ => {}
+            }
+        }
     }
 
     fn take(&mut self, rule: Rule, time: Timestamp, frame: &Frame) {
@@ -271,23 +279,21 @@ fn open_alarms(
     message: &Message,
     reader: AlarmReader,
 ) -> Result<MonitoredChannel, String> {
-    let listener = CanListener::open(&interface.name, interface.fd, &[message.id], &[]);
-    let listener = listener.map_err(|error| error.to_string())?;
+    let tap = Tap::open_for(&interface.name, interface.fd, &[message.id], &[]).map_err(|error| error.to_string())?;
     let check = message.e2e.map(|protection| (CheckConfig::new(protection), Receiver::default()));
     let mut report = ChannelReport::new(interface, "alarm frame", message.id);
     report.protection = message.e2e.map(|_| StatusCounts::default());
-    Ok(MonitoredChannel { listener, reader: ChannelReader::Alarm { reader, check }, report })
+    Ok(MonitoredChannel { tap, reader: ChannelReader::Alarm { reader, check }, report })
 }
 
 /// Opens the channel of DM1. J1939 is classic CAN only.
 fn open_dm1(interface: &InterfaceConfig, j1939: &J1939Config) -> Result<MonitoredChannel, String> {
     let receiver = Dm1Receiver::new(j1939.node.address);
-    let listener = CanListener::open(&interface.name, false, &[], &receiver.patterns());
-    let listener = listener.map_err(|error| error.to_string())?;
+    let tap = Tap::open_for(&interface.name, false, &[], &receiver.patterns()).map_err(|error| error.to_string())?;
     let [id, ..] = j1939.node.sent_ids();
     let mut report = ChannelReport::new(interface, "J1939 DM1", id);
     report.test_code = Some(j1939.test_code);
-    Ok(MonitoredChannel { listener, reader: ChannelReader::Dm1 { receiver, test_code: j1939.test_code }, report })
+    Ok(MonitoredChannel { tap, reader: ChannelReader::Dm1 { receiver, test_code: j1939.test_code }, report })
 }
 
 async fn watch(

@@ -16,14 +16,15 @@ use super::{INBOX, ServiceError, notify};
 use crate::control::protocol::{Answer, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
+use crate::io::log::Record;
 use crate::io::snapshot_file;
-use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::io::socket::LinkOutput;
 use crate::logging;
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
-/// LinkMessage items handled between two checks of the timer: under one tick's time of a full bus.
+/// Records handled between two checks of the timer: under one tick's time of a full bus.
 const BATCH: usize = 256;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
@@ -36,12 +37,12 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct ServiceLoop {
     pub(super) engine: Engine,
-    pub(super) inbox: mpsc::Receiver<LinkMessage>,
+    pub(super) inbox: mpsc::Receiver<Record>,
     pub(super) requests: mpsc::Receiver<PendingRequest>,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
     pub(super) outputs: Vec<LinkOutput>,
-    pub(super) batch: Vec<LinkMessage>,
+    pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
 }
@@ -158,21 +159,14 @@ impl ServiceLoop {
 
     /// Handles a batch in the order of time; items of one interface keep their order.
     fn handle_batch(&mut self) {
-        self.batch.sort_by_key(|received| received.time);
-        let mut has_frame = false;
+        self.batch.sort_by_key(Record::time);
         for received in &self.batch {
-            let LinkMessage { time, bus, what } = *received;
-            let input = match &what {
-                LinkEvent::Frame(frame) => Input::Frame { time, bus, frame },
-                LinkEvent::Event(event) => Input::Bus { time, bus, event: *event },
-            };
-            self.engine.handle(&input, &self.outputs);
-            has_frame |= matches!(what, LinkEvent::Frame(_));
+            if let Some(input) = received.input() {
+                self.engine.handle(&input, &self.outputs);
+            }
         }
         // Outputs leave after the last item: then all frames have their estimates.
-        if has_frame {
-            self.status_publisher.note_frames(&self.batch, self.clock.now());
-        }
+        self.status_publisher.note_frames(&self.batch, self.clock.now());
         self.batch.clear();
     }
 

@@ -3,7 +3,8 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::io::log::Record;
+use crate::io::socket::LinkOutput;
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
 use crate::status::PERIOD;
@@ -36,9 +37,9 @@ impl StatusPublisher {
     }
 
     /// Counts the frames of a batch, which have their estimates at `now`.
-    pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
-        let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
-        frames.for_each(|received| self.latency.record(now.since(received.time)));
+    pub(super) fn note_frames(&mut self, batch: &[Record], now: Timestamp) {
+        let frames = batch.iter().filter(|received| matches!(received, Record::Frame { .. }));
+        frames.for_each(|received| self.latency.record(now.since(received.time())));
     }
 
     /// Counts a reload; `Ok` = the configuration was applied.

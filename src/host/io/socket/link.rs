@@ -17,10 +17,11 @@ use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
 use super::counters::{LinkCounters, LinkState};
-use super::raw::{CALL_BATCH, RawConfig, RawRead, RawSocket, index_of};
+use super::raw::{CALL_BATCH, RawRead, RawSocket, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
+use crate::io::log::Record;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
@@ -52,26 +53,6 @@ pub struct LinkConfig {
     pub patterns: Vec<(u32, u32)>,
     /// Receive buffer to ask for, bytes.
     pub receive_buffer_bytes: usize,
-}
-
-/// A frame or event of an interface, on the program's clock.
-#[derive(Debug, Clone, Copy)]
-pub struct LinkMessage {
-    /// Time.
-    pub time: Timestamp,
-    /// Interface.
-    pub bus: BusIndex,
-    /// Content.
-    pub what: LinkEvent,
-}
-
-/// Frame or event.
-#[derive(Debug, Clone, Copy)]
-pub enum LinkEvent {
-    /// A frame.
-    Frame(Frame),
-    /// Anything else.
-    Event(BusEvent),
 }
 
 /// The sending end of a link. Dropped, it ends the link once what is queued has been sent.
@@ -117,7 +98,7 @@ enum ServiceEnd {
 pub struct Link {
     config: LinkConfig,
     clock: MappedClock,
-    inbox: mpsc::Sender<LinkMessage>,
+    inbox: mpsc::Sender<Record>,
     outgoing: mpsc::Receiver<QueuedFrame>,
     unsent: Arc<AtomicU64>,
     counters: Arc<LinkCounters>,
@@ -153,7 +134,7 @@ fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
 
 impl Link {
     /// A link, not yet running, and its sending end. Must be called inside the runtime.
-    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<LinkMessage>) -> (Self, LinkOutput) {
+    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
         let mut report = interval(REPORT_PERIOD);
@@ -192,17 +173,12 @@ impl Link {
 
     /// Opens the interface and sends its state as an event; `None` when it cannot be opened.
     async fn open(&mut self) -> Option<OpenSocket> {
-        let raw = RawConfig {
-            interface: &self.config.interface,
-            fd: self.config.fd,
-            ids: &self.config.ids,
-            patterns: &self.config.patterns,
-            receive_buffer_bytes: self.config.receive_buffer_bytes,
-        };
-        let opened = RawSocket::open(&raw).and_then(|socket| {
-            let error = socket.take_error()?;
-            Ok((watch(socket)?, error))
-        });
+        let LinkConfig { interface, fd, ids, patterns, receive_buffer_bytes, .. } = &self.config;
+        let opened =
+            RawSocket::open(interface, *fd, &filters(ids, patterns), *receive_buffer_bytes).and_then(|socket| {
+                let error = socket.take_error()?;
+                Ok((watch(socket)?, error))
+            });
         let (socket, error) = match opened {
             Ok(opened) => opened,
             Err(error) => {
@@ -314,17 +290,18 @@ impl Link {
         if self.state != LinkState::Up && time > self.state_since {
             self.enter_at(LinkState::Up, time).await;
         }
-        let what = match received.what {
+        let bus = self.config.bus;
+        let record = match received.what {
             Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
-            Wire::Frame(frame) => LinkEvent::Frame(frame),
-            Wire::Error(class) => LinkEvent::Event(BusEvent::ErrorFrame { class }),
+            Wire::Frame(frame) => Record::Frame { time, bus, frame },
+            Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
             Wire::Malformed => {
                 self.lost += 1;
                 LinkCounters::add(&self.counters.malformed, 1);
                 return;
             }
         };
-        if self.inbox.try_send(LinkMessage { time, bus: self.config.bus, what }).is_err() {
+        if self.inbox.try_send(record).is_err() {
             self.lost += 1;
             LinkCounters::add(&self.counters.inbox_full, 1);
         }
@@ -385,17 +362,10 @@ impl Link {
 
     /// Checks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
     async fn look(&mut self, open: &OpenSocket) -> bool {
-        let raw = RawConfig {
-            interface: &self.config.interface,
-            fd: false,
-            ids: &[],
-            patterns: &[],
-            receive_buffer_bytes: 0,
-        };
         if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
             return false;
         }
-        if let Ok(None) = RawSocket::open(&raw).and_then(|probe| probe.take_error()) {
+        if let Ok(None) = RawSocket::open(&self.config.interface, false, &[], 0).and_then(|probe| probe.take_error()) {
             self.enter(LinkState::Up).await;
         }
         true
@@ -466,7 +436,7 @@ impl Link {
     /// Sends an event. Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
-        let _ = self.inbox.send(LinkMessage { time, bus: self.config.bus, what: LinkEvent::Event(event) }).await;
+        let _ = self.inbox.send(Record::Bus { time, bus: self.config.bus, event }).await;
     }
 
     /// Logs a problem once, until it is another one.
