@@ -5,13 +5,12 @@ use std::time::Duration;
 
 use super::Failure;
 use crate::config;
-use crate::control::ControlSetting;
+use crate::io::place::PlaceSetting;
 use crate::io::snapshot_file;
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
 use crate::monitor::Downtime;
 use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::status::document::ConfigFile;
-use crate::store::StateSetting;
 use crate::{logging, service::Service};
 
 /// Arguments of `run`.
@@ -112,9 +111,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         duration: args.duration.map(Duration::from_secs_f64),
         ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
-        state: StateSetting::from_path(args.state.clone()),
-        control: ControlSetting::from_path(args.control.clone()),
-        status: ControlSetting::from_path(args.status.clone()),
+        state: PlaceSetting::from_path(args.state.clone()),
+        control: PlaceSetting::from_path(args.control.clone()),
+        status: PlaceSetting::from_path(args.status.clone()),
         config_file: ConfigFile::of(&args.config),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))

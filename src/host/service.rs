@@ -21,17 +21,16 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
+use super::control::{ControlServer, MAX_CONNECTIONS};
 
 use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
-use super::store::StateSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::log::Record;
+use crate::io::place::PlaceSetting;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
-use crate::io::unix_socket::SocketSetting;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
@@ -71,11 +70,11 @@ pub struct Service {
     /// Receive buffer requested per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
-    pub control: ControlSetting,
+    pub control: PlaceSetting,
     /// Where state and history are kept.
-    pub state: StateSetting,
+    pub state: PlaceSetting,
     /// The status sockets.
-    pub status: SocketSetting,
+    pub status: PlaceSetting,
     /// The configuration file, for the status document.
     pub config_file: Option<ConfigFile>,
 }

@@ -42,6 +42,7 @@ use tokio::sync::watch;
 
 use crate::config::StoreConfig;
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
+use crate::io::place::{PlaceSetting, first_folder};
 use crate::monitor::{Downtime, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
@@ -69,37 +70,9 @@ const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Period of checkpoints while no frame comes, s: the state only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// Where state and history are kept.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum StateSetting {
-    /// `$STATE_DIRECTORY` under systemd, else `/var/lib/packwatch`; nowhere if that folder cannot be created.
-    Standard,
-    /// Nowhere.
-    Off,
-    /// In this folder.
-    At(PathBuf),
-}
-
-impl StateSetting {
-    /// Reads the value of the command line: a folder, or `none`.
-    pub fn from_path(path: Option<PathBuf>) -> Self {
-        match path {
-            None => Self::Standard,
-            Some(path) if path.as_os_str() == "none" => Self::Off,
-            Some(path) => Self::At(path),
-        }
-    }
-}
-
 /// The standard state folder, and whether systemd created it.
 pub fn standard_folder() -> (PathBuf, bool) {
     first_folder("STATE_DIRECTORY").map_or_else(|| (PathBuf::from(STANDARD_FOLDER), false), |folder| (folder, true))
-}
-
-/// The first folder of a variable of systemd, which separates several by colons.
-fn first_folder(variable: &str) -> Option<PathBuf> {
-    let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
-    std::env::split_paths(&folders).next()
 }
 
 /// Source of the state that the next checkpoint overwrites.
@@ -145,13 +118,9 @@ impl Store {
     ///
     /// # Errors
     /// When another daemon uses the folder.
-    pub fn open(setting: &StateSetting, config: &StoreConfig) -> Result<(Option<Self>, StoredStates), String> {
+    pub fn open(setting: &PlaceSetting, config: &StoreConfig) -> Result<(Option<Self>, StoredStates), String> {
         let none = |works| (None, StoredStates { states: Vec::new(), works });
-        let (path, is_needed) = match setting {
-            StateSetting::Off => return Ok(none(true)),
-            StateSetting::Standard => standard_folder(),
-            StateSetting::At(path) => (path.clone(), true),
-        };
+        let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone(), config.max_half_cycles);
         match folder.lock() {

@@ -8,6 +8,7 @@ pub mod event_log;
 pub mod journal;
 pub mod lines;
 pub mod log;
+pub mod place;
 pub mod result_file;
 pub mod snapshot_file;
 pub mod socket;
