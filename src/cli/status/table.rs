@@ -81,17 +81,17 @@ fn remaining(pack: &PackStatus) -> String {
 
 fn interfaces(text: &mut String, document: &StatusDocument) {
     for it in &document.interfaces {
-        let lost = it.kernel_dropped + it.queue_dropped + it.malformed;
-        let unsent = it.send_queue_full + it.send_failed;
+        let lost = it.link.kernel_dropped + it.link.queue_dropped + it.link.malformed;
+        let unsent = it.link.send_queue_full + it.link.send_failed;
         let _ = writeln!(
             text,
             "interface  {} {}: {} frames in, {lost} lost, {} out, {unsent} not sent, {} errors, {} bus-off, back {} times",
             it.name,
             word(it.state),
-            it.frames,
-            it.sent,
-            it.error_frames,
-            it.bus_offs,
+            it.received.frames,
+            it.link.sent,
+            it.received.error_frames,
+            it.received.bus_offs,
             it.reconnects,
         );
     }

@@ -189,18 +189,19 @@ fn interfaces(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Re
         families.counter(name, help, all.iter().map(|it| (named(&it.name), of(it))))
     };
     counts("interface_reconnects", "Times the interface came up again", |it| it.reconnects)?;
-    counts("interface_received_frames", "Frames received", |it| it.frames)?;
-    counts("interface_error_frames", "Error frames", |it| it.error_frames)?;
-    counts("interface_bus_offs", "Error frames that report bus-off", |it| it.bus_offs)?;
-    counts("interface_sent_frames", "Frames sent", |it| it.sent)?;
+    counts("interface_received_frames", "Frames received", |it| it.received.frames)?;
+    counts("interface_error_frames", "Error frames", |it| it.received.error_frames)?;
+    counts("interface_bus_offs", "Error frames that report bus-off", |it| it.received.bus_offs)?;
+    counts("interface_sent_frames", "Frames sent", |it| it.link.sent)?;
     let with = |name: &str, reason: &str| vec![("interface", name.to_owned()), ("reason", reason.to_owned())];
     let dropped = all.iter().flat_map(|it| {
-        let reasons = [("kernel", it.kernel_dropped), ("queue", it.queue_dropped), ("malformed", it.malformed)];
+        let reasons =
+            [("kernel", it.link.kernel_dropped), ("queue", it.link.queue_dropped), ("malformed", it.link.malformed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
     families.counter("interface_dropped_frames", "Received frames that were lost", dropped)?;
     let unsent = all.iter().flat_map(|it| {
-        let reasons = [("queue", it.send_queue_full), ("kernel", it.send_failed)];
+        let reasons = [("queue", it.link.send_queue_full), ("kernel", it.link.send_failed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
     families.counter("interface_unsent_frames", "Frames that could not be sent", unsent)?;

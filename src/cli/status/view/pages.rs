@@ -211,15 +211,15 @@ fn interfaces(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
         };
         text.push(Line::from(vec![Span::raw(format!("{} ", it.name)), Span::styled(word(it.state), style)]));
         let rows = [
-            ("frames in", it.frames),
-            ("lost by the kernel", it.kernel_dropped),
-            ("lost by our queue", it.queue_dropped),
-            ("no frames", it.malformed),
-            ("frames out", it.sent),
-            ("not sent, queue full", it.send_queue_full),
-            ("not sent, kernel", it.send_failed),
-            ("error frames", it.error_frames),
-            ("bus-off", it.bus_offs),
+            ("frames in", it.received.frames),
+            ("lost by the kernel", it.link.kernel_dropped),
+            ("lost by our queue", it.link.queue_dropped),
+            ("no frames", it.link.malformed),
+            ("frames out", it.link.sent),
+            ("not sent, queue full", it.link.send_queue_full),
+            ("not sent, kernel", it.link.send_failed),
+            ("error frames", it.received.error_frames),
+            ("bus-off", it.received.bus_offs),
             ("came back", it.reconnects),
         ];
         text.extend(rows.map(|(name, count)| count_line(name, count)));

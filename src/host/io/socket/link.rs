@@ -16,7 +16,7 @@ use tokio::io::{Interest, Ready};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
-use super::counters::{LinkCounters, LinkState};
+use super::counters::{LinkHealth, LinkState, SharedHealth};
 use super::raw::{CALL_BATCH, RawRead, RawSocket, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
@@ -60,7 +60,7 @@ pub struct LinkConfig {
 pub struct LinkOutput {
     queue: mpsc::Sender<QueuedFrame>,
     unsent: Arc<AtomicU64>,
-    counters: Arc<LinkCounters>,
+    health: Arc<SharedHealth>,
 }
 
 #[derive(Debug)]
@@ -74,13 +74,13 @@ impl LinkOutput {
     pub fn send(&self, frame: Frame) {
         if self.queue.try_send(QueuedFrame { since: Instant::now(), frame }).is_err() {
             self.unsent.fetch_add(1, Ordering::Relaxed);
-            LinkCounters::add(&self.counters.send_queue_full, 1);
+            self.health.count(|counts| counts.send_queue_full += 1);
         }
     }
 
     /// Counters of the link.
-    pub fn counters(&self) -> &LinkCounters {
-        &self.counters
+    pub fn health(&self) -> LinkHealth {
+        self.health.change(|_| ())
     }
 }
 
@@ -101,7 +101,7 @@ pub struct Link {
     inbox: mpsc::Sender<Record>,
     outgoing: mpsc::Receiver<QueuedFrame>,
     unsent: Arc<AtomicU64>,
-    counters: Arc<LinkCounters>,
+    health: Arc<SharedHealth>,
     state: LinkState,
     /// When that was noted.
     state_since: Timestamp,
@@ -139,15 +139,15 @@ impl Link {
         let unsent = Arc::new(AtomicU64::new(0));
         let mut report = interval(REPORT_PERIOD);
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let counters = Arc::new(LinkCounters::default());
-        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), counters: Arc::clone(&counters) };
+        let health = Arc::<SharedHealth>::default();
+        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), health: Arc::clone(&health) };
         let link = Self {
             config,
             clock,
             inbox,
             outgoing,
             unsent,
-            counters,
+            health,
             state: LinkState::Unknown,
             state_since: clock.now(),
             lost: 0,
@@ -297,13 +297,13 @@ impl Link {
             Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
             Wire::Malformed => {
                 self.lost += 1;
-                LinkCounters::add(&self.counters.malformed, 1);
+                self.health.count(|counts| counts.malformed += 1);
                 return;
             }
         };
         if self.inbox.try_send(record).is_err() {
             self.lost += 1;
-            LinkCounters::add(&self.counters.inbox_full, 1);
+            self.health.count(|counts| counts.queue_dropped += 1);
         }
     }
 
@@ -312,7 +312,7 @@ impl Link {
         let total = open.socket.get_ref().dropped_total();
         let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
         self.lost += dropped;
-        LinkCounters::add(&self.counters.kernel_dropped, dropped);
+        self.health.count(|counts| counts.kernel_dropped += dropped);
     }
 
     /// Sends what waits, if there is room.
@@ -322,7 +322,7 @@ impl Link {
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
             Ok(()) => {
-                LinkCounters::add(&self.counters.sent, 1);
+                self.health.count(|counts| counts.sent += 1);
                 None
             }
             Err(Errno::EAGAIN | Errno::EINTR) => {
@@ -388,7 +388,7 @@ impl Link {
 
     fn count_unsent(&self) {
         self.unsent.fetch_add(1, Ordering::Relaxed);
-        LinkCounters::add(&self.counters.send_failed, 1);
+        self.health.count(|counts| counts.send_failed += 1);
     }
 
     fn lengthen_pause(&mut self) -> Duration {
@@ -412,7 +412,7 @@ impl Link {
         if state == LinkState::Up {
             self.pause = FIRST_PAUSE;
         }
-        self.counters.enter(state);
+        self.health.enter(state);
         let event = match state {
             LinkState::Up => BusEvent::Up,
             LinkState::Down => BusEvent::Down,

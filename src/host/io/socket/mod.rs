@@ -14,7 +14,7 @@ mod sender;
 mod tap;
 mod wire;
 
-pub use counters::{LinkCounters, LinkState};
+pub use counters::{LinkCounts, LinkHealth, LinkState};
 pub use link::{Link, LinkConfig, LinkOutput};
 pub use raw::DEFAULT_RECEIVE_BUFFER_BYTES;
 pub use sender::CanSender;
