@@ -20,7 +20,7 @@ use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
-use crate::io::log::Record;
+use crate::io::record::Record;
 use crate::io::socket::Tap;
 use crate::monitor::{BusEvent, Command, J1939Config};
 use crate::quantity::{BusIndex, Timestamp};

@@ -4,8 +4,6 @@
 //! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
 //! after it, and an unknown gap is put before it. Everything that becomes no record is counted in [`LogCounts`].
 
-mod record;
-
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,7 +13,7 @@ use serde::Serialize;
 
 use super::candump::{self, Line, fast_line};
 use super::csv_log::{CsvLog, CsvOptions, RowResult};
-use super::journal::{self, Mark};
+use super::journal;
 use super::lines::{self, Lines, RawLine};
 use super::table::TableError;
 use crate::can::Frame;
@@ -23,7 +21,7 @@ use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
-pub use record::{Batch, Record};
+pub use super::record::{Batch, Record};
 
 /// Distance between the records so far and a part with an unknown gap before it.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
@@ -193,7 +191,7 @@ impl LogSource {
                 return Ok(Some(record));
             }
             if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
-                && let mut slot = [record::UNUSED]
+                && let mut slot = [Record::UNUSED]
                 && self.state.fast_records(lines, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
@@ -342,21 +340,16 @@ impl ReadState {
             };
             self.counts.lines += 1;
             let record = match candump::parse_line(bytes) {
-                Ok(Line::Other) if journal => match journal::parse_mark(bytes) {
-                    Ok(mark) => self.mark_record(mark),
-                    Err(error) => {
-                        self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
-                        None
-                    }
-                },
-                Ok(line) => self.line_record(&line),
-                Err(error) => {
-                    self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
-                    None
+                Ok(Line::Other) if journal && journal::is_mark(bytes) => {
+                    journal::parse_mark(bytes, |interface| self.bus(interface))
                 }
+                Ok(line) => Ok(self.line_record(&line)),
+                Err(error) => Err(error),
             };
-            if record.is_some() {
-                return Ok(record);
+            match record {
+                Ok(Some(record)) => return Ok(Some(record)),
+                Ok(None) => {}
+                Err(error) => self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?,
             }
         }
     }
@@ -385,25 +378,6 @@ impl ReadState {
                 None
             }
             Line::Other => {
-                self.counts.ignored_lines += 1;
-                None
-            }
-        }
-    }
-
-    fn mark_record(&mut self, mark: Option<Mark<'_>>) -> Option<Record> {
-        match mark {
-            Some(Mark::Tick { time }) => Some(Record::Tick { time }),
-            Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
-            Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
-            Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
-            Some(Mark::Reload { time }) => Some(Record::Reload { time }),
-            Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
-            Some(Mark::Bus { time, interface, event }) => {
-                let bus = self.bus(interface)?;
-                Some(Record::Bus { time, bus, event })
-            }
-            None => {
                 self.counts.ignored_lines += 1;
                 None
             }

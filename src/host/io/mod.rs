@@ -9,6 +9,7 @@ pub mod journal;
 pub mod lines;
 pub mod log;
 pub mod place;
+pub mod record;
 pub mod result_file;
 pub mod snapshot_file;
 pub mod socket;

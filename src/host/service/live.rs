@@ -16,7 +16,7 @@ use super::{INBOX, ServiceError, notify};
 use crate::control::protocol::{Answer, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
-use crate::io::log::Record;
+use crate::io::record::Record;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
 use crate::logging;

@@ -3,7 +3,7 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::io::log::Record;
+use crate::io::record::Record;
 use crate::io::socket::LinkOutput;
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;

@@ -21,7 +21,7 @@ use super::raw::{CALL_BATCH, RawRead, RawSocket, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
-use crate::io::log::Record;
+use crate::io::record::Record;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 

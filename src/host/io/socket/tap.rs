@@ -9,7 +9,7 @@ use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawRead, RawSocket, f
 use super::wire::Wire;
 use crate::can::CanId;
 use crate::io::clock::{MappedClock, Reading, StampMapper};
-use crate::io::log::Record;
+use crate::io::record::Record;
 use crate::monitor::BusEvent;
 use crate::quantity::BusIndex;
 
