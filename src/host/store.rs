@@ -48,11 +48,11 @@ use crate::quantity::Timestamp;
 use database::OpenError;
 use document::StateDocument;
 use folder::{Folder, OpenedDatabase, SET_ASIDE};
-use history_filter::{CommitDecision, HistoryFilter};
+use history_filter::HistoryFilter;
 use reader::MAX_DAEMON_COPY_BYTES;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
-use stamp::{Age, BootId, Stamp, WallClock};
+use stamp::{BootId, Stamp, WallClock};
 use writer::{Retry, WriteQueue, Writer};
 
 pub use folder::with_suffix;
@@ -244,10 +244,7 @@ impl Store {
     /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = match self.history_filter.take(events) {
-            CommitDecision::Commit(rows) => rows,
-            CommitDecision::Nothing | CommitDecision::Deferred => return None,
-        };
+        let rows = self.history_filter.take(events)?;
         self.checkpointed = Some(now);
         Some(self.submit(rows, monitor, now, false))
     }
@@ -358,10 +355,7 @@ fn candidates(
 }
 
 fn candidate(document: StateDocument, source: &'static str, now: &Stamp, wall: WallClock) -> StateCandidate {
-    let downtime = match document.stamp.age(now, wall) {
-        Age::Seconds(seconds) => Downtime::Seconds(seconds),
-        Age::Unknown => Downtime::Unknown,
-    };
+    let downtime = document.stamp.age(now, wall);
     StateCandidate { snapshot: *document.snapshot, downtime, source }
 }
 
