@@ -31,15 +31,18 @@ pub(super) fn output(
 ) -> Option<(OutputConfig, Database)> {
     let keys = raw.output.as_ref().filter(|keys| keys.enabled)?;
     let command = raw.commands.as_ref().filter(|commands| commands.enabled);
-    let frames =
-        [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
+    let frames = [
+        raw.output_status.as_ref()?.config(),
+        raw.output_health.as_ref()?.config(),
+        raw.output_alarm.as_ref()?.config(),
+    ];
     let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
     let command_settings = match command {
-        Some(keys) => Some(message_settings(&keys.frame(), faults)?),
+        Some(keys) => Some(message_settings(&keys.config(), faults)?),
         None => None,
     };
     let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: command_settings };
-    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::frame)).collect();
+    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::config)).collect();
     let own = match &keys.dbc {
         Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
         None => None,

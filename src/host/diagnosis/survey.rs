@@ -117,7 +117,7 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
 /// Signals that fit the cells' pattern beyond the configured number, one after the other.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
-    let source = keys.source();
+    let source = keys.config();
     let (Ok(pattern), Some(bus)) = (Pattern::parse(source.signal), raw.bus_of(source.interface)) else {
         return Vec::new();
     };
