@@ -129,10 +129,11 @@ impl Service {
         let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
         let mut engine = Engine::new(&mut self, clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
+        engine.links = outputs;
         drop(sender);
         // The first input is the time of the start; frames it sends wait for the interfaces.
-        engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        engine.report_store_health(clock.now(), &outputs);
+        engine.handle(&Input::Tick { time: clock.now() });
+        engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
         let mut service = ServiceLoop {
             engine,
@@ -140,7 +141,6 @@ impl Service {
             requests,
             reload,
             clock,
-            outputs,
             batch: Vec::new(),
             left_out_reported: Instant::now(),
             status_publisher,

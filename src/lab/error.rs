@@ -2,7 +2,6 @@
 
 use crate::chart::PlotError;
 use crate::ident::fit::FitError;
-use crate::io::log::LogError;
 use crate::io::table::TableError;
 
 /// Why offline work failed: one line per fault.
@@ -30,7 +29,6 @@ convert!(
     parquet::errors::ParquetError,
     crate::regress::RegressionError,
     FitError,
-    LogError,
     PlotError,
     TableError,
 );

@@ -62,7 +62,7 @@ pub use manual::manual;
 pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;
 pub use reference::reference;
-pub(crate) use resolve::{Databases, ResolvedSignal, input_map};
+pub(crate) use resolve::{Databases, ResolvedSignal, channel_words, input_map};
 pub(crate) use tables::RawTables;
 
 /// A configuration that cannot be wrong.

@@ -229,7 +229,7 @@ fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
 }
 
 /// Name of a channel, for people (cells and sensors from 1).
-pub(super) fn channel_words(channel: Channel) -> String {
+pub(crate) fn channel_words(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),

@@ -12,16 +12,16 @@ use std::sync::atomic::AtomicU64;
 use serde::Serialize;
 
 use super::candump::{self, Line, fast_line};
-use super::csv_log::{CsvLog, CsvOptions, RowResult};
+use super::csv_log::{CsvLog, CsvOptions, RowTime};
 use super::journal;
 use super::lines::{self, Lines, RawLine};
-use super::table::TableError;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
 pub use super::record::{Batch, Record};
+pub use super::table::TableError as LogError;
 
 /// Distance between the records so far and a part with an unknown gap before it.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
@@ -30,17 +30,6 @@ const MAX_FOREIGN_NAMES: usize = 64;
 
 /// Most interfaces, configured and adopted: a log has a handful.
 pub const MAX_ADOPTED: usize = 64;
-
-/// Reason why reading cannot continue, with file and line.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct LogError(pub String);
-
-impl From<TableError> for LogError {
-    fn from(error: TableError) -> Self {
-        Self(error.0)
-    }
-}
 
 /// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
@@ -404,23 +393,23 @@ impl ReadState {
     /// The next good row's time on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
-            match log.next_row() {
-                Ok(RowResult::Good(row)) => {
-                    self.counts.lines += 1;
-                    if row.after_unknown_gap {
-                        (self.fresh, self.unknown) = (true, true);
-                    }
-                    return Ok(Some(row.time));
-                }
-                Ok(RowResult::Bad(error)) => {
-                    self.counts.lines += 1;
-                    self.bad(|| error.0)?;
-                }
-                Ok(RowResult::End) => return Ok(None),
+            let row = match log.next_row() {
+                Ok(None) => return Ok(None),
+                Ok(Some(row)) => row,
                 Err(error) => {
                     self.bad(|| error.0)?;
                     return Ok(None);
                 }
+            };
+            self.counts.lines += 1;
+            match row {
+                Ok(RowTime { time, after_unknown_gap }) => {
+                    if after_unknown_gap {
+                        (self.fresh, self.unknown) = (true, true);
+                    }
+                    return Ok(Some(time));
+                }
+                Err(error) => self.bad(|| error.0)?,
             }
         }
     }

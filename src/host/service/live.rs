@@ -18,7 +18,6 @@ use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
 use crate::io::record::Record;
 use crate::io::snapshot_file;
-use crate::io::socket::LinkOutput;
 use crate::logging;
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
@@ -41,7 +40,6 @@ pub(super) struct ServiceLoop {
     pub(super) requests: mpsc::Receiver<PendingRequest>,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
-    pub(super) outputs: Vec<LinkOutput>,
     pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
@@ -64,7 +62,7 @@ impl ServiceLoop {
                     self.status_publisher.note_tick(now);
                     let time = self.tick().await;
                     self.notify_manager(now);
-                    self.status_publisher.publish(&self.engine, &self.outputs, now, time);
+                    self.status_publisher.publish(&self.engine, now, time);
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -75,7 +73,7 @@ impl ServiceLoop {
                     }
                 }
                 progress = next_progress(&mut stored) => {
-                    self.engine.handle_store_progress(progress, self.clock.now(), &self.outputs);
+                    self.engine.handle_store_progress(progress, self.clock.now());
                 }
                 // At most one request per connection waits.
                 Some(request) = self.requests.recv() => self.answer(request).await,
@@ -112,8 +110,8 @@ impl ServiceLoop {
     async fn tick(&mut self) -> Timestamp {
         self.drain().await;
         let time = self.clock.now();
-        self.engine.poll_store(time, &self.outputs);
-        self.engine.handle(&Input::Tick { time }, &self.outputs);
+        self.engine.poll_store(time);
+        self.engine.handle(&Input::Tick { time });
         time
     }
 
@@ -135,7 +133,7 @@ impl ServiceLoop {
     async fn apply_command(&mut self, command: Command) -> Answer {
         self.drain().await;
         let time = self.clock.now();
-        self.engine.handle(&Input::Command { time, command }, &self.outputs);
+        self.engine.handle(&Input::Command { time, command });
         let Engine { monitor, outputs, .. } = &self.engine;
         answer::outcome(monitor.alarms(), &command, &outputs.events, time)
     }
@@ -162,7 +160,7 @@ impl ServiceLoop {
         self.batch.sort_by_key(Record::time);
         for received in &self.batch {
             if let Some(input) = received.input() {
-                self.engine.handle(&input, &self.outputs);
+                self.engine.handle(&input);
             }
         }
         // Outputs leave after the last item: then all frames have their estimates.
@@ -182,7 +180,7 @@ impl ServiceLoop {
         let mut file = None;
         let taken = read.and_then(|config| {
             file = config.file;
-            self.engine.reconfigure(config.monitor, time, &self.outputs)
+            self.engine.reconfigure(config.monitor, time)
         });
         log_outcome(&taken);
         self.status_publisher.note_reload(if taken.is_ok() { Ok(file) } else { Err(()) });
@@ -208,8 +206,8 @@ impl ServiceLoop {
 
     /// Sends queued frames, closes the files and stores the state.
     pub(super) async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
-        self.engine.release_all(&self.outputs);
-        self.outputs.clear();
+        self.engine.release_all();
+        self.engine.links.clear();
         self.inbox.close();
         let drained = async { while links.join_next().await.is_some() {} };
         if timeout(DRAIN_LIMIT, drained).await.is_err() {

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use crate::config::channel_words;
 use crate::io::socket::LinkState;
 use crate::monitor::{BusEvent, Event, EventKind, Monitor};
 use crate::quantity::Channel;
@@ -191,7 +192,7 @@ impl Readiness {
             }
         }
         if !self.lost.is_empty() && self.first_after.is_some() {
-            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| signal_name(channel)).collect();
+            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| channel_words(channel)).collect();
             if self.lost.len() > MAX_NAMED {
                 names.push("...".to_owned());
             }
@@ -221,19 +222,6 @@ fn describe_duration(seconds: f64) -> String {
         s if s < 7200.0 => format!("{:.0} min", s / 60.0),
         s if s < 2.0 * DAY_S => format!("{:.0} h", s / 3600.0),
         s => format!("{:.0} days", s / DAY_S),
-    }
-}
-
-/// A signal in words; cells and sensors count from 1.
-fn signal_name(channel: Channel) -> String {
-    match channel {
-        Channel::Current => "current".to_owned(),
-        Channel::Temperature(sensor) => format!("temperature {}", sensor.index() + 1),
-        Channel::PackVoltage => "pack voltage".to_owned(),
-        Channel::CellVoltage(cell) => format!("voltage of cell {}", cell.index() + 1),
-        Channel::ReportedSoc => "reported SOC".to_owned(),
-        Channel::ReportedSoh => "reported SOH".to_owned(),
-        Channel::PackIdentity => "pack identity".to_owned(),
     }
 }
 

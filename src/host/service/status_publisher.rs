@@ -4,7 +4,6 @@ use tokio::time::Instant;
 
 use super::engine::Engine;
 use crate::io::record::Record;
-use crate::io::socket::LinkOutput;
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
 use crate::status::PERIOD;
@@ -54,7 +53,7 @@ impl StatusPublisher {
     }
 
     /// Publishes a document, if a period has passed at the tick that was due at `tick`.
-    pub(super) fn publish(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
+    pub(super) fn publish(&mut self, engine: &Engine, tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
         if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {
             return;
@@ -63,7 +62,7 @@ impl StatusPublisher {
         let sources = Sources {
             identity: &self.identity,
             monitor: &engine.monitor,
-            links,
+            links: &engine.links,
             before: self.before.get_or_insert_with(|| CounterBaseline::of(&engine.monitor)),
             counters: self.counters,
             latency: &self.latency,

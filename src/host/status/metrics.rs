@@ -223,6 +223,7 @@ fn message(interface: &str, id: &str) -> Labels {
 
 fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
     let number = |cell: Option<u16>| cell.map(|cell| f64::from(cell) + 1.0);
+    let life = &pack.remaining;
     let rows = [
         ("pack_soc", "ratio", "State of charge", pack.soc),
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
@@ -235,29 +236,24 @@ fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
-        (
-            "pack_remaining_cycles",
-            "",
-            "Equivalent full cycles until its end of life, median",
-            pack.remaining.remaining_cycles,
-        ),
+        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", life.remaining_cycles),
         (
             "pack_remaining_cycles_low",
             "",
             "5 % quantile of the cycles until the end of life",
-            pack.remaining.remaining_cycles_low,
+            life.remaining_cycles_low,
         ),
         (
             "pack_remaining_cycles_high",
             "",
             "95 % quantile of the cycles until the end of life",
-            pack.remaining.remaining_cycles_high,
+            life.remaining_cycles_high,
         ),
         (
             "pack_remaining_life",
             "seconds",
             "Time until the end of life at the recent use, median",
-            pack.remaining.remaining_days.map(|d| 86_400.0 * d),
+            life.remaining_days.map(|d| 86_400.0 * d),
         ),
         ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
         (
