@@ -237,19 +237,19 @@ impl Link {
                 Err(None) => return ServiceEnd::Stopped,
                 Err(Some(outgoing)) => open.pending = Some(outgoing),
                 Ok(()) => {
-                    if self.receive_all(open).await == Some(ServiceEnd::Dead) {
+                    if !self.receive_all(open).await {
                         return ServiceEnd::Dead;
                     }
                 }
             }
-            if self.send_pending(open).await == Some(ServiceEnd::Dead) {
+            if !self.send_pending(open).await {
                 return ServiceEnd::Dead;
             }
         }
     }
 
-    /// Reads until the socket is empty, with pauses for the other tasks.
-    async fn receive_all(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
+    /// Reads until the socket is empty, with pauses for the other tasks; `false` = it is dead.
+    async fn receive_all(&mut self, open: &mut OpenSocket) -> bool {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
                 open.received.clear();
@@ -262,14 +262,14 @@ impl Link {
                         }
                         if open.received.len() < CALL_BATCH {
                             open.mapper.socket_emptied(reading);
-                            return None;
+                            return true;
                         }
                     }
-                    Err(Errno::EAGAIN) => return None,
+                    Err(Errno::EAGAIN) => return true,
                     Err(Errno::EINTR) => {}
                     Err(error) => {
-                        if let Some(end) = self.failed(error).await {
-                            return Some(end);
+                        if !self.survives(error).await {
+                            return false;
                         }
                     }
                 }
@@ -315,49 +315,38 @@ impl Link {
         self.health.count(|counts| counts.kernel_dropped += dropped);
     }
 
-    /// Sends what waits, if there is room.
-    async fn send_pending(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
-        let outgoing = open.pending.take()?;
+    /// Sends what waits, if there is room; `false` = the socket is dead.
+    async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
+        let Some(outgoing) = open.pending.take() else { return true };
         let useless = self.state != LinkState::Up || outgoing.since.elapsed() > SEND_MAX_AGE;
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
-            Ok(()) => {
-                self.health.count(|counts| counts.sent += 1);
-                None
-            }
-            Err(Errno::EAGAIN | Errno::EINTR) => {
-                open.pending = Some(outgoing);
-                None
-            }
+            Ok(()) => self.health.count(|counts| counts.sent += 1),
+            Err(Errno::EAGAIN | Errno::EINTR) => open.pending = Some(outgoing),
             Err(error) => {
                 self.count_unsent();
-                if useless || error == Errno::ENOBUFS { None } else { self.failed(error).await }
+                return useless || error == Errno::ENOBUFS || self.survives(error).await;
             }
         }
+        true
     }
 
-    /// Handles an error of the socket: notes the interface's state; returns whether the socket is dead.
-    async fn failed(&mut self, error: Errno) -> Option<ServiceEnd> {
-        match error {
-            Errno::ENETDOWN => {
-                self.enter(LinkState::Down).await;
-                None
-            }
-            Errno::ENODEV | Errno::ENXIO => {
-                self.enter(LinkState::Missing).await;
-                Some(ServiceEnd::Dead)
-            }
+    /// Handles an error of the socket: notes the interface's state; `false` = the socket is dead.
+    async fn survives(&mut self, error: Errno) -> bool {
+        let (state, is_known, is_alive) = match error {
+            Errno::ENETDOWN => (Some(LinkState::Down), true, true),
+            Errno::ENODEV | Errno::ENXIO => (Some(LinkState::Missing), true, false),
             // A frame this interface cannot carry; counted by the caller.
-            Errno::EINVAL | Errno::EMSGSIZE => {
-                self.problem(&error.into());
-                None
-            }
-            other => {
-                self.problem(&other.into());
-                self.enter(LinkState::Down).await;
-                Some(ServiceEnd::Dead)
-            }
+            Errno::EINVAL | Errno::EMSGSIZE => (None, false, true),
+            _ => (Some(LinkState::Down), false, false),
+        };
+        if !is_known {
+            self.problem(&error.into());
         }
+        if let Some(state) = state {
+            self.enter(state).await;
+        }
+        is_alive
     }
 
     /// Checks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
