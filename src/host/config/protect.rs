@@ -3,9 +3,8 @@
 use super::Config;
 use super::document::Faults;
 use super::keys::ProtectedInput;
-use super::resolve::ResolvedSignal;
+use super::resolve::{Checks, ResolvedSignal};
 use super::schema::did_you_mean;
-use super::tables::RawTables;
 use crate::can::MAX_DATA;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
@@ -14,22 +13,18 @@ use crate::quantity::BusIndex;
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub(super) fn guards(
-    raw: &RawTables,
-    found: &[ResolvedSignal<'_>],
-    inputs_whole: bool,
-    faults: &mut Faults,
-) -> Vec<GuardConfig> {
+pub(super) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardConfig> {
+    let (raw, found) = (checks.raw, checks.found);
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
-        check_profile(keys, faults);
+        check_profile(keys, checks.faults);
         let Some(bus) = raw.bus_of(keys.interface.as_deref()) else { continue };
         let inputs = found.iter().filter(|input| input.bus == bus && input.message.name == keys.message);
         let inputs: Vec<_> = inputs.collect();
         let Some(first) = inputs.first() else {
             if inputs_whole {
                 let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
-                not_an_input(keys, there, faults);
+                not_an_input(keys, there, checks.faults);
             }
             continue;
         };
@@ -38,13 +33,13 @@ pub(super) fn guards(
                 "must be one message, is {} in {} and {} in {}",
                 first.message.id, first.file, other.message.id, other.file
             );
-            keys.place.fault(faults, "message", &what);
+            keys.place.fault(checks.faults, "message", &what);
         }
-        check_layout(keys, &inputs, faults);
+        check_layout(keys, &inputs, checks.faults);
         let guard = guard(keys, first, bus);
         if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
             let what = format!("must be protected once, is also in line {}", twin.place.line_of("message"));
-            keys.place.fault(faults, "message", &what);
+            keys.place.fault(checks.faults, "message", &what);
         }
         guards.push((guard, keys));
     }
