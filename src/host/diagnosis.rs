@@ -18,6 +18,7 @@ use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
 use crate::io::socket::Tap;
+use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
 use crate::quantity::BusIndex;
 
@@ -54,7 +55,7 @@ impl Interrupt {
         let interrupt = Self::default();
         let flag = Arc::clone(&interrupt.0);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let mut stop = runtime.block_on(async { super::service::Stop::new(None) })?;
+        let mut stop = runtime.block_on(async { Stop::new(None) })?;
         std::thread::spawn(move || {
             runtime.block_on(stop.wait());
             flag.store(true, Ordering::Relaxed);

@@ -10,7 +10,6 @@ mod live;
 pub mod readiness;
 mod reload;
 mod status_publisher;
-mod stop;
 
 use std::io;
 use std::path::PathBuf;
@@ -31,6 +30,7 @@ use crate::io::clock::{MappedClock, Reading};
 use crate::io::place::PlaceSetting;
 use crate::io::record::Record;
 use crate::io::socket::{Link, LinkConfig, LinkOutput};
+use crate::io::stop::Stop;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
@@ -38,7 +38,6 @@ use engine::Engine;
 use live::ServiceLoop;
 use reload::Reload;
 use status_publisher::StatusPublisher;
-pub(super) use stop::Stop;
 
 /// Frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;

@@ -55,7 +55,6 @@ use runtime::RuntimeState;
 use stamp::{BootId, Stamp, WallClock};
 use writer::{Retry, WriteQueue, Writer};
 
-pub use folder::with_suffix;
 pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;

@@ -8,8 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout};
 
 use super::client::ControlClient;
 use super::protocol::{CommandOutcome, Request};
@@ -22,6 +21,7 @@ use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
 use crate::io::record::Record;
 use crate::io::socket::Tap;
+use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Command, J1939Config};
 use crate::quantity::{BusIndex, Timestamp};
 
@@ -302,17 +302,12 @@ async fn watch(
     rule: Rule,
     duration: Duration,
 ) -> Result<(), String> {
-    let handler = |kind| signal(kind).map_err(|error| format!("cannot handle signals: {error}"));
-    let (mut interrupt, mut terminate) = (handler(SignalKind::interrupt())?, handler(SignalKind::terminate())?);
+    let mut stop = Stop::new(None).map_err(|error| format!("cannot handle signals: {error}"))?;
     send_test(client, rule, duration.as_secs_f64())?;
     let end = Instant::now() + duration;
     let mut outcome = Ok(());
     loop {
-        let is_stopped = tokio::select! {
-            _ = interrupt.recv() => true,
-            _ = terminate.recv() => true,
-            () = sleep(READ_PERIOD) => false,
-        };
+        let is_stopped = timeout(READ_PERIOD, stop.wait()).await.is_ok();
         if is_stopped {
             outcome = send_test(client, rule, 0.0);
             sleep(GRACE).await;

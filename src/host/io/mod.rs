@@ -14,6 +14,7 @@ pub mod result_file;
 pub mod snapshot_file;
 pub mod socket;
 pub mod stamp;
+pub mod stop;
 pub mod table;
 pub mod ticks;
 pub mod unix_socket;

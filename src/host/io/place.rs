@@ -1,6 +1,6 @@
 //! Places of the daemon's files that the command line or systemd names.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Place of a socket or of the state of the daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -37,4 +37,11 @@ impl PlaceSetting {
 pub fn first_folder(variable: &str) -> Option<PathBuf> {
     let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
     std::env::split_paths(&folders).next()
+}
+
+/// A path with a suffix appended to its name.
+pub fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    PathBuf::from(name)
 }

@@ -8,6 +8,8 @@ use std::io::{self, BufWriter, Write};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 
+use super::place::with_suffix;
+
 /// Bytes collected before a system call.
 const BUFFER: usize = 256 * 1024;
 
@@ -31,9 +33,8 @@ impl ResultFile {
         } else if fs::metadata(path).is_ok_and(|m| !m.is_file()) {
             (File::options().write(true).open(path).map_err(|e| named(path, e))?, None)
         } else {
-            let mut part = path.as_os_str().to_owned();
-            part.push(".part");
-            (File::create(&part).map_err(|e| named(path, e))?, Some(PathBuf::from(part)))
+            let part = with_suffix(path, ".part");
+            (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
         Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(BUFFER, file) })
     }

@@ -13,6 +13,7 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
 use crate::io::journal::JournalWriter;
+use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
 use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
@@ -20,7 +21,7 @@ use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress, with_suffix};
+use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]

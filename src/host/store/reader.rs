@@ -8,11 +8,12 @@ use rusqlite::{Connection, OpenFlags};
 
 use super::chain::hex;
 use super::document::StateDocument;
-use super::folder::{DATABASE, with_suffix};
+use super::folder::DATABASE;
 use super::rows::HistoryTable;
 use super::schema;
 use super::state_slots::{STATE, read_document};
 use super::verify::{self, ChainReport};
+use crate::io::place::with_suffix;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
