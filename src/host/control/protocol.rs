@@ -14,7 +14,7 @@ use serde_json::{Map, Value, json};
 
 use crate::alarm::{Alarm, Rule, Selector, Severity};
 use crate::monitor::{Command, MAX_TEST_S};
-use crate::quantity::{CellIndex, MAX_CELLS, Timestamp};
+use crate::quantity::{MAX_CELLS, Timestamp};
 
 /// Version of requests and answers.
 pub const VERSION: u64 = 1;
@@ -211,6 +211,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::quantity::CellIndex;
 
     fn requests() -> Vec<Request> {
         let which = Selector { rule: Some(Rule::SocLow), severity: Some(Severity::Severe), cell: Some(CellIndex(3)) };
