@@ -87,12 +87,6 @@ pub struct LogSource {
     read_bytes: Arc<AtomicU64>,
 }
 
-impl std::fmt::Debug for LogSource {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LogSource").field("files", &self.files).finish_non_exhaustive()
-    }
-}
-
 struct OpenLog {
     name: String,
     form: LogForm,
