@@ -2,8 +2,9 @@
 
 use std::fmt::Write as _;
 
-use super::Failure;
-use super::control_args::{ControlArgs, print};
+use super::control_args::ControlArgs;
+use super::output::print;
+use super::{Failure, output};
 use crate::alarm::{Alarm, AlarmState, Rule, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
@@ -48,14 +49,7 @@ fn table(list: &AlarmList) -> String {
     if list.alarms.is_empty() {
         text.push_str("no alarm\n");
     } else {
-        let rows: Vec<[String; HEAD.len()]> = list.alarms.iter().map(row).collect();
-        let width = |column: usize| {
-            let longest = rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-            longest.max(HEAD[column].len())
-        };
-        let widths: [usize; HEAD.len()] = std::array::from_fn(width);
-        push_row(&mut text, &HEAD.map(str::to_owned), &widths);
-        rows.iter().for_each(|row| push_row(&mut text, row, &widths));
+        text.push_str(&output::table(&HEAD, list.alarms.iter().map(row), HEAD.len()));
     }
     if list.omitted > 0 {
         let _ = writeln!(text, "and {} more, beyond the length of an answer", list.omitted);
@@ -74,16 +68,10 @@ fn table(list: &AlarmList) -> String {
     text
 }
 
-fn push_row(text: &mut String, row: &[String], widths: &[usize]) {
-    let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
-    text.push_str(cells.join("  ").trim_end());
-    text.push('\n');
-}
-
-fn row(alarm: &Alarm) -> [String; HEAD.len()] {
+fn row(alarm: &Alarm) -> Vec<String> {
     let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc);
     let has_been = alarm.occurrences > 0;
-    [
+    vec![
         alarm.rule.name().to_owned(),
         alarm.severity.name().to_owned(),
         cell(alarm.cell),

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use serde_json::{Map, Value, json};
 
 use super::Failure;
-use super::control_args::print;
+use super::numbers::{NamedValue, one_of};
+use super::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
@@ -63,8 +64,8 @@ struct VerifyArgs {
 #[derive(Debug, clap::Args)]
 struct RowArgs {
     /// Rows of these kinds (default: all)
-    #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
-    kind: Vec<KindName>,
+    #[arg(long, value_name = "KIND", value_parser = one_of(&KINDS), value_delimiter = ',')]
+    kind: Vec<HistoryTable>,
     /// Rows of this cell, counted from 1
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MAX_CELLS as i64))]
     cell: Option<u16>,
@@ -76,37 +77,19 @@ struct RowArgs {
     until: Option<Timestamp>,
 }
 
-/// A kind of rows, on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum KindName {
-    /// Charges and discharges
-    HalfCycle,
-    /// Learned capacities
-    Capacity,
-    /// Remaining life of the cell whose life ends first
-    RemainingLife,
-    /// Alarms
-    Alarm,
-    /// Resets, other packs, damages
-    Reset,
-}
-
-impl From<KindName> for HistoryTable {
-    fn from(name: KindName) -> Self {
-        match name {
-            KindName::HalfCycle => Self::HalfCycle,
-            KindName::Capacity => Self::Capacity,
-            KindName::RemainingLife => Self::RemainingLife,
-            KindName::Alarm => Self::Alarm,
-            KindName::Reset => Self::Reset,
-        }
-    }
-}
+/// Kinds of rows by name.
+const KINDS: [NamedValue<HistoryTable>; 5] = [
+    ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
+    ("capacity", HistoryTable::Capacity, "Learned capacities"),
+    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell whose life ends first"),
+    ("alarm", HistoryTable::Alarm, "Alarms"),
+    ("reset", HistoryTable::Reset, "Resets, other packs, damages"),
+];
 
 impl RowArgs {
     fn filter(&self, limit: Option<u32>) -> HistoryQuery {
         HistoryQuery {
-            kinds: self.kind.iter().map(|&name| name.into()).collect(),
+            kinds: self.kind.clone(),
             cell: self.cell.map(|number| number - 1),
             since_ns: self.since.map(Timestamp::nanos),
             until_ns: self.until.map(Timestamp::nanos),

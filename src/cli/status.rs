@@ -10,7 +10,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::Failure;
-use super::control_args::print;
+use super::output::print;
 use crate::status::client::{StatusClient, parse};
 use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;

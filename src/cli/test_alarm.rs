@@ -9,7 +9,9 @@ use std::time::Duration;
 
 use super::Failure;
 use super::alarms::state_name;
-use super::control_args::{ControlArgs, print, rule_parser};
+use super::control_args::{ControlArgs, rule_parser};
+use super::numbers::above_0_to;
+use super::output::print;
 use crate::alarm::{AlarmState, Rule};
 use crate::config;
 use crate::control::test_alarm::{self, ChannelReport, GenuineAlarm};
@@ -26,17 +28,10 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     /// Duration of the test
-    #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
+    #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = above_0_to(MAX_TEST_S, "seconds, "))]
     duration: f64,
     #[command(flatten)]
     control: ControlArgs,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if value > 0.0 && value <= MAX_TEST_S => Ok(value),
-        _ => Err(format!("must be seconds, above 0 to {MAX_TEST_S}")),
-    }
 }
 
 /// Runs the command.

@@ -7,11 +7,11 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
+use super::args::{FileArgs, GRAMMAR, ModelArgs};
 use super::report::{VERSION, fit_bar, form, jitter_json, mebibytes, score_json, short, show_fits, skipped};
 use super::{ColumnSelection, ColumnTable, PartColumn, read};
 use crate::cli::Failure;
-use crate::cli::numbers::percent;
+use crate::cli::numbers::{percent, whole};
 use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
 use crate::lab::gpr::forecast::{
     self, ForecastPlan, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, RowSpacing, TableForecast, horizons,

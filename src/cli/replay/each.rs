@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::available_parallelism;
 use std::time::Instant;
 
-use indicatif::{ProgressBar, ProgressDrawTarget};
+use indicatif::ProgressBar;
 
 use super::{Args, Failure, report};
 
@@ -147,7 +147,7 @@ struct EachBar {
 
 impl EachBar {
     fn new(logs: &[PathBuf]) -> Self {
-        let bar = report::bar(logs, ProgressDrawTarget::stderr_with_hz(5));
+        let bar = report::bar(logs);
         Self {
             bar,
             logs: logs.len(),
