@@ -3,9 +3,9 @@
 use std::fmt::Write as _;
 
 use super::control_args::ControlArgs;
-use super::output::print;
+use super::output::{print, word};
 use super::{Failure, output};
-use crate::alarm::{Alarm, AlarmState, Rule, Unit};
+use crate::alarm::{Alarm, Rule, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
@@ -75,7 +75,7 @@ fn row(alarm: &Alarm) -> Vec<String> {
         alarm.rule.name().to_owned(),
         alarm.severity.name().to_owned(),
         cell(alarm.cell),
-        state_name(alarm.state).to_owned(),
+        word(alarm.state),
         alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
         with_unit(alarm.rule, alarm.threshold),
         alarm.probability.map_or_else(|| "-".to_owned(), |probability| format!("{:.1} %", 100.0 * probability)),
@@ -107,24 +107,10 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
     }
 }
 
-/// The name of an alarm's state.
-pub(super) fn state_name(state: AlarmState) -> &'static str {
-    match state {
-        AlarmState::Unknown => "unknown",
-        AlarmState::Inactive => "inactive",
-        AlarmState::Pending => "pending",
-        AlarmState::Active => "active",
-        AlarmState::Clearing => "clearing",
-        AlarmState::Suppressed => "suppressed",
-        AlarmState::Latched => "latched",
-        AlarmState::Cleared => "cleared",
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::Severity;
+    use crate::alarm::{AlarmState, Severity};
     use crate::control::protocol::UnknownAlarms;
     use crate::quantity::Timestamp;
 

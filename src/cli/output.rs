@@ -32,6 +32,14 @@ pub(crate) fn print(text: &str) -> Result<(), Failure> {
         .map_err(|failure| Failure::new(format!("standard output cannot be written: {}", failure.message)))
 }
 
+/// A value of an enumeration, as in JSON.
+pub(crate) fn word(value: impl serde::Serialize) -> String {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => word,
+        _ => "?".to_owned(),
+    }
+}
+
 /// Writes one JSON document to standard output.
 pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     let mut out = io::stdout().lock();

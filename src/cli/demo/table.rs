@@ -4,6 +4,7 @@ use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
 
 use crate::alarm::Rule;
+use crate::cli::output::word;
 use crate::quantity::Mode;
 
 /// Pause after each redraw, so that a reader can follow.
@@ -82,12 +83,7 @@ fn text(row: &TableRow) -> String {
         None => format!("{:>6}{:8}", "-", ""),
     };
     let recharge = row.recharge_period_s.map_or("-".to_owned(), |s| format!("{s:.0}"));
-    let mode = match row.mode {
-        Mode::Unknown => "unknown",
-        Mode::Charge => "charge",
-        Mode::Rest => "rest",
-        Mode::Discharge => "discharge",
-    };
+    let mode = word(row.mode);
     let alarms: Vec<String> = row.alarms.iter().map(|rule| rule.name().replace('_', " ")).collect();
     format!(
         "{:5} {:5.1} h | {soc} {:6.1} | {:8.3} +-{:6.3} {:6.3} | {:4.0} | {recharge:>8} | {mode:10} {}",

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
-use crate::cli::alarms::{cell as cell_name, state_name, with_unit};
+use crate::cli::alarms::{cell as cell_name, with_unit};
 use crate::cli::output;
 use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
@@ -136,7 +136,7 @@ pub(super) fn alarm_line(alarm: &Alarm) -> String {
         "{} {} {owner} {}: {value}, threshold {}{probability}{}",
         alarm.severity.name(),
         alarm.rule.name(),
-        state_name(alarm.state),
+        word(alarm.state),
         with_unit(alarm.rule, alarm.threshold),
         if alarm.is_acknowledged { ", acknowledged" } else { "" },
     )

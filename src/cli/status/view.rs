@@ -20,7 +20,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::interval;
 
-use app::{App, Key};
+use app::App;
 
 use crate::status::stream_path;
 
@@ -65,7 +65,7 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
             () = signals.wait() => return Ok(()),
             key = keys.recv() => match key {
                 Some(Event::Key(key)) => match meaning(key) {
-                    Some(Key::Quit) => return Ok(()),
+                    Some(KeyCode::Esc) => return Ok(()),
                     Some(key) => app.handle_key(key),
                     None => continue,
                 },
@@ -117,27 +117,16 @@ fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     Ok(keys)
 }
 
-fn meaning(key: KeyEvent) -> Option<Key> {
-    if key.kind == KeyEventKind::Release {
-        return None;
-    }
-    if key.modifiers.contains(KeyModifiers::CONTROL) {
-        return (key.code == KeyCode::Char('c')).then_some(Key::Quit);
-    }
+/// The key that the view acts on: Esc for every key that leaves it, `None` for one without a meaning.
+fn meaning(key: KeyEvent) -> Option<KeyCode> {
+    let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
     match key.code {
-        KeyCode::Char('q') | KeyCode::Esc => Some(Key::Quit),
-        KeyCode::Tab => Some(Key::NextPage),
-        KeyCode::BackTab => Some(Key::PreviousPage),
-        KeyCode::Up => Some(Key::Up),
-        KeyCode::Down => Some(Key::Down),
-        KeyCode::Left => Some(Key::Left),
-        KeyCode::Right => Some(Key::Right),
-        KeyCode::PageUp => Some(Key::PageUp),
-        KeyCode::PageDown => Some(Key::PageDown),
-        KeyCode::Home => Some(Key::First),
-        KeyCode::End => Some(Key::Last),
-        KeyCode::Char('v') => Some(Key::Quantity),
-        _ => None,
+        _ if key.kind == KeyEventKind::Release => None,
+        KeyCode::Char('c') if has_control => Some(KeyCode::Esc),
+        _ if has_control => None,
+        KeyCode::Char('q') => Some(KeyCode::Esc),
+        KeyCode::Char(letter) if letter != 'v' => None,
+        code => Some(code),
     }
 }
 

@@ -3,6 +3,8 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
+use ratatui::crossterm::event::KeyCode;
+
 use crate::quantity::Timestamp;
 use crate::status::STALE;
 use crate::status::document::StatusDocument;
@@ -17,35 +19,6 @@ pub(super) enum FeedUpdate {
     StatusDocument(Box<StatusDocument>),
     /// The connection failed: why.
     Lost(String),
-}
-
-/// The action of a key.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Key {
-    /// Quit.
-    Quit,
-    /// To the page on the right.
-    NextPage,
-    /// To the page on the left.
-    PreviousPage,
-    /// A row up.
-    Up,
-    /// A row down.
-    Down,
-    /// A cell to the left.
-    Left,
-    /// A cell to the right.
-    Right,
-    /// A screen up.
-    PageUp,
-    /// A screen down.
-    PageDown,
-    /// To the first.
-    First,
-    /// To the last.
-    Last,
-    /// Show the other quantity.
-    Quantity,
 }
 
 /// The pages.
@@ -197,12 +170,11 @@ impl App {
     }
 
     /// Performs the action of a key.
-    pub(super) fn handle_key(&mut self, key: Key) {
+    pub(super) fn handle_key(&mut self, key: KeyCode) {
         match key {
-            Key::Quit => {}
-            Key::NextPage => self.turn_to(self.page.step(1)),
-            Key::PreviousPage => self.turn_to(self.page.step(Page::ALL.len() - 1)),
-            Key::Quantity => {
+            KeyCode::Tab => self.turn_to(self.page.step(1)),
+            KeyCode::BackTab => self.turn_to(self.page.step(Page::ALL.len() - 1)),
+            KeyCode::Char('v') => {
                 self.quantity = match self.quantity {
                     Quantity::Soc => Quantity::Voltage,
                     Quantity::Voltage => Quantity::Soc,
@@ -222,17 +194,17 @@ impl App {
     }
 }
 
-fn moved(at: usize, key: Key, row: usize, screen: usize, last: usize) -> usize {
+fn moved(at: usize, key: KeyCode, row: usize, screen: usize, last: usize) -> usize {
     let to = match key {
-        Key::Up => at.saturating_sub(row),
-        Key::Down => at + row,
-        Key::Left => at.saturating_sub(1),
-        Key::Right => at + 1,
-        Key::PageUp => at.saturating_sub(screen),
-        Key::PageDown => at + screen,
-        Key::First => 0,
-        Key::Last => last,
-        Key::Quit | Key::NextPage | Key::PreviousPage | Key::Quantity => at,
+        KeyCode::Up => at.saturating_sub(row),
+        KeyCode::Down => at + row,
+        KeyCode::Left => at.saturating_sub(1),
+        KeyCode::Right => at + 1,
+        KeyCode::PageUp => at.saturating_sub(screen),
+        KeyCode::PageDown => at + screen,
+        KeyCode::Home => 0,
+        KeyCode::End => last,
+        _ => at,
     };
     to.min(last)
 }
