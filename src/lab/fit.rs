@@ -149,7 +149,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let mut outcome = FitOutcome {
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
-        thermal: thermal.ok(),
+        thermal: thermal.clone().ok(),
         voltage_error_v,
         by_kind,
         files,
@@ -158,7 +158,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         notes: prepared.notes,
         fit: fitted,
     };
-    outcome.notes.extend(thermal.err().map(|error| error.to_string()));
+    outcome.notes.extend(thermal.err());
     add_notes(&mut outcome);
     Ok(outcome)
 }

@@ -207,7 +207,7 @@ impl HorizonTask<'_> {
             calibrated: spread.count(),
             factor: spread.factor,
             fit_s,
-            jitter: model.jitter(),
+            jitter: model.outcome.jitter,
             at_origin,
             held_out,
             score,

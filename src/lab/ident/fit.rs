@@ -87,24 +87,11 @@ pub struct FittedTables {
     pub converged: bool,
 }
 
-/// Why there is no fit.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum FitError {
-    /// Too few rows.
-    #[error("{found} rows can be judged, at least {MIN_ROWS} are needed")]
-    TooFewRows {
-        /// Judged rows.
-        found: usize,
-    },
-    /// The equations have no finite value at the start.
-    #[error(
-        "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number"
-    )]
-    NotFinite,
-    /// The current never changes enough to determine a resistance.
-    #[error("the current does not change: no resistance can be separated from the open-circuit voltage")]
-    NoExcitation,
-}
+/// The equations have no finite value at the start.
+const NOT_FINITE: &str =
+    "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number";
+/// The current never changes enough to determine a resistance.
+const NO_EXCITATION: &str = "the current does not change: no resistance can be separated from the open-circuit voltage";
 
 /// Fits tables to `records` with weights `scale` per record; `progress` receives the pass number and the cost.
 ///
@@ -115,10 +102,10 @@ pub fn fit(
     records: &[Record],
     scale: &[f64],
     progress: impl FnMut(usize, f64),
-) -> Result<FittedTables, FitError> {
+) -> Result<FittedTables, String> {
     let judged = records.iter().flat_map(|r| &r.rows).filter(|row| row.weight_s > 0.0).count();
     if judged < MIN_ROWS {
-        return Err(FitError::TooFewRows { found: judged });
+        return Err(format!("{judged} rows can be judged, at least {MIN_ROWS} are needed"));
     }
     let layout = Layout::new(&settings.grid, settings.tau_s.len());
     let start = start(settings, &layout, records)?;
@@ -132,7 +119,7 @@ pub fn fit(
         normal
     };
     if !evaluate(&start).cost.is_finite() {
-        return Err(FitError::NotFinite);
+        return Err(NOT_FINITE.to_owned());
     }
     let solution = minimise(&space, &start, evaluate, progress);
     let tables = ParameterTables::new(&layout, &solution.theta);
@@ -183,13 +170,13 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
 }
 
 /// Starting values: OCV of the slow test or a straight line, resistances from steps of current.
-fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, FitError> {
+fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, String> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
         true => grid.temperature_c.iter().flat_map(|_| straight_ocv(settings)).collect(),
         false => ocv_nodes(grid, &settings.ocv),
     };
-    let r0_ohm = resistance_of_steps(records).ok_or(FitError::NoExcitation)?;
+    let r0_ohm = resistance_of_steps(records).ok_or(NO_EXCITATION)?;
     let ln_r = |ohm: f64| per_node(grid, |t| libm::log(ohm * arrhenius(t)));
     theta.extend(ln_r(r0_ohm));
     for &tau_s in &settings.tau_s {
