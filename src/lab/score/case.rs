@@ -295,7 +295,7 @@ impl<'a> CaseRun<'a> {
 
     fn finish(mut self, case: &Case) -> Result<CaseScore, LabError> {
         if let Some((_, latest)) = self.span {
-            self.feeder.finish(latest);
+            self.feeder.unknown_gap(latest);
             self.take_events();
         }
         let (job, settings, last) = (self.job, self.settings, self.last);

@@ -7,7 +7,7 @@ use ratatui::crossterm::event::KeyCode;
 
 use crate::quantity::Timestamp;
 use crate::status::STALE;
-use crate::status::document::StatusDocument;
+use crate::status::document::{CellStatus, StatusDocument};
 
 /// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
@@ -57,21 +57,18 @@ pub(super) enum Quantity {
     Voltage,
 }
 
-/// A cell's values at one document.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CellPoint {
-    soc: Option<f32>,
-    voltage_v: Option<f32>,
-}
-
-impl CellPoint {
-    pub(super) fn get(self, quantity: Quantity) -> Option<f64> {
-        match quantity {
-            Quantity::Soc => self.soc.map(f64::from),
-            Quantity::Voltage => self.voltage_v.map(f64::from),
+impl Quantity {
+    /// Its value in a cell.
+    pub(super) fn of(self, cell: &CellStatus) -> Option<f64> {
+        match self {
+            Self::Soc => cell.soc,
+            Self::Voltage => cell.voltage_v,
         }
     }
 }
+
+/// A cell's values at one document, a quantity after the other.
+pub(super) type CellPoint = [Option<f32>; 2];
 
 /// The view.
 #[derive(Debug)]
@@ -162,10 +159,7 @@ impl App {
                 points.pop_front();
             }
             // The plots are a few dots high, so single precision suffices.
-            points.push_back(CellPoint {
-                soc: cell.soc.map(|soc| soc as f32),
-                voltage_v: cell.voltage_v.map(|v| v as f32),
-            });
+            points.push_back([Quantity::Soc, Quantity::Voltage].map(|quantity| Some(quantity.of(cell)? as f32)));
         }
     }
 
