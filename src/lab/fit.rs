@@ -241,7 +241,7 @@ fn by_file(
             rows: only.iter().map(|record| record.raw_rows).sum(),
             seconds: only.iter().map(Record::seconds).sum(),
             outliers: only.iter().map(|record| record.outliers).sum(),
-            residual: fit::judge(&only, &fitted.tables).1,
+            residual: fit::judge(&only, &fitted.tables),
         }
     };
     files.iter().enumerate().map(of_file).collect()

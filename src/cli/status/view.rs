@@ -16,7 +16,7 @@ use std::time::Duration;
 
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::interval;
 
@@ -56,13 +56,17 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
 }
 
 async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
-    let mut signals = Signals::new()?;
+    let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()];
+    let [terminate, interrupt, hangup] = kinds.map(signal);
+    let (mut terminate, mut interrupt, mut hangup) = (terminate?, interrupt?, hangup?);
     let mut keys = read_keys()?;
     let mut updates = feed::start(app.path().to_owned());
     let mut ticks = interval(DRAW_PERIOD);
     loop {
         tokio::select! {
-            () = signals.wait() => return Ok(()),
+            _ = terminate.recv() => return Ok(()),
+            _ = interrupt.recv() => return Ok(()),
+            _ = hangup.recv() => return Ok(()),
             key = keys.recv() => match key {
                 Some(Event::Key(key)) => match meaning(key) {
                     Some(KeyCode::Esc) => return Ok(()),
@@ -79,28 +83,6 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
         }
         app.poll(feed::now());
         terminal.draw(|frame| draw::draw(frame, &mut app))?;
-    }
-}
-
-/// Signals that end the view.
-struct Signals {
-    all: [Signal; 3],
-}
-
-impl Signals {
-    fn new() -> io::Result<Self> {
-        let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()];
-        let [terminate, interrupt, hangup] = kinds.map(signal);
-        Ok(Self { all: [terminate?, interrupt?, hangup?] })
-    }
-
-    async fn wait(&mut self) {
-        let [terminate, interrupt, hangup] = &mut self.all;
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-            _ = hangup.recv() => {}
-        }
     }
 }
 

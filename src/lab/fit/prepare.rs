@@ -300,7 +300,7 @@ impl FitInputs {
         let of_kind = |discharge: bool| {
             let own = self.sources.iter().zip(records).filter(|(s, _)| s.part.is_discharge() == discharge);
             let own: Vec<Record> = own.map(|(_, record)| record.clone()).collect();
-            fit::judge(&own, &fitted.tables).1
+            fit::judge(&own, &fitted.tables)
         };
         (of_kind(true), of_kind(false))
     }

@@ -26,7 +26,8 @@ use crate::alarm::{Rule, RuleConfig};
 use crate::quantity::Timestamp;
 
 /// Longest time from a true raise to the end of life.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Horizon {
     /// In equivalent full cycles.
     Cycles(f64),

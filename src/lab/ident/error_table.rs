@@ -171,15 +171,8 @@ mod tests {
         let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = Record::prepare(&raw, &[], &grid, &limits);
-        let fit = FittedTables {
-            grid,
-            tables,
-            residuals: vec![],
-            total: Residual::default(),
-            visits_s: vec![],
-            passes: 0,
-            converged: true,
-        };
+        let fit =
+            FittedTables { grid, tables, total: Residual::default(), visits_s: vec![], passes: 0, converged: true };
         let error_v = |files: [usize; 4], share: f64| {
             let judged = files.map(|file| WeightedRecord { record: &record, file, share });
             table(&fit, &judged, 2.0)

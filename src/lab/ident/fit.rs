@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::grid::{Grid, GridPoint, arrhenius, interpolate};
+use super::grid::{Grid, arrhenius, interpolate};
 use super::parameters::{Layout, ParameterTables};
 use super::pass::{NormalEquations, accumulate, residuals, visits};
 use super::prior::{Prior, PriorDeviations, per_node};
@@ -75,8 +75,6 @@ pub struct FittedTables {
     pub grid: Grid,
     /// Values in node order.
     pub tables: ParameterTables,
-    /// Per record, in their order.
-    pub residuals: Vec<Residual>,
     /// Over all records.
     pub total: Residual,
     /// Seconds of data near each node.
@@ -123,11 +121,10 @@ pub fn fit(
     }
     let solution = minimise(&space, &start, evaluate, progress);
     let tables = ParameterTables::new(&layout, &solution.theta);
-    let (each, total) = judge(records, &tables);
+    let total = judge(records, &tables);
     let all: Vec<&Record> = records.iter().collect();
     Ok(FittedTables {
         grid: settings.grid.clone(),
-        residuals: each,
         total,
         visits_s: visits(&all, layout.nodes),
         tables,
@@ -260,19 +257,17 @@ fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
     Space { low, high, rising }
 }
 
-/// Residuals of every record and of all together.
-pub fn judge(records: &[Record], tables: &ParameterTables) -> (Vec<Residual>, Residual) {
+/// Residual of all records together.
+pub fn judge(records: &[Record], tables: &ParameterTables) -> Residual {
     let mut total = ResidualSums::default();
-    let each = records.iter().map(|record| {
+    for record in records {
         let mut sums = ResidualSums::default();
         for (row, e) in record.rows.iter().zip(residuals(record, tables)) {
             sums.add(row.weight_s, e);
         }
         total.join(&sums);
-        sums.residual()
-    });
-    let each = each.collect();
-    (each, total.residual())
+    }
+    total.residual()
 }
 
 /// Running sums of weighted residuals.
@@ -333,13 +328,6 @@ impl FittedTables {
         };
         let rows = self.tables.ocv_v.chunks(self.grid.soc.len());
         rows.map(of_row).sum::<f64>() / self.grid.temperature_c.len() as f64
-    }
-
-    /// The model's resistance once all branches have settled, ohm, at a place.
-    pub fn settled_ohm(&self, place: &GridPoint) -> f64 {
-        let corners = self.grid.resistance_corners(place);
-        let branches: f64 = self.tables.r_ohm.iter().map(|r| corners.at(r)).sum();
-        corners.at(&self.tables.r0_ohm) + branches
     }
 }
 
