@@ -149,7 +149,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let mut outcome = FitOutcome {
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
-        thermal: thermal.ok(),
+        thermal: thermal.clone().ok(),
         voltage_error_v,
         by_kind,
         files,
@@ -158,7 +158,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         notes: prepared.notes,
         fit: fitted,
     };
-    outcome.notes.extend(thermal.err().map(|error| error.to_string()));
+    outcome.notes.extend(thermal.err());
     add_notes(&mut outcome);
     Ok(outcome)
 }
@@ -241,7 +241,7 @@ fn by_file(
             rows: only.iter().map(|record| record.raw_rows).sum(),
             seconds: only.iter().map(Record::seconds).sum(),
             outliers: only.iter().map(|record| record.outliers).sum(),
-            residual: fit::judge(&only, &fitted.tables).1,
+            residual: fit::judge(&only, &fitted.tables),
         }
     };
     files.iter().enumerate().map(of_file).collect()
