@@ -236,16 +236,11 @@ impl AlarmEngine {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
-            let config = &self.rules[index].config;
-            let before = self.machines[slot].index_entry();
-            let change = if config.rule.spec().is_learned { self.machines[slot].poll(now, config) } else { None };
-            if let Some(change) = change {
-                // The slot leaves `counting`, so the next one moves into its place.
-                self.update_index(index, slot, before);
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            } else {
-                next += 1;
-            }
+            let is_learned = self.rules[index].config.rule.spec().is_learned;
+            // A change takes the slot out of the list.
+            let has_changed =
+                is_learned && self.change(index, slot, changes, |machine, config| machine.poll(now, config));
+            next += usize::from(!has_changed);
         }
     }
 
@@ -254,9 +249,10 @@ impl AlarmEngine {
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
-            let before = self.machines[slot].index_entry();
-            self.machines[slot].handle_gap();
-            self.update_index(self.rule_of(slot), slot, before);
+            self.change(self.rule_of(slot), slot, &mut Vec::new(), |machine, _| {
+                machine.handle_gap();
+                None
+            });
         }
     }
 
@@ -410,24 +406,14 @@ impl AlarmEngine {
         }
         for index in 0..self.rules.len() {
             if !old.rules.iter().any(|before| before.config == self.rules[index].config) {
-                self.retarget(now, index, changes);
+                for slot in self.rules[index].slots() {
+                    self.change(index, slot, changes, |machine, config| machine.retarget(now, config));
+                }
             }
         }
         ended
     }
 
-    fn retarget(&mut self, now: Timestamp, index: usize, changes: &mut Vec<AlarmChange>) {
-        for slot in self.rules[index].slots() {
-            let before = self.machines[slot].index_entry();
-            let change = self.machines[slot].retarget(now, &self.rules[index].config);
-            self.update_index(index, slot, before);
-            if let Some(change) = change {
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            }
-        }
-    }
-
-    /// Index of the threshold and slot of an alarm, if it is watched.
     fn locate(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<(usize, usize)> {
         let same = |slots: &RuleSlots| (slots.config.rule, slots.config.severity) == (rule, severity);
         let index = self.rules.iter().position(same)?;
@@ -448,13 +434,26 @@ impl AlarmEngine {
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
             let Some(slot) = self.rules[index].slot(cell) else { continue };
-            let before = self.machines[slot].index_entry();
-            let change = act(&mut self.machines[slot], &self.rules[index].config);
-            self.update_index(index, slot, before);
-            if let Some(change) = change {
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            }
+            self.change(index, slot, changes, &mut act);
         }
+    }
+
+    /// Changes one machine and all that is known of it here; returns whether the change is published.
+    #[inline]
+    fn change(
+        &mut self,
+        index: usize,
+        slot: usize,
+        changes: &mut Vec<AlarmChange>,
+        act: impl FnOnce(&mut Machine, &RuleConfig) -> Option<Change>,
+    ) -> bool {
+        let before = self.machines[slot].index_entry();
+        let change = act(&mut self.machines[slot], &self.rules[index].config);
+        self.update_index(index, slot, before);
+        if let Some(change) = change {
+            changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+        }
+        change.is_some()
     }
 
     fn command(
@@ -470,17 +469,12 @@ impl AlarmEngine {
                 if !which.matches(rule, severity, self.rules[index].cell(slot)) {
                     continue;
                 }
-                let before = self.machines[slot].index_entry();
-                let result = act(&mut self.machines[slot]);
-                self.update_index(index, slot, before);
-                match result {
-                    Ok(change) => {
-                        outcome.changed += 1;
-                        changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-                    }
-                    Err(Refusal::NotHealthy) => outcome.refused += 1,
-                    Err(Refusal::Nothing) => {}
-                }
+                let has_changed = self.change(index, slot, changes, |machine, _| {
+                    let result = act(machine);
+                    outcome.refused += u32::from(result == Err(Refusal::NotHealthy));
+                    result.ok()
+                });
+                outcome.changed += u32::from(has_changed);
             }
         }
         outcome
