@@ -35,7 +35,7 @@ impl Default for FloodConfig {
 }
 
 /// Dropping began or ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodChange {
     /// Interface.
     pub bus: BusIndex,

@@ -35,7 +35,7 @@ pub struct GuardConfig {
 }
 
 /// A message turned from usable to failing, or back.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardChange {
     /// Interface.
     pub bus: BusIndex,

@@ -60,6 +60,7 @@ pub use view::{CellView, PackView};
 /// The pure core.
 #[derive(Debug)]
 pub struct Monitor {
+    config: MonitorConfig,
     clock: Clock,
     intake: Intake,
     stages: Stages,
@@ -70,7 +71,8 @@ pub struct Monitor {
 impl Monitor {
     /// A monitor without any knowledge of its pack.
     pub fn new(config: MonitorConfig) -> Self {
-        Self { clock: Clock::default(), intake: Intake::new(&config), stages: Stages::new(&config), pending: None }
+        let (intake, stages) = (Intake::new(&config), Stages::new(&config));
+        Self { config, clock: Clock::default(), intake, stages, pending: None }
     }
 
     /// Takes one input; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
@@ -115,31 +117,32 @@ impl Monitor {
 
     /// Takes a frame: its readings to the stages, or its command.
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
-        let Self { clock, intake, stages, .. } = self;
+        let Self { config, clock, intake, stages, .. } = self;
         let now = clock.now();
         let Some(intact) = intake.admit(now, bus, frame, out) else { return };
-        if intake.is_command(bus, frame) {
-            match intake.command(now, bus, frame, intact.is_ok(), out) {
+        let is_command = |commands: &&CommandConfig| commands.bus == bus && commands.plan.id() == frame.id();
+        if let Some(commands) = config.commands.as_ref().filter(is_command) {
+            match intake.command(now, commands, frame, intact.is_ok(), out) {
                 Some(command) => stages.handle_command(now, Source::Bus(bus), command, out),
                 None => stages.statistics.bad_commands += 1,
             }
             return;
         }
-        intake.decode(bus, frame, |Reading { channel, value }| {
+        config.input.decode(bus, frame, |Reading { channel, value }| {
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
     }
 
     /// Takes an input that is neither a frame nor a gap, at its time.
     fn handle_occasional(&mut self, input: Input<'_>, out: &mut Outputs) {
-        let Self { intake, stages, .. } = self;
+        let Self { config, intake, stages, .. } = self;
         let now = self.clock.now();
         match input {
             Input::Frame { .. } | Input::UnknownGap { .. } => {}
             Input::Tick { .. } => {
                 if stages.take_housekeeping_due(now) {
                     intake.poll(now, out);
-                    stages.keep_house(now, intake.bus_fault(now), out);
+                    stages.keep_house(now, intake.bus_fault(now, config.interfaces), out);
                 }
                 stages.send_due(now, out);
             }
@@ -151,7 +154,7 @@ impl Monitor {
             }
             Input::Bus { bus, event, .. } => {
                 intake.handle_bus_event(now, bus, event, out);
-                if event == BusEvent::Up && stages.sender.j1939().is_some_and(|j1939| j1939.config().bus == bus) {
+                if event == BusEvent::Up && config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
                     stages.sender.claim_address(now, out);
                 }
             }

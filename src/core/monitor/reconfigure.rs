@@ -47,8 +47,8 @@ impl Monitor {
         now: Timestamp,
         out: &mut Outputs,
     ) -> Result<Reconfigured, ReconfigureError> {
-        let old = self.config();
-        old.check_fits(&config)?;
+        self.config.check_fits(&config)?;
+        let old = std::mem::replace(&mut self.config, config.clone());
         let first_event = out.events.len();
         let at = self.clock.now();
         if !old.estimates_as(&config) {
@@ -82,27 +82,6 @@ impl Monitor {
         self.stages.statistics.note_events(&out.events[first_event..]);
         self.find_due();
         Ok(Reconfigured { changed, alarms_ended })
-    }
-
-    /// The present configuration, assembled from the stages.
-    fn config(&self) -> MonitorConfig {
-        let (intake, stages) = (self.intake.config(), &self.stages);
-        let bank = &stages.estimation.bank;
-        MonitorConfig {
-            interfaces: intake.interfaces,
-            input: intake.input.clone(),
-            guards: intake.guards.clone(),
-            identity_readings: stages.sampling.identity_readings(),
-            flood: intake.flood,
-            sample: stages.sampling.sampler.config().clone(),
-            model: bank.model().clone(),
-            estimator: *bank.config(),
-            health: stages.learning.config,
-            rules: stages.alarming.rules().to_vec(),
-            output: stages.sender.config().cloned(),
-            commands: intake.commands.clone(),
-            j1939: stages.sender.j1939().map(|j1939| j1939.config().clone()),
-        }
     }
 
     /// Forgets values measured by another window or load, before new thresholds are set.

@@ -80,11 +80,6 @@ impl Sampling {
         self.identity_readings = config.identity_readings;
     }
 
-    /// Readings in a row that give another identity.
-    pub(super) fn identity_readings(&self) -> u32 {
-        self.identity_readings
-    }
-
     /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
     /// [`handle_reading`](Self::handle_reading) has still to take it.
     #[inline]

@@ -112,16 +112,6 @@ impl Sender {
         }
     }
 
-    /// Settings of the cyclic frames.
-    pub(super) fn config(&self) -> Option<&OutputConfig> {
-        self.config.as_ref()
-    }
-
-    /// The J1939 node.
-    pub(super) fn j1939(&self) -> Option<&J1939> {
-        self.j1939.as_ref()
-    }
-
     /// Other cyclic frames. Without any, a running test ends.
     pub(super) fn reconfigure(
         &mut self,
@@ -329,8 +319,8 @@ impl Sender {
 
     /// Passes a frame to the J1939 node, if it came on the node's interface.
     pub(super) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
-        if let Some(j1939) = self.j1939.as_mut().filter(|j1939| j1939.config().bus == bus) {
-            j1939.handle_frame(now, frame, out);
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.handle_frame(now, bus, frame, out);
         }
     }
 
