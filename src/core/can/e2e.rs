@@ -111,25 +111,9 @@ impl Profile {
 }
 
 /// Why a payload cannot be protected.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum ProtectError {
-    /// Shorter than the header.
-    #[error("payload has {found} bytes, this end-to-end profile needs {needed} or more")]
-    Short {
-        /// Bytes of the payload.
-        found: usize,
-        /// Bytes of the header.
-        needed: usize,
-    },
-    /// A counter above the profile's largest.
-    #[error("end-to-end counter {found}, must be 0 to {max}")]
-    Counter {
-        /// The counter.
-        found: u8,
-        /// The largest.
-        max: u8,
-    },
-}
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ProtectError(String);
 
 /// Agreement between sender and receiver of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -148,10 +132,10 @@ impl Protection {
     pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
         let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
         if found < needed {
-            return Err(ProtectError::Short { found, needed });
+            return Err(ProtectError(format!("payload of {found} bytes, this profile needs {needed} or more")));
         }
         if counter > max {
-            return Err(ProtectError::Counter { found: counter, max });
+            return Err(ProtectError(format!("end-to-end counter {counter}, must be 0 to {max}")));
         }
         match self.profile {
             Profile::P01A => payload[1] = payload[1] & 0xF0 | counter,

@@ -234,7 +234,7 @@ impl Stages {
         let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted));
         estimation.restore(cells, CellBatch::restore(has_reported, snapshot.waiting));
         // Its shape is checked in `Monitor::restore`.
-        let _ = sampling.sampler.restore(&snapshot.sampler);
+        sampling.sampler.restore(snapshot.sampler);
         sampling.identity = snapshot.identity;
         learning.state = snapshot.learning;
         self.sender.restore(snapshot.schedule);
