@@ -439,7 +439,7 @@ impl Replay {
 /// Voltage readings that reached an estimator, since the monitor's first start.
 fn cell_steps(monitor: &Monitor) -> u64 {
     let counts = monitor.statistics();
-    counts.voltages_used + counts.voltages_gated + counts.voltages_without_current
+    counts.voltages.total()
 }
 
 impl Sinks {

@@ -12,7 +12,7 @@ fn readings_are_counted_by_their_outcome() {
     let before = rig.monitor.reading_counts();
     assert_eq!((before.accepted, before.out_of_range), (600, 0));
     assert_eq!(rig.monitor.statistics().buses[0].frames, 200);
-    assert_eq!(rig.monitor.statistics().voltages_used, 200);
+    assert_eq!(rig.monitor.statistics().voltages.used, 200);
     // Above the pack's limits, and for so long that it is reported only once.
     rig.voltages_v[1] = Some(4.9);
     rig.seconds(2);
@@ -29,18 +29,21 @@ fn readings_are_counted_by_their_outcome() {
 fn counts_go_on_after_a_restart() {
     let mut rig = learned();
     let (before, readings) = (rig.monitor.statistics().clone(), rig.monitor.reading_counts());
-    assert_eq!((before.half_cycles, before.capacity_updates, before.capacity_measurements), (2, 2, 2));
+    assert_eq!(
+        (before.learning.half_cycles, before.learning.capacity_updates, before.learning.capacity_measurements),
+        (2, 2, 2)
+    );
     assert_eq!((before.alarms_raised.warning, before.restores), (2, 0));
     rig.restart(Downtime::Seconds(3600.0));
     rig.seconds(1);
     let after = rig.monitor.statistics();
-    assert_eq!((after.half_cycles, after.alarms_raised.warning, after.restores), (2, 2, 1));
+    assert_eq!((after.learning.half_cycles, after.alarms_raised.warning, after.restores), (2, 2, 1));
     assert_eq!(after.gaps, before.gaps + 1);
     assert_eq!(after.buses[0].frames, before.buses[0].frames + 20);
     assert!(rig.monitor.reading_counts().accepted > readings.accepted);
     // The difference is what was added since.
     let added = after.since(&before);
-    assert_eq!((added.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
+    assert_eq!((added.learning.half_cycles, added.restores, added.gaps, added.buses[0].frames), (0, 1, 1, 20));
     assert_eq!(rig.monitor.reading_counts().since(&readings).accepted, 60);
     assert_eq!(before.since(after), Statistics { buses: vec![BusStatistics::default()], ..Statistics::default() });
 }

@@ -287,7 +287,7 @@ fn an_old_frame_replayed_is_refused_and_the_stream_continues() {
     assert!(bench.has(&current_bad));
     (0..10).for_each(|_| bench.cycle());
     assert_eq!(bench.reported().last(), Some(&(CURRENT, Status::Ok, true, 1)), "the next frame of the sender is good");
-    assert!(bench.estimates.iter().all(|estimate| estimate.current_a == 1.0), "-50 A is never used");
+    assert!(bench.estimates.iter().all(|estimate| estimate.measured.current_a == 1.0), "-50 A is never used");
     assert_eq!(bench.estimates_of(0), 10);
 }
 

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::batch::CellBatch;
-use super::{Estimate, MonitorConfig};
+use super::{Estimate, MeasuredValues, MonitorConfig};
 use crate::cell::{CellStep, EstimatorBank};
 use crate::filter::ScalarGaussian;
 use crate::health::{CellCondition, Learner};
@@ -186,9 +186,11 @@ impl Estimation {
             innovation_v: update.map_or(f64::NAN, |u| u.innovation),
             innovation_std_v: update.map_or(f64::NAN, |u| u.innovation_variance.sqrt()),
             accepted: update.is_some_and(|u| u.accepted),
-            voltage_v: sample.voltage_v,
-            current_a: sample.current_a.unwrap_or(f64::NAN),
-            temperature_c: self.bank.temperature_c(index).unwrap_or(f64::NAN),
+            measured: MeasuredValues {
+                voltage_v: sample.voltage_v,
+                current_a: sample.current_a.unwrap_or(f64::NAN),
+                temperature_c: self.bank.temperature_c(index).unwrap_or(f64::NAN),
+            },
         })
     }
 

@@ -50,12 +50,12 @@ pub use event::{Event, EventKind};
 pub use input::{BusEvent, Command, Downtime, DowntimeParseError, Input, MERGE_TOLERANCE_NS, Source, TICK_PERIOD_MS};
 pub use intake::CommandConfig;
 pub use j1939::{AlarmCode, J1939Config};
-pub use outputs::{Estimate, Outputs, Transmit, Validity};
+pub use outputs::{Estimate, MeasuredValues, Outputs, Transmit, Validity};
 pub use reconfigure::{ReconfigureError, Reconfigured};
 pub use sender::{MAX_TEST_S, OutputConfig};
 pub use snapshot::{RestoreError, Snapshot};
-pub use statistics::{AlarmCounts, BusStatistics, Statistics};
-pub use view::{CellView, PackView};
+pub use statistics::{AlarmCounts, BusStatistics, LearningCounts, Statistics, VoltageCounts};
+pub use view::{CellView, PackView, ReportedState};
 
 /// The pure core.
 #[derive(Debug)]

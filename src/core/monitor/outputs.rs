@@ -63,11 +63,18 @@ pub struct Estimate {
     pub innovation_std_v: f64,
     /// Whether the reading passed the gate and moved the estimate.
     pub accepted: bool,
-    /// The voltage used, V.
+    /// The readings it came from.
+    pub measured: MeasuredValues,
+}
+
+/// The readings that one estimate was made from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredValues {
+    /// Voltage, V.
     pub voltage_v: f64,
-    /// The cell current used, A, positive = discharge.
+    /// Cell current, A, positive = discharge.
     pub current_a: f64,
-    /// The temperature used, degrees C.
+    /// Temperature, degrees C.
     pub temperature_c: f64,
 }
 

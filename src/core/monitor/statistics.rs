@@ -18,12 +18,9 @@ use crate::quantity::BusIndex;
 pub struct Statistics {
     /// Per interface, in the order of the configuration; interfaces without input may be missing at the end.
     pub buses: Vec<BusStatistics>,
-    /// Voltage readings that moved an estimate.
-    pub voltages_used: u64,
-    /// Voltage readings beyond the filter's gate: they moved nothing.
-    pub voltages_gated: u64,
-    /// Voltage readings without a current to compare them with.
-    pub voltages_without_current: u64,
+    /// Voltage readings by their effect.
+    #[serde(flatten)]
+    pub voltages: VoltageCounts,
     /// Filters that started again from their voltage.
     pub filter_resets: u64,
     /// Times an estimate lost its trust.
@@ -32,14 +29,9 @@ pub struct Statistics {
     pub gaps: u64,
     /// Changes of mode.
     pub mode_changes: u64,
-    /// Half-cycles, per cell.
-    pub half_cycles: u64,
-    /// Runs of a capacity filter, per cell.
-    pub capacity_updates: u64,
-    /// Those of them with a measurement.
-    pub capacity_measurements: u64,
-    /// Recharge periods recorded, raw or normalised.
-    pub recharge_periods: u64,
+    /// Half-cycles and their results.
+    #[serde(flatten)]
+    pub learning: LearningCounts,
     /// Alarms raised.
     pub alarms_raised: AlarmCounts,
     /// Executed commands, from the bus and from this computer.
@@ -52,6 +44,42 @@ pub struct Statistics {
     pub restores: u64,
     /// Times the files could not be written (any more).
     pub store_failures: u64,
+}
+
+/// Voltage readings by their effect on the estimates.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct VoltageCounts {
+    /// Moved an estimate.
+    #[serde(rename = "voltages_used")]
+    pub used: u64,
+    /// Beyond the filter's gate: they moved nothing.
+    #[serde(rename = "voltages_gated")]
+    pub gated: u64,
+    /// Without a current to compare them with.
+    #[serde(rename = "voltages_without_current")]
+    pub without_current: u64,
+}
+
+impl VoltageCounts {
+    /// All of them.
+    pub const fn total(&self) -> u64 {
+        self.used + self.gated + self.without_current
+    }
+}
+
+/// Half-cycles and their results.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct LearningCounts {
+    /// Half-cycles, per cell.
+    pub half_cycles: u64,
+    /// Runs of a capacity filter, per cell.
+    pub capacity_updates: u64,
+    /// Those of them with a measurement.
+    pub capacity_measurements: u64,
+    /// Recharge periods recorded, raw or normalised.
+    pub recharge_periods: u64,
 }
 
 /// Counts of one interface.
@@ -114,17 +142,21 @@ impl Statistics {
         let buses = self.buses.iter().enumerate();
         Self {
             buses: buses.map(|(bus, now)| before.buses.get(bus).map_or(*now, |before| now.since(before))).collect(),
-            voltages_used: of(|it| it.voltages_used),
-            voltages_gated: of(|it| it.voltages_gated),
-            voltages_without_current: of(|it| it.voltages_without_current),
+            voltages: VoltageCounts {
+                used: of(|it| it.voltages.used),
+                gated: of(|it| it.voltages.gated),
+                without_current: of(|it| it.voltages.without_current),
+            },
             filter_resets: of(|it| it.filter_resets),
             trust_lost: of(|it| it.trust_lost),
             gaps: of(|it| it.gaps),
             mode_changes: of(|it| it.mode_changes),
-            half_cycles: of(|it| it.half_cycles),
-            capacity_updates: of(|it| it.capacity_updates),
-            capacity_measurements: of(|it| it.capacity_measurements),
-            recharge_periods: of(|it| it.recharge_periods),
+            learning: LearningCounts {
+                half_cycles: of(|it| it.learning.half_cycles),
+                capacity_updates: of(|it| it.learning.capacity_updates),
+                capacity_measurements: of(|it| it.learning.capacity_measurements),
+                recharge_periods: of(|it| it.learning.recharge_periods),
+            },
             alarms_raised: AlarmCounts {
                 info: of(|it| it.alarms_raised.info),
                 warning: of(|it| it.alarms_raised.warning),
@@ -167,12 +199,12 @@ impl Statistics {
             EventKind::Trust { trusted: false, .. } => self.trust_lost += 1,
             EventKind::Gap { .. } => self.gaps += 1,
             EventKind::Mode { .. } => self.mode_changes += 1,
-            EventKind::HalfCycle { .. } => self.half_cycles += 1,
+            EventKind::HalfCycle { .. } => self.learning.half_cycles += 1,
             EventKind::Capacity { measured_ah, .. } => {
-                self.capacity_updates += 1;
-                self.capacity_measurements += u64::from(measured_ah.is_some());
+                self.learning.capacity_updates += 1;
+                self.learning.capacity_measurements += u64::from(measured_ah.is_some());
             }
-            EventKind::RechargePeriod { .. } => self.recharge_periods += 1,
+            EventKind::RechargePeriod { .. } => self.learning.recharge_periods += 1,
             EventKind::Alarm { change: Change::Raised, severity, .. } => self.alarms_raised.add(severity),
             EventKind::Command { .. } => self.commands += 1,
             EventKind::PackReplaced { .. } => self.packs_replaced += 1,
@@ -189,9 +221,9 @@ impl Statistics {
             compared += u64::from(update.is_some());
             used += u64::from(update.is_some_and(|update| update.accepted));
         }
-        self.voltages_used += used;
-        self.voltages_gated += compared - used;
-        self.voltages_without_current += all - compared;
+        self.voltages.used += used;
+        self.voltages.gated += compared - used;
+        self.voltages.without_current += all - compared;
     }
 
     fn bus(&mut self, bus: BusIndex) -> &mut BusStatistics {

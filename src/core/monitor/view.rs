@@ -64,10 +64,17 @@ pub struct PackView {
     pub recharge_period_s: Option<f64>,
     /// Time the reference charger needs for the window, s.
     pub normalised_recharge_period: Option<ScalarGaussian>,
-    /// SOC as the pack itself reports it, fraction.
-    pub reported_soc: Option<f64>,
-    /// SOH as the pack itself reports it, fraction.
-    pub reported_soh: Option<f64>,
+    /// The pack's own estimates.
+    pub reported: ReportedState,
+}
+
+/// State of charge and health as the pack itself reports them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ReportedState {
+    /// SOC, fraction.
+    pub soc: Option<f64>,
+    /// SOH, fraction.
+    pub soh: Option<f64>,
 }
 
 impl Monitor {
@@ -236,8 +243,10 @@ impl Monitor {
             remaining_life: learning.lives.of_pack(),
             recharge_period_s: learning.state.recharge_period_s,
             normalised_recharge_period: learning.state.normalised_recharge,
-            reported_soc: sampler.reported(Channel::ReportedSoc, now),
-            reported_soh: sampler.reported(Channel::ReportedSoh, now),
+            reported: ReportedState {
+                soc: sampler.reported(Channel::ReportedSoc, now),
+                soh: sampler.reported(Channel::ReportedSoh, now),
+            },
         }
     }
 }

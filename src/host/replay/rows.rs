@@ -34,7 +34,8 @@ pub(super) fn write_estimate(out: &mut impl Write, estimate: &Estimate) -> io::R
     ];
     filter.into_iter().try_for_each(|value| write_value(out, value))?;
     write!(out, ",{}", e.accepted)?;
-    [e.voltage_v, e.current_a, e.temperature_c].into_iter().try_for_each(|value| write_value(out, value))?;
+    let used = e.measured;
+    [used.voltage_v, used.current_a, used.temperature_c].into_iter().try_for_each(|value| write_value(out, value))?;
     out.write_all(b"\n")
 }
 

@@ -238,8 +238,8 @@ fn pack(monitor: &Monitor) -> PackStatus {
         recharge_period_s: view.recharge_period_s.and_then(finite),
         normalised_recharge_period_s: mean(normalised),
         normalised_recharge_period_std_s: std(normalised),
-        reported_soc: view.reported_soc.and_then(finite),
-        reported_soh: view.reported_soh.and_then(finite),
+        reported_soc: view.reported.soc.and_then(finite),
+        reported_soh: view.reported.soh.and_then(finite),
     }
 }
 

@@ -53,7 +53,7 @@ impl TraceBin {
     fn take(&mut self, e: &Estimate) {
         grow(&mut self.soc, (e.soc, e.soc));
         grow(&mut self.soc_band, (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std));
-        grow(&mut self.temperature_c, (e.temperature_c, e.temperature_c));
+        grow(&mut self.temperature_c, (e.measured.temperature_c, e.measured.temperature_c));
         grow(&mut self.innovation_v, (e.innovation_v, e.innovation_v));
         self.health.take(e);
     }

@@ -64,9 +64,9 @@ fn live(config: &MonitorConfig, settings: Settings) -> Life {
         if let Some(e) = monitor.latest().next().flatten() {
             life.readings.push(Reading {
                 time_s: time.secs(),
-                voltage_v: e.voltage_v,
-                current_a: e.current_a,
-                temperature_c: e.temperature_c,
+                voltage_v: e.measured.voltage_v,
+                current_a: e.measured.current_a,
+                temperature_c: e.measured.temperature_c,
                 resistance_ratio: e.resistance_ratio,
                 soc: e.soc,
                 soc_variance: e.soc_std * e.soc_std,

@@ -3,7 +3,7 @@
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
 use crate::io::socket::LinkState;
-use crate::monitor::{AlarmCounts, BusStatistics, Statistics, Validity};
+use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
 use crate::status::counters::{ClientCounts, Latency, ServiceCounters};
@@ -33,7 +33,11 @@ pub(crate) fn sample(cells: u16) -> StatusDocument {
         alarms: alarms(),
         counters: StatusCounters {
             core: core(),
-            lifetime: Statistics { buses: Vec::new(), half_cycles: 1200, ..core() },
+            lifetime: Statistics {
+                buses: Vec::new(),
+                learning: LearningCounts { half_cycles: 1200, ..core().learning },
+                ..core()
+            },
             readings: ReadingCounts { accepted: 123_456, out_of_range: 7, ..ReadingCounts::default() },
             time_backwards: 2,
             service: ServiceCounters {
@@ -175,10 +179,8 @@ fn alarms() -> AlarmStatus {
 fn core() -> Statistics {
     Statistics {
         buses: vec![BusStatistics { frames: 86_400, error_frames: 4, bus_offs: 1 }],
-        voltages_used: 120_000,
-        voltages_gated: 11,
-        half_cycles: 12,
-        capacity_updates: 12,
+        voltages: VoltageCounts { used: 120_000, gated: 11, without_current: 0 },
+        learning: LearningCounts { half_cycles: 12, capacity_updates: 12, ..LearningCounts::default() },
         alarms_raised: AlarmCounts { info: 0, warning: 1, severe: 1 },
         ..Statistics::default()
     }

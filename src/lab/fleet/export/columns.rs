@@ -104,9 +104,9 @@ pub(super) const ESTIMATES: &[Column<EstimateRow>] = columns! { EstimateRow;
     "innovation_v" Real "V" null, "measured minus predicted voltage", |row| real(row.estimate.innovation_v);
     "innovation_std_v" Real "V" null, "its predicted standard deviation", |row| real(row.estimate.innovation_std_v);
     "accepted" Flag "", "whether the reading moved the estimate", |row| FieldValue::Flag(row.estimate.accepted);
-    "voltage_v" Real "V" null, "voltage used", |row| real(row.estimate.voltage_v);
-    "current_a" Real "A" null, "cell current used, positive = discharge", |row| real(row.estimate.current_a);
-    "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.temperature_c);
+    "voltage_v" Real "V" null, "voltage used", |row| real(row.estimate.measured.voltage_v);
+    "current_a" Real "A" null, "cell current used, positive = discharge", |row| real(row.estimate.measured.current_a);
+    "temperature_c" Real "degrees C" null, "temperature used", |row| real(row.estimate.measured.temperature_c);
 };
 
 /// Of `half_cycles`.

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::alarm::{AlarmState, Change, Rule, Severity};
-use crate::monitor::{Estimate, Event, EventKind};
+use crate::monitor::{Estimate, Event, EventKind, MeasuredValues};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 
 #[test]
@@ -72,9 +72,7 @@ fn estimate(half: u16, minute: u16, cell: u16) -> Estimate {
         innovation_v: 0.01 * noise(half.wrapping_mul(180).wrapping_add(minute), cell),
         innovation_std_v: 0.006,
         accepted: true,
-        voltage_v: 3.7,
-        current_a: 1.0,
-        temperature_c: 25.0 + 5.0 * noise(half, minute),
+        measured: MeasuredValues { voltage_v: 3.7, current_a: 1.0, temperature_c: 25.0 + 5.0 * noise(half, minute) },
     }
 }
 

@@ -8,7 +8,7 @@ use parquet::record::RowAccessor;
 use super::super::columns::ESTIMATES;
 use super::super::rows::EstimateRow;
 use super::*;
-use crate::monitor::Estimate;
+use crate::monitor::{Estimate, MeasuredValues};
 use crate::quantity::{CellIndex, Timestamp};
 
 fn row(index: u32) -> EstimateRow {
@@ -26,9 +26,7 @@ fn row(index: u32) -> EstimateRow {
         innovation_v: f64::NAN,
         innovation_std_v: f64::NAN,
         accepted: index.is_multiple_of(2),
-        voltage_v: 3.7,
-        current_a: -1.0,
-        temperature_c: 25.0,
+        measured: MeasuredValues { voltage_v: 3.7, current_a: -1.0, temperature_c: 25.0 },
     };
     EstimateRow { log: "life".into(), since_s: number, estimate }
 }
