@@ -194,24 +194,6 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
-    /// renewed, and nothing is raised or cleared by it. For rules whose value is measured all the time it does nothing.
-    pub fn set_inputs_valid(
-        &mut self,
-        now: Timestamp,
-        rule: Rule,
-        cell: Option<CellIndex>,
-        valid: bool,
-        changes: &mut Vec<AlarmChange>,
-    ) {
-        if rule.spec().is_learned {
-            self.each_threshold(rule, cell, changes, |machine, config| match valid {
-                true => machine.resume(now, config),
-                false => machine.suspend(now, config),
-            });
-        }
-    }
-
     /// Whether values of `rule`, whatever cell they are of, change nothing as long as none is worse than `worst`: every
     /// alarm is at rest, and that is not beyond a threshold. Also when nothing watches the rule.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
@@ -254,18 +236,6 @@ impl AlarmEngine {
                 None
             });
         }
-    }
-
-    /// Acknowledges alarms.
-    pub fn acknowledge(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
-        self.command(which, changes, Machine::acknowledge)
-    }
-
-    /// Clears alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten;
-    /// those that are active, or whose value has not been healthy since, stay and count as refused. No learned value is
-    /// touched.
-    pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
-        self.command(which, changes, Machine::clear)
     }
 
     /// Forgets alarms on learned values, and their past: another pack is connected.
@@ -425,7 +395,7 @@ impl AlarmEngine {
         u16::try_from(most).unwrap_or(u16::MAX)
     }
 
-    fn each_threshold(
+    pub(super) fn each_threshold(
         &mut self,
         rule: Rule,
         cell: Option<CellIndex>,
@@ -456,7 +426,7 @@ impl AlarmEngine {
         change.is_some()
     }
 
-    fn command(
+    pub(super) fn command(
         &mut self,
         which: &Selector,
         changes: &mut Vec<AlarmChange>,

@@ -54,7 +54,7 @@ pub(super) struct LearningState {
 }
 
 /// Health of one cell.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct CellHealth {
     /// SOC that the last full charge left; 1 until there was one.
     pub(super) full_soc: f64,
@@ -62,6 +62,7 @@ pub(super) struct CellHealth {
     pub(super) tapered: bool,
     pub(super) usable: Option<ScalarGaussian>,
     /// Resistance relative to new after the last discharge.
+    #[serde(default)]
     pub(super) discharge_resistance: Option<ScalarGaussian>,
 }
 

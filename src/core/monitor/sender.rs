@@ -64,14 +64,6 @@ pub(super) struct Schedule {
     counters: SendCounters,
 }
 
-/// Which cyclic frames are due now.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct DueFrames {
-    pub(super) status: bool,
-    pub(super) health: bool,
-    pub(super) alarm: bool,
-}
-
 impl Schedule {
     /// Moves stored times onto another clock.
     pub(super) fn rebase(&mut self, by_nanos: i64) {
@@ -176,14 +168,14 @@ impl Sender {
         take_due(&mut self.schedule.housekeeping, now, period_s)
     }
 
-    /// Which cyclic frames are due; `None` = none is configured.
-    pub(super) fn take_frames_due(&mut self, now: Timestamp) -> Option<DueFrames> {
+    /// Whether status, health and alarm frames are due; `None` = none is configured.
+    pub(super) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 3]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
-        Some(DueFrames {
-            status: take_due(&mut schedule.status, now, config.status_period_s),
-            health: take_due(&mut schedule.health, now, config.health_period_s),
-            alarm: take_due(&mut schedule.alarm, now, config.alarm_period_s),
-        })
+        Some([
+            take_due(&mut schedule.status, now, config.status_period_s),
+            take_due(&mut schedule.health, now, config.health_period_s),
+            take_due(&mut schedule.alarm, now, config.alarm_period_s),
+        ])
     }
 
     /// Sends the status frame.

@@ -62,11 +62,8 @@ struct StoredCell {
     estimator: CellState,
     consumed: Option<Consumed>,
     trusted: bool,
-    full_soc: f64,
-    tapered: bool,
-    usable: Option<ScalarGaussian>,
-    #[serde(default)]
-    discharge_resistance: Option<ScalarGaussian>,
+    #[serde(flatten)]
+    health: CellHealth,
     /// `None` in states of programs without forecasts: it begins with the next reading.
     #[serde(default)]
     forecast: Option<Forecast>,
@@ -205,15 +202,11 @@ impl Monitor {
 impl Stages {
     fn stored_cell(&self, cell: usize) -> StoredCell {
         let Self { estimation, learning, .. } = self;
-        let health = &learning.cells[cell];
         StoredCell {
             estimator: estimation.bank.cell(cell).snapshot(),
             consumed: estimation.consumed(cell),
             trusted: estimation.is_trusted(cell),
-            full_soc: health.full_soc,
-            tapered: health.tapered,
-            usable: health.usable,
-            discharge_resistance: health.discharge_resistance,
+            health: learning.cells[cell],
             forecast: Some(learning.lives.cells[cell].forecast.clone()),
             updated_in_round: estimation.batch.has_reported(cell),
         }
@@ -224,7 +217,7 @@ impl Stages {
         let Self { sampling, estimation, learning, .. } = self;
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in snapshot.cells.iter().enumerate() {
-            learning.cells[index] = cell.health();
+            learning.cells[index] = cell.health;
             learning.lives.cells[index] = cell.life(estimation.bank.model(), &learning.config);
             if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
                 estimation.bank.put(index, &estimator);
@@ -304,18 +297,13 @@ impl LearningState {
 impl StoredCell {
     fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
-        InvalidState::unless_number("the SOC of a full cell", self.full_soc)?;
-        check_positive("the usable capacity", self.usable)?;
-        check_positive("the resistance of discharge", self.discharge_resistance)?;
+        InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;
+        check_positive("the usable capacity", self.health.usable)?;
+        check_positive("the resistance of discharge", self.health.discharge_resistance)?;
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         InvalidState::unless_number("the charge taken in", charge_as)?;
         InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
-    }
-
-    fn health(&self) -> CellHealth {
-        let Self { full_soc, tapered, usable, discharge_resistance, .. } = *self;
-        CellHealth { full_soc, tapered, usable, discharge_resistance }
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {

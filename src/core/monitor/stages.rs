@@ -270,16 +270,16 @@ impl Stages {
     /// Sends the frames that are due.
     pub(super) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sender.poll_j1939(now, out);
-        let Some(due) = self.sender.take_frames_due(now) else { return };
-        if due.status {
+        let Some([is_status_due, is_health_due, is_alarm_due]) = self.sender.take_frames_due(now) else { return };
+        if is_status_due {
             let fields = self.status_fields();
             self.sender.send_status(now, &fields, out);
         }
-        if due.health {
+        if is_health_due {
             let fields = self.learning.health_fields(&self.estimation.bank);
             self.sender.send_health(now, &fields, out);
         }
-        if due.alarm {
+        if is_alarm_due {
             self.sender.send_next_alarm(now, &self.alarming.engine, out);
         }
         self.sender.continue_test(now, &self.alarming.engine, out);

@@ -7,7 +7,7 @@ use super::words::{number, toml};
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::doctor::plan::{Kind, SignalPlan};
 use crate::doctor::report::{Severity, Topic};
-use crate::doctor::series::{AlternativeReading, Extent, LayoutVariant};
+use crate::doctor::series::{AlternativeReading, Extent, LAYOUT_FAULTS};
 
 /// Factors by which a unit may be wrong.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
@@ -33,9 +33,9 @@ fn better_layout<'d>(
     fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,
 ) -> Option<(SignalSeries<'d>, &'d AlternativeReading)> {
     let alive = all.iter().filter(|(_, series)| series.count() > 0).count();
-    [LayoutVariant::ByteOrder, LayoutVariant::Sign, LayoutVariant::Both].into_iter().find_map(|variant| {
+    LAYOUT_FAULTS.into_iter().find_map(|fault| {
         let alternative = |(signal, series): SignalSeries<'d>| {
-            let other = series.alternatives.iter().find(|other| other.variant == variant)?;
+            let other = series.alternatives.iter().find(|other| other.fault == fault)?;
             (other.extent.count > 0 && fits((signal, series), other)).then_some(((signal, series), other))
         };
         let fitting: Vec<_> = all.iter().filter_map(|signal| alternative(*signal)).collect();
@@ -60,11 +60,6 @@ fn wrong_layout(
     ((signal, series), other): (SignalSeries<'_>, &AlternativeReading),
     what: &str,
 ) {
-    let fault = match other.variant {
-        LayoutVariant::ByteOrder => "wrong byte order",
-        LayoutVariant::Sign => "signed and unsigned exchanged",
-        LayoutVariant::Both => "wrong byte order and sign of the number",
-    };
     let span = |extent: &Extent| {
         format!("{} to {} in steps of {}", number(extent.min), number(extent.max), number(extent.step()))
     };
@@ -72,7 +67,7 @@ fn wrong_layout(
     let order = if layout.byte_order == ByteOrder::LittleEndian { "@1" } else { "@0" };
     let sign = if layout.value_type == ValueType::Signed { "-" } else { "+" };
     let others = if all.len() > 1 { format!(" (and {} others)", all.len() - 1) } else { String::new() };
-    error(judge, Topic::Layout, format!("{what}: {fault} in the DBC"))
+    error(judge, Topic::Layout, format!("{what}: {} in the DBC", other.fault))
         .seen(format!("{name} reads {here}; with the other layout {there}"))
         .why("a pack's values do not jump like this, and with the other layout they do not")
         .advice(format!("in the DBC: {name}{others} : {}|{}{order}{sign}", layout.start_bit, layout.length_bits));
