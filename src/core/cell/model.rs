@@ -230,21 +230,19 @@ impl CellModel {
 
     /// SOC of an open-circuit voltage at a temperature with a known position, see [`Self::soc_of_ocv`].
     pub fn soc_of_ocv_at(&self, temperature: &TemperaturePosition, voltage_v: f64) -> f64 {
-        falling_crossing(-0.5, 1.5, |soc| voltage_v - self.ocv_v(&self.grid_position_at(temperature, soc)))
+        let is_below = |soc| voltage_v - self.ocv_v(&self.grid_position_at(temperature, soc)) > 0.0;
+        let (low, high) = bisect((-0.5, 1.5), 40, is_below);
+        0.5 * (low + high)
     }
 }
 
-/// Zero crossing of the falling function `f` in [`low`, `high`], to 2^-40 of the width; the nearest end if there is none.
-pub(crate) fn falling_crossing(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
-    for _ in 0..40 {
+/// Halves the interval `ends` again and again towards the place where `is_below` turns false; the nearest end if it never
+/// does.
+pub(crate) fn bisect(ends: (f64, f64), halvings: u32, is_below: impl Fn(f64) -> bool) -> (f64, f64) {
+    (0..halvings).fold(ends, |(low, high), _| {
         let middle = 0.5 * (low + high);
-        if f(middle) > 0.0 {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    0.5 * (low + high)
+        if is_below(middle) { (middle, high) } else { (low, middle) }
+    })
 }
 
 #[cfg(test)]

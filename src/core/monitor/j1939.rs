@@ -71,7 +71,7 @@ impl J1939 {
     }
 
     pub(super) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
-        self.node.handle_gap(now, &mut self.out);
+        self.node.start(now, &mut self.out);
         self.dispatch_outputs(now, out);
     }
 

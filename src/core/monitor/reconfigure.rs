@@ -50,7 +50,7 @@ impl Monitor {
         self.config.check_fits(&config)?;
         let old = std::mem::replace(&mut self.config, config.clone());
         let first_event = out.events.len();
-        let at = self.clock.now();
+        let at = self.clock.now;
         if !old.estimates_as(&config) {
             // Earlier samples are judged by the earlier settings.
             self.stages.step_waiting(at, true, out);
@@ -62,7 +62,7 @@ impl Monitor {
         stages.sampling.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);
         if old.j1939 != config.j1939 {
-            stages.sender.reconfigure_j1939(at, &config, self.clock.has_started(), out);
+            stages.sender.reconfigure_j1939(at, &config, self.clock.has_started, out);
         }
         stages.learning.config = config.health;
         self.forget_measures(&old.health, out);
@@ -86,7 +86,7 @@ impl Monitor {
 
     /// Forgets values measured by another window or load, before new thresholds are set.
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
-        let now = self.clock.now();
+        let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();
         let (learning, mut publisher) = self.stages.learning_and_publisher(now, out);
         let new = learning.config;

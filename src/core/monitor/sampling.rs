@@ -17,7 +17,7 @@ pub(super) struct Sampling {
     pub(super) identity: Identity,
     identity_readings: u32,
     /// Whether a usable reading has come since the first input.
-    has_usable_reading: bool,
+    pub(super) has_usable_reading: bool,
     /// Changes of the input at hand, kept for their memory.
     changes: Vec<SignalChange>,
 }
@@ -25,7 +25,7 @@ pub(super) struct Sampling {
 /// The pack's identity as its signal gives it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Identity {
-    known: Option<f64>,
+    pub(super) known: Option<f64>,
     /// Another number, and how many readings in a row have given it.
     #[serde(skip)]
     candidate: Option<(f64, u32)>,
@@ -41,11 +41,6 @@ pub(super) struct IdentityChange {
 }
 
 impl Identity {
-    /// The known number; `None` = none yet.
-    pub(super) fn known(&self) -> Option<f64> {
-        self.known
-    }
-
     /// Takes a reading; the new number when `readings` in a row have given it.
     fn observe(&mut self, value: f64, readings: u32) -> Option<IdentityChange> {
         if self.known == Some(value) {
@@ -113,11 +108,6 @@ impl Sampling {
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sampler.poll(now, &mut self.changes);
         self.report(now, out);
-    }
-
-    /// Whether a usable reading has come since the first input. Values of a restored state do not count.
-    pub(super) fn has_usable_reading(&self) -> bool {
-        self.has_usable_reading
     }
 
     /// The channel of a cell's voltage.

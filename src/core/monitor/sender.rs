@@ -36,7 +36,7 @@ pub struct OutputConfig {
 #[derive(Debug)]
 pub(super) struct Sender {
     config: Option<OutputConfig>,
-    schedule: Schedule,
+    pub(super) schedule: Schedule,
     /// A running test of an alarm frame; it ends with the process.
     test: Option<AlarmTest>,
     j1939: Option<J1939>,
@@ -144,14 +144,6 @@ impl Sender {
     pub(super) fn restart(&mut self, now: Timestamp) {
         let schedule = &mut self.schedule;
         (schedule.housekeeping, schedule.status, schedule.health, schedule.alarm) = (now, now, now, now);
-    }
-
-    pub(super) fn snapshot(&self) -> Schedule {
-        self.schedule.clone()
-    }
-
-    pub(super) fn restore(&mut self, schedule: Schedule) {
-        self.schedule = schedule;
     }
 
     /// When a tick next does something.

@@ -137,15 +137,15 @@ impl Monitor {
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
-            time: self.clock.now(),
+            time: self.clock.now,
             cells: (0..estimation.cells()).map(|cell| self.stages.stored_cell(cell)).collect(),
             waiting: estimation.batch.waiting.clone(),
             sampler: sampling.sampler.snapshot(),
             learning: learning.state.clone(),
-            updated_cells: estimation.batch.reported(),
-            time_backwards: self.clock.time_backwards(),
+            updated_cells: estimation.batch.reported,
+            time_backwards: self.clock.time_backwards,
             alarms: alarming.engine.snapshot(),
-            schedule: sender.snapshot(),
+            schedule: sender.schedule.clone(),
             intake,
             buses,
             identity: sampling.identity,
@@ -192,7 +192,7 @@ impl Monitor {
             Downtime::AsStamped | Downtime::Unknown => None,
         };
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
-        self.clock.restore(snapshot.time, snapshot.time_backwards);
+        (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
         self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
         self.stages.restore(*snapshot, now, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
@@ -230,7 +230,7 @@ impl Stages {
         sampling.sampler.restore(snapshot.sampler);
         sampling.identity = snapshot.identity;
         learning.state = snapshot.learning;
-        self.sender.restore(snapshot.schedule);
+        self.sender.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;

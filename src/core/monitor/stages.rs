@@ -289,7 +289,7 @@ impl Stages {
     pub(super) fn validity(&self) -> Validity {
         if self.learning.state.pack.is_none() {
             Validity::Unavailable
-        } else if !self.estimation.all_trusted() {
+        } else if !self.estimation.all_trusted {
             Validity::Untrusted
         } else if self.sampling.sampler.any_bad() {
             Validity::Degraded

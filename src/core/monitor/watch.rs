@@ -240,7 +240,7 @@ impl Stages {
 
     /// Whether no cell's innovations can change an alarm or its trust: then they are only shown.
     pub(super) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
-        self.estimation.all_trusted() && !out.want_alarm_inputs && {
+        self.estimation.all_trusted && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
             worst <= bank.config().consistency.limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)

@@ -121,12 +121,6 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// After time without listening (sleep, the interface was away): another node may have claimed the address, so it is
-    /// claimed again, also after a loss.
-    pub fn handle_gap(&mut self, now: Timestamp, out: &mut NodeOutputs) {
-        self.start(now, out);
-    }
-
     /// Sets the codes to send: active ones and previously active ones, most severe or latest first, and whether every value
     /// that could raise one is known. The next [`poll`](Self::poll) sends them.
     pub fn set_codes(
@@ -157,7 +151,7 @@ impl Node {
     fn handle_claim(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
         let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return };
         out.events.extend(self.claim.contend(now, Name::from_bytes(bytes)));
-        if self.claim.state() == ClaimState::Lost {
+        if self.claim.state == ClaimState::Lost {
             self.fall_silent();
         }
     }
@@ -165,7 +159,7 @@ impl Node {
     fn handle_request(&mut self, now: Timestamp, frame: &Frame, header: Header) {
         let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
-        let answer = match (pgn_of([low, middle, high]), self.claim.state()) {
+        let answer = match (pgn_of([low, middle, high]), self.claim.state) {
             // After a loss the address belongs to another node: only requests to all are for this one.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
@@ -324,7 +318,7 @@ impl Node {
 
     /// Whether only address claims may be sent: the node does not have its address.
     pub fn is_silent(&self) -> bool {
-        match self.claim.state() {
+        match self.claim.state {
             ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost => true,
             ClaimState::Claimed => false,
         }

@@ -421,7 +421,7 @@ fn after_a_gap_the_address_is_claimed_again_and_the_codes_are_sent_again() {
     bench.run_to(300);
     bench.receive(&claim_of(99));
     bench.run_to(5000);
-    bench.node.handle_gap(at(5000), &mut bench.out);
+    bench.node.start(at(5000), &mut bench.out);
     bench.run_to(5300);
     assert_eq!(bench.events[2..], [NodeEvent::Claimed { address: ADDRESS }]);
     assert_eq!(bench.received(PGN_DM1).last(), Some(&(5300, vec![1])));
