@@ -66,7 +66,7 @@ impl Binding {
     /// # Errors
     /// When the layout of the signal or of one of its multiplexors is invalid.
     pub fn new(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Result<Self, LayoutFault> {
-        let selectors = signal.multiplex.conditions.iter().filter_map(|condition| {
+        let selectors = signal.conditions.iter().filter_map(|condition| {
             let selector = message.signals.get(condition.selector)?;
             Some(selector.layout.plan().map(|plan| MuxTest { plan, ranges: condition.ranges.clone() }))
         });

@@ -189,39 +189,27 @@ impl Protection {
     }
 }
 
-/// CRC of one byte value, with a register of `bits` bits.
-const fn byte_crc(byte: usize, bits: u32, polynomial: u16) -> u16 {
-    let (mut crc, mut bit) = ((byte as u16) << (bits - 8), 0);
-    while bit < 8 {
-        crc = if crc >> (bits - 1) & 1 == 1 { crc << 1 ^ polynomial } else { crc << 1 };
-        bit += 1;
+/// CRC of each byte value in a register of so many bits.
+const fn crc_table(bits: u32, polynomial: u16) -> [u16; 256] {
+    let (mut table, mut byte) = ([0; 256], 0);
+    while byte < 256 {
+        let (mut crc, mut bit) = ((byte as u16) << (bits - 8), 0);
+        while bit < 8 {
+            crc = if crc >> (bits - 1) & 1 == 1 { crc << 1 ^ polynomial } else { crc << 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
     }
-    crc
+    table
 }
 
-/// CRC-8 of each byte value, polynomial 0x1D.
-static CRC8: [u8; 256] = {
-    let (mut table, mut byte) = ([0; 256], 0);
-    while byte < 256 {
-        // The lowest byte is the register.
-        table[byte] = byte_crc(byte, 8, 0x1D) as u8;
-        byte += 1;
-    }
-    table
-};
-
-/// CRC-16 of each byte value, polynomial 0x1021.
-static CRC16: [u16; 256] = {
-    let (mut table, mut byte) = ([0; 256], 0);
-    while byte < 256 {
-        table[byte] = byte_crc(byte, 16, 0x1021);
-        byte += 1;
-    }
-    table
-};
+static CRC8: [u16; 256] = crc_table(8, 0x1D);
+static CRC16: [u16; 256] = crc_table(16, 0x1021);
 
 fn crc8(start: u8, bytes: &[u8]) -> u8 {
-    bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)])
+    // The lowest byte is the register.
+    bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 
 fn crc16(start: u16, bytes: &[u8]) -> u16 {

@@ -61,9 +61,6 @@ pub struct GuardCounts {
     pub counts: StatusCounts,
 }
 
-/// State kept over a restart: counts, no counters.
-pub type GuardsState = Vec<GuardCounts>;
-
 #[derive(Debug, Clone)]
 struct Guard {
     config: GuardConfig,
@@ -162,13 +159,8 @@ impl Guards {
         })
     }
 
-    /// The counts, to be stored.
-    pub fn snapshot(&self) -> GuardsState {
-        self.counts().collect()
-    }
-
     /// Restores stored counts and restarts the receivers. Counts of a message that is no longer protected are dropped.
-    pub fn restore(&mut self, state: &GuardsState) {
+    pub fn restore(&mut self, state: &[GuardCounts]) {
         self.restart();
         for guard in &mut self.guards {
             let key = (guard.config.bus, guard.config.id);

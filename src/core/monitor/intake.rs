@@ -108,7 +108,7 @@ impl Intake {
     /// The value of the rule about interfaces: for how long the worst of them has been out of order, s.
     pub(super) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
         let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
-        Observation { is_bound: !is_whole, ..Observation::new(fault_s) }
+        Observation::new(fault_s).of_part(!is_whole)
     }
 
     /// Finds periods without a frame, and floods that are over.
@@ -141,7 +141,7 @@ impl Intake {
     }
 
     pub(super) fn snapshot(&self) -> (IntakeState, Buses) {
-        let state = IntakeState { protected: self.guards.snapshot(), dropped: self.gate.counts().collect() };
+        let state = IntakeState { protected: self.guards.counts().collect(), dropped: self.gate.counts().collect() };
         (state, self.buses.clone())
     }
 

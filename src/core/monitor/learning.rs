@@ -39,7 +39,7 @@ pub(super) struct Learning {
 }
 
 /// The stage's part of the snapshot, without the cells.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(super) struct LearningState {
     pub(super) detector: TransitionDetector,
     pub(super) learner: Learner,
@@ -74,15 +74,7 @@ impl Default for CellHealth {
 
 impl LearningState {
     fn new(config: &HealthConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
-        Self {
-            detector: TransitionDetector::default(),
-            learner: Learner::new(&config.capacity, cells, initial_capacity),
-            learned_at: None,
-            recharge: RechargeTimer::default(),
-            recharge_period_s: None,
-            normalised_recharge: None,
-            pack: None,
-        }
+        Self { learner: Learner::new(&config.capacity, cells, initial_capacity), ..Self::default() }
     }
 
     /// Moves every stamp by `by_nanos`, onto another clock.

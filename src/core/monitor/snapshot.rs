@@ -73,22 +73,9 @@ struct StoredCell {
 /// Why a snapshot cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RestoreError {
-    /// Written by another version.
-    #[error("snapshot version {found}, this program reads {allowed}")]
-    Version {
-        /// In the file.
-        found: u32,
-        /// Readable here.
-        allowed: u32,
-    },
-    /// Taken with another configuration.
-    #[error("snapshot is of {found}, the configuration has {allowed}")]
-    Shape {
-        /// In the file.
-        found: String,
-        /// Configured.
-        allowed: String,
-    },
+    /// Written by another version, or taken with another configuration.
+    #[error("{0}")]
+    Unfit(String),
     /// A number in it is impossible: it is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
@@ -162,7 +149,10 @@ impl Monitor {
     /// damaged number leaves the others in doubt.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
-            return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
+            let found = snapshot.version;
+            return Err(RestoreError::Unfit(format!(
+                "snapshot version {found}, this program reads {SNAPSHOT_VERSION}"
+            )));
         }
         let Stages { sampling, estimation, .. } = &self.stages;
         let (branches, cells) = (estimation.bank.model().branches.len(), estimation.cells());
@@ -172,10 +162,11 @@ impl Monitor {
             && snapshot.waiting_fits()
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
-            return Err(RestoreError::Shape {
-                found: format!("{} cells, another number of branches, or samples of no cell", snapshot.cells.len()),
-                allowed: format!("{cells} cells of {branches} branches"),
-            });
+            let found = snapshot.cells.len();
+            return Err(RestoreError::Unfit(format!(
+                "snapshot is of {found} cells, another number of branches, or samples of no cell, the configuration has \
+                 {cells} cells of {branches} branches"
+            )));
         }
         snapshot.check()?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });

@@ -11,7 +11,7 @@ use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
-use crate::alarm::{AlarmInput, Observation};
+use crate::alarm::{AlarmInput, CommandOutcome, Observation};
 use crate::can::encode::StatusFields;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
@@ -173,22 +173,17 @@ impl Stages {
     /// Executes a command.
     pub(super) fn handle_command(&mut self, now: Timestamp, source: Source, command: Command, out: &mut Outputs) {
         self.step_waiting(now, true, out);
-        let (changed, refused) = match command {
-            Command::Acknowledge(which) => {
-                let outcome = self.publisher(now, out).apply(AlarmInput::Acknowledge(which));
-                (outcome.changed, outcome.refused)
-            }
-            Command::Clear(which) => {
-                let outcome = self.publisher(now, out).apply(AlarmInput::Clear(which));
-                (outcome.changed, outcome.refused)
-            }
+        let CommandOutcome { changed, refused } = match command {
+            Command::Acknowledge(which) => self.publisher(now, out).apply(AlarmInput::Acknowledge(which)),
+            Command::Clear(which) => self.publisher(now, out).apply(AlarmInput::Clear(which)),
             Command::PackReplaced => {
                 self.replace_pack(now, out);
-                (u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX), 0)
+                let changed = u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX);
+                CommandOutcome { changed, refused: 0 }
             }
             Command::Test { rule, seconds } => {
                 let has_output = self.sender.start_test(now, rule, seconds, &self.alarming.engine, out);
-                (0, u32::from(!has_output))
+                CommandOutcome { changed: 0, refused: u32::from(!has_output) }
             }
         };
         let mut publisher = self.publisher(now, out);

@@ -224,7 +224,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
 fn multiplex(resolved: &ResolvedSignal<'_>) -> String {
     let name = |message: &Message, index: usize| message.signals.get(index).map(|s| s.name.clone()).unwrap_or_default();
     let range = |&(low, high): &(u64, u64)| if low == high { format!("{low}") } else { format!("{low}-{high}") };
-    let conditions = resolved.signal.multiplex.conditions.iter().map(|condition| {
+    let conditions = resolved.signal.conditions.iter().map(|condition| {
         let ranges: Vec<String> = condition.ranges.iter().map(range).collect();
         format!("{} = {}", name(resolved.message, condition.selector), ranges.join(", "))
     });

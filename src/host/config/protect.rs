@@ -117,7 +117,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
 
 /// A signal and the multiplexors it depends on.
 fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
-    let selectors = signal.multiplex.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
+    let selectors = signal.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
     selectors.chain([signal])
 }
 

@@ -160,7 +160,7 @@ fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(Si
     };
     let all = signal.values.iter().find(|(_, word)| word == "all").and_then(|(code, _)| u64::try_from(*code).ok());
     match signal.layout.plan() {
-        Ok(_) if !signal.multiplex.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
+        Ok(_) if !signal.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
         Ok(plan) if plan.bytes_needed() > usize::from(message.len_bytes) => {
             fault(format!(": reaches past the message's {} bytes", message.len_bytes));
         }

@@ -244,7 +244,7 @@ fn set_header(message: &mut Message) {
     let places: Vec<Option<usize>> = places.collect();
     let kept = std::mem::replace(&mut message.signals, header).into_iter().filter(is_kept);
     message.signals.extend(kept.map(|mut signal| {
-        for condition in &mut signal.multiplex.conditions {
+        for condition in &mut signal.conditions {
             condition.selector = places.get(condition.selector).copied().flatten().unwrap_or(condition.selector);
         }
         signal
@@ -282,7 +282,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
         },
         unit: String::new(),
         receivers: Vec::new(),
-        multiplex: Default::default(),
+        conditions: Vec::new(),
         is_multiplexor: false,
         values: Vec::new(),
         comment: Some(comment.to_owned()),
