@@ -141,6 +141,13 @@ impl SignalLayout {
         self.minimum != 0.0 || self.maximum != 0.0
     }
 
+    /// Whether one of its bits is in the mask, which is of the payload's first bytes.
+    pub fn touches(&self, mask: [u8; 3]) -> bool {
+        let mut payload = [0; MAX_DATA];
+        payload[..mask.len()].copy_from_slice(&mask);
+        self.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
+    }
+
     fn check(&self) -> Result<(), LayoutFault> {
         let Self { length_bits, value_type, factor, offset, minimum, maximum, .. } = *self;
         let allowed = match value_type {

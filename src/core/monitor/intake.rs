@@ -35,7 +35,7 @@ pub(super) struct Intake {
     guards: Guards,
     buses: Buses,
     /// When a rejected command frame was last reported.
-    bad_command_at: Option<Timestamp>,
+    pub(super) bad_command_at: Option<Timestamp>,
 }
 
 /// Counts that are kept over a restart.
@@ -123,11 +123,6 @@ impl Intake {
         self.guards.restart();
         self.gate.restart();
         self.report(now, out);
-    }
-
-    /// How long ago a command was rejected is not known any more.
-    pub(super) fn handle_unknown_gap(&mut self) {
-        self.bad_command_at = None;
     }
 
     /// Per protected message: the count of each status.

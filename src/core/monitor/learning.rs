@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::estimation::{end_state, resistance};
+use super::estimation::resistance;
 use super::life::PackLife;
 use super::publisher::{Publisher, learned};
 use super::{EventKind, MonitorConfig};
@@ -15,7 +15,6 @@ use crate::can::encode::HealthFields;
 use crate::cell::{CellEstimator, CellModel, EstimatorBank};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
-use crate::health::transition::TransitionOutcome;
 use crate::health::usable::usable_capacity;
 use crate::health::{
     CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
@@ -115,16 +114,6 @@ impl Learning {
     /// Published capacity of a cell.
     pub(super) fn capacity(&self, index: usize) -> ScalarGaussian {
         self.state.learner.capacity(&self.config.capacity, index)
-    }
-
-    /// Takes the pack current into the mode detector; `None` = stale.
-    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
-        self.state.detector.observe(&self.config.transition, now, current_a)
-    }
-
-    /// Marks where a mode begins that may follow the present one; `charge_as` is the charge counted so far.
-    pub(super) fn mark_candidate(&mut self, now: Timestamp, charge_as: f64, bank: &EstimatorBank) {
-        self.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
     }
 
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.

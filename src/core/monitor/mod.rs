@@ -92,7 +92,7 @@ impl Monitor {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
-                if self.stages.sender.has_j1939() {
+                if self.stages.sender.j1939.is_some() {
                     self.stages.sender.handle_j1939_frame(self.clock.now, bus, frame, out);
                     self.find_due();
                 }
@@ -140,7 +140,7 @@ impl Monitor {
         match input {
             Input::Frame { .. } | Input::UnknownGap { .. } => {}
             Input::Tick { .. } => {
-                if stages.take_housekeeping_due(now) {
+                if stages.sender.take_housekeeping_due(now, HOUSEKEEPING_S) {
                     intake.poll(now, out);
                     stages.keep_house(now, intake.bus_fault(now, config.interfaces), out);
                 }
@@ -247,7 +247,8 @@ impl Monitor {
     /// Continues at `time` after a gap of unknown length.
     fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.fall_asleep(out);
-        self.intake.handle_unknown_gap();
+        // How long ago a command was rejected is not known any more.
+        self.intake.bad_command_at = None;
         self.stages.begin_unknown_gap(self.clock.now, out);
         self.clock.now = time;
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });

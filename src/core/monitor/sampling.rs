@@ -31,18 +31,9 @@ pub(super) struct Identity {
     candidate: Option<(f64, u32)>,
 }
 
-/// A pack identity that was found.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct IdentityChange {
-    /// As the signal gives it.
-    pub(super) identity: f64,
-    /// Whether another pack was known before.
-    pub(super) is_replacement: bool,
-}
-
 impl Identity {
     /// Takes a reading; the new number when `readings` in a row have given it.
-    fn observe(&mut self, value: f64, readings: u32) -> Option<IdentityChange> {
+    fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
         if self.known == Some(value) {
             self.candidate = None;
             return None;
@@ -54,7 +45,7 @@ impl Identity {
         }
         let is_replacement = self.known.is_some();
         *self = Self { known: Some(value), candidate: None };
-        Some(IdentityChange { identity: value, is_replacement })
+        Some((value, is_replacement))
     }
 }
 
@@ -98,8 +89,8 @@ impl Sampling {
         sample
     }
 
-    /// Takes a reading of the identity signal.
-    pub(super) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<IdentityChange> {
+    /// Takes a reading of the identity signal. Returns another identity, and whether another pack was known before.
+    pub(super) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         self.identity.observe(value, self.identity_readings)
     }

@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use super::j1939::J1939;
 use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
-use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, StoredAlarm};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
-use crate::quantity::{BusIndex, CellIndex, Timestamp};
+use crate::quantity::{BusIndex, Timestamp};
 
 /// Period of a test's frames, s: a consumer that reads once a second receives several.
 const TEST_PERIOD_S: f64 = 0.1;
@@ -39,7 +39,7 @@ pub(super) struct Sender {
     pub(super) schedule: Schedule,
     /// A running test of an alarm frame; it ends with the process.
     test: Option<AlarmTest>,
-    j1939: Option<J1939>,
+    pub(super) j1939: Option<J1939>,
 }
 
 /// A running test of an alarm frame.
@@ -210,12 +210,8 @@ impl Sender {
     }
 
     /// Sends that no threshold watches an alarm any more: its state is not known.
-    pub(super) fn send_alarm_end(
-        &mut self,
-        now: Timestamp,
-        (rule, severity, cell): (Rule, Severity, Option<CellIndex>),
-        out: &mut Outputs,
-    ) {
+    pub(super) fn send_alarm_end(&mut self, now: Timestamp, alarm: &StoredAlarm, out: &mut Outputs) {
+        let StoredAlarm { rule, severity, cell, .. } = *alarm;
         let (rule, state, severity) = (rule as u8, Some(AlarmState::Unknown.wire_code()), Some(severity as u8));
         self.send_alarm_fields(now, &AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
     }
@@ -286,12 +282,6 @@ impl Sender {
     fn send_test(&mut self, now: Timestamp, rule: Rule, state: AlarmState, out: &mut Outputs) {
         let (rule, state) = (rule as u8, Some(state.wire_code()));
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
-    }
-
-    /// Whether there is a J1939 node.
-    #[inline]
-    pub(super) fn has_j1939(&self) -> bool {
-        self.j1939.is_some()
     }
 
     /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.

@@ -235,7 +235,7 @@ impl Stages {
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
             let kind = EventKind::AlarmDropped { rule, severity, cell, active, occurrences };
             out.events.push(Event { time, kind });
-            self.sender.send_alarm_end(time, (rule, severity, cell), out);
+            self.sender.send_alarm_end(time, &orphan, out);
         }
     }
 }

@@ -4,8 +4,7 @@
 //! input at hand.
 
 use super::alarming::Alarming;
-use super::clock::HOUSEKEEPING_S;
-use super::estimation::Estimation;
+use super::estimation::{Estimation, end_state};
 use super::learning::Learning;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
@@ -81,11 +80,11 @@ impl Stages {
     }
 
     fn handle_identity(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
-        let Some(found) = self.sampling.handle_identity(reading.value) else { return };
-        if found.is_replacement {
+        let Some((identity, is_replacement)) = self.sampling.handle_identity(reading.value) else { return };
+        if is_replacement {
             self.handle_command(now, Source::Bus(bus), Command::PackReplaced, out);
         }
-        out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity: found.identity } });
+        out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
 
     /// Takes a sample: it waits until all cells have one, or its cell reports for the second time.
@@ -151,7 +150,8 @@ impl Stages {
 
     /// Takes the pack current into the mode detector; `None` = stale. A change of mode is learned from.
     pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
-        let observed = self.learning.observe_current(now, current_a);
+        let Learning { config, state, .. } = &mut self.learning;
+        let observed = state.detector.observe(&config.transition, now, current_a);
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
@@ -161,7 +161,8 @@ impl Stages {
         }
         if observed.candidate_begins {
             let (charge_as, _) = self.sampling.sampler.counted(now);
-            self.learning.mark_candidate(now, charge_as, &self.estimation.bank);
+            let bank = &self.estimation.bank;
+            self.learning.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
         }
     }
 
@@ -255,11 +256,6 @@ impl Stages {
             self.forget_pack_state();
         }
         self.watch(now, bus_fault, out);
-    }
-
-    /// Whether housekeeping is due.
-    pub(super) fn take_housekeeping_due(&mut self, now: Timestamp) -> bool {
-        self.sender.take_housekeeping_due(now, HOUSEKEEPING_S)
     }
 
     /// Sends the frames that are due.

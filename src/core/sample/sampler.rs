@@ -294,7 +294,7 @@ impl Sampler {
     /// Time since the channel's latest reading, good or bad, s (the value of the rule `input_missing`).
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
         // `None` < `Some`: a stamp before the start or the last waking counts from there.
-        let since = self.state.signals[self.slot(channel)?].received_at().max(self.state.began);
+        let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
         Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
 
@@ -372,14 +372,14 @@ impl Sampler {
 
     /// Whether the channel has a reading, good or bad, since the start or the last waking.
     pub fn has_input_since_waking(&self, channel: Channel) -> bool {
-        self.slot(channel).is_some_and(|slot| self.state.signals[slot].received_at() >= self.state.began)
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].received >= self.state.began)
     }
 
     /// Whether every voltage has a fresh good reading.
     pub fn voltages_fresh(&self, now: Timestamp) -> bool {
         let first = 1 + self.sensors;
         let voltages = &self.state.signals[first..first + self.voltages];
-        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good_at()?)));
+        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good?.time)));
         oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
     }
 

@@ -100,7 +100,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
     let mut noted: Vec<&str> = Vec::new();
     for input in inputs {
         for signal in read_with(input.message, input.signal) {
-            if lies_in(signal, profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
+            if signal.layout.touches(profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
                 noted.push(&signal.name);
                 let what = format!(
                     "must not lie in {}, which profile \"{}\" writes: {}.{} does",
@@ -119,13 +119,6 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
 fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
     let selectors = signal.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
     selectors.chain([signal])
-}
-
-/// Whether a signal has a bit in these of the first bytes: then it does not read 0 there.
-fn lies_in(signal: &Signal, mask: [u8; 3]) -> bool {
-    let mut payload = [0; MAX_DATA];
-    payload[..mask.len()].copy_from_slice(&mask);
-    signal.layout.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
 }
 
 fn header_words(mask: [u8; 3]) -> &'static str {

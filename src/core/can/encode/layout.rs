@@ -306,7 +306,7 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
         );
     }
     let in_header = |signal: &&Signal| {
-        !HEADER_SIGNALS.contains(&signal.name.as_str()) && touches(&signal.layout, profile.header_mask())
+        !HEADER_SIGNALS.contains(&signal.name.as_str()) && signal.layout.touches(profile.header_mask())
     };
     for signal in message.signals.iter().filter(in_header) {
         let what = format!(
@@ -317,18 +317,6 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
         );
         fault("e2e", what);
     }
-}
-
-/// Whether one of the signal's bits is in the mask, which is of the payload's first bytes.
-fn touches(layout: &SignalLayout, mask: [u8; 3]) -> bool {
-    let (first, last) = layout.span();
-    let bit_of = |place: u32| match layout.byte_order {
-        ByteOrder::LittleEndian => place % 8,
-        ByteOrder::BigEndian => 7 - place % 8,
-    };
-    (0..)
-        .zip(mask)
-        .any(|(byte, mask)| (first.max(8 * byte)..=last.min(8 * byte + 7)).any(|p| mask >> bit_of(p) & 1 == 1))
 }
 
 /// Steps of signals in Ah: the smallest of 1, 2, 5, 10, ... times the built-in one with which the largest value the

@@ -12,8 +12,7 @@ use super::state_vector::{
 };
 use super::step::{CellStep, StepResult};
 use crate::cell::circuit;
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::{CellModel, MAX_BRANCHES};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::{FilterError, ScalarGaussian, Update};
 
 /// The estimator of one cell.
