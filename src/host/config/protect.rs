@@ -6,7 +6,6 @@ use super::keys::ProtectedInput;
 use super::resolve::ResolvedSignal;
 use super::schema::did_you_mean;
 use super::tables::RawTables;
-use crate::can::MAX_DATA;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
