@@ -78,7 +78,8 @@ struct Guard {
 pub struct Guards {
     /// Sorted by interface and identifier.
     guards: Vec<Guard>,
-    changes: Vec<GuardChange>,
+    /// Changes that wait to be published, in their order.
+    pub(crate) changes: Vec<GuardChange>,
 }
 
 impl Guards {
@@ -130,16 +131,6 @@ impl Guards {
     /// Counts the frames that are missing by now.
     pub fn poll(&mut self, now: Timestamp) {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
-    }
-
-    /// Whether there are changes since the last [`Self::take_changes`].
-    pub fn has_changes(&self) -> bool {
-        !self.changes.is_empty()
-    }
-
-    /// The changes since the last call, in their order.
-    pub fn take_changes(&mut self) -> impl Iterator<Item = GuardChange> + '_ {
-        self.changes.drain(..)
     }
 
     /// After time without listening, or a step of the clock: every receiver waits for a first frame again; counts stay.

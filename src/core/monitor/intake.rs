@@ -148,15 +148,16 @@ impl Intake {
 
     #[inline]
     fn report(&mut self, time: Timestamp, out: &mut Outputs) {
-        if self.guards.has_changes() || self.gate.has_changes() {
+        if !self.guards.changes.is_empty() || !self.gate.changes.is_empty() {
             self.report_changes(time, out);
         }
     }
 
     fn report_changes(&mut self, time: Timestamp, out: &mut Outputs) {
-        let protection = self.guards.take_changes().map(EventKind::Protection);
-        out.events
-            .extend(protection.chain(self.gate.take_changes().map(EventKind::Flood)).map(|kind| Event { time, kind }));
+        let protection = self.guards.changes.drain(..).map(EventKind::Protection);
+        out.events.extend(
+            protection.chain(self.gate.changes.drain(..).map(EventKind::Flood)).map(|kind| Event { time, kind }),
+        );
     }
 }
 

@@ -197,7 +197,7 @@ impl Learning {
     /// the SOC has jumped, and what it crossed on the way was not charged.
     pub(super) fn handle_sample(&mut self, sample: &CellSample, was_reset: bool, model: &CellModel) {
         if was_reset {
-            self.state.recharge.discard();
+            self.state.recharge = RechargeTimer::default();
         }
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;

@@ -34,7 +34,7 @@ fn at(tenths: i64) -> Timestamp {
 }
 
 fn changes(guards: &mut Guards) -> Vec<(Status, bool, u64)> {
-    guards.take_changes().map(|change| (change.status, change.usable, change.count)).collect()
+    guards.changes.drain(..).map(|change| (change.status, change.usable, change.count)).collect()
 }
 
 fn count(guards: &Guards, status: Status) -> u64 {

@@ -250,8 +250,8 @@ impl Node {
     fn send_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.codes.show(now);
         let payload = dm_payload(self.codes.lamps(), &self.codes.shown());
-        if payload.left_out() != self.codes_left_out {
-            self.codes_left_out = payload.left_out();
+        if payload.left_out != self.codes_left_out {
+            self.codes_left_out = payload.left_out;
             out.events.push(NodeEvent::CodesLeftOut { codes: self.codes_left_out });
         }
         self.send(now, PGN_DM1, payload, out);

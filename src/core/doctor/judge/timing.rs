@@ -71,7 +71,7 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(stats) = judge.bus(message.bus).and_then(|bus| bus.ids.get(&message.id)) else { continue };
         // The pages of a multiplexed message may come in bursts of any length.
         let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
-        let (span_s, awake_s) = (stats.last.since(stats.first), judge.doctor.clock.awake_s);
+        let (span_s, awake_s) = (stats.last.since(stats.first), judge.doctor.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
         let period_s = span_s / (stats.count.max(2) - 1) as f64;
         if stats.count < 10 || period_s < SLOWER * cycle_s {
