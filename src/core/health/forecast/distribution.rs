@@ -12,9 +12,8 @@
 //! divided into slices of equal width; each is a lognormal of its middle loss, with the rate conditional on it and, for
 //! its own width w, an added variance of (w / L)^2 / 12.
 
-use crate::cell::model::bisect;
-
 use super::{RATE_WALK, RATE_WALK_USE};
+use crate::cell::model::bisect;
 
 /// Slices of the loss.
 const SLICES: usize = 10;
