@@ -221,7 +221,7 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
 
 fn multiplex(resolved: &ResolvedSignal<'_>) -> String {
     let name = |message: &Message, index: usize| message.signals.get(index).map(|s| s.name.clone()).unwrap_or_default();
-    let conditions = resolved.signal.multiplex.conditions.iter().map(|condition| {
+    let conditions = resolved.signal.conditions.iter().map(|condition| {
         let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| span(low, high)).collect();
         format!("{} = {}", name(resolved.message, condition.selector), ranges.join(", "))
     });

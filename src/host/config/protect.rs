@@ -5,7 +5,6 @@ use super::document::Faults;
 use super::keys::ProtectedInput;
 use super::resolve::{Checks, ResolvedSignal};
 use super::schema::did_you_mean;
-use crate::can::MAX_DATA;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
@@ -95,7 +94,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
     let mut noted: Vec<&str> = Vec::new();
     for input in inputs {
         for signal in read_with(input.message, input.signal) {
-            if lies_in(signal, profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
+            if signal.layout.touches(profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
                 noted.push(&signal.name);
                 let what = format!(
                     "must not lie in {}, which profile \"{}\" writes: {}.{} does",
@@ -112,15 +111,8 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
 
 /// A signal and the multiplexors it depends on.
 fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
-    let selectors = signal.multiplex.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
+    let selectors = signal.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
     selectors.chain([signal])
-}
-
-/// Whether a signal has a bit in these of the first bytes: then it does not read 0 there.
-fn lies_in(signal: &Signal, mask: [u8; 3]) -> bool {
-    let mut payload = [0; MAX_DATA];
-    payload[..mask.len()].copy_from_slice(&mask);
-    signal.layout.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
 }
 
 fn header_words(mask: [u8; 3]) -> &'static str {

@@ -86,15 +86,15 @@ pub(super) fn note_event(
             summary.bad_readings += bad_readings;
             "signal_good"
         }
-        EventKind::Protection { usable, .. } => {
-            if usable {
+        EventKind::Protection(change) => {
+            if change.usable {
                 "protection_usable"
             } else {
                 "protection_failed"
             }
         }
-        EventKind::Flood { active, .. } => {
-            if active {
+        EventKind::Flood(change) => {
+            if change.active {
                 "flood_begun"
             } else {
                 "flood_over"
