@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
-use super::Failure;
-use super::control_args::{ControlArgs, print};
-use crate::alarm::{Alarm, AlarmState, Rule, Unit};
+use super::control_args::ControlArgs;
+use super::output::{print, word};
+use super::{Failure, output};
+use crate::alarm::{Alarm, Rule, Unit};
 use crate::control::protocol::{AlarmList, Request, contents};
 use crate::io::stamp;
 use crate::quantity::CellIndex;
@@ -48,14 +49,7 @@ fn table(list: &AlarmList) -> String {
     if list.alarms.is_empty() {
         text.push_str("no alarm\n");
     } else {
-        let rows: Vec<[String; HEAD.len()]> = list.alarms.iter().map(row).collect();
-        let width = |column: usize| {
-            let longest = rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-            longest.max(HEAD[column].len())
-        };
-        let widths: [usize; HEAD.len()] = std::array::from_fn(width);
-        push_row(&mut text, &HEAD.map(str::to_owned), &widths);
-        rows.iter().for_each(|row| push_row(&mut text, row, &widths));
+        text.push_str(&output::table(&HEAD, list.alarms.iter().map(row), HEAD.len()));
     }
     if list.omitted > 0 {
         let _ = writeln!(text, "and {} more, beyond the length of an answer", list.omitted);
@@ -74,20 +68,14 @@ fn table(list: &AlarmList) -> String {
     text
 }
 
-fn push_row(text: &mut String, row: &[String], widths: &[usize]) {
-    let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
-    text.push_str(cells.join("  ").trim_end());
-    text.push('\n');
-}
-
-fn row(alarm: &Alarm) -> [String; HEAD.len()] {
+fn row(alarm: &Alarm) -> Vec<String> {
     let stamp = |time: Option<_>| time.map_or_else(|| "-".to_owned(), stamp::format_utc);
     let has_been = alarm.occurrences > 0;
-    [
+    vec![
         alarm.rule.name().to_owned(),
         alarm.severity.name().to_owned(),
         cell(alarm.cell),
-        state_name(alarm.state).to_owned(),
+        word(alarm.state),
         alarm.value.map_or_else(|| "unknown".to_owned(), |value| with_unit(alarm.rule, value)),
         with_unit(alarm.rule, alarm.threshold),
         alarm.probability.map_or_else(|| "-".to_owned(), |probability| format!("{:.1} %", 100.0 * probability)),
@@ -119,24 +107,10 @@ pub(super) fn with_unit(rule: Rule, value: f64) -> String {
     }
 }
 
-/// The name of an alarm's state.
-pub(super) fn state_name(state: AlarmState) -> &'static str {
-    match state {
-        AlarmState::Unknown => "unknown",
-        AlarmState::Inactive => "inactive",
-        AlarmState::Pending => "pending",
-        AlarmState::Active => "active",
-        AlarmState::Clearing => "clearing",
-        AlarmState::Suppressed => "suppressed",
-        AlarmState::Latched => "latched",
-        AlarmState::Cleared => "cleared",
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::alarm::Severity;
+    use crate::alarm::{AlarmState, Severity};
     use crate::control::protocol::UnknownAlarms;
     use crate::quantity::Timestamp;
 

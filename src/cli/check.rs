@@ -5,8 +5,8 @@
 
 use std::path::PathBuf;
 
-use super::Failure;
-use super::control_args::print;
+use super::output::{print, print_json, unless_closed};
+use super::{Failure, output};
 use crate::config::{Description, OutputUse, SignalUse};
 
 /// Arguments of `check`.
@@ -30,9 +30,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let description = crate::config::describe(file)?;
     if args.json {
-        let json = serde_json::to_string_pretty(&description);
-        let json = json.map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?;
-        print(&(json + "\n"))
+        unless_closed(print_json(&description))
     } else {
         let mut page = String::new();
         show(&description, &mut page);
@@ -43,7 +41,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 fn show(description: &Description, page: &mut String) {
     page.push_str(&format!("{}: good\n", description.file));
     page.push_str(&format!("\ncell\n  {}\n", description.cell));
-    list("pack", &description.pack, page);
+    list("pack", &description.pack, "", page);
     page.push_str("\ninterfaces\n");
     for interface in &description.interfaces {
         let kind = if interface.fd { "classic and FD" } else { "classic" };
@@ -53,30 +51,27 @@ fn show(description: &Description, page: &mut String) {
         };
         page.push_str(&format!("  {}: {kind}, {ids}\n", interface.name));
     }
-    page.push_str("\nsignals\n");
-    table(&description.signals.iter().map(signal).collect::<Vec<_>>(), page);
-    list("plausible readings", &description.limits, page);
-    list("checks of frames", &description.intake, page);
-    page.push_str("\noutputs\n");
-    if description.outputs.is_empty() {
-        page.push_str("  nothing is sent\n");
-    }
-    table(&description.outputs.iter().map(output).collect::<Vec<_>>(), page);
-    if description.alarms.is_empty() {
-        list("alarms", &["none".to_owned()], page);
-    } else {
-        list("alarms", &description.alarms, page);
-    }
+    list("signals", &table(description.signals.iter().map(signal)), "", page);
+    list("plausible readings", &description.limits, "", page);
+    list("checks of frames", &description.intake, "", page);
+    list("outputs", &table(description.outputs.iter().map(sent)), "nothing is sent", page);
+    list("alarms", &description.alarms, "none", page);
     if !description.j1939.is_empty() {
-        list("j1939", &description.j1939, page);
+        list("j1939", &description.j1939, "", page);
     }
 }
 
-fn list(heading: &str, lines: &[String], page: &mut String) {
+/// A heading and indented lines, or the word for none of them.
+fn list(heading: &str, lines: &[String], none: &str, page: &mut String) {
     page.push_str(&format!("\n{heading}\n"));
-    for line in lines {
+    for line in lines.iter().map(String::as_str).chain(Some(none).filter(|none| lines.is_empty() && !none.is_empty())) {
         page.push_str(&format!("  {line}\n"));
     }
+}
+
+/// Rows with their columns aligned.
+fn table(rows: impl Iterator<Item = Vec<String>>) -> Vec<String> {
+    output::table::<&str>(&[], rows, usize::MAX).lines().map(str::to_owned).collect()
 }
 
 fn signal(signal: &SignalUse) -> Vec<String> {
@@ -113,7 +108,7 @@ fn signal(signal: &SignalUse) -> Vec<String> {
     ]
 }
 
-fn output(output: &OutputUse) -> Vec<String> {
+fn sent(output: &OutputUse) -> Vec<String> {
     vec![
         output.frame.to_owned(),
         output.id.clone(),
@@ -125,15 +120,4 @@ fn output(output: &OutputUse) -> Vec<String> {
             protection => format!("end-to-end {protection}"),
         },
     ]
-}
-
-/// Rows with their columns aligned.
-fn table(rows: &[Vec<String>], page: &mut String) {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
-    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
-    for row in rows {
-        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
-        page.push_str(&format!("  {}\n", cells.join("  ").trim_end()));
-    }
 }

@@ -6,7 +6,8 @@ use std::fmt::Write as _;
 
 use super::Failure;
 use super::alarms::{cell, with_unit};
-use super::control_args::{ControlArgs, SelectorArgs, print};
+use super::control_args::{ControlArgs, SelectorArgs};
+use super::output::print;
 use crate::alarm::Alarm;
 use crate::control::answer::refusal;
 use crate::control::client::ControlClient;

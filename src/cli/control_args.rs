@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 
 use crate::alarm::{Rule, Selector, Severity};
-use crate::cli::Failure;
 use crate::control::client::ControlClient;
 use crate::quantity::{CellIndex, MAX_CELLS};
 
@@ -63,15 +62,4 @@ fn severity_parser() -> impl TypedValueParser<Value = Severity> {
 fn cell(text: &str) -> Result<CellIndex, String> {
     let number = text.parse::<u16>().ok().filter(|number| (1..=MAX_CELLS).contains(&usize::from(*number)));
     number.map(|number| CellIndex(number - 1)).ok_or_else(|| format!("must be a cell's number, 1 to {MAX_CELLS}"))
-}
-
-/// Writes to standard output; a closed pipe (`| head`) is not a failure.
-pub(crate) fn print(text: &str) -> Result<(), Failure> {
-    use std::io::Write as _;
-    match std::io::stdout().write_all(text.as_bytes()) {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
-            Err(Failure::new(format!("standard output cannot be written: {error}")))
-        }
-        Ok(()) | Err(_) => Ok(()),
-    }
 }

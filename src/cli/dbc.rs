@@ -7,6 +7,7 @@
 use std::io::Write as _;
 use std::path::PathBuf;
 
+use super::output::unless_closed;
 use super::{EXIT_CONFIG, Failure};
 use crate::config;
 use crate::io::result_file::ResultFile;
@@ -33,9 +34,5 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         file.write_all(&layout.to_dbc_bytes())?;
         file.finish()
     });
-    match written {
-        // A reader that closes the pipe (`| head`) is no failure.
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::new(error.to_string())),
-        Ok(()) | Err(_) => Ok(()),
-    }
+    unless_closed(written)
 }

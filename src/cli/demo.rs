@@ -11,6 +11,7 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use super::Failure;
+use super::output::word;
 use crate::alarm::{Change, Rule};
 use crate::can::Frame;
 use crate::can::encode::InputEncoder;
@@ -21,7 +22,7 @@ use crate::monitor::{EventKind, Input, Monitor, Outputs, TICK_PERIOD_MS};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use consumer::Consumer;
-use table::{Table, TableRow};
+use table::Table;
 
 /// Files built into the binary, by the path the configuration calls them.
 const FILES: [(&str, &str); 3] = [
@@ -192,24 +193,26 @@ impl Demo {
         last.is_some_and(|(a, b)| self.sim.pack().cycles() + 1 > a.cycle.max(b.cycle) + CYCLES_AFTER)
     }
 
-    fn row(&self, moment: &Moment, cycles: u32) -> TableRow {
-        let truth = self.sim.pack().cells()[0];
-        let estimate = self.monitor.latest().next().flatten();
+    /// A row of the table: estimate and truth at this moment.
+    fn row(&self, moment: &Moment, cycles: u32) -> String {
+        let soc = match self.monitor.latest().next().flatten() {
+            Some(e) => format!("{:6.1} +-{:5.1}", 100.0 * e.soc, 100.0 * e.soc_std),
+            None => format!("{:>6}{:8}", "-", ""),
+        };
+        let (cycle, hours, true_soc) =
+            (cycles + 1, moment.time.secs() / 3600.0, 100.0 * self.sim.pack().cells()[0].soc);
         let capacity = self.monitor.capacity(CellIndex(0));
-        let mut alarms: Vec<Rule> = self.raised.iter().map(|raised| raised.rule).collect();
+        let (ah, std_ah, true_ah, soh) =
+            (capacity.mean, capacity.std(), self.true_capacity_ah, 100.0 * capacity.mean / self.rated_ah);
+        let recharge = self.monitor.recharge_period_s().map_or("-".to_owned(), |s| format!("{s:.0}"));
+        let mode = word(self.monitor.mode());
+        let mut alarms: Vec<String> = self.raised.iter().map(|raised| raised.rule.name().replace('_', " ")).collect();
         alarms.dedup();
-        TableRow {
-            cycle: cycles + 1,
-            hours: moment.time.secs() / 3600.0,
-            mode: self.monitor.mode(),
-            soc: estimate.map(|e| (e.soc, e.soc_std)),
-            true_soc: truth.soc,
-            capacity_ah: (capacity.mean, capacity.std()),
-            true_capacity_ah: self.true_capacity_ah,
-            soh: capacity.mean / self.rated_ah,
-            recharge_period_s: self.monitor.recharge_period_s(),
-            alarms,
-        }
+        format!(
+            "{cycle:5} {hours:5.1} h | {soc} {true_soc:6.1} | {ah:8.3} +-{std_ah:6.3} {true_ah:6.3} | {soh:4.0} | {recharge:>8} | \
+             {mode:10} {}",
+            alarms.join(", ")
+        )
     }
 
     /// The alarm frames as an ECU receives them.

@@ -8,9 +8,8 @@ mod page;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-
-use super::control_args::print;
+use super::numbers::above_0_to;
+use super::output::{print_json, progress_bar, unless_closed};
 use super::replay::{Bar, CsvSign, column};
 use super::{EXIT_CONFIG, Failure};
 
@@ -38,7 +37,7 @@ pub(crate) struct Args {
     #[arg(value_name = "LOG")]
     logs: Vec<PathBuf>,
     /// How long to listen, s [default: 60; logs: all of them]
-    #[arg(long = "for", value_name = "S", value_parser = seconds)]
+    #[arg(long = "for", value_name = "S", value_parser = above_0_to(MAX_SECONDS, "seconds, "))]
     seconds: Option<f64>,
     /// Print the report as JSON
     #[arg(long)]
@@ -52,13 +51,6 @@ pub(crate) struct Args {
     /// CSV table with the section's column and `start`
     #[arg(long, value_name = "TABLE.csv")]
     start_times: Option<PathBuf>,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if value > 0.0 && value <= MAX_SECONDS => Ok(value),
-        _ => Err(format!("must be seconds, above 0 and at most {MAX_SECONDS}")),
-    }
 }
 
 /// Runs the command.
@@ -136,9 +128,7 @@ fn replay(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report,
 
 fn listen(args: &Args, survey: &Survey, interrupt: &Interrupt) -> Result<Report, Failure> {
     let wanted_s = args.seconds.unwrap_or(DEFAULT_SECONDS);
-    let bar = ProgressBar::with_draw_target(Some((1000.0 * wanted_s) as u64), ProgressDrawTarget::stderr_with_hz(5));
-    let template = "listening {bar:32} {msg} (Ctrl-C ends early)";
-    bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    let bar = progress_bar((1000.0 * wanted_s) as u64, "listening {bar:32} {msg} (Ctrl-C ends early)");
     let result = diagnosis::listen(survey, Duration::from_secs_f64(wanted_s), interrupt, &mut |progress| {
         bar.set_position((1000.0 * progress.seconds) as u64);
         bar.set_message(format!("{:.0} of {wanted_s:.0} s, {} frames", progress.seconds, progress.frames));
@@ -169,7 +159,5 @@ fn json(report: &Report, config: &Path, source: &str) -> Result<(), Failure> {
         "ok": !report.has_findings(),
         "report": report,
     });
-    let text = serde_json::to_string_pretty(&document)
-        .map_err(|error| Failure::new(format!("cannot be written as JSON: {error}")))?;
-    print(&(text + "\n"))
+    unless_closed(print_json(&document))
 }

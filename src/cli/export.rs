@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::Failure;
 use super::fleet::LogArgs;
-use super::numbers::within;
+use super::numbers::{NamedValue, one_of, within};
 use super::output::{failure, print_json, unless_closed, write_table};
 use crate::config::{self, Config};
 use crate::lab::fleet::LogAccess;
@@ -16,14 +16,11 @@ use crate::lab::fleet::export::{self, ExportResult, ExportSettings, TableFormat}
 /// Version of the JSON document.
 const VERSION: u32 = 1;
 
-/// Form of the tables.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum FormatName {
-    /// Apache Parquet, compressed with Snappy
-    Parquet,
-    /// CSV with a heading
-    Csv,
-}
+/// Forms of the tables by name.
+const FORMATS: [NamedValue<TableFormat>; 2] = [
+    ("parquet", TableFormat::Parquet, "Apache Parquet, compressed with Snappy"),
+    ("csv", TableFormat::Csv, "CSV with a heading"),
+];
 
 /// Arguments of `export`.
 #[derive(Debug, clap::Args)]
@@ -41,8 +38,8 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE", required_unless_present = "columns_page")]
     config: Option<PathBuf>,
     /// Form of the tables
-    #[arg(long, value_enum, default_value = "parquet")]
-    format: FormatName,
+    #[arg(long, value_parser = one_of(&FORMATS), default_value = "parquet")]
+    format: TableFormat,
     /// Folder for the logs' folders; created when it does not exist
     #[arg(short, long, value_name = "DIR", required_unless_present = "columns_page")]
     out: Option<PathBuf>,
@@ -69,10 +66,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let open = |config: &Config, log: &Path| args.logs.open(config, log);
     let settings = ExportSettings {
         access: LogAccess { open: &open, sleep_gap_s: args.logs.sleep_gap_s() },
-        format: match args.format {
-            FormatName::Parquet => TableFormat::Parquet,
-            FormatName::Csv => TableFormat::Csv,
-        },
+        format: args.format,
         out: out.clone(),
         period_s: args.period,
         jobs: args.logs.threads(),

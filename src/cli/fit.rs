@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use super::Failure;
 use super::numbers::{above_0, finite, share};
-use super::output::{failure, unless_closed};
+use super::output::{failure, progress_bar, unless_closed};
 use crate::cell::MAX_BRANCHES;
 use crate::lab;
 use crate::lab::fit::{self, FitRequest};
@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     }
     let begin = Instant::now();
     let request = request(args);
-    let bar = report::spinner();
+    let bar = progress_bar(None, "{spinner} {elapsed_precise} {msg}");
     let result = fit::run(&request, |progress| report::show(&bar, progress));
     bar.finish_and_clear();
     let outcome = result.map_err(failure)?;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::{CommandFactory, Subcommand};
 use clap_mangen::Man;
 
-use super::control_args::print;
+use super::output::print;
 use super::{Cli, Failure};
 
 /// Name of the manual page about configurations.

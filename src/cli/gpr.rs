@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use super::Failure;
+use super::numbers::whole;
 use super::output::{create_folder, failure, unless_closed};
 use crate::lab::gpr::{self, ColumnSelection, ColumnTable, PartColumn, TrainedModel};
 use crate::regress::{Kernel, score};
-use args::{FileArgs, ModelArgs, whole};
+use args::{FileArgs, ModelArgs};
 
 /// Arguments of `gpr`.
 #[derive(Debug, clap::Args)]

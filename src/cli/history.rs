@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
 use super::Failure;
-use super::control_args::print;
+use super::numbers::{NamedValue, one_of};
+use super::output::print;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
 use crate::quantity::{MAX_CELLS, Timestamp};
@@ -63,8 +64,8 @@ struct VerifyArgs {
 #[derive(Debug, clap::Args)]
 struct RowArgs {
     /// Rows of these kinds (default: all)
-    #[arg(long, value_name = "KIND", value_enum, value_delimiter = ',')]
-    kind: Vec<KindName>,
+    #[arg(long, value_name = "KIND", value_parser = one_of(&KINDS), value_delimiter = ',')]
+    kind: Vec<HistoryTable>,
     /// Rows of this cell, counted from 1
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MAX_CELLS as i64))]
     cell: Option<u16>,
@@ -76,37 +77,19 @@ struct RowArgs {
     until: Option<Timestamp>,
 }
 
-/// A kind of rows, on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum KindName {
-    /// Charges and discharges
-    HalfCycle,
-    /// Learned capacities
-    Capacity,
-    /// Remaining life of the cell whose life ends first
-    RemainingLife,
-    /// Alarms
-    Alarm,
-    /// Resets, other packs, damages
-    Reset,
-}
-
-impl From<KindName> for HistoryTable {
-    fn from(name: KindName) -> Self {
-        match name {
-            KindName::HalfCycle => Self::HalfCycle,
-            KindName::Capacity => Self::Capacity,
-            KindName::RemainingLife => Self::RemainingLife,
-            KindName::Alarm => Self::Alarm,
-            KindName::Reset => Self::Reset,
-        }
-    }
-}
+/// Kinds of rows by name.
+const KINDS: [NamedValue<HistoryTable>; 5] = [
+    ("half-cycle", HistoryTable::HalfCycle, "Charges and discharges"),
+    ("capacity", HistoryTable::Capacity, "Learned capacities"),
+    ("remaining-life", HistoryTable::RemainingLife, "Remaining life of the cell whose life ends first"),
+    ("alarm", HistoryTable::Alarm, "Alarms"),
+    ("reset", HistoryTable::Reset, "Resets, other packs, damages"),
+];
 
 impl RowArgs {
     fn filter(&self, limit: Option<u32>) -> HistoryQuery {
         HistoryQuery {
-            kinds: self.kind.iter().map(|&name| name.into()).collect(),
+            kinds: self.kind.clone(),
             cell: self.cell.map(|number| number - 1),
             since_ns: self.since.map(Timestamp::nanos),
             until_ns: self.until.map(Timestamp::nanos),
@@ -158,63 +141,53 @@ fn describe(entry: &HistoryEntry) -> String {
         let column = entry.kind.columns().iter().position(|column| *column == name);
         column.and_then(|column| entry.values.get(column)).unwrap_or(&Value::Null)
     };
-    let number = |name: &str, factor: f64, digits: usize| match value(name).as_f64() {
-        Some(number) => format!("{:.digits$}", factor * number),
-        None => "-".to_owned(),
-    };
-    let text = |name: &str| value(name).as_str().unwrap_or("").to_owned();
-    match entry.kind {
-        HistoryTable::HalfCycle => format!(
-            "{} {} Ah, swing {} +/- {} %, {} s, {} A, {} C",
-            text("mode"),
-            number("charge_ah", 1.0, 3),
-            number("swing", 100.0, 1),
-            number("swing_std", 100.0, 1),
-            number("duration_s", 1.0, 0),
-            number("mean_current_a", 1.0, 2),
-            number("mean_temperature_c", 1.0, 1)
-        ),
-        HistoryTable::Capacity => format!(
-            "{} +/- {} Ah, usable {} +/- {} Ah, resistance {} +/- {}, measured {} +/- {} Ah",
-            number("capacity_ah", 1.0, 3),
-            number("capacity_std_ah", 1.0, 3),
-            number("usable_capacity_ah", 1.0, 3),
-            number("usable_capacity_std_ah", 1.0, 3),
-            number("resistance_ratio", 1.0, 2),
-            number("resistance_ratio_std", 1.0, 2),
-            number("measured_ah", 1.0, 3),
-            number("measured_std_ah", 1.0, 3)
-        ),
-        HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known".to_owned(),
-        HistoryTable::RemainingLife => format!(
-            "{} cycles ({} to {}), {} days ({} to {})",
-            number("cycles", 1.0, 0),
-            number("cycles_low", 1.0, 0),
-            number("cycles_high", 1.0, 0),
-            number("days", 1.0, 0),
-            number("days_low", 1.0, 0),
-            number("days_high", 1.0, 0)
-        ),
-        HistoryTable::Alarm => format!(
-            "{} {} {}, value {}, threshold {}, raised {} times",
-            text("rule"),
-            text("severity"),
-            text("change"),
-            number("value", 1.0, 4),
-            number("threshold", 1.0, 4),
-            number("occurrences", 1.0, 0)
-        ),
+    let words = match entry.kind {
+        HistoryTable::HalfCycle => {
+            "{mode} {charge_ah:3} Ah, swing {swing%1} +/- {swing_std%1} %, {duration_s:0} s, {mean_current_a:2} A, \
+             {mean_temperature_c:1} C"
+        }
+        HistoryTable::Capacity => {
+            "{capacity_ah:3} +/- {capacity_std_ah:3} Ah, usable {usable_capacity_ah:3} +/- {usable_capacity_std_ah:3} Ah, \
+             resistance {resistance_ratio:2} +/- {resistance_ratio_std:2}, measured {measured_ah:3} +/- {measured_std_ah:3} Ah"
+        }
+        HistoryTable::RemainingLife if value("cycles").is_null() => "no longer known",
+        HistoryTable::RemainingLife => {
+            "{cycles:0} cycles ({cycles_low:0} to {cycles_high:0}), {days:0} days ({days_low:0} to {days_high:0})"
+        }
+        HistoryTable::Alarm => {
+            "{rule} {severity} {change}, value {value:4}, threshold {threshold:4}, raised {occurrences:0} times"
+        }
         HistoryTable::Reset => {
             let learned =
                 value("capacity_ah").as_f64().map(|ah| format!(", capacity was {ah:.3} Ah")).unwrap_or_default();
             let detail = value("detail").as_str().map(|detail| format!(": {detail}")).unwrap_or_default();
-            format!("{}{learned}{detail}", text("reason"))
+            return format!("{}{learned}{detail}", value("reason").as_str().unwrap_or(""));
         }
+    };
+    filled(words, &value)
+}
+
+/// The words with the values of their fields: `{name:2}` is a number with two decimals, `{name%1}` one in per cent, `{name}` a text.
+fn filled<'v>(words: &str, value: &impl Fn(&str) -> &'v Value) -> String {
+    let mut parts = words.split('{');
+    let mut text = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (field, after) = part.split_once('}').unwrap_or((part, ""));
+        let name = field.trim_end_matches(|c: char| c.is_ascii_digit()).trim_end_matches([':', '%']);
+        let digits = field.rsplit([':', '%']).next().and_then(|digits| digits.parse::<usize>().ok());
+        let factor = if field.contains('%') { 100.0 } else { 1.0 };
+        text += &match (digits, value(name).as_f64()) {
+            (Some(digits), Some(number)) => format!("{:.digits$}", factor * number),
+            (Some(_), None) => "-".to_owned(),
+            (None, _) => value(name).as_str().unwrap_or("").to_owned(),
+        };
+        text += after;
     }
+    text
 }
 
 fn document(entry: &HistoryEntry) -> Value {
-    let own = json!({
+    let mut row = json!({
         "kind": entry.kind.name(),
         "seq": entry.seq,
         "wall_ns": entry.wall_ns,
@@ -222,10 +195,8 @@ fn document(entry: &HistoryEntry) -> Value {
         "boot": entry.boot,
         "pack": entry.pack,
     });
-    let mut keys = if let Value::Object(keys) = own { keys } else { Map::new() };
-    let columns = entry.kind.columns().iter().map(|column| (*column).to_owned());
-    keys.extend(columns.zip(entry.values.iter().cloned()));
-    Value::Object(keys)
+    entry.kind.columns().iter().zip(&entry.values).for_each(|(column, value)| row[*column] = value.clone());
+    row
 }
 
 /// Columns of every row in a CSV.

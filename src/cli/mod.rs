@@ -19,9 +19,9 @@ mod generate;
 #[cfg(feature = "lab")]
 mod gpr;
 mod history;
-#[cfg(feature = "lab")]
+#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod numbers;
-#[cfg(feature = "lab")]
+#[cfg_attr(not(feature = "lab"), expect(dead_code, reason = "the offline commands use more of it"))]
 mod output;
 mod replay;
 #[cfg(feature = "lab")]

@@ -1,4 +1,18 @@
-//! Parsers of number arguments; each error names the allowed values.
+//! Parsers of arguments: numbers, and names that stand for a value; each error names the allowed ones.
+
+use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+
+/// A name, its value, and its line in the help.
+pub(crate) type NamedValue<T> = (&'static str, T, &'static str);
+
+/// One of these values, by its name.
+pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
+    all: &'static [NamedValue<T>],
+) -> impl TypedValueParser<Value = T> {
+    let names = all.iter().map(|(name, _, help)| PossibleValue::new(*name).help(*help));
+    let find = |name: String| all.iter().find(|known| known.0 == name).map(|known| known.1).ok_or("no such name");
+    PossibleValuesParser::new(names).try_map(find)
+}
 
 /// A finite number.
 pub(crate) fn finite(text: &str) -> Result<f64, String> {
@@ -9,6 +23,22 @@ pub(crate) fn finite(text: &str) -> Result<f64, String> {
 pub(crate) fn within(text: &str, is_allowed: impl Fn(f64) -> bool, allowed: &str) -> Result<f64, String> {
     let value = text.trim().parse::<f64>().ok().filter(|value| value.is_finite() && is_allowed(*value));
     value.ok_or_else(|| format!("must be {allowed}"))
+}
+
+/// A number from `low` to `high`; the error begins with `what`.
+pub(crate) fn between(low: f64, high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| within(text, |value| (low..=high).contains(&value), &format!("{what}{low} to {high}"))
+}
+
+/// A number above 0, at most `high`; the error begins with `what`.
+pub(crate) fn above_0_to(high: f64, what: &'static str) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| within(text, |value| value > 0.0 && value <= high, &format!("{what}above 0, at most {high}"))
+}
+
+/// A whole number.
+pub(crate) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<usize, String> {
+    let number = text.trim().parse::<usize>().ok().filter(|number| (LOW..=HIGH).contains(number));
+    number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }
 
 /// A finite number above 0.

@@ -25,6 +25,21 @@ pub(crate) fn unless_closed(written: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
+/// Writes to standard output.
+pub(crate) fn print(text: &str) -> Result<(), Failure> {
+    let written = io::stdout().write_all(text.as_bytes());
+    unless_closed(written)
+        .map_err(|failure| Failure::new(format!("standard output cannot be written: {}", failure.message)))
+}
+
+/// A value of an enumeration, as in JSON.
+pub(crate) fn word(value: impl serde::Serialize) -> String {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => word,
+        _ => "?".to_owned(),
+    }
+}
+
 /// Writes one JSON document to standard output.
 pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     let mut out = io::stdout().lock();
@@ -32,32 +47,37 @@ pub(crate) fn print_json(document: &impl Serialize) -> io::Result<()> {
     writeln!(out)
 }
 
-/// Writes columns as wide as their widest entry: the first `left` are aligned to the left, the others to the right.
+/// Columns as wide as their widest entry: the first `left` are aligned to the left, the others to the right.
+pub(crate) fn table<H: AsRef<str>>(heads: &[H], rows: impl IntoIterator<Item = Vec<String>>, left: usize) -> String {
+    let heads: Vec<String> = heads.iter().map(|head| head.as_ref().to_owned()).collect();
+    let rows: Vec<Vec<String>> = Some(heads).filter(|heads| !heads.is_empty()).into_iter().chain(rows).collect();
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
+    let widths: Vec<usize> =
+        (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| {
+        let cells = widths.iter().enumerate().map(|(column, &width)| {
+            let text = entry(row, column);
+            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
+        });
+        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned() + "\n"
+    };
+    rows.iter().map(line).collect()
+}
+
+/// Writes such a [`table`].
 pub(crate) fn write_table<H: AsRef<str>>(
     out: &mut impl Write,
     heads: &[H],
     rows: impl IntoIterator<Item = Vec<String>>,
     left: usize,
 ) -> io::Result<()> {
-    let heads = heads.iter().map(|head| head.as_ref().to_owned()).collect();
-    let rows: Vec<Vec<String>> = std::iter::once(heads).chain(rows).collect();
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let entry = |row: &[String], column: usize| row.get(column).cloned().unwrap_or_default();
-    let widths: Vec<usize> =
-        (0..columns).map(|c| rows.iter().map(|row| entry(row, c).chars().count()).max().unwrap_or(0)).collect();
-    for row in rows {
-        let cells = widths.iter().enumerate().map(|(column, &width)| {
-            let text = entry(&row, column);
-            if column < left { format!("{text:<width$}") } else { format!("{text:>width$}") }
-        });
-        writeln!(out, "{}", cells.collect::<Vec<_>>().join("  ").trim_end())?;
-    }
-    Ok(())
+    out.write_all(table(heads, rows, left).as_bytes())
 }
 
-/// A progress bar over `total` units.
-pub(crate) fn progress_bar(total: u64, template: &str) -> ProgressBar {
-    let bar = ProgressBar::with_draw_target(Some(total), ProgressDrawTarget::stderr_with_hz(5));
+/// A progress bar over `total` units, if they are known.
+pub(crate) fn progress_bar(total: impl Into<Option<u64>>, template: &str) -> ProgressBar {
+    let bar = ProgressBar::with_draw_target(total.into(), ProgressDrawTarget::stderr_with_hz(5));
     bar.with_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 

@@ -8,6 +8,7 @@ use std::io;
 use std::path::Path;
 
 use super::Failure;
+use super::output::print_json;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::config::{self, Config};
 use crate::io::csv_log::CsvOptions;
@@ -130,5 +131,5 @@ fn create(path: Option<&Path>) -> io::Result<Option<ResultFile>> {
 }
 
 fn print_summary(args: &Args, summary: &ReplaySummary) -> io::Result<()> {
-    if args.json { report::json(summary) } else { report::table(summary, args.results_on_stdout()) }
+    if args.json { print_json(summary) } else { report::table(summary, args.results_on_stdout()) }
 }

@@ -4,7 +4,8 @@ use std::path::PathBuf;
 
 use super::Failure;
 use super::command;
-use super::control_args::{ControlArgs, print};
+use super::control_args::ControlArgs;
+use super::output::print;
 use crate::store;
 
 /// Arguments of `reset`.

@@ -4,14 +4,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
+use super::numbers::{between, whole};
 use crate::config;
-use crate::control::ControlSetting;
+use crate::io::place::PlaceSetting;
 use crate::io::snapshot_file;
 use crate::io::socket::DEFAULT_RECEIVE_BUFFER_BYTES;
 use crate::monitor::Downtime;
 use crate::service::readiness::{DEFAULT_READY_TIMEOUT_S, MAX_READY_TIMEOUT_S};
 use crate::status::document::ConfigFile;
-use crate::store::StateSetting;
 use crate::{logging, service::Service};
 
 /// Arguments of `run`.
@@ -43,16 +43,16 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     snapshot: Option<PathBuf>,
     /// Stop after this time
-    #[arg(long = "for", value_name = "SECONDS", value_parser = seconds)]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = between(0.0, MAX_SECONDS, "seconds, "))]
     duration: Option<f64>,
     /// Wait this long for the first usable frame before reporting readiness to the service manager
-    #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = ready_seconds)]
+    #[arg(long, value_name = "SECONDS", default_value_t = DEFAULT_READY_TIMEOUT_S, value_parser = between(0.0, MAX_READY_TIMEOUT_S, "seconds, "))]
     ready_timeout: f64,
     /// Log level or filter: error, warn, info, debug, trace (default: $PACKWATCH_LOG, else info)
     #[arg(long, value_name = "LEVEL")]
     log: Option<String>,
     /// Receive buffer to request from the kernel, per interface
-    #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = buffer_bytes)]
+    #[arg(long, value_name = "BYTES", default_value_t = DEFAULT_RECEIVE_BUFFER_BYTES, value_parser = whole::<0, MAX_BUFFER_BYTES>)]
     receive_buffer: usize,
     /// Socket for `packwatch alarms` and other commands, or none for no socket (default: $RUNTIME_DIRECTORY/control.sock
     /// under systemd, else /run/packwatch/control.sock if that can be created)
@@ -69,32 +69,13 @@ const MAX_SECONDS: f64 = 315_576_000.0;
 /// Largest receive buffer, bytes: the kernel's own limit on the option, halved as it doubles it.
 const MAX_BUFFER_BYTES: usize = (i32::MAX / 2) as usize;
 
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if (0.0..=MAX_SECONDS).contains(&value) => Ok(value),
-        _ => Err(format!("must be seconds, 0 to {MAX_SECONDS}")),
-    }
-}
-
-fn ready_seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if (0.0..=MAX_READY_TIMEOUT_S).contains(&value) => Ok(value),
-        _ => Err(format!("must be seconds, 0 to {MAX_READY_TIMEOUT_S}")),
-    }
-}
-
 /// Parses the age of a stored state.
 pub(crate) fn away(text: &str) -> Result<Downtime, String> {
     match text {
         "unknown" => Ok(Downtime::Unknown),
-        _ => seconds(text).map(Downtime::Seconds).map_err(|must| format!("{must}, or unknown")),
-    }
-}
-
-fn buffer_bytes(text: &str) -> Result<usize, String> {
-    match text.parse::<usize>() {
-        Ok(value) if value <= MAX_BUFFER_BYTES => Ok(value),
-        _ => Err(format!("must be bytes, 0 to {MAX_BUFFER_BYTES}")),
+        _ => between(0.0, MAX_SECONDS, "seconds, ")(text)
+            .map(Downtime::Seconds)
+            .map_err(|must| format!("{must}, or unknown")),
     }
 }
 
@@ -112,9 +93,9 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         duration: args.duration.map(Duration::from_secs_f64),
         ready_timeout: Duration::from_secs_f64(args.ready_timeout),
         receive_buffer_bytes: args.receive_buffer,
-        state: StateSetting::from_path(args.state.clone()),
-        control: ControlSetting::from_path(args.control.clone()),
-        status: ControlSetting::from_path(args.status.clone()),
+        state: PlaceSetting::from_path(args.state.clone()),
+        control: PlaceSetting::from_path(args.control.clone()),
+        status: PlaceSetting::from_path(args.status.clone()),
         config_file: ConfigFile::of(&args.config),
     };
     service.run().map_err(|error| Failure::new(error.to_string()))

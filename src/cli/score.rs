@@ -72,10 +72,9 @@ fn settings(args: &Args, config: &Config) -> Result<ScoreSettings, Failure> {
             config.path.display()
         )));
     }
-    if let Some(load) = args.life.load {
+    if let Some([current_a, temperature_c, cutoff_v]) = args.life.load {
         let taper_current_a =
             monitor.health.usable.map_or(monitor.model.rated_capacity_ah / 20.0, |u| u.taper_current_a);
-        let (current_a, temperature_c, cutoff_v) = (load.current_a, load.temperature_c, load.cutoff_v);
         monitor.health.usable = Some(UsableConfig { current_a, temperature_c, cutoff_v, taper_current_a });
     }
     if !args.life.cycles.is_empty() && monitor.health.usable.is_none() {
@@ -122,7 +121,7 @@ impl Args {
                 for &capacity_error_percent in &self.starts.capacity_error {
                     for &current_offset_a in &self.starts.current_offset {
                         cases.extend(seeds.iter().map(|&seed| Case {
-                            start: (*start).into(),
+                            start: *start,
                             soc_error_points: error.0,
                             capacity_error_percent,
                             current_offset_a,

@@ -11,13 +11,14 @@ mod settings;
 use std::path::PathBuf;
 
 use super::Failure;
+use super::numbers::one_of;
 use crate::can::encode::{InputEncoder, InputProtector};
 use crate::can::{CanId, Frame};
 use crate::config::{self, Config};
 use crate::monitor::MonitorConfig;
 use crate::quantity::{BusIndex, CellIndex, Channel, Timestamp};
 use crate::sample::{SampleConfig, VoltageSource};
-use crate::sim::{Moment, Settings, Simulation, Wiring};
+use crate::sim::{Moment, Scenario, Settings, Simulation, Wiring};
 use output::{LogWriter, TruthWriter};
 use player::Player;
 
@@ -28,7 +29,8 @@ const FRAME_SPACING_NS: i64 = 130_000;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Scenario of the load
-    scenario: settings::Name,
+    #[arg(value_parser = one_of(&settings::SCENARIOS))]
+    scenario: Scenario,
     /// Configuration whose DBC, cell model and number of cells are used
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
@@ -132,7 +134,7 @@ impl Sink {
 /// The scenario's defaults for the configured cell, with what the command line changes.
 fn settings_for(args: &Args, config: &Config) -> Result<Settings, Failure> {
     let capacity_ah = args.changes.pack.capacity_ah.unwrap_or(config.monitor.model.capacity_ah);
-    let mut settings = Settings::of(args.scenario.into(), capacity_ah);
+    let mut settings = Settings::of(args.scenario, capacity_ah);
     let series = cells_in_series(&config.monitor.sample);
     settings.pack.cells = series;
     settings.pack.ambient_c = config.monitor.sample.ambient_c;

@@ -10,7 +10,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use super::Failure;
-use super::control_args::print;
+use super::output::{print, word};
 use crate::status::client::{StatusClient, parse};
 use crate::status::document::StatusDocument;
 use crate::status::metrics::openmetrics;
@@ -100,14 +100,6 @@ fn duration(seconds: f64) -> String {
         (0, 0, minutes) => format!("{minutes} min {} s", seconds % 60),
         (0, hours, minutes) => format!("{hours} h {minutes} min"),
         (days, hours, _) => format!("{days} d {hours} h"),
-    }
-}
-
-/// A value of an enumeration, as in JSON.
-fn word(value: impl serde::Serialize) -> String {
-    match serde_json::to_value(value) {
-        Ok(serde_json::Value::String(word)) => word,
-        _ => "?".to_owned(),
     }
 }
 

@@ -8,8 +8,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::Failure;
-use super::alarms::state_name;
-use super::control_args::{ControlArgs, print, rule_parser};
+use super::control_args::{ControlArgs, rule_parser};
+use super::numbers::above_0_to;
+use super::output::{print, word};
 use crate::alarm::{AlarmState, Rule};
 use crate::config;
 use crate::control::test_alarm::{self, ChannelReport, GenuineAlarm};
@@ -26,17 +27,10 @@ pub(crate) struct Args {
     #[arg(short, long, value_name = "FILE")]
     config: PathBuf,
     /// Duration of the test
-    #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
+    #[arg(long = "for", value_name = "SECONDS", default_value_t = 5.0, value_parser = above_0_to(MAX_TEST_S, "seconds, "))]
     duration: f64,
     #[command(flatten)]
     control: ControlArgs,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if value > 0.0 && value <= MAX_TEST_S => Ok(value),
-        _ => Err(format!("must be seconds, above 0 to {MAX_TEST_S}")),
-    }
 }
 
 /// Runs the command.
@@ -120,7 +114,7 @@ fn push_notes(text: &mut String, report: &ChannelReport) {
     let others = [
         (observed.foreign, "test frames of other rules"),
         (observed.unreadable, "frames that could not be read"),
-        (u64::from(report.dropped), "frames lost by this computer before they were seen"),
+        (report.dropped, "frames lost by this computer before they were seen"),
     ];
     for (count, what) in others.into_iter().filter(|(count, _)| *count > 0) {
         let _ = writeln!(text, "  meanwhile {count} {what}");
@@ -134,7 +128,7 @@ fn alarm_words(rule: u8, state: u8) -> String {
     let name = Rule::from_number(rule).map_or("unknown rule", Rule::name);
     let found = ON_THE_WIRE.into_iter().find(|known| known.wire_code() == state);
     let kind = if found.is_some_and(AlarmState::is_raised) { "REAL, " } else { "" };
-    format!("{kind}without the marker: {name} {}", found.map_or("in an unknown state", state_name))
+    format!("{kind}without the marker: {name} {}", found.map_or_else(|| "in an unknown state".to_owned(), word))
 }
 
 /// Appends the test code in DM1: a trouble code has no marker, so its number identifies the test.

@@ -6,6 +6,7 @@ mod report;
 use std::path::{Path, PathBuf};
 
 use super::Failure;
+use super::control_args::rule_parser;
 use super::fleet::LogArgs;
 use super::numbers::{above_0, percent};
 use super::output::{failure, unless_closed};
@@ -59,7 +60,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "TRUTH.csv")]
     truth: Vec<PathBuf>,
     /// Rules in the table (default: those of --set; all when --set names another key, or is not given)
-    #[arg(long, value_name = "RULE", value_delimiter = ',', value_parser = rule)]
+    #[arg(long, value_name = "RULE", value_delimiter = ',', value_parser = rule_parser(), hide_possible_values = true)]
     rule: Vec<Rule>,
     /// Show every log in addition to the summary (as for a single log)
     #[arg(long)]
@@ -170,12 +171,6 @@ fn horizon(text: &str) -> Result<Horizon, String> {
         Some(days) => above_0(days).map(Horizon::Days).map_err(fault),
         None => above_0(text).map(Horizon::Cycles).map_err(fault),
     }
-}
-
-fn rule(text: &str) -> Result<Rule, String> {
-    let names: Vec<_> = Rule::ALL.iter().map(|rule| rule.name()).collect();
-    let found = Rule::ALL.into_iter().find(|rule| rule.name() == text);
-    found.ok_or_else(|| format!("must be one of {}", names.join(", ")))
 }
 
 #[cfg(test)]

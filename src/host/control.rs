@@ -25,7 +25,6 @@ use std::time::Duration;
 
 use crate::io::unix_socket::runtime_folder;
 
-pub use crate::io::unix_socket::SocketSetting as ControlSetting;
 pub use server::{ControlServer, PendingRequest};
 
 /// Connections at once: a person, a display and a script, with room; each is a task and a few kilobytes.

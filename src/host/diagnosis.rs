@@ -17,9 +17,10 @@ use crate::doctor::{Doctor, Report};
 use crate::io::clock::{MappedClock, Reading};
 use crate::io::csv_log::CsvOptions;
 use crate::io::log::{LogCounts, LogError, LogOptions, LogSource, Record};
-use crate::io::socket::{Tap, TapEvent};
+use crate::io::socket::Tap;
+use crate::io::stop::Stop;
 use crate::monitor::{BusEvent, Input, Monitor, Outputs};
-use crate::quantity::{BusIndex, Timestamp};
+use crate::quantity::BusIndex;
 
 pub use survey::{Survey, survey};
 
@@ -54,7 +55,7 @@ impl Interrupt {
         let interrupt = Self::default();
         let flag = Arc::clone(&interrupt.0);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-        let mut stop = runtime.block_on(async { super::service::Stop::new(None) })?;
+        let mut stop = runtime.block_on(async { Stop::new(None) })?;
         std::thread::spawn(move || {
             runtime.block_on(stop.wait());
             flag.store(true, Ordering::Relaxed);
@@ -85,8 +86,9 @@ impl Session {
         }
     }
 
-    fn feed(&mut self, input: &Input<'_>) {
-        let bus = match *input {
+    fn feed(&mut self, record: &Record) {
+        let Some(input) = record.input() else { return };
+        let bus = match input {
             Input::Frame { time, bus, frame } => {
                 self.doctor.handle_frame(time, bus, frame);
                 Some(bus)
@@ -105,7 +107,7 @@ impl Session {
             return;
         }
         if let Some(monitor) = &mut self.monitor {
-            monitor.handle(*input, &mut self.out);
+            monitor.handle(input, &mut self.out);
             self.forward_estimates();
         }
     }
@@ -161,9 +163,7 @@ pub fn replay(
             session.doctor.add_interface(name);
         }
         known = source.interfaces().len();
-        if let Some(input) = record.input() {
-            session.feed(&input);
-        }
+        session.feed(&record);
         records += 1;
         let is_over = limit_s.is_some_and(|limit_s| session.doctor.seconds() >= limit_s)
             && !matches!(record, Record::UnknownGap { .. });
@@ -214,15 +214,8 @@ pub fn listen(
             listener.look(clock, &mut session)?;
             listener.read(&mut received, &mut session);
         }
-        received.sort_by_key(|(time, ..)| *time);
-        for (time, bus, what) in received.drain(..) {
-            let input = match &what {
-                TapEvent::Frame(frame) => Input::Frame { time, bus, frame },
-                TapEvent::Error(class) => Input::Bus { time, bus, event: BusEvent::ErrorFrame { class: *class } },
-                TapEvent::Dropped(frames) => Input::Bus { time, bus, event: BusEvent::Dropped { frames: *frames } },
-            };
-            session.feed(&input);
-        }
+        received.sort_by_key(Record::time);
+        received.drain(..).for_each(|record| session.feed(&record));
         each(DiagnosisProgress { bytes: 0, frames: session.doctor.frames(), seconds: began.elapsed().as_secs_f64() });
         std::thread::sleep(READ_PERIOD);
     }
@@ -249,11 +242,11 @@ impl BusListener {
         Ok(())
     }
 
-    fn read(&mut self, received: &mut Vec<(Timestamp, BusIndex, TapEvent)>, session: &mut Session) {
+    fn read(&mut self, received: &mut Vec<Record>, session: &mut Session) {
         let Some(tap) = &mut self.tap else { return };
-        let mut events = Vec::new();
+        let before = received.len();
         loop {
-            match tap.next(&mut events) {
+            match tap.next(self.bus, received) {
                 Ok(true) => {}
                 Ok(false) => break,
                 Err(error) if error.raw_os_error() == Some(Errno::ENETDOWN as i32) => {
@@ -266,10 +259,9 @@ impl BusListener {
                 }
             }
         }
-        if !events.is_empty() {
+        if received.len() > before {
             session.doctor.handle_bus(self.bus, BusEvent::Up);
         }
-        received.extend(events.into_iter().map(|(time, what)| (time, self.bus, what)));
     }
 }
 

@@ -26,10 +26,10 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use sd_notify::NotifyState;
 use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream, UnixStream};
-use tokio::signal::unix::{SignalKind, signal};
 use tokio::task::{JoinSet, LocalSet};
 use tokio::time::{sleep, timeout};
 
+use super::io::stop::Stop;
 use super::service::notify;
 use super::status::client::{check_length, explain, parse};
 use super::status::document::StatusDocument;
@@ -81,7 +81,7 @@ pub fn run(listen: SocketAddr, socket: PathBuf) -> Result<(), String> {
 }
 
 async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
-    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    let mut stop = Stop::new(None)?;
     let listener = TcpListener::bind(listen).await?;
     let address = listener.local_addr()?;
     tracing::info!(%address, socket = %source.path.display(), "exporter listens");
@@ -90,8 +90,7 @@ async fn serve(listen: SocketAddr, source: Rc<StatusSource>) -> io::Result<()> {
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
-            _ = terminate.recv() => break,
-            _ = interrupt.recv() => break,
+            () = stop.wait() => break,
             Some(_) = connections.join_next() => continue,
             accepted = listener.accept() => accepted,
         };

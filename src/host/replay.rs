@@ -28,7 +28,7 @@ pub use cells::CellSummary;
 pub use clock::LogTime;
 use clock::{Pace, RecordSpan, TimeWindow, WindowPosition};
 pub use in_order::in_order;
-pub use intake::{DroppedSummary, ProtectedSummary};
+pub use intake::ProtectedSummary;
 use rows::{write_estimate, write_estimates_header, write_frame};
 pub use summary::ReplaySummary;
 use summary::{note_event, peak_memory_kib};

@@ -10,7 +10,6 @@ mod live;
 pub mod readiness;
 mod reload;
 mod status_publisher;
-mod stop;
 
 use std::io;
 use std::path::PathBuf;
@@ -21,16 +20,17 @@ use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 
-use super::control::{ControlServer, ControlSetting, MAX_CONNECTIONS};
+use super::control::{ControlServer, MAX_CONNECTIONS};
 
 use super::status::StatusServer;
 use super::status::collect::ServiceIdentity;
 use super::status::document::ConfigFile;
-use super::store::StateSetting;
 use crate::config::Config;
 use crate::io::clock::{MappedClock, Reading};
-use crate::io::socket::{Link, LinkConfig, LinkMessage, LinkOutput};
-use crate::io::unix_socket::SocketSetting;
+use crate::io::place::PlaceSetting;
+use crate::io::record::Record;
+use crate::io::socket::{Link, LinkConfig, LinkOutput};
+use crate::io::stop::Stop;
 use crate::monitor::{Downtime, Input, RestoreError, Snapshot};
 use crate::quantity::BusIndex;
 
@@ -38,9 +38,8 @@ use engine::Engine;
 use live::ServiceLoop;
 use reload::Reload;
 use status_publisher::StatusPublisher;
-pub(super) use stop::Stop;
 
-/// LinkMessage frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
+/// Frames and events that wait for the core: half a second of a full 1 Mbit/s bus.
 const INBOX: usize = 4096;
 
 /// Threads for work that would block the loop: reading a configuration, long answers. More would only wait for the disk.
@@ -70,11 +69,11 @@ pub struct Service {
     /// Receive buffer requested per interface, bytes.
     pub receive_buffer_bytes: usize,
     /// The control socket.
-    pub control: ControlSetting,
+    pub control: PlaceSetting,
     /// Where state and history are kept.
-    pub state: StateSetting,
+    pub state: PlaceSetting,
     /// The status sockets.
-    pub status: SocketSetting,
+    pub status: PlaceSetting,
     /// The configuration file, for the status document.
     pub config_file: Option<ConfigFile>,
 }
@@ -129,10 +128,11 @@ impl Service {
         let status = StatusServer::start(&self.status).map_err(ServiceError::Socket)?;
         let mut engine = Engine::new(&mut self, clock)?;
         let (links, outputs) = self.start_links(clock, &sender);
+        engine.links = outputs;
         drop(sender);
         // The first input is the time of the start; frames it sends wait for the interfaces.
-        engine.handle(&Input::Tick { time: clock.now() }, &outputs);
-        engine.report_store_health(clock.now(), &outputs);
+        engine.handle(&Input::Tick { time: clock.now() });
+        engine.report_store_health(clock.now());
         let status_publisher = StatusPublisher::new(status, self.identity(clock));
         let mut service = ServiceLoop {
             engine,
@@ -140,7 +140,6 @@ impl Service {
             requests,
             reload,
             clock,
-            outputs,
             batch: Vec::new(),
             left_out_reported: Instant::now(),
             status_publisher,
@@ -160,7 +159,7 @@ impl Service {
         ServiceIdentity { started: clock.now(), config: self.config_file.clone(), interfaces }
     }
 
-    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<LinkMessage>) -> (JoinSet<()>, Vec<LinkOutput>) {
+    fn start_links(&self, clock: MappedClock, inbox: &mpsc::Sender<Record>) -> (JoinSet<()>, Vec<LinkOutput>) {
         let mut links = JoinSet::new();
         let mut outputs = Vec::new();
         for (bus, interface) in (0_u8..).map(BusIndex).zip(&self.config.interfaces) {

@@ -42,19 +42,19 @@ use tokio::sync::watch;
 
 use crate::config::StoreConfig;
 use crate::io::background_file::{MAX_FINISH, ends_in_time};
+use crate::io::place::{PlaceSetting, first_folder};
 use crate::monitor::{Downtime, Event, Monitor, Snapshot};
 use crate::quantity::Timestamp;
 use database::OpenError;
 use document::StateDocument;
 use folder::{Folder, OpenedDatabase, SET_ASIDE};
-use history_filter::{CommitDecision, HistoryFilter};
+use history_filter::HistoryFilter;
 use reader::MAX_DAEMON_COPY_BYTES;
 use rows::{HistoryRow, RowBatch};
 use runtime::RuntimeState;
-use stamp::{Age, BootId, Stamp, WallClock};
+use stamp::{BootId, Stamp, WallClock};
 use writer::{Retry, WriteQueue, Writer};
 
-pub use folder::with_suffix;
 pub use reader::{HistoryEntry, HistoryQuery, HistoryReader};
 pub use recorder::Recorder;
 pub use replace::replace_pack;
@@ -69,37 +69,9 @@ const RUNTIME_PERIOD_S: f64 = 1.0;
 /// Period of checkpoints while no frame comes, s: the state only grows older.
 const QUIET_PERIOD_S: f64 = 3600.0;
 
-/// Where state and history are kept.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum StateSetting {
-    /// `$STATE_DIRECTORY` under systemd, else `/var/lib/packwatch`; nowhere if that folder cannot be created.
-    Standard,
-    /// Nowhere.
-    Off,
-    /// In this folder.
-    At(PathBuf),
-}
-
-impl StateSetting {
-    /// Reads the value of the command line: a folder, or `none`.
-    pub fn from_path(path: Option<PathBuf>) -> Self {
-        match path {
-            None => Self::Standard,
-            Some(path) if path.as_os_str() == "none" => Self::Off,
-            Some(path) => Self::At(path),
-        }
-    }
-}
-
 /// The standard state folder, and whether systemd created it.
 pub fn standard_folder() -> (PathBuf, bool) {
     first_folder("STATE_DIRECTORY").map_or_else(|| (PathBuf::from(STANDARD_FOLDER), false), |folder| (folder, true))
-}
-
-/// The first folder of a variable of systemd, which separates several by colons.
-fn first_folder(variable: &str) -> Option<PathBuf> {
-    let folders = std::env::var_os(variable).filter(|folders| !folders.is_empty())?;
-    std::env::split_paths(&folders).next()
 }
 
 /// Source of the state that the next checkpoint overwrites.
@@ -145,13 +117,9 @@ impl Store {
     ///
     /// # Errors
     /// When another daemon uses the folder.
-    pub fn open(setting: &StateSetting, config: &StoreConfig) -> Result<(Option<Self>, StoredStates), String> {
+    pub fn open(setting: &PlaceSetting, config: &StoreConfig) -> Result<(Option<Self>, StoredStates), String> {
         let none = |works| (None, StoredStates { states: Vec::new(), works });
-        let (path, is_needed) = match setting {
-            StateSetting::Off => return Ok(none(true)),
-            StateSetting::Standard => standard_folder(),
-            StateSetting::At(path) => (path.clone(), true),
-        };
+        let Some((path, is_needed)) = setting.resolve(standard_folder) else { return Ok(none(true)) };
         let shown = path.display().to_string();
         let mut folder = Folder::new(path.clone(), config.max_half_cycles);
         match folder.lock() {
@@ -275,10 +243,7 @@ impl Store {
     /// Commits what the events of one input have taught. Returns the ticket that its announcement waits for; `None` = no
     /// wait.
     pub fn learned(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Option<u64> {
-        let rows = match self.history_filter.take(events) {
-            CommitDecision::Commit(rows) => rows,
-            CommitDecision::Nothing | CommitDecision::Deferred => return None,
-        };
+        let rows = self.history_filter.take(events)?;
         self.checkpointed = Some(now);
         Some(self.submit(rows, monitor, now, false))
     }
@@ -389,10 +354,7 @@ fn candidates(
 }
 
 fn candidate(document: StateDocument, source: &'static str, now: &Stamp, wall: WallClock) -> StateCandidate {
-    let downtime = match document.stamp.age(now, wall) {
-        Age::Seconds(seconds) => Downtime::Seconds(seconds),
-        Age::Unknown => Downtime::Unknown,
-    };
+    let downtime = document.stamp.age(now, wall);
     StateCandidate { snapshot: *document.snapshot, downtime, source }
 }
 

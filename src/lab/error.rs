@@ -1,8 +1,6 @@
 //! The one error of offline work: a text with the place, what was found and what is allowed.
 
 use crate::chart::PlotError;
-use crate::ident::fit::FitError;
-use crate::io::log::LogError;
 use crate::io::table::TableError;
 
 /// Why offline work failed: one line per fault.
@@ -29,8 +27,6 @@ convert!(
     serde_json::Error,
     parquet::errors::ParquetError,
     crate::regress::RegressionError,
-    FitError,
-    LogError,
     PlotError,
     TableError,
 );

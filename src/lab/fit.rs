@@ -167,7 +167,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         electrodes,
         capacity_ah: prepared.capacity_ah,
         voltage_v: prepared.voltage_v,
-        thermal: thermal.ok(),
+        thermal: thermal.clone().ok(),
         voltage_error_v,
         by_kind,
         files,
@@ -176,7 +176,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
         notes: prepared.notes,
         fit: fitted,
     };
-    outcome.notes.extend(thermal.err().map(|error| error.to_string()));
+    outcome.notes.extend(thermal.err());
     add_notes(request, &mut outcome);
     Ok(outcome)
 }
@@ -279,7 +279,7 @@ fn by_file(
             rows: only.iter().map(|record| record.raw_rows).sum(),
             seconds: only.iter().map(Record::seconds).sum(),
             outliers: only.iter().map(|record| record.outliers).sum(),
-            residual: fit::judge(&only, &fitted.tables).1,
+            residual: fit::judge(&only, &fitted.tables),
         }
     };
     files.iter().enumerate().map(of_file).collect()

@@ -6,47 +6,8 @@
 
 use std::path::{Path, PathBuf};
 
+pub use crate::ident::MeasuredPart;
 use crate::io::table::{Header, PART_COLUMNS, Row, Table, TableError};
-
-/// A stretch of rows over which time runs on.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct MeasuredPart {
-    /// Its key in the part column; empty where there is none.
-    pub key: String,
-    /// Value of the `type` column in its first row: `charge`, `discharge`; empty where there is none.
-    pub kind: String,
-    /// Seconds since the part's own beginning.
-    pub time_s: Vec<f64>,
-    /// Current, A, positive = discharge.
-    pub current_a: Vec<f64>,
-    /// Terminal voltage, V.
-    pub voltage_v: Vec<f64>,
-    /// Cell temperature, degrees C; NaN where there is none.
-    pub temperature_c: Vec<f64>,
-    /// The cycler's own counter, Ah taken out; NaN where there is none.
-    pub discharged_ah: Vec<f64>,
-}
-
-impl MeasuredPart {
-    /// Rows.
-    pub fn len(&self) -> usize {
-        self.time_s.len()
-    }
-
-    /// Adds a row.
-    pub(crate) fn push(&mut self, time_s: f64, current_a: f64, voltage_v: f64, temperature_c: f64, discharged_ah: f64) {
-        self.time_s.push(time_s);
-        self.current_a.push(current_a);
-        self.voltage_v.push(voltage_v);
-        self.temperature_c.push(temperature_c);
-        self.discharged_ah.push(discharged_ah);
-    }
-
-    /// Whether it has no rows.
-    pub fn is_empty(&self) -> bool {
-        self.time_s.is_empty()
-    }
-}
 
 /// One measured file.
 #[derive(Debug, Clone, PartialEq)]

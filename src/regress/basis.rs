@@ -9,6 +9,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::error::RegressionError;
+use super::linear_algebra::solve_upper;
 
 /// Mean function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -79,6 +80,17 @@ impl Coefficients {
         let beta: Vec<f64> = (0..size).map(|i| (0..size).map(|j| covariance[i * size + j] * g[j + 1]).sum()).collect();
         let squared_norm = g[0] - (0..size).map(|j| beta[j] * g[j + 1]).sum::<f64>();
         Ok(Self { beta, covariance, squared_norm: squared_norm.max(0.0) })
+    }
+
+    /// Solves the factor's upper half for the targets and the functions in `right`: weights of the targets without the
+    /// functions' share, and those of the functions.
+    pub(super) fn weights(&self, factor: &[f64], n: usize, mut right: Vec<f64>) -> (Vec<f64>, Vec<f64>) {
+        solve_upper(factor, n, &mut right);
+        let functions = right.split_off(n);
+        for (beta, function) in self.beta.iter().zip(functions.chunks(n)) {
+            right.iter_mut().zip(function).for_each(|(a, h)| *a -= beta * h);
+        }
+        (right, functions)
     }
 
     /// Value of the mean function at a row.

@@ -17,9 +17,9 @@ use rayon::prelude::*;
 use super::basis::Coefficients;
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
-use super::linear_algebra::{cholesky, dot, parallelism, solve_lower, solve_upper};
-use super::pairs::{BLOCK_PAIRS, by_column, cross, squares};
-use super::plan::{Plan, Values, Work};
+use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, solve_lower};
+use super::pairs::{BLOCK_PAIRS, by_column, squares};
+use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
 /// Queries of one block of a prediction.
@@ -31,8 +31,7 @@ const COLUMNS: usize = 8;
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
     pub data: StandardisedRows,
-    pub plan: Plan,
-    pub values: Values,
+    pub covariance: Covariance,
     pub coefficients: Coefficients,
     /// Inputs, column after column.
     columns: Vec<f64>,
@@ -51,54 +50,28 @@ pub(super) struct Posterior {
 
 impl Posterior {
     pub(super) fn new(data: StandardisedRows, plan: Plan, theta: &[f64]) -> Result<Self, RegressionError> {
-        let (n, values) = (data.len(), plan.values(theta));
+        let (n, covariance) = (data.len(), Covariance::new(plan, theta));
         let columns = by_column(&data.inputs, data.dimensions);
         let mut factor = vec![0.0; n * n];
         let mut jitter = Jitter::default();
         let used_jitter = until_positive(|added| {
-            fill(&plan, &values, &data, &columns, added, &mut factor);
+            fill(&covariance, &data, &columns, added, &mut factor);
             cholesky(&mut factor, n)
         })?;
         jitter.note(used_jitter);
-        let mut posterior = Self {
-            data,
-            plan,
-            values,
-            coefficients: Coefficients { beta: vec![], covariance: vec![], squared_norm: 0.0 },
-            columns,
-            factor,
-            alpha: vec![],
-            basis_solved: vec![],
-            value: 0.0,
-            jitter,
-            used_jitter,
-        };
-        posterior.solve()?;
-        Ok(posterior)
-    }
-
-    /// Coefficients, weights and likelihood from the factor.
-    fn solve(&mut self) -> Result<(), RegressionError> {
-        let (n, data) = (self.data.len(), &self.data);
         let size = data.basis.size(data.dimensions);
         let mut right = data.targets.clone();
         for k in 0..size {
             right.extend((0..n).map(|row| data.basis.value(data.row(row), k)));
         }
         let width = size + 1;
-        solve_lower(&self.factor, n, &mut right);
+        solve_lower(&factor, n, &mut right);
         let column = |k: usize| &right[k * n..][..n];
         let g: Vec<f64> = (0..width * width).map(|at| dot(column(at / width), column(at % width))).collect();
-        self.coefficients = Coefficients::solve(&g, size)?;
-        solve_upper(&self.factor, n, &mut right);
-        self.alpha = right[..n].to_vec();
-        for (k, beta) in self.coefficients.beta.iter().enumerate() {
-            self.alpha.iter_mut().zip(&right[(k + 1) * n..]).for_each(|(a, h)| *a -= beta * h);
-        }
-        self.basis_solved = right[n..].to_vec();
-        let log_determinant: f64 = (0..n).map(|k| self.factor[k * n + k].ln()).sum::<f64>() * 2.0;
-        self.value = 0.5 * (self.coefficients.squared_norm + log_determinant + n as f64 * TAU.ln());
-        Ok(())
+        let coefficients = Coefficients::solve(&g, size)?;
+        let (alpha, basis_solved) = coefficients.weights(&factor, n, right);
+        let value = 0.5 * (coefficients.squared_norm + log_determinant(&factor, n) + n as f64 * TAU.ln());
+        Ok(Self { data, covariance, coefficients, columns, factor, alpha, basis_solved, value, jitter, used_jitter })
     }
 
     /// Derivative of minus the log likelihood by every parameter.
@@ -113,31 +86,31 @@ impl Posterior {
             par,
             MemStack::new(&mut memory),
         );
-        let parameters = self.plan.parameters.len();
+        let parameters = self.covariance.plan.parameters.len();
         let parts: Vec<(Vec<f64>, f64)> = (inverse.par_chunks(n).enumerate())
             .map_init(Default::default, |scratch: &mut (Vec<f64>, Vec<f64>, Work), (j, column)| {
                 let mut gradient = vec![0.0; parameters];
                 let (point, aj) = (self.data.row(j), self.alpha[j]);
                 for from in (j + 1..n).step_by(BLOCK_PAIRS) {
                     let count = BLOCK_PAIRS.min(n - from);
-                    squares(&self.columns, n, from, count, point, &mut scratch.0);
+                    squares(&self.columns, from, count, point, &mut scratch.0);
                     scratch.1.clear();
                     let weight = |(k, a): (&f64, &f64)| k - a * aj;
                     scratch.1.extend(column[from..][..count].iter().zip(&self.alpha[from..][..count]).map(weight));
-                    self.plan.add_gradient(&self.values, &scratch.0, &scratch.1, &mut scratch.2, &mut gradient);
+                    self.covariance.add_gradient(&scratch.0, &scratch.1, &mut scratch.2, &mut gradient);
                 }
                 (gradient, 0.5 * (column[j] - aj * aj))
             })
             .collect();
         let (mut gradient, mut diagonal) = (vec![0.0; parameters], 0.0);
         for (part, weight) in parts {
-            gradient.iter_mut().zip(part).for_each(|(total, sum)| *total += sum);
+            add(&mut gradient, &part);
             diagonal += weight;
         }
         let zero = vec![0.0; self.data.dimensions];
         let prior = diagonal * (1.0 + self.used_jitter);
-        self.plan.add_gradient(&self.values, &zero, &[prior], &mut Work::default(), &mut gradient);
-        gradient[parameters - 1] += 2.0 * self.values.noise_variance * diagonal;
+        self.covariance.add_gradient(&zero, &[prior], &mut Work::default(), &mut gradient);
+        gradient[parameters - 1] += 2.0 * self.covariance.noise_variance * diagonal;
         gradient
     }
 
@@ -150,13 +123,13 @@ impl Posterior {
             let count = rows.len() / d;
             let block = &mut block[..n * count];
             block.par_chunks_mut(n).zip(rows.par_chunks(d)).for_each_init(Default::default, |scratch, (out, row)| {
-                cross(&self.plan, &self.values, &self.columns, n, 0, row, scratch, out);
+                self.covariance.cross(&self.columns, 0, row, scratch, out);
             });
             let means: Vec<(f64, Vec<f64>)> =
                 block.par_chunks(n).zip(rows.par_chunks(d)).map(|(column, row)| self.mean(row, column)).collect();
             solve_lower(&self.factor, n, block);
             all.extend(means.into_iter().zip(block.chunks(n)).map(|((mean, rest), column)| {
-                let own = (self.values.prior_variance - dot(column, column)).max(0.0);
+                let own = (self.covariance.prior_variance - dot(column, column)).max(0.0);
                 (mean, own + self.coefficients.variance(&rest))
             }));
         }
@@ -189,14 +162,14 @@ impl Posterior {
 }
 
 /// The covariance of all measurements, lower triangle.
-fn fill(plan: &Plan, values: &Values, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
+fn fill(covariance: &Covariance, data: &StandardisedRows, columns: &[f64], jitter: f64, matrix: &mut [f64]) {
     let n = data.len();
-    let diagonal = values.prior_variance * (1.0 + jitter) + values.noise_variance;
+    let diagonal = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
     matrix.par_chunks_mut(n).enumerate().with_max_len(COLUMNS).for_each_init(
         Default::default,
         |scratch, (j, column)| {
             column[j] = diagonal;
-            cross(plan, values, columns, n, j + 1, data.row(j), scratch, &mut column[j + 1..]);
+            covariance.cross(columns, j + 1, data.row(j), scratch, &mut column[j + 1..]);
         },
     );
 }

@@ -143,6 +143,6 @@ fn one_fold(
         hyperparameters: model.hyperparameters(),
         log_marginal_likelihood: model.log_marginal_likelihood(),
         interval_factor: model.interval_factor(),
-        jitter: model.jitter(),
+        jitter: model.outcome.jitter,
     })
 }

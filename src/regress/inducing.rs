@@ -29,9 +29,9 @@ use super::basis::Coefficients;
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::kd_tree::KdTree;
-use super::linear_algebra::{cholesky, dot, parallelism, solve_lower, solve_upper};
-use super::pairs::{BLOCK_PAIRS, by_column, cross, squares};
-use super::plan::{Plan, Values, Work};
+use super::linear_algebra::{add, cholesky, dot, log_determinant, parallelism, solve_lower, solve_upper};
+use super::pairs::{BLOCK_PAIRS, by_column, squares};
+use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
 /// Rows of a block.
@@ -45,8 +45,7 @@ const MEANS_PASSES: usize = 10;
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
     pub data: StandardisedRows,
-    plan: Plan,
-    values: Values,
+    covariance: Covariance,
     coefficients: Coefficients,
     points: Vec<f64>,
     /// Points, column after column.
@@ -105,16 +104,15 @@ impl Posterior {
         theta: &[f64],
         points: &[f64],
     ) -> Result<Self, RegressionError> {
-        let values = plan.values(theta);
+        let covariance = Covariance::new(plan.clone(), theta);
         let (d, m) = (data.dimensions, points.len() / data.dimensions);
         let columns = by_column(points, d);
-        let (l, added) = factor_of_points(plan, &values, points, &columns)?;
+        let (l, added) = factor_of_points(&covariance, points, &columns)?;
         let mut jitter = Jitter::default();
         jitter.note(added);
         let mut posterior = Self {
             data: data.clone(),
-            plan: plan.clone(),
-            values,
+            covariance,
             coefficients: Coefficients { beta: vec![], covariance: vec![], squared_norm: 0.0 },
             points: points.to_vec(),
             columns,
@@ -144,7 +142,7 @@ impl Posterior {
         let count = rows.len() / d;
         let mut v = vec![0.0; m * count];
         v.par_chunks_mut(m).zip(rows.par_chunks(d)).for_each_init(Default::default, |scratch, (out, row)| {
-            cross(&self.plan, &self.values, &self.columns, m, 0, row, scratch, out);
+            self.covariance.cross(&self.columns, 0, row, scratch, out);
         });
         solve_lower(&self.l, m, &mut v);
         v
@@ -152,8 +150,9 @@ impl Posterior {
 
     fn block(&self, rows: &[f64]) -> Block {
         let v = self.projected(rows);
-        let own =
-            |column: &[f64]| (self.values.prior_variance - dot(column, column)).max(0.0) + self.values.noise_variance;
+        let own = |column: &[f64]| {
+            (self.covariance.prior_variance - dot(column, column)).max(0.0) + self.covariance.noise_variance
+        };
         let l = v.chunks(self.count()).map(own).collect();
         Block { v, l }
     }
@@ -195,14 +194,8 @@ impl Posterior {
             g[at] -= dot(&right[at / width * m..][..m], &right[at % width * m..][..m]);
         }
         self.coefficients = Coefficients::solve(&g, size)?;
-        solve_upper(&self.b, m, &mut right);
-        self.c = right[..m].to_vec();
-        for (k, beta) in self.coefficients.beta.iter().enumerate() {
-            self.c.iter_mut().zip(&right[(k + 1) * m..]).for_each(|(c, h)| *c -= beta * h);
-        }
-        self.basis_solved = right[m..].to_vec();
-        let log_determinant: f64 = 2.0 * (0..m).map(|k| self.b[k * m + k].ln()).sum::<f64>();
-        self.value = 0.5 * (logs + log_determinant + self.coefficients.squared_norm + n as f64 * TAU.ln());
+        (self.c, self.basis_solved) = self.coefficients.weights(&self.b, m, right);
+        self.value = 0.5 * (logs + log_determinant(&self.b, m) + self.coefficients.squared_norm + n as f64 * TAU.ln());
         Ok(())
     }
 
@@ -222,7 +215,7 @@ impl Posterior {
     /// Derivative of minus the log likelihood by every parameter.
     pub(super) fn gradient(&self) -> Vec<f64> {
         let (m, d) = (self.count(), self.data.dimensions);
-        let parameters = self.plan.parameters.len();
+        let parameters = self.covariance.plan.parameters.len();
         let (mut gradient, mut by_points, mut by_rows) = (vec![0.0; parameters], vec![0.0; m * m], 0.0);
         for (at, rows) in self.data.inputs.chunks(BLOCK * d).enumerate() {
             let block = self.block(rows);
@@ -251,7 +244,7 @@ impl Posterior {
             self.add_columns(rows, &y, &mut gradient);
         }
         self.add_points(by_points, by_rows, &mut gradient);
-        gradient[parameters - 1] += 2.0 * self.values.noise_variance * by_rows;
+        gradient[parameters - 1] += 2.0 * self.covariance.noise_variance * by_rows;
         gradient
     }
 
@@ -262,15 +255,13 @@ impl Posterior {
             .map_init(Default::default, |scratch: &mut (Vec<f64>, Work), (column, row)| {
                 let mut part = vec![0.0; gradient.len()];
                 for (k, some) in column.chunks(BLOCK_PAIRS).enumerate() {
-                    squares(&self.columns, m, k * BLOCK_PAIRS, some.len(), row, &mut scratch.0);
-                    self.plan.add_gradient(&self.values, &scratch.0, some, &mut scratch.1, &mut part);
+                    squares(&self.columns, k * BLOCK_PAIRS, some.len(), row, &mut scratch.0);
+                    self.covariance.add_gradient(&scratch.0, some, &mut scratch.1, &mut part);
                 }
                 part
             })
             .collect();
-        for part in parts {
-            gradient.iter_mut().zip(part).for_each(|(total, sum)| *total += sum);
-        }
+        parts.iter().for_each(|part| add(gradient, part));
     }
 
     /// Adds the derivative through `k(Z, Z)` (from `-Y V'`) and through the variances of the rows.
@@ -287,12 +278,12 @@ impl Posterior {
             diagonal += weights[j * m + j] * (1.0 + NUGGET + self.added);
             for from in (j + 1..m).step_by(BLOCK_PAIRS) {
                 let count = BLOCK_PAIRS.min(m - from);
-                squares(&self.columns, m, from, count, point, &mut scratch.0);
+                squares(&self.columns, from, count, point, &mut scratch.0);
                 let both: Vec<f64> = (from..from + count).map(|i| weights[j * m + i] + weights[i * m + j]).collect();
-                self.plan.add_gradient(&self.values, &scratch.0, &both, &mut scratch.1, gradient);
+                self.covariance.add_gradient(&scratch.0, &both, &mut scratch.1, gradient);
             }
         }
-        self.plan.add_gradient(&self.values, &vec![0.0; d], &[diagonal], &mut scratch.1, gradient);
+        self.covariance.add_gradient(&vec![0.0; d], &[diagonal], &mut scratch.1, gradient);
     }
 
     /// Mean and variance of the function at standardised rows.
@@ -306,7 +297,7 @@ impl Posterior {
                 let solved = |k: usize| dot(v, &self.basis_solved[k * m..][..m]);
                 let rest: Vec<f64> =
                     (0..self.coefficients.beta.len()).map(|k| self.data.basis.value(row, k) - solved(k)).collect();
-                let own = (self.values.prior_variance - dot(v, v)).max(0.0);
+                let own = (self.covariance.prior_variance - dot(v, v)).max(0.0);
                 let mean = self.coefficients.mean(self.data.basis, row) + dot(v, &self.c);
                 (mean, own + dot(t, t) + self.coefficients.variance(&rest))
             }));
@@ -351,19 +342,18 @@ fn add_square(b: &mut [f64], v: &[f64], m: usize) {
 
 /// Factor of `k(Z, Z)`, and the jitter on its diagonal, as part of it.
 fn factor_of_points(
-    plan: &Plan,
-    values: &Values,
+    covariance: &Covariance,
     points: &[f64],
     columns: &[f64],
 ) -> Result<(Vec<f64>, f64), RegressionError> {
-    let d = plan.dimensions;
+    let d = covariance.plan.dimensions;
     let m = points.len() / d;
     let mut matrix = vec![0.0; m * m];
     let jitter = until_positive(|jitter| {
         let mut scratch = Default::default();
         for (j, column) in matrix.chunks_mut(m).enumerate() {
-            column[j] = values.prior_variance * (1.0 + NUGGET + jitter);
-            cross(plan, values, columns, m, j + 1, &points[j * d..][..d], &mut scratch, &mut column[j + 1..]);
+            column[j] = covariance.prior_variance * (1.0 + NUGGET + jitter);
+            covariance.cross(columns, j + 1, &points[j * d..][..d], &mut scratch, &mut column[j + 1..]);
         }
         cholesky(&mut matrix, m)
     })?;

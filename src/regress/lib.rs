@@ -55,7 +55,7 @@ pub use error::RegressionError;
 pub use folds::{Fold, Folds, PredictionScore, assign, cross_validate, score};
 pub use jitter::Jitter;
 pub use kernel::{Kernel, Shape};
-pub use model::{Hyperparameter, Model, Prediction, fit};
+pub use model::{FitOutcome, Hyperparameter, Model, ModelSpec, Prediction, fit};
 pub use settings::{
     FitProgress, Form, GprSettings, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback,
     TrainingRows,

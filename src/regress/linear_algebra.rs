@@ -43,3 +43,13 @@ pub(super) fn solve_upper(l: &[f64], n: usize, right: &mut [f64]) {
 pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
+
+/// Adds a vector to another.
+pub(super) fn add(total: &mut [f64], part: &[f64]) {
+    total.iter_mut().zip(part).for_each(|(total, part)| *total += part);
+}
+
+/// Logarithm of the determinant of the matrix with this factor.
+pub(super) fn log_determinant(l: &[f64], n: usize) -> f64 {
+    (0..n).map(|k| l[k * n + k].ln()).sum::<f64>() * 2.0
+}

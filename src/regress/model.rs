@@ -17,12 +17,10 @@ use super::jitter::{self, Jitter};
 use super::kernel::Kernel;
 use super::minimise::Minimum;
 use super::nearest::ConditionalFactors;
-use super::plan::{ParameterRole, Plan};
+use super::plan::{Covariance, Plan};
 use super::scale::{Scale, StandardisedRows, check};
 use super::search::{SearchMonitor, descend, first_start, log_bounds, random_start};
-use super::settings::{
-    FitProgress, Form, GprSettings, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS, ProgressCallback, TrainingRows,
-};
+use super::settings::{FitProgress, Form, GprSettings, ProgressCallback, TrainingRows};
 use super::{exact, inducing, nearest};
 
 /// Rows whose factors the search of [`Form::Nearest`] sums over; the effect of this choice on the hyperparameters is far
@@ -65,12 +63,14 @@ pub struct Prediction {
 /// A fitted process.
 #[derive(Debug)]
 pub struct Model {
-    pub(super) spec: ModelSpec,
+    /// What it is.
+    pub spec: ModelSpec,
     pub(super) scale: Scale,
     /// Logarithms, in standardised units.
     pub(super) theta: Vec<f64>,
     pub(super) posterior: Posterior,
-    pub(super) outcome: FitOutcome,
+    /// How its fit ended.
+    pub outcome: FitOutcome,
     pub(super) calibration: Calibration,
     pub(super) pool: ThreadPool,
 }
@@ -78,21 +78,28 @@ pub struct Model {
 /// Structure of a model, without its numbers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct ModelSpec {
+pub struct ModelSpec {
+    /// Its kernel.
     pub kernel: Kernel,
+    /// Its mean function.
     pub basis: Basis,
+    /// Whether every input has a length scale of its own.
     pub ard: bool,
+    /// Exact or sparse.
     pub form: Form,
+    /// Number of inputs of a row.
     pub dimensions: usize,
 }
 
 /// Outcome of the fit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct FitOutcome {
+pub struct FitOutcome {
     /// Log likelihood, in standardised targets.
     pub log_likelihood: f64,
+    /// Jitter on diagonals.
     pub jitter: Jitter,
+    /// Steps of the best search, over all its choices of neighbours or inducing points.
     pub iterations: usize,
 }
 
@@ -195,10 +202,7 @@ impl<'a> FitJob<'a> {
         if given.len() != count || given.iter().any(|value| !(value.is_finite() && *value > 0.0)) {
             return Err(RegressionError::range("start", format!("{given:?}"), format!("{count} positive numbers")));
         }
-        let unit = |role| {
-            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
-        };
-        Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / unit(p.role)).ln()).collect())
+        Ok(given.iter().zip(&self.plan.parameters).map(|(value, p)| (value / p.role.unit(&self.scale)).ln()).collect())
     }
 
     /// Result of the best search, and its steps.
@@ -249,7 +253,7 @@ impl<'a> FitJob<'a> {
     }
 
     fn metric(&self, theta: &[f64]) -> Vec<f64> {
-        self.plan.metric(&self.plan.values(theta))
+        Covariance::new(self.plan.clone(), theta).metric()
     }
 
     fn one_round(
@@ -290,7 +294,7 @@ impl<'a> FitJob<'a> {
 
     fn finish(self, theta: Vec<f64>, iterations: usize) -> Result<Model, RegressionError> {
         let metric = self.metric(&theta);
-        let noise_variance = self.plan.values(&theta).noise_variance;
+        let noise_variance = (2.0 * theta[theta.len() - 1]).exp();
         let (data, plan) = (self.data, self.plan);
         let (posterior, value, jitter) = self.pool.install(|| match self.settings.form {
             Form::Exact => {
@@ -359,20 +363,7 @@ fn check_settings(settings: &GprSettings, rows: usize) -> Result<(), RegressionE
     if settings.restarts > MAX_RESTARTS {
         return Err(RegressionError::range("restarts", settings.restarts, format!("at most {MAX_RESTARTS}")));
     }
-    match settings.form {
-        Form::Exact if rows > MAX_EXACT_ROWS => Err(RegressionError::range(
-            "rows of an exact fit",
-            rows,
-            format!("at most {MAX_EXACT_ROWS}; take a sparse form"),
-        )),
-        Form::Nearest { neighbours } if neighbours == 0 || neighbours > MAX_NEIGHBOURS => {
-            Err(RegressionError::range("neighbours", neighbours, format!("1 to {MAX_NEIGHBOURS}")))
-        }
-        Form::Inducing { points } if points == 0 || points > MAX_INDUCING => {
-            Err(RegressionError::range("inducing points", points, format!("1 to {MAX_INDUCING}")))
-        }
-        _ => Ok(()),
-    }
+    settings.form.check(rows)
 }
 
 impl Model {
@@ -425,11 +416,8 @@ impl Model {
     /// Fitted hyperparameters; the noise is the last. The same order serves as a start ([`GprSettings::start`]).
     pub fn hyperparameters(&self) -> Vec<Hyperparameter> {
         let plan = Plan::new(&self.spec.kernel, self.spec.dimensions, self.spec.ard);
-        let unit = |role| {
-            if matches!(role, ParameterRole::Signal | ParameterRole::Noise) { self.scale.target_deviation } else { 1.0 }
-        };
         let named = plan.parameters.into_iter().zip(&self.theta);
-        named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * unit(p.role) }).collect()
+        named.map(|(p, value)| Hyperparameter { name: p.name, value: value.exp() * p.role.unit(&self.scale) }).collect()
     }
 
     /// Natural logarithm of the density of the training targets, in their units (of a sparse form: of its own density).
@@ -444,38 +432,8 @@ impl Model {
         self.calibration.factor
     }
 
-    /// Jitter on diagonals.
-    pub fn jitter(&self) -> Jitter {
-        self.outcome.jitter
-    }
-
-    /// Steps of the best search, over all its choices of neighbours or inducing points.
-    pub fn iterations(&self) -> usize {
-        self.outcome.iterations
-    }
-
     /// Number of training rows.
     pub fn rows(&self) -> usize {
         self.posterior.data().len()
-    }
-
-    /// Number of inputs of a row.
-    pub fn dimensions(&self) -> usize {
-        self.spec.dimensions
-    }
-
-    /// Its kernel.
-    pub fn kernel(&self) -> &Kernel {
-        &self.spec.kernel
-    }
-
-    /// Its mean function.
-    pub fn basis(&self) -> Basis {
-        self.spec.basis
-    }
-
-    /// Exact or sparse.
-    pub fn form(&self) -> Form {
-        self.spec.form
     }
 }

@@ -26,7 +26,8 @@ use super::basis::Coefficients;
 use super::error::RegressionError;
 use super::jitter::{Jitter, until_positive};
 use super::kd_tree::KdTree;
-use super::plan::{Plan, Values, Work};
+use super::linear_algebra::add;
+use super::plan::{Covariance, Plan, Work};
 use super::scale::StandardisedRows;
 
 /// Rows per task; sums are the same for any number of threads.
@@ -80,60 +81,61 @@ impl ConditionalFactors {
         theta: &[f64],
         with_gradient: bool,
     ) -> Result<LikelihoodSums, RegressionError> {
-        let values = plan.values(theta);
+        let covariance = &Covariance::new(plan.clone(), theta);
         let size = data.basis.size(data.dimensions);
         let width = size + 1;
         let first: Vec<Result<FactorBatch, RegressionError>> = (self.rows.par_chunks(CHUNK))
             .zip(self.neighbours.par_chunks(CHUNK))
-            .map_init(Scratch::default, |scratch, (rows, near)| scratch.part(data, plan, &values, rows, near))
+            .map_init(|| Scratch::new(data, covariance), |scratch, (rows, near)| scratch.part(rows, near))
             .collect();
         let (mut g, mut value, mut factors) = (vec![0.0; width * width], 0.0, Vec::with_capacity(first.len()));
         let mut jitter = Jitter::default();
         for part in first {
             let part = part?;
             part.factors.iter().for_each(|factor| jitter.note(factor.jitter));
-            g.iter_mut().zip(&part.g).for_each(|(total, sum)| *total += sum);
+            add(&mut g, &part.g);
             value += part.log;
             factors.push(part.factors);
         }
         let coefficients = Coefficients::solve(&g, size)?;
         value += 0.5 * coefficients.squared_norm;
         let gradient =
-            if with_gradient { self.gradient(data, plan, &values, &factors, &coefficients.beta) } else { vec![] };
+            if with_gradient { self.gradient(data, covariance, &factors, &coefficients.beta) } else { vec![] };
         Ok(LikelihoodSums { value, gradient, coefficients, jitter })
     }
 
     fn gradient(
         &self,
         data: &StandardisedRows,
-        plan: &Plan,
-        values: &Values,
+        covariance: &Covariance,
         factors: &[Vec<ConditionalFactor>],
         beta: &[f64],
     ) -> Vec<f64> {
-        let count = plan.parameters.len();
+        let count = covariance.plan.parameters.len();
         let parts: Vec<Vec<f64>> = (self.neighbours.par_chunks(CHUNK))
             .zip(self.rows.par_chunks(CHUNK).zip(factors))
-            .map_init(Scratch::default, |scratch, (neighbours, (rows, factors))| {
-                let mut gradient = vec![0.0; count];
-                for ((near, row), factor) in neighbours.iter().zip(rows).zip(factors) {
-                    scratch.gather(data, *row, near);
-                    scratch.add_gradient(plan, values, factor, beta, &mut gradient);
-                }
-                gradient
-            })
+            .map_init(
+                || Scratch::new(data, covariance),
+                |scratch, (neighbours, (rows, factors))| {
+                    let mut gradient = vec![0.0; count];
+                    for ((near, row), factor) in neighbours.iter().zip(rows).zip(factors) {
+                        scratch.gather(*row, near);
+                        scratch.add_gradient(factor, beta, &mut gradient);
+                    }
+                    gradient
+                },
+            )
             .collect();
         let mut gradient = vec![0.0; count];
-        for part in parts {
-            gradient.iter_mut().zip(part).for_each(|(total, sum)| *total += sum);
-        }
+        parts.iter().for_each(|part| add(&mut gradient, part));
         gradient
     }
 }
 
 /// Memory of one thread.
-#[derive(Default)]
-struct Scratch {
+struct Scratch<'a> {
+    data: &'a StandardisedRows,
+    covariance: &'a Covariance,
     /// Squared differences of all pairs (lower triangle, column after column), and one pair of equal rows at the end.
     squares: Vec<f64>,
     matrix: Vec<f64>,
@@ -142,8 +144,14 @@ struct Scratch {
     work: Work,
 }
 
-impl Scratch {
-    fn gather(&mut self, data: &StandardisedRows, row: u32, near: &[u32]) {
+impl<'a> Scratch<'a> {
+    fn new(data: &'a StandardisedRows, covariance: &'a Covariance) -> Self {
+        let (squares, matrix, weights) = (vec![], vec![], vec![]);
+        Self { data, covariance, squares, matrix, weights, rows: vec![], work: Work::default() }
+    }
+
+    fn gather(&mut self, row: u32, near: &[u32]) {
+        let data = self.data;
         self.rows.clear();
         self.rows.extend_from_slice(near);
         self.rows.push(row);
@@ -160,18 +168,11 @@ impl Scratch {
         debug_assert_eq!(self.squares.len(), pairs * data.dimensions);
     }
 
-    fn part(
-        &mut self,
-        data: &StandardisedRows,
-        plan: &Plan,
-        values: &Values,
-        rows: &[u32],
-        neighbours: &[Vec<u32>],
-    ) -> Result<FactorBatch, RegressionError> {
-        let width = data.basis.size(data.dimensions) + 1;
+    fn part(&mut self, rows: &[u32], neighbours: &[Vec<u32>]) -> Result<FactorBatch, RegressionError> {
+        let width = self.data.basis.size(self.data.dimensions) + 1;
         let mut part = FactorBatch { factors: Vec::with_capacity(rows.len()), g: vec![0.0; width * width], log: 0.0 };
         for (row, near) in rows.iter().zip(neighbours) {
-            let factor = self.factor(data, plan, values, *row, near)?;
+            let factor = self.factor(*row, near)?;
             let (n, q) = (factor.q.len(), factor.q[factor.q.len() - 1]);
             let last: Vec<f64> = (0..width).map(|c| factor.a[c * n + n - 1]).collect();
             (0..width * width).for_each(|at| part.g[at] += last[at / width] * last[at % width] / q);
@@ -181,18 +182,11 @@ impl Scratch {
         Ok(part)
     }
 
-    fn factor(
-        &mut self,
-        data: &StandardisedRows,
-        plan: &Plan,
-        values: &Values,
-        row: u32,
-        near: &[u32],
-    ) -> Result<ConditionalFactor, RegressionError> {
-        self.gather(data, row, near);
-        let n = self.rows.len();
-        let kernel = plan.evaluate(values, &self.squares, n * (n - 1) / 2 + 1, &mut self.work);
-        let jitter = factorise(&mut self.matrix, kernel, n, values)?;
+    fn factor(&mut self, row: u32, near: &[u32]) -> Result<ConditionalFactor, RegressionError> {
+        self.gather(row, near);
+        let (data, n) = (self.data, self.rows.len());
+        let kernel = self.covariance.evaluate(&self.squares, n * (n - 1) / 2 + 1, &mut self.work);
+        let jitter = factorise(&mut self.matrix, kernel, n, self.covariance)?;
         let width = data.basis.size(data.dimensions) + 1;
         let mut a = Vec::with_capacity(width * n);
         a.extend(self.rows.iter().map(|r| data.targets[*r as usize]));
@@ -209,14 +203,8 @@ impl Scratch {
         Ok(ConditionalFactor { q, a, jitter })
     }
 
-    fn add_gradient(
-        &mut self,
-        plan: &Plan,
-        values: &Values,
-        factor: &ConditionalFactor,
-        beta: &[f64],
-        gradient: &mut [f64],
-    ) {
+    fn add_gradient(&mut self, factor: &ConditionalFactor, beta: &[f64], gradient: &mut [f64]) {
+        let covariance = self.covariance;
         let (q, n) = (&factor.q, factor.q.len());
         let mut a = factor.a[..n].to_vec();
         for (k, coefficient) in beta.iter().enumerate() {
@@ -231,19 +219,19 @@ impl Scratch {
         }
         let diagonal: f64 = q.iter().zip(&a).map(|(q, a)| c * q * q + b * q * a).sum();
         self.weights.push(diagonal * (1.0 + factor.jitter));
-        plan.add_gradient(values, &self.squares, &self.weights, &mut self.work, gradient);
-        gradient[plan.parameters.len() - 1] += 2.0 * values.noise_variance * diagonal;
+        covariance.add_gradient(&self.squares, &self.weights, &mut self.work, gradient);
+        gradient[covariance.plan.parameters.len() - 1] += 2.0 * covariance.noise_variance * diagonal;
     }
 }
 
 /// Cholesky factor (lower, column after column) of the kernel's lower triangle with prior and noise on the diagonal;
 /// returns the jitter, as part of the prior variance.
-fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, values: &Values) -> Result<f64, RegressionError> {
+fn factorise(matrix: &mut Vec<f64>, kernel: &[f64], n: usize, covariance: &Covariance) -> Result<f64, RegressionError> {
     matrix.resize(n * n, 0.0);
     until_positive(|jitter| {
         let mut from = 0;
         for j in 0..n {
-            matrix[j * n + j] = values.prior_variance * (1.0 + jitter) + values.noise_variance;
+            matrix[j * n + j] = covariance.prior_variance * (1.0 + jitter) + covariance.noise_variance;
             matrix[j * n + j + 1..][..n - j - 1].copy_from_slice(&kernel[from..][..n - j - 1]);
             from += n - j - 1;
         }
@@ -309,8 +297,7 @@ fn backward(matrix: &[f64], b: &mut [f64]) {
 #[derive(Debug, Clone)]
 pub(super) struct Posterior {
     pub data: StandardisedRows,
-    pub plan: Plan,
-    pub values: Values,
+    covariance: Covariance,
     pub coefficients: Coefficients,
     pub neighbours: usize,
     tree: KdTree,
@@ -324,9 +311,9 @@ impl Posterior {
         coefficients: Coefficients,
         neighbours: usize,
     ) -> Self {
-        let values = plan.values(theta);
-        let tree = KdTree::new(&data.inputs, &plan.metric(&values));
-        Self { data, plan, values, coefficients, neighbours, tree }
+        let covariance = Covariance::new(plan, theta);
+        let tree = KdTree::new(&data.inputs, &covariance.metric());
+        Self { data, covariance, coefficients, neighbours, tree }
     }
 
     /// Mean and variance of the function at standardised rows; row `excluded[k]` is left out of query `k`.
@@ -336,37 +323,36 @@ impl Posterior {
         excluded: Option<&[u32]>,
     ) -> Result<Vec<(f64, f64)>, RegressionError> {
         let d = self.data.dimensions;
-        let parts: Vec<Result<Vec<(f64, f64)>, RegressionError>> = (queries.par_chunks(CHUNK * d).enumerate())
-            .map_init(Scratch::default, |scratch, (chunk, rows)| {
-                let one = |(at, row): (usize, &[f64])| {
-                    self.one(scratch, row, excluded.map(|excluded| excluded[chunk * CHUNK + at] as usize))
-                };
-                rows.chunks_exact(d).enumerate().map(one).collect()
-            })
+        let parts: Result<Vec<Vec<(f64, f64)>>, RegressionError> = (queries.par_chunks(CHUNK * d).enumerate())
+            .map_init(
+                || Scratch::new(&self.data, &self.covariance),
+                |scratch, (chunk, rows)| {
+                    let one = |(at, row): (usize, &[f64])| {
+                        self.one(scratch, row, excluded.map(|excluded| excluded[chunk * CHUNK + at] as usize))
+                    };
+                    rows.chunks_exact(d).enumerate().map(one).collect()
+                },
+            )
             .collect();
-        let mut all = Vec::with_capacity(queries.len() / d);
-        for part in parts {
-            all.extend(part?);
-        }
-        Ok(all)
+        Ok(parts?.concat())
     }
 
     fn one(&self, scratch: &mut Scratch, row: &[f64], excluded: Option<usize>) -> Result<(f64, f64), RegressionError> {
         let near = self.tree.nearest(row, self.neighbours, self.data.len(), excluded);
         let (Some((last, rest)), n) = (near.split_last(), near.len()) else {
             let h: Vec<f64> = (0..self.coefficients.beta.len()).map(|k| self.data.basis.value(row, k)).collect();
-            let variance = self.values.prior_variance + self.coefficients.variance(&h);
+            let variance = self.covariance.prior_variance + self.coefficients.variance(&h);
             return Ok((self.coefficients.mean(self.data.basis, row), variance));
         };
-        scratch.gather(&self.data, *last, rest);
-        let kernel = self.plan.evaluate(&self.values, &scratch.squares, n * (n - 1) / 2 + 1, &mut scratch.work);
-        factorise(&mut scratch.matrix, kernel, n, &self.values)?;
+        scratch.gather(*last, rest);
+        let kernel = self.covariance.evaluate(&scratch.squares, n * (n - 1) / 2 + 1, &mut scratch.work);
+        factorise(&mut scratch.matrix, kernel, n, &self.covariance)?;
         scratch.squares.clear();
         for (d, x) in row.iter().enumerate() {
             let value = |r: &u32| self.data.row(*r as usize)[d] - x;
             scratch.squares.extend(near.iter().map(|r| value(r) * value(r)));
         }
-        let mut cross = self.plan.evaluate(&self.values, &scratch.squares, n, &mut scratch.work).to_vec();
+        let mut cross = self.covariance.evaluate(&scratch.squares, n, &mut scratch.work).to_vec();
         forward(&scratch.matrix, &mut cross);
         let explained: f64 = cross.iter().map(|v| v * v).sum();
         backward(&scratch.matrix, &mut cross);
@@ -377,7 +363,7 @@ impl Posterior {
             mean += weight * (self.data.targets[*r as usize] - self.coefficients.mean(self.data.basis, near_row));
             (0..rest.len()).for_each(|k| rest[k] -= weight * self.data.basis.value(near_row, k));
         }
-        let variance = (self.values.prior_variance - explained).max(0.0) + self.coefficients.variance(&rest);
+        let variance = (self.covariance.prior_variance - explained).max(0.0) + self.coefficients.variance(&rest);
         Ok((mean, variance))
     }
 }

@@ -2,7 +2,7 @@
 //!
 //! In: rows, column after column, and a point. Out: squared differences and kernel values. Inputs are checked before.
 
-use super::plan::{Plan, Values, Work};
+use super::plan::{Covariance, Work};
 
 /// Pairs evaluated at a time: their memory fits the near cache.
 pub(super) const BLOCK_PAIRS: usize = 1024;
@@ -12,27 +12,27 @@ pub(super) fn by_column(inputs: &[f64], dimensions: usize) -> Vec<f64> {
     (0..dimensions).flat_map(|d| inputs.iter().skip(d).step_by(dimensions).copied()).collect()
 }
 
-/// Kernel of one point with the rows `first..` of `columns` (which has `n` rows), into `out`.
-#[expect(clippy::too_many_arguments, reason = "one flat loop of arithmetic")]
-pub(super) fn cross(
-    plan: &Plan,
-    values: &Values,
-    columns: &[f64],
-    n: usize,
-    first: usize,
-    point: &[f64],
-    scratch: &mut (Vec<f64>, Work),
-    out: &mut [f64],
-) {
-    for (block, part) in out.chunks_mut(BLOCK_PAIRS).enumerate() {
-        let (from, count) = (first + block * BLOCK_PAIRS, part.len());
-        squares(columns, n, from, count, point, &mut scratch.0);
-        part.copy_from_slice(plan.evaluate(values, &scratch.0, count, &mut scratch.1));
+impl Covariance {
+    /// Covariance of one point with the rows `first..` of `columns`, into `out`.
+    pub(super) fn cross(
+        &self,
+        columns: &[f64],
+        first: usize,
+        point: &[f64],
+        scratch: &mut (Vec<f64>, Work),
+        out: &mut [f64],
+    ) {
+        for (block, part) in out.chunks_mut(BLOCK_PAIRS).enumerate() {
+            let count = part.len();
+            squares(columns, first + block * BLOCK_PAIRS, count, point, &mut scratch.0);
+            part.copy_from_slice(self.evaluate(&scratch.0, count, &mut scratch.1));
+        }
     }
 }
 
 /// Squared differences of the rows `from..from + count` to a point, input after input, into `out`.
-pub(super) fn squares(columns: &[f64], n: usize, from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
+pub(super) fn squares(columns: &[f64], from: usize, count: usize, point: &[f64], out: &mut Vec<f64>) {
+    let n = columns.len() / point.len();
     out.resize(count * point.len(), 0.0);
     for (d, x) in point.iter().enumerate() {
         let column = &columns[d * n + from..][..count];

@@ -8,6 +8,7 @@
 use faer::traits::pulp::Arch;
 
 use super::kernel::{Kernel, Node, Shape};
+use super::scale::Scale;
 use super::vector_math;
 
 /// Kind of a parameter.
@@ -17,6 +18,13 @@ pub(super) enum ParameterRole {
     Alpha,
     Signal,
     Noise,
+}
+
+impl ParameterRole {
+    /// Its unit in standardised targets.
+    pub(super) fn unit(self, scale: &Scale) -> f64 {
+        if matches!(self, Self::Signal | Self::Noise) { scale.target_deviation } else { 1.0 }
+    }
 }
 
 /// One parameter: kind and name in reports.
@@ -52,9 +60,11 @@ pub(super) struct Plan {
     pub parameters: Vec<Parameter>,
 }
 
-/// Parameters of the leaves in the form that the loops use.
+/// A plan at given parameters: the covariance of the function at two rows.
 #[derive(Debug, Clone)]
-pub(super) struct Values {
+pub(super) struct Covariance {
+    pub plan: Plan,
+    /// Parameters of the leaves in the form that the loops use.
     leaves: Vec<LeafValues>,
     /// Variance of the function at a point.
     pub prior_variance: f64,
@@ -123,15 +133,6 @@ impl Plan {
         self.leaves.len() - 1
     }
 
-    pub(super) fn values(&self, theta: &[f64]) -> Values {
-        let leaves: Vec<LeafValues> = self.leaves.iter().map(|leaf| self.leaf_values(leaf, theta)).collect();
-        let mut values =
-            Values { leaves, prior_variance: 0.0, noise_variance: (2.0 * theta[self.parameters.len() - 1]).exp() };
-        let zero = vec![0.0; self.dimensions];
-        values.prior_variance = self.evaluate(&values, &zero, 1, &mut Work::default())[0];
-        values
-    }
-
     fn leaf_values(&self, leaf: &Leaf, theta: &[f64]) -> LeafValues {
         let length = |d: usize| theta[leaf.lengths + if self.ard { d } else { 0 }];
         LeafValues {
@@ -140,37 +141,42 @@ impl Plan {
             variance: leaf.signal.map_or(1.0, |at| (2.0 * theta[at]).exp()),
         }
     }
+}
+
+impl Covariance {
+    /// The covariance at these parameters.
+    pub(super) fn new(plan: Plan, theta: &[f64]) -> Self {
+        let leaves = plan.leaves.iter().map(|leaf| plan.leaf_values(leaf, theta)).collect();
+        let noise_variance = (2.0 * theta[plan.parameters.len() - 1]).exp();
+        let mut covariance = Self { plan, leaves, prior_variance: 0.0, noise_variance };
+        let zero = vec![0.0; covariance.plan.dimensions];
+        covariance.prior_variance = covariance.evaluate(&zero, 1, &mut Work::default())[0];
+        covariance
+    }
 
     /// Weights of the inputs in the distance between rows: by the shortest length scale of each.
-    pub(super) fn metric(&self, values: &Values) -> Vec<f64> {
-        let of = |d: usize| values.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
-        (0..self.dimensions).map(of).collect()
+    pub(super) fn metric(&self) -> Vec<f64> {
+        let of = |d: usize| self.leaves.iter().map(|leaf| leaf.inverse_squares[d].sqrt()).fold(0.0, f64::max);
+        (0..self.plan.dimensions).map(of).collect()
     }
 
     /// The kernel over a block of pairs.
-    pub(super) fn evaluate<'w>(&self, values: &Values, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
-        self.forward(values, squares, count, work, false);
-        &work.values[self.steps.len() - 1][..count]
+    pub(super) fn evaluate<'w>(&self, squares: &[f64], count: usize, work: &'w mut Work) -> &'w [f64] {
+        self.forward(squares, count, work, false);
+        &work.values[self.plan.steps.len() - 1][..count]
     }
 
     /// Adds to `gradient` the derivative of `sum of weight * kernel` over a block of pairs by every parameter but the noise.
-    pub(super) fn add_gradient(
-        &self,
-        values: &Values,
-        squares: &[f64],
-        weights: &[f64],
-        work: &mut Work,
-        gradient: &mut [f64],
-    ) {
+    pub(super) fn add_gradient(&self, squares: &[f64], weights: &[f64], work: &mut Work, gradient: &mut [f64]) {
         let count = weights.len();
-        self.forward(values, squares, count, work, true);
-        work.adjoints.resize_with(self.steps.len(), Vec::new);
-        let root = &mut work.adjoints[self.steps.len() - 1];
+        self.forward(squares, count, work, true);
+        work.adjoints.resize_with(self.plan.steps.len(), Vec::new);
+        let root = &mut work.adjoints[self.plan.steps.len() - 1];
         root.clear();
         root.extend_from_slice(weights);
-        for at in (0..self.steps.len()).rev() {
-            match &self.steps[at] {
-                PlanStep::Leaf(leaf) => self.leaf_gradient(at, *leaf, values, squares, work, gradient),
+        for at in (0..self.plan.steps.len()).rev() {
+            match &self.plan.steps[at] {
+                PlanStep::Leaf(leaf) => self.leaf_gradient(at, *leaf, squares, work, gradient),
                 PlanStep::Sum(children) => {
                     let (below, here) = work.adjoints.split_at_mut(at);
                     for child in children {
@@ -182,17 +188,9 @@ impl Plan {
         }
     }
 
-    fn leaf_gradient(
-        &self,
-        at: usize,
-        leaf: usize,
-        values: &Values,
-        squares: &[f64],
-        work: &Work,
-        gradient: &mut [f64],
-    ) {
-        let (adjoints, numbers, leaf_values) = (&work.adjoints[at], &work.values[at], &values.leaves[leaf]);
-        let (count, slopes, leaf) = (adjoints.len(), &work.slopes[leaf], (&self.leaves[leaf], &work.alphas[leaf]));
+    fn leaf_gradient(&self, at: usize, leaf: usize, squares: &[f64], work: &Work, gradient: &mut [f64]) {
+        let (adjoints, numbers, leaf_values) = (&work.adjoints[at], &work.values[at], &self.leaves[leaf]);
+        let (count, slopes, leaf) = (adjoints.len(), &work.slopes[leaf], (&self.plan.leaves[leaf], &work.alphas[leaf]));
         let dot = |a: &[f64], b: &[f64]| Arch::new().dispatch(|| dot_product(a, b));
         if let Some(signal) = leaf.0.signal {
             gradient[signal] += 2.0 * dot(adjoints, &numbers[..count]);
@@ -201,28 +199,28 @@ impl Plan {
             gradient[alpha] += dot(adjoints, &leaf.1[..count]);
         }
         let weighted: Vec<f64> = adjoints.iter().zip(slopes).map(|(a, s)| a * s).collect();
-        for d in 0..self.dimensions {
-            let target = leaf.0.lengths + if self.ard { d } else { 0 };
+        for d in 0..self.plan.dimensions {
+            let target = leaf.0.lengths + if self.plan.ard { d } else { 0 };
             let sum = dot(&weighted, &squares[d * count..][..count]);
             gradient[target] -= 2.0 * leaf_values.inverse_squares[d] * sum;
         }
     }
 
-    fn forward(&self, values: &Values, squares: &[f64], count: usize, work: &mut Work, slopes: bool) {
-        work.values.resize_with(self.steps.len(), Vec::new);
+    fn forward(&self, squares: &[f64], count: usize, work: &mut Work, slopes: bool) {
+        work.values.resize_with(self.plan.steps.len(), Vec::new);
         work.slopes.resize_with(self.leaves.len(), Vec::new);
         work.alphas.resize_with(self.leaves.len(), Vec::new);
-        for at in 0..self.steps.len() {
+        for at in 0..self.plan.steps.len() {
             let (below, here) = work.values.split_at_mut(at);
             let out = &mut here[0];
             out.resize(count, 0.0);
-            match &self.steps[at] {
+            match &self.plan.steps[at] {
                 PlanStep::Leaf(leaf) => {
-                    distances(&values.leaves[*leaf].inverse_squares, squares, out);
+                    distances(&self.leaves[*leaf].inverse_squares, squares, out);
                     let (slope, alpha) = (&mut work.slopes[*leaf], &mut work.alphas[*leaf]);
                     slope.resize(if slopes { count } else { 0 }, 0.0);
                     alpha.resize(slope.len(), 0.0);
-                    shape_values(self.leaves[*leaf].shape, &values.leaves[*leaf], out, slope, alpha);
+                    shape_values(self.plan.leaves[*leaf].shape, &self.leaves[*leaf], out, slope, alpha);
                 }
                 PlanStep::Sum(children) => combine(below, children, out, |total, value| total + value),
                 PlanStep::Product(children) => combine(below, children, out, |total, value| total * value),
@@ -367,10 +365,12 @@ mod tests {
                     ParameterRole::Noise => 0.1_f64.ln(),
                 })
                 .collect();
-            let values = plan.values(&theta);
-            let found = plan.evaluate(&values, &[9.0], 1, &mut Work::default())[0];
+            let covariance = Covariance::new(plan.clone(), &theta);
+            let found = covariance.evaluate(&[9.0], 1, &mut Work::default())[0];
             assert!((found - 9.0 * expected).abs() < 1e-14, "{name}: {found}, expected {}", 9.0 * expected);
-            assert!((values.prior_variance - 9.0).abs() < 1e-14 && (values.noise_variance - 0.01).abs() < 1e-16);
+            assert!(
+                (covariance.prior_variance - 9.0).abs() < 1e-14 && (covariance.noise_variance - 0.01).abs() < 1e-16
+            );
         }
     }
 
@@ -392,11 +392,16 @@ mod tests {
                 let theta: Vec<f64> = (0..plan.parameters.len()).map(|k| 0.3 * (k as f64 * 1.7).sin()).collect();
                 let sum = |theta: &[f64]| {
                     let mut work = Work::default();
-                    let values = plan.values(theta);
-                    dot_product(plan.evaluate(&values, &squares, 5, &mut work), &weights)
+                    let covariance = Covariance::new(plan.clone(), theta);
+                    dot_product(covariance.evaluate(&squares, 5, &mut work), &weights)
                 };
                 let mut gradient = vec![0.0; theta.len()];
-                plan.add_gradient(&plan.values(&theta), &squares, &weights, &mut Work::default(), &mut gradient);
+                Covariance::new(plan.clone(), &theta).add_gradient(
+                    &squares,
+                    &weights,
+                    &mut Work::default(),
+                    &mut gradient,
+                );
                 for k in 0..theta.len() {
                     let (mut low, mut high) = (theta.clone(), theta.clone());
                     (low[k], high[k]) = (theta[k] - 1e-5, theta[k] + 1e-5);

@@ -12,7 +12,7 @@ use super::error::RegressionError;
 use super::model::{FitOutcome, Model, ModelSpec, Posterior, threads};
 use super::plan::Plan;
 use super::scale::{Scale, StandardisedRows};
-use super::settings::{Form, MAX_DIMENSIONS, MAX_EXACT_ROWS, MAX_INDUCING, MAX_NEIGHBOURS};
+use super::settings::{Form, MAX_DIMENSIONS};
 use super::{exact, inducing, nearest};
 
 /// Format name in the header.
@@ -137,22 +137,15 @@ impl Body {
         let plan = Plan::new(&self.spec.kernel, d, self.spec.ard);
         same("theta", self.theta.len(), plan.parameters.len())?;
         let size = self.spec.basis.size(d);
+        self.spec.form.check(n).map_err(damaged)?;
         match self.spec.form {
-            Form::Exact if n > MAX_EXACT_ROWS => return Err(damaged(format!("{n} rows of an exact model"))),
             Form::Exact => {}
-            Form::Nearest { neighbours } => {
-                if neighbours == 0 || neighbours > MAX_NEIGHBOURS {
-                    return Err(damaged(format!("neighbours = {neighbours}")));
-                }
+            Form::Nearest { .. } => {
                 same("coefficients", self.beta.len(), size)?;
                 same("their covariance", self.beta_covariance.len(), size * size)?;
             }
-            Form::Inducing { points } => {
-                if points == 0 || points > MAX_INDUCING || self.points.is_empty() {
-                    return Err(damaged(format!("inducing points = {points}")));
-                }
-                same("their inputs", self.points.len() % d, 0)?;
-            }
+            Form::Inducing { .. } if self.points.is_empty() => return Err(damaged("no inducing points")),
+            Form::Inducing { .. } => same("their inputs", self.points.len() % d, 0)?,
         }
         let scale = &self.scale;
         let numbers = [&self.inputs, &self.targets, &self.theta, &scale.means, &scale.deviations, &self.beta];

@@ -7,6 +7,7 @@ use std::ops::ControlFlow;
 use serde::{Deserialize, Serialize};
 
 use super::basis::Basis;
+use super::error::RegressionError;
 use super::kernel::Kernel;
 
 /// Most inputs of a row.
@@ -48,6 +49,21 @@ pub enum Form {
         /// Number of inducing points, 1 to 5000.
         points: usize,
     },
+}
+
+impl Form {
+    /// Checks its numbers, and that of the rows, against the limits.
+    pub(super) fn check(self, rows: usize) -> Result<(), RegressionError> {
+        let (what, found, most, advice) = match self {
+            Self::Exact => ("rows of an exact fit", rows, MAX_EXACT_ROWS, "; take a sparse form"),
+            Self::Nearest { neighbours } => ("neighbours", neighbours, MAX_NEIGHBOURS, ""),
+            Self::Inducing { points } => ("inducing points", points, MAX_INDUCING, ""),
+        };
+        if (1..=most).contains(&found) {
+            return Ok(());
+        }
+        Err(RegressionError::range(what, found, format!("1 to {most}{advice}")))
+    }
 }
 
 /// Settings of a fit.

@@ -128,7 +128,7 @@ fn rows_left_out_are_predicted_as_by_a_model_fitted_without_them() {
         without.targets.remove(row);
         let without = exact::Posterior::new(without, plan.clone(), &at).expect("positive definite");
         let (mean, variance) = without.predict(data.row(row))[0];
-        let expected = (data.targets[row] - mean, variance + without.values.noise_variance);
+        let expected = (data.targets[row] - mean, variance + without.covariance.noise_variance);
         for (residual, measured) in [all.left_out(&[row as u32])[0], inducing_all.left_out(&[row as u32])[0]] {
             assert!((residual - expected.0).abs() < 1e-5 && (measured - expected.1).abs() < 1e-5, "row {row}");
         }
@@ -162,7 +162,7 @@ fn without_a_search_the_given_start_is_the_model() {
     });
     let found: Vec<f64> = model.hyperparameters().iter().map(|h| h.value).collect();
     assert!(found.iter().zip(start).all(|(f, s)| (f / s - 1.0).abs() < 1e-12), "{found:?}");
-    assert_eq!(model.iterations(), 0);
+    assert_eq!(model.outcome.iterations, 0);
 }
 
 #[test]
@@ -188,10 +188,14 @@ fn equal_rows_with_hardly_any_noise_need_jitter_and_it_is_counted() {
         settings.start = vec![3.0, 1.0, 1e-12];
         let model = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).expect("jitter helps");
         if !matches!(form, Form::Inducing { .. }) {
-            assert!(model.jitter().matrices > 0 && model.jitter().largest >= 1e-10, "{form:?}: {:?}", model.jitter());
+            assert!(
+                model.outcome.jitter.matrices > 0 && model.outcome.jitter.largest >= 1e-10,
+                "{form:?}: {:?}",
+                model.outcome.jitter
+            );
         }
     }
-    assert_eq!(fitted(Form::Exact, |_| ()).jitter(), Jitter::default());
+    assert_eq!(fitted(Form::Exact, |_| ()).outcome.jitter, Jitter::default());
 }
 
 #[test]

@@ -16,7 +16,7 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 const PAYLOADS: usize = 1000;
 
 fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
-    message.signals[signal].multiplex.conditions.iter().all(|condition| {
+    message.signals[signal].conditions.iter().all(|condition| {
         let code = message.signals[condition.selector].layout.plan().unwrap().raw(payload).unwrap();
         condition.ranges.iter().any(|(low, high)| (*low..=*high).contains(&code))
     })
@@ -25,11 +25,11 @@ fn is_there(message: &Message, signal: usize, payload: &[u8]) -> bool {
 /// Random payloads: for each page of the message `PAYLOADS` of them with its selectors written. The other selectors
 /// get codes that some signal is there for: cantools refuses a payload with any other code.
 fn payloads(message: &Message, random: &mut ChaCha8Rng) -> Vec<Vec<u8>> {
-    let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.multiplex.conditions).collect();
+    let all: Vec<&MuxCondition> = message.signals.iter().flat_map(|signal| &signal.conditions).collect();
     let mut pages: Vec<&[MuxCondition]> = Vec::new();
-    for signal in message.signals.iter().filter(|signal| !signal.multiplex.conditions.is_empty()) {
-        if !pages.contains(&signal.multiplex.conditions.as_slice()) {
-            pages.push(&signal.multiplex.conditions);
+    for signal in message.signals.iter().filter(|signal| !signal.conditions.is_empty()) {
+        if !pages.contains(&signal.conditions.as_slice()) {
+            pages.push(&signal.conditions);
         }
     }
     if pages.is_empty() {

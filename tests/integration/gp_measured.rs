@@ -54,10 +54,10 @@ fn the_exponential_kernel_beats_the_papers_error_and_its_intervals_hold_what_the
     let model = fit(&rows, &settings, &mut |_| ControlFlow::Continue(())).unwrap();
     let predictions = model.predict(&queries).unwrap();
     let score = score(&predictions, &truth);
-    println!("{score:?}, {} steps", model.iterations());
+    println!("{score:?}, {} steps", model.outcome.iterations);
     assert!(score.rmse <= 0.1058, "{score:?}");
     assert!((0.93..=0.97).contains(&score.coverage_95), "{score:?}");
-    assert_eq!(model.jitter().matrices, 0);
+    assert_eq!(model.outcome.jitter.matrices, 0);
     let loaded = Model::load(&model.save().unwrap(), 2).unwrap();
     assert_eq!(loaded.predict(&queries[..300]).unwrap(), predictions[..100]);
 }

@@ -3,6 +3,8 @@
 
 use crate::support::config_texts;
 use packwatch::can::e2e::{Profile, Protection, Status};
+use packwatch::can::flood::FloodChange;
+use packwatch::can::guard::GuardChange;
 use packwatch::can::{CanId, Frame};
 use packwatch::monitor::{Downtime, Estimate, Event, EventKind, Input, Monitor, MonitorConfig, Outputs, Snapshot};
 use packwatch::quantity::{BusIndex, CellIndex, Channel, Fault, Timestamp};
@@ -147,7 +149,7 @@ impl Bench {
     /// (id, status, usable, count) of the reports about protected messages.
     fn reported(&self) -> Vec<(CanId, Status, bool, u64)> {
         let reported = self.events.iter().filter_map(|event| match event.kind {
-            EventKind::Protection { id, status, usable, count, .. } => Some((id, status, usable, count)),
+            EventKind::Protection(GuardChange { id, status, usable, count, .. }) => Some((id, status, usable, count)),
             _ => None,
         });
         reported.collect()
@@ -340,7 +342,7 @@ fn a_flood_of_one_identifier_is_cut_counted_and_reported_while_the_others_contin
     assert_eq!((bench.estimates_of(0), bench.estimates_of(1) as u64), (20, taken));
     (0..15).for_each(|_| bench.cycle());
     let floods = bench.events.iter().filter_map(|event| match event.kind {
-        EventKind::Flood { bus, id, active, dropped } => Some((bus, id, active, dropped)),
+        EventKind::Flood(FloodChange { bus, id, active, dropped }) => Some((bus, id, active, dropped)),
         _ => None,
     });
     assert_eq!(floods.collect::<Vec<_>>(), [(BUS, CELL_2, true, 1), (BUS, CELL_2, false, dropped.dropped)]);

@@ -50,7 +50,7 @@ impl Consumer {
 }
 
 fn is_present(message: &Message, signal: &Signal, data: &[u8]) -> bool {
-    signal.multiplex.conditions.iter().all(|condition| {
+    signal.conditions.iter().all(|condition| {
         let selector = &message.signals[condition.selector];
         let code = selector.layout.plan().ok().and_then(|plan| plan.raw(data).ok());
         code.is_some_and(|code| condition.ranges.iter().any(|&(low, high)| (low..=high).contains(&code)))

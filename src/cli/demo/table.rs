@@ -3,30 +3,11 @@
 use std::io::{self, IsTerminal, Write};
 use std::time::Duration;
 
-use crate::alarm::Rule;
-use crate::quantity::Mode;
-
 /// Pause after each redraw, so that a reader can follow.
 const FRAME_TIME: Duration = Duration::from_millis(20);
 
 /// Erases the line.
 const ERASE_LINE: &str = "\r\x1b[K";
-
-/// Values of a row.
-pub(super) struct TableRow {
-    pub(super) cycle: u32,
-    pub(super) hours: f64,
-    pub(super) mode: Mode,
-    /// Estimate and its standard deviation, fraction.
-    pub(super) soc: Option<(f64, f64)>,
-    pub(super) true_soc: f64,
-    /// Estimate and its standard deviation, Ah.
-    pub(super) capacity_ah: (f64, f64),
-    pub(super) true_capacity_ah: f64,
-    pub(super) soh: f64,
-    pub(super) recharge_period_s: Option<f64>,
-    pub(super) alarms: Vec<Rule>,
-}
 
 /// Writes rows to standard output.
 pub(super) struct Table {
@@ -45,19 +26,19 @@ impl Table {
     }
 
     /// A row that stays.
-    pub(super) fn keep(&mut self, row: &TableRow) -> io::Result<()> {
+    pub(super) fn keep(&mut self, row: &str) -> io::Result<()> {
         self.head()?;
         let start = if self.live { ERASE_LINE } else { "" };
-        writeln!(io::stdout(), "{start}{}", text(row))
+        writeln!(io::stdout(), "{start}{}", row)
     }
 
     /// The live row; nothing without a terminal.
-    pub(super) fn redraw(&mut self, row: &TableRow) -> io::Result<()> {
+    pub(super) fn redraw(&mut self, row: &str) -> io::Result<()> {
         if !self.live {
             return Ok(());
         }
         self.head()?;
-        write!(io::stdout(), "{ERASE_LINE}{}", text(row))?;
+        write!(io::stdout(), "{ERASE_LINE}{}", row)?;
         io::stdout().flush()?;
         std::thread::sleep(FRAME_TIME);
         Ok(())
@@ -74,30 +55,4 @@ impl Table {
         }
         Ok(())
     }
-}
-
-fn text(row: &TableRow) -> String {
-    let soc = match row.soc {
-        Some((soc, std)) => format!("{:6.1} +-{:5.1}", 100.0 * soc, 100.0 * std),
-        None => format!("{:>6}{:8}", "-", ""),
-    };
-    let recharge = row.recharge_period_s.map_or("-".to_owned(), |s| format!("{s:.0}"));
-    let mode = match row.mode {
-        Mode::Unknown => "unknown",
-        Mode::Charge => "charge",
-        Mode::Rest => "rest",
-        Mode::Discharge => "discharge",
-    };
-    let alarms: Vec<String> = row.alarms.iter().map(|rule| rule.name().replace('_', " ")).collect();
-    format!(
-        "{:5} {:5.1} h | {soc} {:6.1} | {:8.3} +-{:6.3} {:6.3} | {:4.0} | {recharge:>8} | {mode:10} {}",
-        row.cycle,
-        row.hours,
-        100.0 * row.true_soc,
-        row.capacity_ah.0,
-        row.capacity_ah.1,
-        row.true_capacity_ah,
-        100.0 * row.soh,
-        alarms.join(", "),
-    )
 }

@@ -3,7 +3,7 @@
 use std::io::IsTerminal as _;
 use std::path::Path;
 
-use super::super::{Failure, control_args};
+use super::super::{Failure, output};
 use crate::doctor::{Change, Finding, Report, Severity};
 
 /// Width of the text without a terminal.
@@ -40,7 +40,7 @@ pub(super) fn print(report: &Report, config: &Path, source: &str) -> Result<(), 
     } else {
         DEFAULT_WIDTH
     };
-    control_args::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
+    output::print(&render(report, config, source, width.clamp(WIDTHS.0, WIDTHS.1), paint))
 }
 
 fn render(report: &Report, config: &Path, source: &str, width: usize, paint: Paint) -> String {

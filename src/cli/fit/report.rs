@@ -3,19 +3,10 @@
 use std::io::{self, Write as _};
 use std::path::Path;
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 
 use crate::ident::fit::Residual;
 use crate::lab::fit::{FitOutcome, FitProgress};
-
-/// Live line on the terminal; nothing where standard error is no terminal.
-pub(super) fn spinner() -> ProgressBar {
-    let bar = ProgressBar::new_spinner();
-    match ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}") {
-        Ok(style) => bar.with_style(style),
-        Err(_) => bar,
-    }
-}
 
 /// Shows the progress of the fit.
 pub(super) fn show(bar: &ProgressBar, progress: FitProgress) {

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::cli::Failure;
+use crate::cli::numbers::{NamedValue, one_of, whole};
 use crate::io::result_file::check_place;
 use crate::lab::gpr::MissingPolicy;
 use crate::regress::{Basis, Form, GprSettings, Kernel, MAX_INDUCING, MAX_NEIGHBOURS};
@@ -48,33 +49,19 @@ pub(super) enum FormName {
     Inducing,
 }
 
-/// Mean function, on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum BasisName {
-    /// 0
-    Zero,
-    /// One constant
-    Constant,
-    /// A constant and a slope for every input
-    Linear,
-}
-
-impl From<BasisName> for Basis {
-    fn from(name: BasisName) -> Self {
-        match name {
-            BasisName::Zero => Self::Zero,
-            BasisName::Constant => Self::Constant,
-            BasisName::Linear => Self::Linear,
-        }
-    }
-}
+/// Mean functions by name.
+const BASES: [NamedValue<Basis>; 3] = [
+    ("zero", Basis::Zero, "0"),
+    ("constant", Basis::Constant, "One constant"),
+    ("linear", Basis::Linear, "A constant and a slope for every input"),
+];
 
 /// Settings of a model.
 #[derive(Debug, clap::Args)]
 pub(super) struct ModelArgs {
     /// Mean function
-    #[arg(long, value_enum, default_value = "constant")]
-    basis: BasisName,
+    #[arg(long, value_parser = one_of(&BASES), default_value = "constant")]
+    basis: Basis,
     /// A length scale for every input instead of one for all
     #[arg(long)]
     ard: bool,
@@ -112,7 +99,7 @@ impl ModelArgs {
             None if settings.form == Form::Exact => Form::Exact,
             None => Form::Nearest { neighbours: self.neighbours },
         };
-        settings.basis = self.basis.into();
+        settings.basis = self.basis;
         (settings.ard, settings.restarts, settings.seed) = (self.ard, self.restarts, self.seed);
         settings.max_iterations = self.max_iterations;
         settings.threads = threads(self.threads);
@@ -128,10 +115,4 @@ impl ModelArgs {
 /// Returns the given number of threads, or one per core.
 pub(super) fn threads(given: Option<usize>) -> usize {
     given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from))
-}
-
-/// A whole number in a range.
-pub(super) fn whole<const LOW: usize, const HIGH: usize>(text: &str) -> Result<usize, String> {
-    let number = text.trim().parse::<usize>().ok().filter(|number| (LOW..=HIGH).contains(number));
-    number.ok_or_else(|| format!("must be a whole number from {LOW} to {HIGH}"))
 }

@@ -7,11 +7,11 @@ use std::time::Instant;
 
 use serde_json::{Value, json};
 
-use super::args::{FileArgs, GRAMMAR, ModelArgs, whole};
-use super::report::{VERSION, fit_bar, form, jitter_json, mebibytes, score_json, short, show_fits, skipped};
+use super::args::{FileArgs, GRAMMAR, ModelArgs};
+use super::report::{VERSION, fit_bar, form, mebibytes, score_json, short, show_fits, skipped};
 use super::{ColumnSelection, ColumnTable, PartColumn, read};
 use crate::cli::Failure;
-use crate::cli::numbers::percent;
+use crate::cli::numbers::{percent, whole};
 use crate::cli::output::{create_folder, failure, print_json, unless_closed, write_table};
 use crate::lab::gpr::forecast::{
     self, ForecastPlan, HorizonForecast, MAX_LAGS, MAX_STEPS, OutputForecast, RowSpacing, TableForecast, horizons,
@@ -218,12 +218,12 @@ fn horizon_json(horizon: &HorizonForecast) -> Value {
     let p = &horizon.at_origin;
     let score = horizon.score.as_ref().map(|score| {
         let mut score = score_json(score);
-        score.insert("persistence_rmse".to_owned(), json!(horizon.persistence_rmse));
+        score["persistence_rmse"] = json!(horizon.persistence_rmse);
         score
     });
     json!({
         "steps": horizon.steps, "trained": horizon.trained, "calibrated": horizon.calibrated,
-        "interval_factor": horizon.factor, "seconds": horizon.fit_s, "jitter": jitter_json(horizon.jitter),
+        "interval_factor": horizon.factor, "seconds": horizon.fit_s, "jitter": horizon.jitter,
         "at_origin": {
             "mean": p.mean, "std": p.measurement_variance.sqrt(), "low_95": p.low_95, "high_95": p.high_95,
         },

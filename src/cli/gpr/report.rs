@@ -59,10 +59,6 @@ pub(super) fn mebibytes(kib: Option<u64>) -> String {
     kib.map_or_else(|| "-".to_owned(), |kib| format!("{:.0}", kib as f64 / 1024.0))
 }
 
-pub(super) fn jitter_json(jitter: Jitter) -> Value {
-    json!({ "matrices": jitter.matrices, "largest": jitter.largest })
-}
-
 pub(super) fn skipped(out: &mut impl Write, table: &ColumnTable) -> io::Result<()> {
     if table.skipped > 0 {
         writeln!(out, "{} rows left out: a value is missing", table.skipped)?;
@@ -75,14 +71,11 @@ fn hyperparameters(all: &[Hyperparameter]) -> Map<String, Value> {
 }
 
 /// Errors of predictions.
-pub(super) fn score_json(s: &PredictionScore) -> Map<String, Value> {
-    let values = [
-        ("rmse", s.rmse),
-        ("mean_absolute_error", s.mean_absolute_error),
-        ("coverage_95", s.coverage_95),
-        ("mean_width_95", s.mean_width_95),
-    ];
-    values.map(|(name, value)| (name.to_owned(), json!(value))).into_iter().collect()
+pub(super) fn score_json(s: &PredictionScore) -> Value {
+    json!({
+        "rmse": s.rmse, "mean_absolute_error": s.mean_absolute_error, "coverage_95": s.coverage_95,
+        "mean_width_95": s.mean_width_95,
+    })
 }
 
 /// A number with four digits that matter.
@@ -178,7 +171,7 @@ impl CvReport<'_> {
                 "coverage_95": s.coverage_95, "gaussian_coverage_95": s.gaussian_coverage_95,
                 "mean_width_95": s.mean_width_95, "training_s": total(validated, |fold| fold.fit_s),
                 "prediction_s": total(validated, |fold| fold.predict_s), "seconds": validated.seconds,
-                "peak_memory_kib": validated.peak_kib, "jitter": jitter_json(jitter(validated)),
+                "peak_memory_kib": validated.peak_kib, "jitter": jitter(validated),
                 "folds": validated.folds.folds.iter().map(fold).collect::<Vec<_>>(),
             })
         };
@@ -205,20 +198,20 @@ impl TrainReport<'_> {
         let mut out = io::stdout().lock();
         let (trained, model) = (self.trained, &self.trained.model);
         writeln!(out, "{} from {}: {} rows", trained.output, trained.inputs.join(", "), model.rows())?;
-        writeln!(out, "{}; {:?} basis", form_note(model.form(), self.default_form), model.basis())?;
+        writeln!(out, "{}; {:?} basis", form_note(model.spec.form, self.default_form), model.spec.basis)?;
         skipped(&mut out, self.table)?;
         for h in model.hyperparameters() {
             writeln!(out, "  {:<40} {}", h.name, short(h.value))?;
         }
-        if model.jitter().matrices > 0 {
-            let jitter = model.jitter();
+        if model.outcome.jitter.matrices > 0 {
+            let jitter = model.outcome.jitter;
             writeln!(
                 out,
                 "jitter on {} matrices, at most {:e} of the signal variance",
                 jitter.matrices, jitter.largest
             )?;
         }
-        let (steps, likelihood) = (model.iterations(), model.log_marginal_likelihood());
+        let (steps, likelihood) = (model.outcome.iterations, model.log_marginal_likelihood());
         let peak = mebibytes(peak_kib());
         writeln!(
             out,
@@ -233,11 +226,11 @@ impl TrainReport<'_> {
         let (trained, model) = (self.trained, &self.trained.model);
         print_json(&json!({
             "version": VERSION, "output": trained.output, "inputs": trained.inputs, "rows": model.rows(),
-            "skipped": self.table.skipped, "kernel": model.kernel().to_string(), "form": form(model.form()),
-            "basis": format!("{:?}", model.basis()).to_lowercase(),
+            "skipped": self.table.skipped, "kernel": model.spec.kernel.to_string(), "form": form(model.spec.form),
+            "basis": format!("{:?}", model.spec.basis).to_lowercase(),
             "hyperparameters": hyperparameters(&model.hyperparameters()),
-            "log_marginal_likelihood": model.log_marginal_likelihood(), "steps": model.iterations(),
-            "interval_factor": model.interval_factor(), "jitter": jitter_json(model.jitter()),
+            "log_marginal_likelihood": model.log_marginal_likelihood(), "steps": model.outcome.iterations,
+            "interval_factor": model.interval_factor(), "jitter": model.outcome.jitter,
             "seconds": self.seconds, "peak_memory_kib": peak_kib(),
         }))
     }

@@ -8,10 +8,11 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::available_parallelism;
 use std::time::Instant;
 
-use indicatif::{ProgressBar, ProgressDrawTarget};
+use indicatif::ProgressBar;
 
 use super::{Args, Failure, report};
 
+use crate::cli::output::{check_distinct, create_folder};
 use crate::config::Config;
 use crate::io::log::LogSource;
 use crate::io::result_file::{ResultFile, check_place};
@@ -22,8 +23,7 @@ use crate::replay::{self, ReplayError, ReplayProgress, ReplaySummary, Sinks, in_
 pub(super) fn run(args: &Args, config: &Config) -> Result<(), Failure> {
     check(args)?;
     for folder in folders(args).into_iter().flatten() {
-        std::fs::create_dir_all(folder)
-            .map_err(|error| Failure::new(format!("{}: cannot be made: {error}", folder.display())))?;
+        create_folder(folder)?;
     }
     for log in &args.logs {
         results(args, log)
@@ -62,11 +62,9 @@ fn check(args: &Args) -> Result<(), Failure> {
     if folders(args).into_iter().flatten().any(|folder| folder == Path::new("-")) {
         return Err(Failure::new("-: with --each the place of a result must be a folder, which gets a file per log"));
     }
+    check_distinct(&args.logs)?;
     let mut names: BTreeMap<String, &PathBuf> = BTreeMap::new();
     for log in &args.logs {
-        if args.logs.iter().filter(|other| *other == log).count() > 1 {
-            return Err(Failure::new(format!("{}: named twice", log.display())));
-        }
         let has_results = folders(args).into_iter().flatten().next().is_some();
         if let Some(other) = names.insert(name(log), log).filter(|_| has_results) {
             let (log, other) = (log.display(), other.display());
@@ -147,7 +145,7 @@ struct EachBar {
 
 impl EachBar {
     fn new(logs: &[PathBuf]) -> Self {
-        let bar = report::bar(logs, ProgressDrawTarget::stderr_with_hz(5));
+        let bar = report::bar(logs);
         Self {
             bar,
             logs: logs.len(),

@@ -4,8 +4,9 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::ProgressBar;
 
+use crate::cli::output::progress_bar;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::replay::{ProtectedSummary, ReplayProgress, ReplaySummary};
@@ -22,7 +23,7 @@ pub(crate) struct Bar(ProgressBar);
 impl Bar {
     /// A bar for logs whose sizes make up the whole; one without a size (standard input) gives a bar without an end.
     pub(crate) fn new(logs: &[PathBuf]) -> Self {
-        Self(bar(logs, ProgressDrawTarget::stderr_with_hz(5)))
+        Self(bar(logs))
     }
 
     /// Shows the current state.
@@ -48,15 +49,14 @@ impl Bar {
 }
 
 /// A bar over the sizes of logs; without an end where one has no size.
-pub(super) fn bar(logs: &[PathBuf], target: ProgressDrawTarget) -> ProgressBar {
+pub(super) fn bar(logs: &[PathBuf]) -> ProgressBar {
     let size = |path: &PathBuf| std::fs::metadata(path).ok().filter(std::fs::Metadata::is_file).map(|m| m.len());
     let total: Option<u64> = logs.iter().map(size).sum();
     let template = match total {
         Some(_) => "{bar:32} {percent:>3} % {bytes}/{total_bytes} {bytes_per_sec} {msg} eta {eta}",
         None => "{spinner} {bytes} {bytes_per_sec} {msg}",
     };
-    let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::with_draw_target(total, target).with_style(style)
+    progress_bar(total, template)
 }
 
 /// The summary as one line of JSON that begins with the log's name.
@@ -68,13 +68,6 @@ pub(super) fn json_line(out: &mut impl Write, log: &Path, summary: &ReplaySummar
         summary: &'a ReplaySummary,
     }
     serde_json::to_writer(&mut *out, &Named { name: log.display().to_string(), summary })?;
-    writeln!(out)
-}
-
-/// The summary as one JSON document on standard output.
-pub(super) fn json(summary: &ReplaySummary) -> io::Result<()> {
-    let mut out = io::stdout().lock();
-    serde_json::to_writer_pretty(&mut out, summary)?;
     writeln!(out)
 }
 

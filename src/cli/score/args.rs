@@ -3,39 +3,19 @@
 use std::path::PathBuf;
 
 use crate::cli::Failure;
-use crate::cli::numbers::{above_0, finite, fraction, within};
+use crate::cli::numbers::{NamedValue, above_0, above_0_to, finite, fraction, one_of, within};
 use crate::cli::output::check_distinct;
-use crate::lab::score;
+use crate::lab::score::Start;
 
 /// Where in a file the estimator starts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(crate) enum Start {
-    /// At the file's first row
-    Full,
-    /// Where --remove has been taken out; the rows before are dropped
-    Middle,
-}
-
-impl From<Start> for score::Start {
-    fn from(start: Start) -> Self {
-        match start {
-            Start::Full => Self::Full,
-            Start::Middle => Self::Middle,
-        }
-    }
-}
+const STARTS: [NamedValue<Start>; 2] = [
+    ("full", Start::Full, "At the file's first row"),
+    ("middle", Start::Middle, "Where --remove has been taken out; the rows before are dropped"),
+];
 
 /// Error of the initial SOC, points; `None` = no initial SOC is given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct InitialSocError(pub(crate) Option<f64>);
-
-/// The load of the table's capacities.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Load {
-    pub(crate) current_a: f64,
-    pub(crate) temperature_c: f64,
-    pub(crate) cutoff_v: f64,
-}
 
 /// Arguments of `score`.
 #[derive(Debug, clap::Args)]
@@ -69,7 +49,7 @@ pub(crate) struct Args {
 #[command(next_help_heading = "Starts")]
 pub(crate) struct StartArgs {
     /// Where in each file the estimator starts
-    #[arg(long, value_enum, value_delimiter = ',', default_value = "full")]
+    #[arg(long, value_parser = one_of(&STARTS), value_delimiter = ',', default_value = "full")]
     pub(crate) start: Vec<Start>,
     /// Part of the full charge already taken out where a start in the middle begins
     #[arg(long, value_name = "FRACTION", default_value_t = 0.3, value_parser = fraction)]
@@ -80,14 +60,14 @@ pub(crate) struct StartArgs {
           allow_hyphen_values = true)]
     pub(crate) soc_error: Vec<InitialSocError>,
     /// Standard deviation of the initial SOC, points; when not given, as large as the error and 5 at least
-    #[arg(long, value_name = "POINTS", value_parser = percent_above_0)]
+    #[arg(long, value_name = "POINTS", value_parser = above_0_to(100.0, ""))]
     pub(crate) soc_std: Option<f64>,
     /// Error of the capacity the estimator starts with, percent of the model's
     #[arg(long, value_name = "PERCENT", value_delimiter = ',', default_value = "0", value_parser = capacity_error,
           allow_hyphen_values = true)]
     pub(crate) capacity_error: Vec<f64>,
     /// Standard deviation that goes with it, percent of the model's; the configuration's when not given
-    #[arg(long, value_name = "PERCENT", value_parser = percent_above_0)]
+    #[arg(long, value_name = "PERCENT", value_parser = above_0_to(100.0, ""))]
     pub(crate) capacity_std: Option<f64>,
     /// Offset of the current sensor, A: added to every measured current before the estimator sees it
     #[arg(long, value_name = "AMPERE", value_delimiter = ',', default_value = "0", value_parser = finite,
@@ -119,7 +99,7 @@ pub(crate) struct LifeArgs {
     pub(crate) cycles: Vec<PathBuf>,
     /// Load at which the table's capacities were measured, A, degrees C, V: 2,24,2.7; the configuration's [usable] when not given
     #[arg(long, value_name = "CURRENT,TEMPERATURE,CUTOFF", value_parser = load)]
-    pub(crate) load: Option<Load>,
+    pub(crate) load: Option<[f64; 3]>,
     /// Report the first discharge below this capacity, Ah
     #[arg(long, value_name = "AH", default_value_t = 1.4, value_parser = above_0)]
     pub(crate) threshold: f64,
@@ -159,10 +139,6 @@ impl Args {
     }
 }
 
-fn percent_above_0(text: &str) -> Result<f64, String> {
-    within(text, |value| value > 0.0 && value <= 100.0, "above 0 and at most 100")
-}
-
 fn initial_soc_error(text: &str) -> Result<InitialSocError, String> {
     if text == "none" {
         return Ok(InitialSocError(None));
@@ -192,15 +168,11 @@ fn window(text: &str) -> Result<(f64, f64), String> {
     if least > 0.0 && least <= most && most <= 1.0 { Ok((least, most)) } else { Err(EXPECTED.to_owned()) }
 }
 
-fn load(text: &str) -> Result<Load, String> {
-    const EXPECTED: &str = "must be amperes above 0, degrees C and volts above 0, like 2,24,2.7";
-    let values: Result<Vec<f64>, String> = text.split(',').map(finite).collect();
-    match values.as_deref() {
-        Ok(&[current_a, temperature_c, cutoff_v]) if current_a > 0.0 && cutoff_v > 0.0 => {
-            Ok(Load { current_a, temperature_c, cutoff_v })
-        }
-        _ => Err(EXPECTED.to_owned()),
-    }
+fn load(text: &str) -> Result<[f64; 3], String> {
+    let values: Option<Vec<f64>> = text.split(',').map(|part| finite(part).ok()).collect();
+    let load: Option<[f64; 3]> = values.and_then(|values| values.try_into().ok());
+    let load = load.filter(|[current_a, _, cutoff_v]| *current_a > 0.0 && *cutoff_v > 0.0);
+    load.ok_or_else(|| "must be amperes above 0, degrees C and volts above 0, like 2,24,2.7".to_owned())
 }
 
 #[cfg(test)]
@@ -218,7 +190,7 @@ mod tests {
     fn lists_and_ranges_are_checked() {
         assert_eq!(window("0.4,0.7"), Ok((0.4, 0.7)));
         assert!(["0.7,0.4", "0,0.5", "0.5", "0.5,1.1"].iter().all(|text| window(text).is_err()));
-        assert_eq!(load("2,-10,2.7"), Ok(Load { current_a: 2.0, temperature_c: -10.0, cutoff_v: 2.7 }));
+        assert_eq!(load("2,-10,2.7"), Ok([2.0, -10.0, 2.7]));
         assert!(["2,24", "0,24,2.7", "2,24,2.7,1", "a,b,c"].iter().all(|text| load(text).is_err()));
         assert_eq!(initial_soc_error("none"), Ok(InitialSocError(None)));
         assert_eq!(initial_soc_error("-20"), Ok(InitialSocError(Some(-20.0))));

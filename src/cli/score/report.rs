@@ -8,7 +8,7 @@ use serde::Serialize;
 use crate::cli::output::{print_json, progress_bar, write_table};
 use crate::config::Config;
 use crate::lab::score::{
-    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore, Start,
+    CONVERGED_HOLD_S, CONVERGED_POINTS, Case, CaseScore, LifeScore, ScoreJob, ScoreSettings, SocScore,
 };
 
 /// Progress on standard error, when that is a terminal; by the files' sizes.
@@ -245,15 +245,7 @@ fn worst<'a, T>(all: &[(&'a str, &T)], value: impl Fn(&T) -> f64) -> Option<(&'a
 }
 
 fn describe(case: &Case) -> String {
-    let mut words = vec![match case.start {
-        Start::Full => "full".to_owned(),
-        Start::Middle => "middle".to_owned(),
-    }];
-    words.extend(case.soc_error_points.map(|points| format!("told {points:+}")));
-    words.extend((case.capacity_error_percent != 0.0).then(|| format!("C {:+} %", case.capacity_error_percent)));
-    words.extend((case.current_offset_a != 0.0).then(|| format!("I {:+} A", case.current_offset_a)));
-    words.extend(case.seed.map(|seed| format!("windows {seed}")));
-    words.join(" ")
+    case.words(" ", ["C", "I"])
 }
 
 fn soc_row(score: &CaseScore, soc: &SocScore) -> Vec<String> {

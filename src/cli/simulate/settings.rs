@@ -1,31 +1,16 @@
 //! Changes of a scenario's settings by the command line.
 
 use crate::cli::Failure;
+use crate::cli::numbers::{NamedValue, between, finite, share, within};
 use crate::sim::{Hysteresis, PackSettings, Scenario, Sensors, Settings};
 
 /// Scenarios by name.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub(super) enum Name {
-    /// 2.6 Ah, 0.05 Ah lost per cycle between SOC 30 and 90 %, until 0.25 Ah
-    Paper,
-    /// The 30 Ah example: random discharge pulses, 1 Ah lost per cycle
-    Reference,
-    /// Random 5-minute loads with reference cycles in between
-    RandomWalk,
-    /// A day of an electric car: drive, park asleep, fast charge
-    EvDay,
-}
-
-impl From<Name> for Scenario {
-    fn from(name: Name) -> Self {
-        match name {
-            Name::Paper => Self::Paper,
-            Name::Reference => Self::Reference,
-            Name::RandomWalk => Self::RandomWalk,
-            Name::EvDay => Self::EvDay,
-        }
-    }
-}
+pub(super) const SCENARIOS: [NamedValue<Scenario>; 4] = [
+    ("paper", Scenario::Paper, "2.6 Ah, 0.05 Ah lost per cycle between SOC 30 and 90 %, until 0.25 Ah"),
+    ("reference", Scenario::Reference, "The 30 Ah example: random discharge pulses, 1 Ah lost per cycle"),
+    ("random-walk", Scenario::RandomWalk, "Random 5-minute loads with reference cycles in between"),
+    ("ev-day", Scenario::EvDay, "A day of an electric car: drive, park asleep, fast charge"),
+];
 
 /// All changes; without one the scenario's setting applies. Amounts of a scenario (currents, losses) are stated for its
 /// source's cell and scale with the capacity.
@@ -65,10 +50,10 @@ pub(super) struct PackChanges {
     #[arg(long, value_name = "AH", value_parser = positive)]
     pub(super) capacity_ah: Option<f64>,
     /// SOC at the start, fraction (paper: 0.9; reference: 1; random-walk: 0.9; ev-day: 0.85)
-    #[arg(long, value_name = "SOC", value_parser = fraction)]
+    #[arg(long, value_name = "SOC", value_parser = share)]
     initial_soc: Option<f64>,
     /// Temperature of the surroundings, degrees C [default: as configured]
-    #[arg(long, value_name = "C", allow_negative_numbers = true, value_parser = temperature)]
+    #[arg(long, value_name = "C", allow_negative_numbers = true, value_parser = between(-60.0, 100.0, ""))]
     ambient: Option<f64>,
     /// Capacity lost per cycle, Ah
     #[arg(long, value_name = "AH", value_parser = non_negative)]
@@ -77,13 +62,13 @@ pub(super) struct PackChanges {
     #[arg(long, value_name = "X", value_parser = non_negative)]
     resistance_per_cycle: Option<f64>,
     /// Spread of capacity over the cells, relative standard deviation (ev-day: 0.01, others 0)
-    #[arg(long, value_name = "X", value_parser = spread)]
+    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_capacity: Option<f64>,
     /// Spread of resistance over the cells, relative standard deviation (ev-day: 0.03, others 0)
-    #[arg(long, value_name = "X", value_parser = spread)]
+    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_resistance: Option<f64>,
     /// Spread of the first SOC over the cells, standard deviation (ev-day: 0.005, others 0)
-    #[arg(long, value_name = "X", value_parser = spread)]
+    #[arg(long, value_name = "X", value_parser = between(0.0, 0.3, ""))]
     spread_soc: Option<f64>,
     /// Open-circuit hysteresis that the estimator does not model, V each way
     #[arg(long, value_name = "V", value_parser = non_negative)]
@@ -118,7 +103,7 @@ struct SensorChanges {
     #[arg(long, value_name = "V", value_parser = non_negative)]
     resolution_voltage: Option<f64>,
     /// Probability that a reading is missing
-    #[arg(long, value_name = "P", value_parser = fraction)]
+    #[arg(long, value_name = "P", value_parser = share)]
     dropout: Option<f64>,
 }
 
@@ -189,33 +174,10 @@ fn set(value: &mut f64, change: Option<f64>) {
 
 /// Parses a number above 0.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
-    checked(text, "above 0", |x| x > 0.0)
+    within(text, |x| x > 0.0, "above 0")
 }
 
 /// Parses a number of 0 or more.
 pub(super) fn non_negative(text: &str) -> Result<f64, String> {
-    checked(text, "0 or more", |x| x >= 0.0)
-}
-
-fn fraction(text: &str) -> Result<f64, String> {
-    checked(text, "0 to 1", |x| (0.0..=1.0).contains(&x))
-}
-
-fn spread(text: &str) -> Result<f64, String> {
-    checked(text, "0 to 0.3", |x| (0.0..=0.3).contains(&x))
-}
-
-fn temperature(text: &str) -> Result<f64, String> {
-    checked(text, "-60 to 100", |x| (-60.0..=100.0).contains(&x))
-}
-
-fn finite(text: &str) -> Result<f64, String> {
-    checked(text, "a finite number", |_| true)
-}
-
-fn checked(text: &str, allowed: &str, good: fn(f64) -> bool) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(x) if x.is_finite() && good(x) => Ok(x),
-        _ => Err(format!("must be {allowed}")),
-    }
+    within(text, |x| x >= 0.0, "0 or more")
 }

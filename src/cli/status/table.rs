@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use super::{config, duration, number, percent, shown, store, with_std, word};
 use crate::alarm::Alarm;
-use crate::cli::alarms::{cell as cell_name, state_name, with_unit};
+use crate::cli::alarms::{cell as cell_name, with_unit};
+use crate::cli::output;
 use crate::io::stamp;
 use crate::status::counters::LATENCY_BOUNDS_S;
 use crate::status::document::{CellStatus, PackStatus, StatusDocument};
@@ -81,17 +82,17 @@ fn remaining(pack: &PackStatus) -> String {
 
 fn interfaces(text: &mut String, document: &StatusDocument) {
     for it in &document.interfaces {
-        let lost = it.kernel_dropped + it.queue_dropped + it.malformed;
-        let unsent = it.send_queue_full + it.send_failed;
+        let lost = it.link.kernel_dropped + it.link.queue_dropped + it.link.malformed;
+        let unsent = it.link.send_queue_full + it.link.send_failed;
         let _ = writeln!(
             text,
             "interface  {} {}: {} frames in, {lost} lost, {} out, {unsent} not sent, {} errors, {} bus-off, back {} times",
             it.name,
             word(it.state),
-            it.frames,
-            it.sent,
-            it.error_frames,
-            it.bus_offs,
+            it.received.frames,
+            it.link.sent,
+            it.received.error_frames,
+            it.received.bus_offs,
             it.reconnects,
         );
     }
@@ -135,7 +136,7 @@ pub(super) fn alarm_line(alarm: &Alarm) -> String {
         "{} {} {owner} {}: {value}, threshold {}{probability}{}",
         alarm.severity.name(),
         alarm.rule.name(),
-        state_name(alarm.state),
+        word(alarm.state),
         with_unit(alarm.rule, alarm.threshold),
         if alarm.is_acknowledged { ", acknowledged" } else { "" },
     )
@@ -154,22 +155,12 @@ fn cells(text: &mut String, cells: &[CellStatus], all: bool) {
         }
         text.push_str("outliers (--cells lists all):\n");
     }
-    let rows: Vec<[String; 7]> = listed.into_iter().map(row).collect();
-    let width = |column: usize| {
-        let widest = rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        widest.max(HEAD[column].chars().count())
-    };
-    let widths: [usize; 7] = std::array::from_fn(width);
-    for row in std::iter::once(&HEAD.map(str::to_owned)).chain(&rows) {
-        let padded: Vec<String> = row.iter().zip(widths).map(|(field, width)| format!("{field:>width$}")).collect();
-        text.push_str(&padded.join("  "));
-        text.push('\n');
-    }
+    text.push_str(&output::table(&HEAD, listed.into_iter().map(row), 0));
 }
 
-fn row(cell: &CellStatus) -> [String; 7] {
+fn row(cell: &CellStatus) -> Vec<String> {
     let soc = with_std(cell.soc.map(|soc| 100.0 * soc), cell.soc_std.map(|std| 100.0 * std), 1, " %");
-    [
+    vec![
         number(cell.cell).to_string(),
         shown(cell.voltage_v, 3, " V"),
         shown(cell.temperature_c, 1, " °C"),

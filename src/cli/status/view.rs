@@ -16,11 +16,11 @@ use std::time::Duration;
 
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event, KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::interval;
 
-use app::{App, Key};
+use app::App;
 
 use crate::status::stream_path;
 
@@ -56,16 +56,20 @@ pub(super) fn run(socket: &Path) -> Result<(), String> {
 }
 
 async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
-    let mut signals = Signals::new()?;
+    let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()];
+    let [terminate, interrupt, hangup] = kinds.map(signal);
+    let (mut terminate, mut interrupt, mut hangup) = (terminate?, interrupt?, hangup?);
     let mut keys = read_keys()?;
     let mut updates = feed::start(app.path().to_owned());
     let mut ticks = interval(DRAW_PERIOD);
     loop {
         tokio::select! {
-            () = signals.wait() => return Ok(()),
+            _ = terminate.recv() => return Ok(()),
+            _ = interrupt.recv() => return Ok(()),
+            _ = hangup.recv() => return Ok(()),
             key = keys.recv() => match key {
                 Some(Event::Key(key)) => match meaning(key) {
-                    Some(Key::Quit) => return Ok(()),
+                    Some(KeyCode::Esc) => return Ok(()),
                     Some(key) => app.handle_key(key),
                     None => continue,
                 },
@@ -82,28 +86,6 @@ async fn watch(mut terminal: DefaultTerminal, mut app: App) -> io::Result<()> {
     }
 }
 
-/// Signals that end the view.
-struct Signals {
-    all: [Signal; 3],
-}
-
-impl Signals {
-    fn new() -> io::Result<Self> {
-        let kinds = [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()];
-        let [terminate, interrupt, hangup] = kinds.map(signal);
-        Ok(Self { all: [terminate?, interrupt?, hangup?] })
-    }
-
-    async fn wait(&mut self) {
-        let [terminate, interrupt, hangup] = &mut self.all;
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-            _ = hangup.recv() => {}
-        }
-    }
-}
-
 /// Starts a thread that reads keys and changes of size.
 fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     let (sender, keys) = mpsc::channel(KEYS);
@@ -117,27 +99,16 @@ fn read_keys() -> io::Result<mpsc::Receiver<Event>> {
     Ok(keys)
 }
 
-fn meaning(key: KeyEvent) -> Option<Key> {
-    if key.kind == KeyEventKind::Release {
-        return None;
-    }
-    if key.modifiers.contains(KeyModifiers::CONTROL) {
-        return (key.code == KeyCode::Char('c')).then_some(Key::Quit);
-    }
+/// The key that the view acts on: Esc for every key that leaves it, `None` for one without a meaning.
+fn meaning(key: KeyEvent) -> Option<KeyCode> {
+    let has_control = key.modifiers.contains(KeyModifiers::CONTROL);
     match key.code {
-        KeyCode::Char('q') | KeyCode::Esc => Some(Key::Quit),
-        KeyCode::Tab => Some(Key::NextPage),
-        KeyCode::BackTab => Some(Key::PreviousPage),
-        KeyCode::Up => Some(Key::Up),
-        KeyCode::Down => Some(Key::Down),
-        KeyCode::Left => Some(Key::Left),
-        KeyCode::Right => Some(Key::Right),
-        KeyCode::PageUp => Some(Key::PageUp),
-        KeyCode::PageDown => Some(Key::PageDown),
-        KeyCode::Home => Some(Key::First),
-        KeyCode::End => Some(Key::Last),
-        KeyCode::Char('v') => Some(Key::Quantity),
-        _ => None,
+        _ if key.kind == KeyEventKind::Release => None,
+        KeyCode::Char('c') if has_control => Some(KeyCode::Esc),
+        _ if has_control => None,
+        KeyCode::Char('q') => Some(KeyCode::Esc),
+        KeyCode::Char(letter) if letter != 'v' => None,
+        code => Some(code),
     }
 }
 

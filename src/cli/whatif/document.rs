@@ -9,7 +9,6 @@ use super::report::WhatifReport;
 use crate::cli::output::print_json;
 use crate::io::result_file::ResultFile;
 use crate::io::stamp;
-use crate::lab::fleet::judge::Horizon;
 use crate::lab::fleet::variants::Variant;
 use crate::lab::fleet::whatif::{LogResult, ThresholdScore};
 use crate::quantity::Timestamp;
@@ -54,11 +53,6 @@ fn text(value: Option<impl ToString>) -> String {
 impl WhatifReport<'_> {
     /// Prints one JSON document.
     pub(super) fn json(&self) -> io::Result<()> {
-        let horizon = match self.settings.horizon {
-            None => json!(null),
-            Some(Horizon::Cycles(cycles)) => json!({ "cycles": cycles }),
-            Some(Horizon::Days(days)) => json!({ "days": days }),
-        };
         let setting = |variant: &Variant| {
             let set = self.grid.keys.iter().cloned().zip(variant.values.iter().map(|value| json!(value)));
             json!({ "set": serde_json::Map::from_iter(set), "replay": variant.replay })
@@ -75,7 +69,7 @@ impl WhatifReport<'_> {
             "version": VERSION,
             "end_of_life_ah": self.settings.end_of_life_ah,
             "rated_capacity_ah": self.rated_ah,
-            "horizon": horizon,
+            "horizon": self.settings.horizon,
             "replays_per_log": self.grid.replays,
             "settings": self.grid.variants.iter().map(setting).collect::<Vec<_>>(),
             "summary": self.summaries(),

@@ -194,24 +194,6 @@ impl AlarmEngine {
         self.each_threshold(rule, cell, changes, |machine, config| machine.observe(now, config, observation));
     }
 
-    /// Whether the inputs a learned value of `rule` came from are valid now: while they are not, the value cannot be
-    /// renewed, and nothing is raised or cleared by it. For rules whose value is measured all the time it does nothing.
-    pub fn set_inputs_valid(
-        &mut self,
-        now: Timestamp,
-        rule: Rule,
-        cell: Option<CellIndex>,
-        valid: bool,
-        changes: &mut Vec<AlarmChange>,
-    ) {
-        if rule.spec().is_learned {
-            self.each_threshold(rule, cell, changes, |machine, config| match valid {
-                true => machine.resume(now, config),
-                false => machine.suspend(now, config),
-            });
-        }
-    }
-
     /// Whether values of `rule`, whatever cell they are of, change nothing as long as none is worse than `worst`: every
     /// alarm is at rest, and that is not beyond a threshold. Also when nothing watches the rule.
     pub fn is_quiet(&self, rule: Rule, worst: f64) -> bool {
@@ -236,16 +218,11 @@ impl AlarmEngine {
         let mut next = 0;
         while let Some(&slot) = self.counting.get(next) {
             let index = self.rule_of(slot);
-            let config = &self.rules[index].config;
-            let before = self.machines[slot].index_entry();
-            let change = if config.rule.spec().is_learned { self.machines[slot].poll(now, config) } else { None };
-            if let Some(change) = change {
-                // The slot leaves `counting`, so the next one moves into its place.
-                self.update_index(index, slot, before);
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            } else {
-                next += 1;
-            }
+            let is_learned = self.rules[index].config.rule.spec().is_learned;
+            // A change takes the slot out of the list.
+            let has_changed =
+                is_learned && self.change(index, slot, changes, |machine, config| machine.poll(now, config));
+            next += usize::from(!has_changed);
         }
     }
 
@@ -254,22 +231,11 @@ impl AlarmEngine {
     pub fn handle_gap(&mut self) {
         let measured: Vec<usize> = self.counting.iter().copied().filter(|&slot| !self.is_learned(slot)).collect();
         for slot in measured {
-            let before = self.machines[slot].index_entry();
-            self.machines[slot].handle_gap();
-            self.update_index(self.rule_of(slot), slot, before);
+            self.change(self.rule_of(slot), slot, &mut Vec::new(), |machine, _| {
+                machine.handle_gap();
+                None
+            });
         }
-    }
-
-    /// Acknowledges alarms.
-    pub fn acknowledge(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
-        self.command(which, changes, Machine::acknowledge)
-    }
-
-    /// Clears alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten;
-    /// those that are active, or whose value has not been healthy since, stay and count as refused. No learned value is
-    /// touched.
-    pub fn clear(&mut self, which: &Selector, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
-        self.command(which, changes, Machine::clear)
     }
 
     /// Forgets alarms on learned values, and their past: another pack is connected.
@@ -410,24 +376,14 @@ impl AlarmEngine {
         }
         for index in 0..self.rules.len() {
             if !old.rules.iter().any(|before| before.config == self.rules[index].config) {
-                self.retarget(now, index, changes);
+                for slot in self.rules[index].slots() {
+                    self.change(index, slot, changes, |machine, config| machine.retarget(now, config));
+                }
             }
         }
         ended
     }
 
-    fn retarget(&mut self, now: Timestamp, index: usize, changes: &mut Vec<AlarmChange>) {
-        for slot in self.rules[index].slots() {
-            let before = self.machines[slot].index_entry();
-            let change = self.machines[slot].retarget(now, &self.rules[index].config);
-            self.update_index(index, slot, before);
-            if let Some(change) = change {
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            }
-        }
-    }
-
-    /// Index of the threshold and slot of an alarm, if it is watched.
     fn locate(&self, rule: Rule, severity: Severity, cell: Option<CellIndex>) -> Option<(usize, usize)> {
         let same = |slots: &RuleSlots| (slots.config.rule, slots.config.severity) == (rule, severity);
         let index = self.rules.iter().position(same)?;
@@ -439,7 +395,7 @@ impl AlarmEngine {
         u16::try_from(most).unwrap_or(u16::MAX)
     }
 
-    fn each_threshold(
+    pub(super) fn each_threshold(
         &mut self,
         rule: Rule,
         cell: Option<CellIndex>,
@@ -448,16 +404,29 @@ impl AlarmEngine {
     ) {
         for index in self.by_rule[usize::from(rule as u8)].clone() {
             let Some(slot) = self.rules[index].slot(cell) else { continue };
-            let before = self.machines[slot].index_entry();
-            let change = act(&mut self.machines[slot], &self.rules[index].config);
-            self.update_index(index, slot, before);
-            if let Some(change) = change {
-                changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-            }
+            self.change(index, slot, changes, &mut act);
         }
     }
 
-    fn command(
+    /// Changes one machine and all that is known of it here; returns whether the change is published.
+    #[inline]
+    fn change(
+        &mut self,
+        index: usize,
+        slot: usize,
+        changes: &mut Vec<AlarmChange>,
+        act: impl FnOnce(&mut Machine, &RuleConfig) -> Option<Change>,
+    ) -> bool {
+        let before = self.machines[slot].index_entry();
+        let change = act(&mut self.machines[slot], &self.rules[index].config);
+        self.update_index(index, slot, before);
+        if let Some(change) = change {
+            changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
+        }
+        change.is_some()
+    }
+
+    pub(super) fn command(
         &mut self,
         which: &Selector,
         changes: &mut Vec<AlarmChange>,
@@ -470,17 +439,12 @@ impl AlarmEngine {
                 if !which.matches(rule, severity, self.rules[index].cell(slot)) {
                     continue;
                 }
-                let before = self.machines[slot].index_entry();
-                let result = act(&mut self.machines[slot]);
-                self.update_index(index, slot, before);
-                match result {
-                    Ok(change) => {
-                        outcome.changed += 1;
-                        changes.push(AlarmChange { change, alarm: self.alarm(index, slot) });
-                    }
-                    Err(Refusal::NotHealthy) => outcome.refused += 1,
-                    Err(Refusal::Nothing) => {}
-                }
+                let has_changed = self.change(index, slot, changes, |machine, _| {
+                    let result = act(machine);
+                    outcome.refused += u32::from(result == Err(Refusal::NotHealthy));
+                    result.ok()
+                });
+                outcome.changed += u32::from(has_changed);
             }
         }
         outcome

@@ -5,6 +5,7 @@
 //! monitor with those thresholds would have done (except `input_missing`: its strictest threshold decides whether a
 //! silence is passed to the engine at all).
 
+use super::machine::Machine;
 use super::{AlarmChange, AlarmEngine, CommandOutcome, Observation, Rule, Selector};
 use crate::quantity::{CellIndex, Timestamp};
 
@@ -20,7 +21,8 @@ pub enum AlarmInput {
         /// The value.
         observation: Observation,
     },
-    /// [`AlarmEngine::set_inputs_valid`].
+    /// Whether the inputs a learned value came from are valid now: while they are not, the value cannot be renewed, and
+    /// nothing is raised or cleared by it. For rules whose value is measured all the time it does nothing.
     InputsValid {
         /// Of which rule.
         rule: Rule,
@@ -33,9 +35,10 @@ pub enum AlarmInput {
     Poll,
     /// [`AlarmEngine::handle_gap`].
     Gap,
-    /// [`AlarmEngine::acknowledge`].
+    /// Acknowledges alarms.
     Acknowledge(Selector),
-    /// [`AlarmEngine::clear`].
+    /// Clears alarms: latched ones end (unless they are beyond their threshold again), past ones are forgotten; those that
+    /// are active, or whose value has not been healthy since, stay and count as refused. No learned value is touched.
     Clear(Selector),
     /// [`AlarmEngine::forget_learned`].
     ForgetLearned,
@@ -46,11 +49,17 @@ impl AlarmEngine {
     pub fn apply(&mut self, now: Timestamp, input: &AlarmInput, changes: &mut Vec<AlarmChange>) -> CommandOutcome {
         match *input {
             AlarmInput::Observe { rule, cell, observation } => self.observe(now, rule, cell, &observation, changes),
-            AlarmInput::InputsValid { rule, cell, valid } => self.set_inputs_valid(now, rule, cell, valid, changes),
+            AlarmInput::InputsValid { rule, cell, valid: true } if rule.spec().is_learned => {
+                self.each_threshold(rule, cell, changes, |machine, config| machine.resume(now, config));
+            }
+            AlarmInput::InputsValid { rule, cell, valid: false } if rule.spec().is_learned => {
+                self.each_threshold(rule, cell, changes, |machine, config| machine.suspend(now, config));
+            }
+            AlarmInput::InputsValid { .. } => {}
             AlarmInput::Poll => self.poll(now, changes),
             AlarmInput::Gap => self.handle_gap(),
-            AlarmInput::Acknowledge(which) => return self.acknowledge(&which, changes),
-            AlarmInput::Clear(which) => return self.clear(&which, changes),
+            AlarmInput::Acknowledge(which) => return self.command(&which, changes, Machine::acknowledge),
+            AlarmInput::Clear(which) => return self.command(&which, changes, Machine::clear),
             AlarmInput::ForgetLearned => self.forget_learned(changes),
         }
         CommandOutcome::default()

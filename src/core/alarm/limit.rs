@@ -80,6 +80,12 @@ impl Observation {
     pub fn with_std(self, std: f64) -> Self {
         Self { std: Some(std), ..self }
     }
+
+    /// The same of a part of the sources only, if `is_bound`: the others may be worse.
+    #[must_use]
+    pub fn of_part(self, is_bound: bool) -> Self {
+        Self { is_bound, ..self }
+    }
 }
 
 /// A value compared with the limits of a rule.

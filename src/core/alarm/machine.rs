@@ -67,14 +67,6 @@ impl AlarmState {
     }
 }
 
-/// Input of an alarm machine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum MachineInput {
-    Check(LimitCheck),
-    Acknowledge,
-    Clear,
-}
-
 /// A change of an alarm that is published.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -103,59 +95,6 @@ pub enum Refusal {
     NotHealthy,
     /// There was nothing to do.
     Nothing,
-}
-
-/// Action in a state on an input.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Action {
-    /// Nothing changes.
-    Stay,
-    /// Count towards the other side.
-    Count,
-    /// Keep what was counted, count nothing.
-    Hold,
-    /// Forget what was counted, go there.
-    Go(AlarmState),
-    /// Forget what was counted, go to rest.
-    Rest,
-    /// Raised without a value; what was counted towards the end is kept.
-    Suppress,
-    /// Mark the raised alarm as acknowledged.
-    Mark,
-    /// Mark the past alarm as acknowledged.
-    Settle,
-    /// That the alarm was raised is forgotten.
-    Forget,
-    /// Not possible.
-    Refuse,
-}
-
-const fn action(state: AlarmState, input: MachineInput) -> Action {
-    use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
-    match input {
-        MachineInput::Check(check) => match (state, check) {
-            (Unknown | Inactive | Pending | Latched | Cleared, LimitCheck::Beyond) => Action::Count,
-            (Active, LimitCheck::Beyond | LimitCheck::Between) => Action::Stay,
-            (Clearing | Suppressed, LimitCheck::Beyond | LimitCheck::Between) => Action::Go(Active),
-            (Unknown | Pending, LimitCheck::Between | LimitCheck::Healthy) => Action::Rest,
-            (Inactive | Cleared, LimitCheck::Between | LimitCheck::Healthy) => Action::Stay,
-            (Latched, LimitCheck::Between | LimitCheck::Healthy) => Action::Go(Latched),
-            (Active | Clearing | Suppressed, LimitCheck::Healthy) => Action::Count,
-            (Unknown, LimitCheck::Unknown) => Action::Stay,
-            (Inactive | Cleared, LimitCheck::Unknown) => Action::Go(Unknown),
-            (Pending | Suppressed | Latched, LimitCheck::Unknown) => Action::Hold,
-            (Active | Clearing, LimitCheck::Unknown) => Action::Suppress,
-        },
-        MachineInput::Acknowledge => match state {
-            Unknown | Inactive | Pending | Cleared => Action::Settle,
-            Active | Clearing | Suppressed | Latched => Action::Mark,
-        },
-        MachineInput::Clear => match state {
-            Unknown | Inactive | Pending | Cleared => Action::Forget,
-            Active | Clearing | Suppressed => Action::Refuse,
-            Latched => Action::Rest,
-        },
-    }
 }
 
 /// One alarm: its state, its past, and what its debounce has counted.
@@ -267,25 +206,23 @@ impl Machine {
 
     /// Acknowledges the alarm.
     pub(super) fn acknowledge(&mut self) -> Result<Change, Refusal> {
-        match action(self.state, MachineInput::Acknowledge) {
-            Action::Mark | Action::Settle if self.occurrences == 0 || self.is_acknowledged => Err(Refusal::Nothing),
-            _ => {
-                self.is_acknowledged = true;
-                if self.state == AlarmState::Cleared {
-                    self.enter(AlarmState::Inactive);
-                }
-                Ok(Change::Acknowledged)
-            }
+        if self.occurrences == 0 || self.is_acknowledged {
+            return Err(Refusal::Nothing);
         }
+        self.is_acknowledged = true;
+        if self.state == AlarmState::Cleared {
+            self.enter(AlarmState::Inactive);
+        }
+        Ok(Change::Acknowledged)
     }
 
     /// Clears it: a latched alarm ends, a past one is forgotten, one that is beyond or not known stays.
     pub(super) fn clear(&mut self) -> Result<Change, Refusal> {
-        match action(self.state, MachineInput::Clear) {
-            Action::Refuse => Err(Refusal::NotHealthy),
+        match self.state {
+            AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed => Err(Refusal::NotHealthy),
             // Beyond again, only not for long enough yet.
-            Action::Rest if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
-            Action::Rest => {
+            AlarmState::Latched if self.events > 0 || self.counted_to.is_some() => Err(Refusal::NotHealthy),
+            AlarmState::Latched => {
                 self.is_acknowledged = true;
                 self.enter(if self.is_known { AlarmState::Inactive } else { AlarmState::Unknown });
                 Ok(Change::Cleared)
@@ -340,22 +277,32 @@ impl Machine {
         self.handle_check(now, rule, check, is_new)
     }
 
+    /// The table of the machine: every state with every outcome of a comparison.
     fn handle_check(&mut self, now: Timestamp, rule: &RuleConfig, check: LimitCheck, is_new: bool) -> Option<Change> {
+        use AlarmState::{Active, Cleared, Clearing, Inactive, Latched, Pending, Suppressed, Unknown};
+        use LimitCheck::{Between, Beyond, Healthy};
         self.is_known = check != LimitCheck::Unknown;
-        match action(self.state, MachineInput::Check(check)) {
-            Action::Count => return self.count(now, rule, is_new),
-            Action::Hold => self.counted_to = None,
-            Action::Suppress => {
-                (self.state, self.counted_to) = (AlarmState::Suppressed, None);
+        match (self.state, check) {
+            (Unknown | Inactive | Pending | Latched | Cleared, Beyond) | (Active | Clearing | Suppressed, Healthy) => {
+                return self.count(now, rule, is_new);
+            }
+            (Active, Beyond | Between) | (Inactive | Cleared, Between | Healthy) => {}
+            (Clearing, Beyond | Between) => self.enter(Active),
+            (Suppressed, Beyond | Between) => {
+                self.enter(Active);
+                return Some(Change::Resumed);
+            }
+            (Unknown | Pending, Between | Healthy) => self.enter(self.rest()),
+            (Latched, Between | Healthy) => self.enter(Latched),
+            (Unknown, LimitCheck::Unknown) => {}
+            (Inactive | Cleared, LimitCheck::Unknown) => self.enter(Unknown),
+            // What was counted is kept, and nothing is counted.
+            (Pending | Suppressed | Latched, LimitCheck::Unknown) => self.counted_to = None,
+            // What was counted towards the end is kept.
+            (Active | Clearing, LimitCheck::Unknown) => {
+                (self.state, self.counted_to) = (Suppressed, None);
                 return Some(Change::Suppressed);
             }
-            Action::Go(state) => {
-                let was_suppressed = self.state == AlarmState::Suppressed;
-                self.enter(state);
-                return was_suppressed.then_some(Change::Resumed);
-            }
-            Action::Rest => self.enter(self.rest()),
-            Action::Stay | Action::Mark | Action::Settle | Action::Forget | Action::Refuse => {}
         }
         None
     }
@@ -372,34 +319,25 @@ impl Machine {
         self.counted_to = Some(now);
         let held_long_enough = self.held_nanos >= Timestamp::from_secs(rule.debounce_s).nanos();
         let is_over = held_long_enough && self.events >= rule.debounce_events;
-        match (self.state, is_over) {
-            (AlarmState::Unknown | AlarmState::Inactive | AlarmState::Pending | AlarmState::Cleared, false) => {
-                self.state = AlarmState::Pending;
-                None
-            }
-            (AlarmState::Latched, false) => None,
-            (AlarmState::Active | AlarmState::Clearing, false) => {
-                self.state = AlarmState::Clearing;
-                None
-            }
-            (AlarmState::Suppressed, false) => {
-                self.state = AlarmState::Clearing;
-                Some(Change::Resumed)
-            }
-            (
-                AlarmState::Unknown
-                | AlarmState::Inactive
-                | AlarmState::Pending
-                | AlarmState::Cleared
-                | AlarmState::Latched,
-                true,
-            ) => {
+        let is_healthy_side = !self.state.is_raised() || self.state == AlarmState::Latched;
+        match (is_healthy_side, is_over) {
+            (true, true) => {
                 self.raise(now);
                 Some(Change::Raised)
             }
-            (AlarmState::Active | AlarmState::Clearing | AlarmState::Suppressed, true) => {
+            (true, false) => {
+                if self.state != AlarmState::Latched {
+                    self.state = AlarmState::Pending;
+                }
+                None
+            }
+            (false, true) => {
                 self.enter(if rule.is_latching { AlarmState::Latched } else { self.rest() });
                 Some(if rule.is_latching { Change::Latched } else { Change::Cleared })
+            }
+            (false, false) => {
+                let before = std::mem::replace(&mut self.state, AlarmState::Clearing);
+                (before == AlarmState::Suppressed).then_some(Change::Resumed)
             }
         }
     }

@@ -92,21 +92,14 @@ pub struct Signal {
     pub unit: String,
     /// Receiving nodes.
     pub receivers: Vec<String>,
-    /// When the signal is in the payload.
-    pub multiplex: Multiplex,
+    /// The signal is in the payload when all conditions hold; outermost multiplexor first.
+    pub conditions: Vec<MuxCondition>,
     /// Whether the presence of other signals depends on this one.
     pub is_multiplexor: bool,
     /// `VAL_`: raw value (signed for signed signals) and its name.
     pub values: Vec<(i64, String)>,
     /// `CM_ SG_`.
     pub comment: Option<String>,
-}
-
-/// When a signal is in the payload: when all conditions hold; without conditions always.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Multiplex {
-    /// Outermost multiplexor first.
-    pub conditions: Vec<MuxCondition>,
 }
 
 /// Condition on one multiplexor.
@@ -374,8 +367,11 @@ fn read_signal<'a>(
         layout,
         unit: signal.unit.clone(),
         receivers: signal.receivers.clone(),
-        multiplex: Multiplex { conditions: conditions(details, message, signal, 0).map_err(fault)? },
-        is_multiplexor: is_multiplexor(signal),
+        conditions: conditions(details, message, signal, 0).map_err(fault)?,
+        is_multiplexor: matches!(
+            signal.multiplexer_indicator,
+            can_dbc::MultiplexIndicator::Multiplexor | can_dbc::MultiplexIndicator::MultiplexorAndMultiplexedSignal(_)
+        ),
         values: own.values.iter().map(|value| (value.id, value.description.clone())).collect(),
         comment: own.comment.map(str::to_owned),
     })
@@ -386,14 +382,6 @@ fn number(value: &can_dbc::NumericValue) -> f64 {
         can_dbc::NumericValue::Uint(value) => crate::can::signal::float_of(value),
         can_dbc::NumericValue::Int(value) => crate::can::signal::float_of_signed(value),
         can_dbc::NumericValue::Double(value) => value,
-    }
-}
-
-fn is_multiplexor(signal: &can_dbc::Signal) -> bool {
-    use can_dbc::MultiplexIndicator as Indicator;
-    match signal.multiplexer_indicator {
-        Indicator::Multiplexor | Indicator::MultiplexorAndMultiplexedSignal(_) => true,
-        Indicator::MultiplexedSignal(_) | Indicator::Plain => false,
     }
 }
 

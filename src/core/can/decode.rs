@@ -66,7 +66,7 @@ impl Binding {
     /// # Errors
     /// When the layout of the signal or of one of its multiplexors is invalid.
     pub fn new(bus: BusIndex, message: &Message, signal: &Signal, channel: Channel) -> Result<Self, LayoutFault> {
-        let selectors = signal.multiplex.conditions.iter().filter_map(|condition| {
+        let selectors = signal.conditions.iter().filter_map(|condition| {
             let selector = message.signals.get(condition.selector)?;
             Some(selector.layout.plan().map(|plan| MuxTest { plan, ranges: condition.ranges.clone() }))
         });
@@ -127,14 +127,14 @@ impl InputMap {
             let start = runs.last().map_or(0, |last| last.end);
             runs.push(start..start + run.len());
         }
-        let mut messages: Vec<(BusIndex, CanId, Range<usize>)> = Vec::new();
-        for (index, run) in runs.iter().enumerate() {
-            let Binding { bus, id, .. } = bindings[run.start];
-            match messages.last_mut() {
-                Some((last_bus, last_id, range)) if (*last_bus, *last_id) == (bus, id) => range.end = index + 1,
-                _ => messages.push((bus, id, index..index + 1)),
-            }
-        }
+        let message = |run: &Range<usize>| (bindings[run.start].bus, bindings[run.start].id);
+        let mut first = 0;
+        let messages = runs.chunk_by(|a, b| message(a) == message(b)).map(|runs| {
+            let ((bus, id), start) = (message(&runs[0]), first);
+            first += runs.len();
+            (bus, id, start..first)
+        });
+        let messages = messages.collect();
         Self { fast: FastDecoder::new(&bindings, &runs), bindings, runs, messages }
     }
 

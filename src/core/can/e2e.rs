@@ -111,25 +111,9 @@ impl Profile {
 }
 
 /// Why a payload cannot be protected.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum ProtectError {
-    /// Shorter than the header.
-    #[error("payload has {found} bytes, this end-to-end profile needs {needed} or more")]
-    Short {
-        /// Bytes of the payload.
-        found: usize,
-        /// Bytes of the header.
-        needed: usize,
-    },
-    /// A counter above the profile's largest.
-    #[error("end-to-end counter {found}, must be 0 to {max}")]
-    Counter {
-        /// The counter.
-        found: u8,
-        /// The largest.
-        max: u8,
-    },
-}
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ProtectError(String);
 
 /// Agreement between sender and receiver of one message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -148,10 +132,10 @@ impl Protection {
     pub fn protect(&self, payload: &mut [u8], counter: u8) -> Result<(), ProtectError> {
         let (found, needed, max) = (payload.len(), self.profile.header_bytes(), self.profile.max_counter());
         if found < needed {
-            return Err(ProtectError::Short { found, needed });
+            return Err(ProtectError(format!("payload of {found} bytes, this profile needs {needed} or more")));
         }
         if counter > max {
-            return Err(ProtectError::Counter { found: counter, max });
+            return Err(ProtectError(format!("end-to-end counter {counter}, must be 0 to {max}")));
         }
         match self.profile {
             Profile::P01A => payload[1] = payload[1] & 0xF0 | counter,
@@ -205,39 +189,27 @@ impl Protection {
     }
 }
 
-/// CRC of one byte value, with a register of `bits` bits.
-const fn byte_crc(byte: usize, bits: u32, polynomial: u16) -> u16 {
-    let (mut crc, mut bit) = ((byte as u16) << (bits - 8), 0);
-    while bit < 8 {
-        crc = if crc >> (bits - 1) & 1 == 1 { crc << 1 ^ polynomial } else { crc << 1 };
-        bit += 1;
+/// CRC of each byte value in a register of so many bits.
+const fn crc_table(bits: u32, polynomial: u16) -> [u16; 256] {
+    let (mut table, mut byte) = ([0; 256], 0);
+    while byte < 256 {
+        let (mut crc, mut bit) = ((byte as u16) << (bits - 8), 0);
+        while bit < 8 {
+            crc = if crc >> (bits - 1) & 1 == 1 { crc << 1 ^ polynomial } else { crc << 1 };
+            bit += 1;
+        }
+        table[byte] = crc;
+        byte += 1;
     }
-    crc
+    table
 }
 
-/// CRC-8 of each byte value, polynomial 0x1D.
-static CRC8: [u8; 256] = {
-    let (mut table, mut byte) = ([0; 256], 0);
-    while byte < 256 {
-        // The lowest byte is the register.
-        table[byte] = byte_crc(byte, 8, 0x1D) as u8;
-        byte += 1;
-    }
-    table
-};
-
-/// CRC-16 of each byte value, polynomial 0x1021.
-static CRC16: [u16; 256] = {
-    let (mut table, mut byte) = ([0; 256], 0);
-    while byte < 256 {
-        table[byte] = byte_crc(byte, 16, 0x1021);
-        byte += 1;
-    }
-    table
-};
+static CRC8: [u16; 256] = crc_table(8, 0x1D);
+static CRC16: [u16; 256] = crc_table(16, 0x1021);
 
 fn crc8(start: u8, bytes: &[u8]) -> u8 {
-    bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)])
+    // The lowest byte is the register.
+    bytes.iter().fold(start, |crc, byte| CRC8[usize::from(crc ^ byte)].to_le_bytes()[0])
 }
 
 fn crc16(start: u16, bytes: &[u8]) -> u16 {

@@ -35,7 +35,7 @@ impl Default for FloodConfig {
 }
 
 /// Dropping began or ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FloodChange {
     /// Interface.
     pub bus: BusIndex,
@@ -81,7 +81,8 @@ pub struct FloodGate {
     buckets: Vec<LeakyBucket>,
     /// Index of a message's bucket.
     numbers: IdTable,
-    changes: Vec<FloodChange>,
+    /// Changes that wait to be published, in their order.
+    pub(crate) changes: Vec<FloodChange>,
 }
 
 impl FloodGate {
@@ -141,16 +142,6 @@ impl FloodGate {
         self.buckets.iter_mut().for_each(|bucket| bucket.spent_until = None);
     }
 
-    /// Whether there are changes since the last [`Self::take_changes`].
-    pub fn has_changes(&self) -> bool {
-        !self.changes.is_empty()
-    }
-
-    /// The changes since the last call.
-    pub fn take_changes(&mut self) -> impl Iterator<Item = FloodChange> + '_ {
-        self.changes.drain(..)
-    }
-
     /// Messages with dropped frames, and their number.
     pub fn counts(&self) -> impl Iterator<Item = FloodCount> + '_ {
         let dropped = self.buckets.iter().filter(|bucket| bucket.dropped > 0);
@@ -200,7 +191,7 @@ mod tests {
     fn the_allowed_rate_always_passes() {
         let mut gate = gate(2000, 1);
         assert_eq!(taken(&mut gate, 0, 500_000, 100_000), 100_000);
-        assert_eq!((gate.counts().count(), gate.take_changes().count()), (0, 0));
+        assert_eq!((gate.counts().count(), gate.changes.drain(..).count()), (0, 0));
     }
 
     #[test]
@@ -241,11 +232,11 @@ mod tests {
         assert_eq!(taken(&mut gate, 900_000_000, 0, 12), 10, "the flood continues");
         gate.poll(Timestamp::from_secs(1.8));
         let begun = FloodChange { bus: BUS, id: ID, active: true, dropped: 1 };
-        assert_eq!(gate.take_changes().collect::<Vec<_>>(), [begun]);
+        assert_eq!(gate.changes.drain(..).collect::<Vec<_>>(), [begun]);
         gate.poll(Timestamp::from_secs(1.9));
-        assert_eq!(gate.take_changes().collect::<Vec<_>>(), [FloodChange { active: false, dropped: 7, ..begun }]);
+        assert_eq!(gate.changes.drain(..).collect::<Vec<_>>(), [FloodChange { active: false, dropped: 7, ..begun }]);
         gate.poll(Timestamp::from_secs(9.0));
-        assert_eq!(gate.take_changes().count(), 0);
+        assert_eq!(gate.changes.drain(..).count(), 0);
     }
 
     #[test]
@@ -253,7 +244,7 @@ mod tests {
         let mut gate = gate(100, 1);
         assert_eq!(taken(&mut gate, 1_000_000_000_000, 0, 15), 10);
         gate.restart();
-        assert_eq!(gate.take_changes().map(|change| change.active).collect::<Vec<_>>(), [true, false]);
+        assert_eq!(gate.changes.drain(..).map(|change| change.active).collect::<Vec<_>>(), [true, false]);
         assert_eq!(taken(&mut gate, 0, 0, 5), 5);
     }
 

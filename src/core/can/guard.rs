@@ -35,7 +35,7 @@ pub struct GuardConfig {
 }
 
 /// A message turned from usable to failing, or back.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GuardChange {
     /// Interface.
     pub bus: BusIndex,
@@ -61,9 +61,6 @@ pub struct GuardCounts {
     pub counts: StatusCounts,
 }
 
-/// State kept over a restart: counts, no counters.
-pub type GuardsState = Vec<GuardCounts>;
-
 #[derive(Debug, Clone)]
 struct Guard {
     config: GuardConfig,
@@ -81,7 +78,8 @@ struct Guard {
 pub struct Guards {
     /// Sorted by interface and identifier.
     guards: Vec<Guard>,
-    changes: Vec<GuardChange>,
+    /// Changes that wait to be published, in their order.
+    pub(crate) changes: Vec<GuardChange>,
 }
 
 impl Guards {
@@ -135,16 +133,6 @@ impl Guards {
         self.guards.iter_mut().for_each(|guard| guard.count_missed(now, &mut self.changes));
     }
 
-    /// Whether there are changes since the last [`Self::take_changes`].
-    pub fn has_changes(&self) -> bool {
-        !self.changes.is_empty()
-    }
-
-    /// The changes since the last call, in their order.
-    pub fn take_changes(&mut self) -> impl Iterator<Item = GuardChange> + '_ {
-        self.changes.drain(..)
-    }
-
     /// After time without listening, or a step of the clock: every receiver waits for a first frame again; counts stay.
     pub fn restart(&mut self) {
         for guard in &mut self.guards {
@@ -162,13 +150,8 @@ impl Guards {
         })
     }
 
-    /// The counts, to be stored.
-    pub fn snapshot(&self) -> GuardsState {
-        self.counts().collect()
-    }
-
     /// Restores stored counts and restarts the receivers. Counts of a message that is no longer protected are dropped.
-    pub fn restore(&mut self, state: &GuardsState) {
+    pub fn restore(&mut self, state: &[GuardCounts]) {
         self.restart();
         for guard in &mut self.guards {
             let key = (guard.config.bus, guard.config.id);

@@ -59,32 +59,9 @@ pub struct SignalLayout {
 }
 
 /// Why a layout is invalid.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum LayoutFault {
-    /// Too few or too many bits.
-    #[error("length is {0} bits, must be 1 to 64")]
-    Length(u16),
-    /// Reaches past the longest payload.
-    #[error("reaches to bit {0} of the payload, must end within 512 bits (64 bytes)")]
-    Outside(u32),
-    /// An IEEE float of another size.
-    #[error("IEEE float of {found} bits, must be {allowed}")]
-    FloatLength {
-        /// In the layout.
-        found: u16,
-        /// 32 or 64.
-        allowed: u16,
-    },
-    /// Zero or not finite.
-    #[error("factor is {0}, must be finite and not 0")]
-    Factor(f64),
-    /// Not finite.
-    #[error("offset is {0}, must be finite")]
-    Offset(f64),
-    /// The range excludes every value.
-    #[error("range is [{0}|{1}], the first must not be above the second")]
-    Range(f64, f64),
-}
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct LayoutFault(String);
 
 /// A layout compiled for reading and writing.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -164,32 +141,35 @@ impl SignalLayout {
         self.minimum != 0.0 || self.maximum != 0.0
     }
 
+    /// Whether one of its bits is in the mask, which is of the payload's first bytes.
+    pub fn touches(&self, mask: [u8; 3]) -> bool {
+        let mut payload = [0; MAX_DATA];
+        payload[..mask.len()].copy_from_slice(&mask);
+        self.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
+    }
+
     fn check(&self) -> Result<(), LayoutFault> {
-        if !(1..=64).contains(&self.length_bits) {
-            return Err(LayoutFault::Length(self.length_bits));
-        }
-        let (_, last) = self.span();
-        if last >= u32::from(MAX_BITS) {
-            return Err(LayoutFault::Outside(last));
-        }
-        let allowed = match self.value_type {
-            ValueType::Unsigned | ValueType::Signed => self.length_bits,
+        let Self { length_bits, value_type, factor, offset, minimum, maximum, .. } = *self;
+        let allowed = match value_type {
+            ValueType::Unsigned | ValueType::Signed => length_bits,
             ValueType::Float32 => 32,
             ValueType::Float64 => 64,
         };
-        if self.length_bits != allowed {
-            return Err(LayoutFault::FloatLength { found: self.length_bits, allowed });
-        }
-        if !self.factor.is_finite() || self.factor == 0.0 {
-            return Err(LayoutFault::Factor(self.factor));
-        }
-        if !self.offset.is_finite() {
-            return Err(LayoutFault::Offset(self.offset));
-        }
-        if self.minimum.is_nan() || self.maximum.is_nan() || self.minimum > self.maximum {
-            return Err(LayoutFault::Range(self.minimum, self.maximum));
-        }
-        Ok(())
+        Err(LayoutFault(if !(1..=64).contains(&length_bits) {
+            format!("length is {length_bits} bits, must be 1 to 64")
+        } else if self.span().1 >= u32::from(MAX_BITS) {
+            format!("reaches to bit {} of the payload, must end within 512 bits (64 bytes)", self.span().1)
+        } else if length_bits != allowed {
+            format!("IEEE float of {length_bits} bits, must be {allowed}")
+        } else if !factor.is_finite() || factor == 0.0 {
+            format!("factor is {factor}, must be finite and not 0")
+        } else if !offset.is_finite() {
+            format!("offset is {offset}, must be finite")
+        } else if minimum.is_nan() || maximum.is_nan() || minimum > maximum {
+            format!("range is [{minimum}|{maximum}], the first must not be above the second")
+        } else {
+            return Ok(());
+        }))
     }
 
     /// Smallest and largest code the bits can hold.

@@ -12,7 +12,7 @@
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
 //! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve.
 
-use super::model::falling_crossing;
+use super::model::bisect;
 
 /// Smallest distance of a lithium content from 0 and 1, where the half-cell functions diverge.
 const EDGE: f64 = 1e-4;
@@ -266,9 +266,15 @@ impl Electrodes {
         let least = LITHIUM_RANGE.0 * new_lithium;
         // More lithium than the electrodes hold at their best balance lowers the capacity again.
         let most = most_capable(least, LITHIUM_RANGE.1 * new_lithium, |lithium| cell(lithium).capacity());
-        let found = cell(falling_crossing(least, most, |lithium| capacity - cell(lithium).capacity()));
+        let found = cell(crossing((least, most), |lithium| cell(lithium).capacity() < capacity));
         ((found.capacity() - capacity).abs() < 1e-6).then_some(found)
     }
+}
+
+/// Where `is_below` turns false, to 2^-40 of the interval.
+fn crossing(ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> f64 {
+    let (low, high) = bisect(ends, 40, is_below);
+    0.5 * (low + high)
 }
 
 /// Where a function with one maximum between `low` and `high` has it, by golden section.
@@ -293,7 +299,7 @@ impl AgedElectrodes {
     fn content_at(&self, voltage_v: f64) -> f64 {
         let low = ((self.lithium - self.positive_capacity) / self.negative_capacity).max(EDGE);
         let high = (self.lithium / self.negative_capacity).min(1.0 - EDGE);
-        falling_crossing(low, high, |x| voltage_v - self.voltage_at(x))
+        crossing((low, high), |x| self.voltage_at(x) < voltage_v)
     }
 
     /// Capacity relative to the new cell's.

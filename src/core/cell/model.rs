@@ -241,109 +241,21 @@ impl CellModel {
     /// SOC at which a cell that has aged to a capacity has an open-circuit voltage, see [`Self::soc_of_ocv`].
     pub fn soc_of_aged_ocv(&self, temperature: &TemperaturePosition, capacity_ah: f64, voltage_v: f64) -> f64 {
         let segment = self.aged_ocv.segment(capacity_ah);
-        falling_crossing(-0.5, 1.5, |soc| {
-            voltage_v - self.aged_ocv_v(&self.grid_position_at(temperature, soc), segment, capacity_ah)
-        })
+        let is_below =
+            |soc| voltage_v > self.aged_ocv_v(&self.grid_position_at(temperature, soc), segment, capacity_ah);
+        let (low, high) = bisect((-0.5, 1.5), 40, is_below);
+        0.5 * (low + high)
     }
 }
 
-/// Zero crossing of the falling function `f` in [`low`, `high`], to 2^-40 of the width; the nearest end if there is none.
-pub(crate) fn falling_crossing(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
-    for _ in 0..40 {
+/// Halves the interval `ends` again and again towards the place where `is_below` turns false; the nearest end if it never
+/// does.
+pub(crate) fn bisect(ends: (f64, f64), halvings: u32, is_below: impl Fn(f64) -> bool) -> (f64, f64) {
+    (0..halvings).fold(ends, |(low, high), _| {
         let middle = 0.5 * (low + high);
-        if f(middle) > 0.0 {
-            low = middle;
-        } else {
-            high = middle;
-        }
-    }
-    0.5 * (low + high)
+        if is_below(middle) { (middle, high) } else { (low, middle) }
+    })
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-
-    /// A small two-temperature, one-branch cell for tests.
-    pub(crate) fn small_model() -> CellModel {
-        let table = |rows: [[f64; 3]; 2]| Table { values: rows.iter().map(|r| r.to_vec()).collect() };
-        CellModel {
-            name: "test".into(),
-            rated_capacity_ah: 2.0,
-            capacity_ah: 2.0,
-            voltage_min_v: 2.7,
-            voltage_max_v: 4.2,
-            soc: vec![0.0, 0.5, 1.0],
-            temperature_c: vec![0.0, 40.0],
-            aged_ocv: AgedOcv::default(),
-            ocv_v: table([[3.0, 3.6, 4.2], [3.0, 3.7, 4.2]]),
-            r0_ohm: table([[0.08, 0.06, 0.06], [0.04, 0.03, 0.03]]),
-            branches: vec![Branch {
-                r_ohm: table([[0.04, 0.02, 0.02], [0.02, 0.01, 0.01]]),
-                c_farad: table([[1000.0; 3]; 2]),
-            }],
-            voltage_error_v: None,
-            thermal: Some(Thermal { heat_capacity_j_per_k: 45.0, resistance_k_per_w: 8.0 }),
-        }
-    }
-
-    #[test]
-    fn tables_are_bilinear_inside_and_exact_at_the_nodes() {
-        let model = small_model();
-        assert_eq!(model.ocv_v(&model.grid_position(0.5, 40.0)), 3.7);
-        assert!((model.ocv_v(&model.grid_position(0.25, 20.0)) - 3.325).abs() < 1e-12);
-    }
-
-    #[test]
-    fn resistances_between_temperatures_follow_arrhenius_and_a_constant_time_constant_stays() {
-        let mut model = small_model();
-        let ratio = arrhenius(0.0) / arrhenius(40.0);
-        for (cold, warm) in [(0.08, 0), (0.06, 1), (0.06, 2)] {
-            model.r0_ohm.values[0][warm] = cold;
-            model.r0_ohm.values[1][warm] = cold / ratio;
-        }
-        let at = |t_c: f64| model.r0_ohm(&model.grid_position(1.0, t_c));
-        for t_c in [0.0, 7.0, 20.0, 33.0, 40.0] {
-            assert!((at(t_c) / at(0.0) - arrhenius(t_c) / arrhenius(0.0)).abs() < 1e-12, "{t_c}");
-        }
-        // Nodes of one time constant and unlike resistances.
-        for (t, s) in [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)] {
-            model.branches[0].c_farad.values[t][s] = 30.0 / model.branches[0].r_ohm.values[t][s];
-        }
-        assert!((model.branch_tau_s(0, &model.grid_position(0.2, 13.0)) - 30.0).abs() < 1e-12);
-    }
-
-    #[test]
-    fn outside_the_grid_ocv_continues_in_soc_and_all_else_holds_its_edge() {
-        let model = small_model();
-        assert!((model.ocv_v(&model.grid_position(1.1, 0.0)) - 4.32).abs() < 1e-12);
-        assert!((model.ocv_v(&model.grid_position(-0.1, 0.0)) - 2.88).abs() < 1e-12);
-        assert_eq!(model.r0_ohm(&model.grid_position(-0.1, -30.0)), 0.08);
-        assert_eq!(model.r0_ohm(&model.grid_position(1.1, 60.0)), 0.03);
-    }
-
-    #[test]
-    fn soc_of_ocv_inverts_the_curve() {
-        let model = small_model();
-        for soc in [-0.1, 0.0, 0.3, 0.5, 0.77, 1.0, 1.05] {
-            let voltage = model.ocv_v(&model.grid_position(soc, 17.0));
-            assert!((model.soc_of_ocv(voltage, 17.0) - soc).abs() < 1e-9);
-        }
-    }
-
-    #[test]
-    fn an_aged_cells_voltage_and_slope_agree_and_invert() {
-        let mut model = small_model();
-        model.aged_ocv = AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, |soc| 3.0 + soc);
-        let (segment, temperature) = (model.aged_ocv.segment(1.5), model.temperature_position(17.0));
-        let at = |soc: f64| model.aged_ocv_v(&model.grid_position_at(&temperature, soc), segment, 1.5);
-        // A quarter lost moves the middle by 0.8 x 0.25 x 0.25 of SOC.
-        let new_v = model.ocv_v(&model.grid_position(0.5, 17.0));
-        assert!((at(0.5) - new_v - 0.05).abs() < 1e-12);
-        for soc in [-0.1, 0.1, 0.45, 0.7, 1.05] {
-            let slope_v = model.ocv_slope_v(&model.grid_position(soc, 17.0), 1.5);
-            assert!(((at(soc + 1e-6) - at(soc)) / 1e-6 - slope_v).abs() < 1e-6, "{soc}");
-            assert!((model.soc_of_aged_ocv(&temperature, 1.5, at(soc)) - soc).abs() < 1e-9, "{soc}");
-        }
-    }
-}
+pub(crate) mod tests;

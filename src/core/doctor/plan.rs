@@ -18,8 +18,8 @@ pub struct Plan {
     pub more_cells: Vec<SignalPlan>,
     /// The pack.
     pub pack: PackPlan,
-    /// Ages from which readings are stale.
-    pub ages: Ages,
+    /// Age from which a current, voltage and temperature is stale, s; `None` = never.
+    pub max_ages_s: [Option<f64>; 3],
     /// Smallest and largest plausible current, cell voltage and temperature; infinite = any.
     pub limits: [(f64, f64); 3],
     /// Protected messages.
@@ -60,23 +60,6 @@ pub struct InterfacePlan {
     pub name: String,
     /// FD frames are accepted.
     pub fd: bool,
-}
-
-/// Ages from which a reading is stale, s; infinite = never.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Ages {
-    /// Current.
-    pub current_s: f64,
-    /// Voltages.
-    pub voltage_s: f64,
-    /// Temperatures.
-    pub temperature_s: f64,
-}
-
-impl Default for Ages {
-    fn default() -> Self {
-        Self { current_s: f64::INFINITY, voltage_s: f64::INFINITY, temperature_s: f64::INFINITY }
-    }
 }
 
 /// One configured signal.
@@ -160,24 +143,13 @@ impl Kind {
 impl Plan {
     /// The age from which a reading of the channel is stale, s.
     pub(super) fn max_age_s(&self, channel: Channel) -> f64 {
-        match Kind::of(channel) {
-            Kind::Current => self.ages.current_s,
-            Kind::Voltage => self.ages.voltage_s,
-            Kind::Temperature => self.ages.temperature_s,
-            Kind::Reported => f64::INFINITY,
-        }
+        self.max_ages_s.get(Kind::of(channel) as usize).copied().flatten().unwrap_or(f64::INFINITY)
     }
 
     /// Plausible values of the channel, in its unit; `None` = any (limits of 0 and 0 too).
     pub(super) fn plausible(&self, channel: Channel) -> Option<(f64, f64)> {
-        let [current, voltage, temperature] = self.limits;
+        let (low, high) = *self.limits.get(Kind::of(channel) as usize)?;
         let cells = if channel == Channel::PackVoltage { f64::from(self.pack.cells) } else { 1.0 };
-        let limits = match Kind::of(channel) {
-            Kind::Current => current,
-            Kind::Voltage => (voltage.0 * cells, voltage.1 * cells),
-            Kind::Temperature => temperature,
-            Kind::Reported => return None,
-        };
-        (limits != (0.0, 0.0)).then_some(limits)
+        ((low, high) != (0.0, 0.0)).then_some((low * cells, high * cells))
     }
 }

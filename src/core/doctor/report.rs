@@ -116,50 +116,39 @@ impl Finding {
         Self { severity, topic, title: title.into(), seen, why, changes: Vec::new(), advice: None }
     }
 
-    pub(super) fn error(topic: Topic, title: impl Into<String>) -> Self {
-        Self::new(Severity::Error, topic, title)
-    }
-
-    pub(super) fn warning(topic: Topic, title: impl Into<String>) -> Self {
-        Self::new(Severity::Warning, topic, title)
-    }
-
-    pub(super) fn note(topic: Topic, title: impl Into<String>) -> Self {
-        Self::new(Severity::Note, topic, title)
-    }
-
-    pub(super) fn seen(mut self, seen: impl Into<String>) -> Self {
+    pub(super) fn seen(&mut self, seen: impl Into<String>) -> &mut Self {
         self.seen = seen.into();
         self
     }
 
-    pub(super) fn why(mut self, why: impl Into<String>) -> Self {
+    pub(super) fn why(&mut self, why: impl Into<String>) -> &mut Self {
         self.why = why.into();
         self
     }
 
-    pub(super) fn change(mut self, table: &str, key: &str, proposed: impl Into<String>) -> Self {
+    pub(super) fn change(&mut self, table: &str, key: &str, proposed: impl Into<String>) -> &mut Self {
         let (table, key) = (table.to_owned(), key.to_owned());
         self.changes.push(Change { table, key, proposed: proposed.into(), place: None, now: None });
         self
     }
 
-    pub(super) fn change_cell_model(self) -> Self {
+    pub(super) fn change_cell_model(&mut self) -> &mut Self {
         self.change("pack", "cell_model", "the model of the cell that is in the pack")
     }
 
-    pub(super) fn advice(mut self, advice: impl Into<String>) -> Self {
+    pub(super) fn advice(&mut self, advice: impl Into<String>) -> &mut Self {
         self.advice = Some(advice.into());
         self
     }
 }
 
 impl Report {
-    /// Adds a finding in the order of `findings`.
-    pub fn add(&mut self, finding: Finding) {
+    /// Adds a finding in the order of `findings`, and returns it there.
+    pub fn add(&mut self, finding: Finding) -> &mut Finding {
         let key = |f: &Finding| (f.severity, f.topic);
         let at = self.findings.partition_point(|other| key(other) <= key(&finding));
         self.findings.insert(at, finding);
+        &mut self.findings[at]
     }
 
     /// Whether there is an error or a warning.
@@ -175,12 +164,12 @@ mod tests {
     #[test]
     fn findings_are_sorted_by_severity_then_cause_before_effect() {
         let mut report = Report::default();
-        report.add(Finding::note(Topic::Interface, "n"));
+        report.add(Finding::new(Severity::Note, Topic::Interface, "n"));
         assert!(!report.has_findings());
-        report.add(Finding::warning(Topic::Silent, "w"));
-        report.add(Finding::error(Topic::CellModel, "late"));
-        report.add(Finding::error(Topic::Unit, "early"));
-        report.add(Finding::error(Topic::Unit, "early, second"));
+        report.add(Finding::new(Severity::Warning, Topic::Silent, "w"));
+        report.add(Finding::new(Severity::Error, Topic::CellModel, "late"));
+        report.add(Finding::new(Severity::Error, Topic::Unit, "early"));
+        report.add(Finding::new(Severity::Error, Topic::Unit, "early, second"));
         let titles: Vec<&str> = report.findings.iter().map(|finding| finding.title.as_str()).collect();
         assert_eq!(titles, ["early", "early, second", "late", "w", "n"]);
         assert!(report.has_findings());

@@ -138,7 +138,7 @@ struct BlockMean {
 }
 
 /// A run that continues. Its sums count time and voltage from the first evaluated block: small numbers keep their digits.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 struct OpenRun {
     from: Timestamp,
     last: Timestamp,
@@ -156,12 +156,6 @@ struct OpenRun {
 }
 
 impl OpenRun {
-    fn new(from: Timestamp) -> Self {
-        let (current_sum, blocks, first) = (0.0, 0, None);
-        let (n, t, tt, v, vv, tv) = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0);
-        Self { from, last: from, current_sum, blocks, first, n, t, tt, v, vv, tv }
-    }
-
     fn current_a(&self) -> f64 {
         self.current_sum / f64::from(self.blocks)
     }
@@ -205,7 +199,7 @@ impl OpenRun {
 }
 
 /// Relation of the voltages to the current, over blocks of one length.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(crate) struct VoltageResponse {
     block_s: f64,
     /// Current changes up to this are no change of load, A.
@@ -224,13 +218,8 @@ impl VoltageResponse {
         Self {
             block_s,
             tolerance_a,
-            current: None,
             block: Block { cells: vec![(0.0, 0); cells], ..Block::default() },
-            previous: None,
-            open_run: None,
-            steps: Vec::new(),
-            runs: Vec::new(),
-            rests: Vec::new(),
+            ..Self::default()
         }
     }
 
@@ -298,7 +287,7 @@ impl VoltageResponse {
         if !continues {
             self.close_run();
         }
-        self.open_run.get_or_insert_with(|| OpenRun::new(mean.time)).push(mean);
+        self.open_run.get_or_insert_with(|| OpenRun { from: mean.time, ..OpenRun::default() }).push(mean);
     }
 
     fn close_run(&mut self) {

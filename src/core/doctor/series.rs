@@ -110,21 +110,15 @@ impl Extent {
     }
 }
 
-/// Another layout the bits could have.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum LayoutVariant {
-    /// The other byte order, the same bytes.
-    ByteOrder,
-    /// Signed for unsigned, or the other way.
-    Sign,
-    /// Both.
-    Both,
-}
+/// Faults of a layout that are looked for, in the order of the alternatives.
+pub(crate) const LAYOUT_FAULTS: [&str; 3] =
+    ["wrong byte order", "signed and unsigned exchanged", "wrong byte order and sign of the number"];
 
 /// The same bits read with another layout.
 #[derive(Debug, Clone)]
 pub(crate) struct AlternativeReading {
-    pub(crate) variant: LayoutVariant,
+    /// One of [`LAYOUT_FAULTS`].
+    pub(crate) fault: &'static str,
     pub(crate) layout: SignalLayout,
     plan: SignalPlan,
     pub(crate) extent: Extent,
@@ -259,30 +253,19 @@ pub(crate) fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 }
 
 fn alternatives(layout: &SignalLayout) -> Vec<AlternativeReading> {
-    let mut readings = Vec::new();
-    let mut add = |variant, layout: SignalLayout| {
-        // The stated range belongs to the stated layout.
-        let open = SignalLayout { minimum: 0.0, maximum: 0.0, ..layout };
-        if let Ok(plan) = open.plan() {
-            readings.push(AlternativeReading { variant, layout, plan, extent: Extent::default() });
-        }
-    };
-    let other_order = byte_swapped(layout);
-    if let Some(swapped) = other_order {
-        add(LayoutVariant::ByteOrder, swapped);
-    }
-    let other_sign = match layout.value_type {
-        ValueType::Unsigned => Some(ValueType::Signed),
-        ValueType::Signed => Some(ValueType::Unsigned),
+    let other_sign = |layout: SignalLayout| match layout.value_type {
+        ValueType::Unsigned => Some(SignalLayout { value_type: ValueType::Signed, ..layout }),
+        ValueType::Signed => Some(SignalLayout { value_type: ValueType::Unsigned, ..layout }),
         ValueType::Float32 | ValueType::Float64 => None,
     };
-    if let Some(value_type) = other_sign {
-        add(LayoutVariant::Sign, SignalLayout { value_type, ..*layout });
-        if let Some(swapped) = other_order {
-            add(LayoutVariant::Both, SignalLayout { value_type, ..swapped });
-        }
-    }
-    readings
+    let swapped = byte_swapped(layout);
+    let others = [swapped, other_sign(*layout), swapped.and_then(other_sign)];
+    let reading = |(fault, layout): (&'static str, Option<SignalLayout>)| {
+        // The stated range belongs to the stated layout.
+        let plan = SignalLayout { minimum: 0.0, maximum: 0.0, ..layout? }.plan().ok()?;
+        Some(AlternativeReading { fault, layout: layout?, plan, extent: Extent::default() })
+    };
+    LAYOUT_FAULTS.into_iter().zip(others).filter_map(reading).collect()
 }
 
 /// The same whole bytes in the other order; `None` = the signal does not fill whole bytes, or only one.

@@ -58,17 +58,6 @@ pub(crate) struct EstimatorStats {
     pub(crate) innovation_sum: f64,
 }
 
-/// Time listened.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct ListeningClock {
-    /// Time of the latest frame.
-    last: Option<Timestamp>,
-    /// Time between frames without sleep, s.
-    pub(crate) awake_s: f64,
-    /// Time on live interfaces, s; `None` = a record, `awake_s` counts.
-    listened_s: Option<f64>,
-}
-
 /// Collects frames, events and estimates; [`Doctor::finish`] judges them.
 #[derive(Debug)]
 pub struct Doctor {
@@ -85,7 +74,12 @@ pub struct Doctor {
     /// Over short and long blocks.
     responses: [VoltageResponse; 2],
     pub(crate) estimator: EstimatorStats,
-    pub(crate) clock: ListeningClock,
+    /// Time of the latest frame.
+    latest: Option<Timestamp>,
+    /// Time between frames without sleep, s.
+    pub(crate) awake_s: f64,
+    /// Time on live interfaces, s; `None` = a record, `awake_s` counts.
+    listened_s: Option<f64>,
     pub(crate) frames: u64,
 }
 
@@ -114,7 +108,9 @@ impl Doctor {
             protected: BTreeMap::new(),
             responses: BLOCKS_S.map(|block_s| VoltageResponse::new(cells, tolerance_a, block_s)),
             estimator: EstimatorStats::default(),
-            clock: ListeningClock::default(),
+            latest: None,
+            awake_s: 0.0,
+            listened_s: None,
             frames: 0,
             plan,
         }
@@ -145,7 +141,7 @@ impl Doctor {
 
     fn check_protection(&mut self, time: Timestamp, bus: BusIndex, frame: &Frame) {
         let Some(status) = self.guards.check(time, bus, frame) else { return };
-        self.guards.take_changes().for_each(drop);
+        self.guards.changes.clear();
         let stats = self.protected.entry((bus, frame.id())).or_default();
         *stats.counts.entry(status.name()).or_default() += 1;
         stats.good += u64::from(status.is_usable());
@@ -206,14 +202,14 @@ impl Doctor {
     }
 
     fn note_time(&mut self, time: Timestamp) {
-        let last = *self.clock.last.get_or_insert(time);
+        let last = *self.latest.get_or_insert(time);
         let passed_s = time.since(last);
         if passed_s > SLEEP_S {
             self.handle_gap();
         } else {
-            self.clock.awake_s += passed_s.max(0.0);
+            self.awake_s += passed_s.max(0.0);
         }
-        self.clock.last = Some(last.max(time));
+        self.latest = Some(last.max(time));
     }
 
     /// Takes a time of unknown length without listening.
@@ -250,12 +246,12 @@ impl Doctor {
 
     /// Seconds listened so far, sleep not counted.
     pub fn seconds(&self) -> f64 {
-        self.clock.listened_s.unwrap_or(self.clock.awake_s)
+        self.listened_s.unwrap_or(self.awake_s)
     }
 
     /// Takes the time listened to live interfaces, s, whether a frame came or not.
     pub fn handle_listened(&mut self, seconds: f64) {
-        self.clock.listened_s = Some(seconds);
+        self.listened_s = Some(seconds);
     }
 
     /// Frames so far.

@@ -30,6 +30,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 use self::distribution::Crossing;
+use crate::cell::model::bisect;
 use crate::filter::update_states;
 use crate::quantity::InvalidState;
 
@@ -423,16 +424,8 @@ impl Forecast {
     /// Quantile of the capacity after `ahead` units of use: the threshold passed by then with that probability.
     fn capacity_ah(&self, ahead: f64, quantile: f64) -> f64 {
         let (level, std) = (self.x[LEVEL], self.level_variance().sqrt());
-        let (mut below, mut above) = (0.0, level + 5.0 * std);
-        for _ in 0..distribution::HALVINGS {
-            let middle = 0.5 * (below + above);
-            if self.crossing(middle).probability(ahead) < quantile {
-                below = middle;
-            } else {
-                above = middle;
-            }
-        }
-        self.reference_ah * above
+        let is_below = |threshold_ah: f64| self.crossing(threshold_ah).probability(ahead) < quantile;
+        self.reference_ah * bisect((0.0, level + 5.0 * std), distribution::HALVINGS, is_below).1
     }
 }
 

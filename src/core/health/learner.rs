@@ -106,7 +106,7 @@ struct Mark {
 }
 
 /// Totals, marks and capacity filters of all cells.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Learner {
     totals: Vec<CellMark>,
     /// Beginning of the present half-cycle.
@@ -134,15 +134,11 @@ impl Learner {
     pub fn new(config: &CapacityConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
         Self {
             totals: vec![CellMark::default(); cells],
-            start: None,
-            candidate: None,
             prior: vec![initial_capacity; cells],
             capacity: vec![initial_capacity; cells],
-            rest_s: 0.0,
-            mode_since: None,
-            joining: false,
             learned: vec![false; cells],
             drift: vec![DriftFilter::new(config, initial_capacity); cells],
+            ..Self::default()
         }
     }
 

@@ -78,11 +78,6 @@ impl RechargeTimer {
         (self.last, self.entered) = (None, None);
     }
 
-    /// Discards this charge: the SOC jumped, or its time is unknown.
-    pub fn discard(&mut self) {
-        *self = Self::default();
-    }
-
     /// Handles a new window: discards the period of the old one, keeps the range of SOC.
     pub fn change_window(&mut self) {
         self.interrupt();
@@ -185,7 +180,7 @@ mod tests {
         for (t, soc) in [(0.0, 0.2), (1.0, 0.31)] {
             timer.observe(&CONFIG, Timestamp::from_secs(t), Mode::Charge, soc);
         }
-        timer.discard();
+        timer = RechargeTimer::default();
         assert_eq!(timer.observe(&CONFIG, Timestamp::from_secs(2.0), Mode::Charge, 0.95), None);
         assert_eq!(timer.finish(&CONFIG), ChargeRecord::default());
     }

@@ -14,7 +14,6 @@ const SHOW_S: f64 = 1.0;
 #[derive(Debug)]
 pub(super) struct Alarming {
     pub(super) engine: AlarmEngine,
-    rules: Vec<RuleConfig>,
     /// Silence that the strictest threshold calls missing, s; `None` = no rule does.
     pub(super) missing_after_s: Option<f64>,
     /// Changes that wait to be published.
@@ -31,7 +30,6 @@ impl Alarming {
     pub(super) fn new(config: &MonitorConfig) -> Self {
         Self {
             engine: AlarmEngine::new(config.rules.clone(), config.sample.cells),
-            rules: config.rules.clone(),
             missing_after_s: missing_after_s(&config.rules),
             changes: Vec::new(),
             inputs_shown_at: Timestamp::from_nanos(i64::MIN),
@@ -41,14 +39,8 @@ impl Alarming {
         }
     }
 
-    /// The rules in the order of the configuration.
-    pub(super) fn rules(&self) -> &[RuleConfig] {
-        &self.rules
-    }
-
     /// Other rules; returns how many alarms, raised or past, ended by it.
     pub(super) fn reconfigure(&mut self, now: Timestamp, config: &MonitorConfig) -> usize {
-        self.rules.clone_from(&config.rules);
         self.missing_after_s = missing_after_s(&config.rules);
         self.knows_all_valid = false;
         self.engine.reconfigure(now, config.rules.clone(), config.sample.cells, &mut self.changes)

@@ -12,7 +12,7 @@ pub(super) struct CellBatch {
     /// Samples that wait for their step, in the order of arrival, at most one per cell.
     pub(super) waiting: Vec<CellSample>,
     has_reported: Vec<bool>,
-    reported: usize,
+    pub(super) reported: usize,
 }
 
 impl CellBatch {
@@ -28,11 +28,6 @@ impl CellBatch {
 
     pub(super) fn has_reported(&self, cell: usize) -> bool {
         self.has_reported[cell]
-    }
-
-    /// Number of cells that have reported.
-    pub(super) fn reported(&self) -> usize {
-        self.reported
     }
 
     /// Whether the cell has not reported in this batch.

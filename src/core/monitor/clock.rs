@@ -16,9 +16,12 @@ pub(super) const HOUSEKEEPING_S: f64 = 0.1;
 /// The clock of one monitor.
 #[derive(Debug, Default)]
 pub(super) struct Clock {
-    has_started: bool,
-    now: Timestamp,
-    time_backwards: u64,
+    /// Whether an input has come.
+    pub(super) has_started: bool,
+    /// Time of the latest input that did something.
+    pub(super) now: Timestamp,
+    /// Inputs with a time before that of an earlier one.
+    pub(super) time_backwards: u64,
     /// When a tick next does something; `None` = not started.
     pub(super) due: Option<Timestamp>,
 }
@@ -39,42 +42,10 @@ pub(super) enum TimeJump {
 }
 
 impl Clock {
-    /// Time of the latest input that did something.
-    #[inline]
-    pub(super) fn now(&self) -> Timestamp {
-        self.now
-    }
-
-    /// Whether an input has come.
-    #[inline]
-    pub(super) fn has_started(&self) -> bool {
-        self.has_started
-    }
-
-    /// Inputs with a time before that of an earlier one.
-    pub(super) fn time_backwards(&self) -> u64 {
-        self.time_backwards
-    }
-
     /// Whether a tick at `time` comes too early to do anything.
     #[inline]
     pub(super) fn is_before_due(&self, time: Timestamp) -> bool {
         self.due.is_some_and(|due| time < due)
-    }
-
-    /// The first input comes at `time`.
-    pub(super) fn start(&mut self, time: Timestamp) {
-        (self.has_started, self.now) = (true, time);
-    }
-
-    /// Continues from a stored state that was taken at `now`.
-    pub(super) fn restore(&mut self, now: Timestamp, time_backwards: u64) {
-        (self.now, self.time_backwards) = (now, time_backwards);
-    }
-
-    /// Sets the time, also back.
-    pub(super) fn set(&mut self, now: Timestamp) {
-        self.now = now;
     }
 
     /// Moves to the time of an input. After a jump the time is still that before it: the caller ends what was under
@@ -112,12 +83,12 @@ mod tests {
     fn time_moves_forward_and_jumps_are_reported() {
         let at = Timestamp::from_secs;
         let mut clock = Clock::default();
-        clock.start(at(100.0));
-        assert_eq!((clock.advance(at(105.0)), clock.now()), (None, at(105.0)));
+        clock.now = at(100.0);
+        assert_eq!((clock.advance(at(105.0)), clock.now), (None, at(105.0)));
         // Merged out of order: counted, and the time stays.
-        assert_eq!((clock.advance(at(104.5)), clock.now()), (None, at(105.0)));
-        assert_eq!((clock.advance(at(100.0)), clock.now()), (Some(TimeJump::Backwards { seconds: 5.0 }), at(105.0)));
-        assert_eq!((clock.advance(at(111.0)), clock.now()), (Some(TimeJump::Asleep { seconds: 6.0 }), at(105.0)));
-        assert_eq!(clock.time_backwards(), 2);
+        assert_eq!((clock.advance(at(104.5)), clock.now), (None, at(105.0)));
+        assert_eq!((clock.advance(at(100.0)), clock.now), (Some(TimeJump::Backwards { seconds: 5.0 }), at(105.0)));
+        assert_eq!((clock.advance(at(111.0)), clock.now), (Some(TimeJump::Asleep { seconds: 6.0 }), at(105.0)));
+        assert_eq!(clock.time_backwards, 2);
     }
 }

@@ -22,7 +22,7 @@ pub(super) struct Estimation {
     progress: Vec<CellProgress>,
     /// Per cell: whether its innovations agree with their covariance.
     trusted: Vec<bool>,
-    all_trusted: bool,
+    pub(super) all_trusted: bool,
     ambient_c: f64,
     /// Cells for which the next half-cycle may have begun in the gap before their latest sample.
     after_gap: Vec<usize>,
@@ -138,11 +138,6 @@ impl Estimation {
     pub(super) fn record(&mut self, sample: &CellSample) -> bool {
         self.progress[sample.cell.index()].sample = Some(*sample);
         self.bank.result(sample.cell.index()).reset
-    }
-
-    /// Whether every cell is trusted.
-    pub(super) fn all_trusted(&self) -> bool {
-        self.all_trusted
     }
 
     /// Whether a cell's innovations agree with their covariance.

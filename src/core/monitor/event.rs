@@ -4,9 +4,9 @@ use serde::{Deserialize, Serialize};
 
 use super::input::{BusEvent, Command, Source};
 use crate::alarm::{AlarmState, Change, Rule, Severity};
-use crate::can::CanId;
 use crate::can::decode::Channel;
-use crate::can::e2e::Status;
+use crate::can::flood::FloodChange;
+use crate::can::guard::GuardChange;
 use crate::can::j1939::NodeEvent;
 use crate::quantity::{BusIndex, CellIndex, Fault, Mode, Timestamp};
 
@@ -191,29 +191,9 @@ pub enum EventKind {
     },
     /// A protected message turned from usable to failing, or back (reported on change, then counted). A first frame, and as many
     /// missing ones as its check allows to be lost, turn nothing.
-    Protection {
-        /// Which interface.
-        bus: BusIndex,
-        /// Which message.
-        id: CanId,
-        /// The status of its check that turned it.
-        status: Status,
-        /// Whether it is usable from here on.
-        usable: bool,
-        /// Checks without a usable frame since it was last usable: so far, or when it is back, all of them.
-        count: u64,
-    },
+    Protection(GuardChange),
     /// More frames of one identifier come than the limit allows; or no more.
-    Flood {
-        /// Which interface.
-        bus: BusIndex,
-        /// Which message.
-        id: CanId,
-        /// Whether it began.
-        active: bool,
-        /// Frames dropped in this flood: 1 when it begins, all of them when it ends.
-        dropped: u64,
-    },
+    Flood(FloodChange),
     /// An interface event.
     Bus {
         /// Which interface.

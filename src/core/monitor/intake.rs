@@ -11,11 +11,10 @@ use super::{BusEvent, Command, Event, EventKind, MonitorConfig, Outputs};
 
 use crate::alarm::{Observation, Rule, Selector, Severity};
 use crate::can::Frame;
-use crate::can::decode::InputMap;
 use crate::can::encode::{self, CommandFields, CommandPlan};
-use crate::can::flood::{FloodConfig, FloodCount, FloodGate};
-use crate::can::guard::{GuardConfig, GuardCounts, Guards};
-use crate::quantity::{BusIndex, Fault, Reading, Timestamp};
+use crate::can::flood::{FloodCount, FloodGate};
+use crate::can::guard::{GuardCounts, Guards};
+use crate::quantity::{BusIndex, Fault, Timestamp};
 
 /// Rejected command frames are reported at most this often, s.
 const BAD_COMMAND_S: f64 = 1.0;
@@ -29,25 +28,14 @@ pub struct CommandConfig {
     pub plan: CommandPlan,
 }
 
-/// Settings of the stage.
-#[derive(Debug)]
-pub(super) struct IntakeConfig {
-    pub(super) interfaces: usize,
-    pub(super) input: InputMap,
-    pub(super) guards: Vec<GuardConfig>,
-    pub(super) flood: FloodConfig,
-    pub(super) commands: Option<CommandConfig>,
-}
-
 /// The intake stage.
 #[derive(Debug)]
 pub(super) struct Intake {
-    config: IntakeConfig,
     gate: FloodGate,
     guards: Guards,
     buses: Buses,
     /// When a rejected command frame was last reported.
-    bad_command_at: Option<Timestamp>,
+    pub(super) bad_command_at: Option<Timestamp>,
 }
 
 /// Counts that are kept over a restart.
@@ -60,26 +48,13 @@ pub(super) struct IntakeState {
 
 impl Intake {
     pub(super) fn new(config: &MonitorConfig) -> Self {
-        let config = IntakeConfig {
-            interfaces: config.interfaces,
-            input: config.input.clone(),
-            guards: config.guards.clone(),
-            flood: config.flood,
-            commands: config.commands.clone(),
-        };
         let commands = config.commands.iter().map(|commands| (commands.bus, commands.plan.id(), 1));
         Self {
             gate: FloodGate::new(&config.flood, config.input.messages().chain(commands)),
             guards: Guards::new(config.guards.clone()),
             buses: Buses::default(),
             bad_command_at: None,
-            config,
         }
-    }
-
-    /// The settings.
-    pub(super) fn config(&self) -> &IntakeConfig {
-        &self.config
     }
 
     /// Other limits and checks for the same messages: counts, and floods under way, stay.
@@ -87,7 +62,6 @@ impl Intake {
         let new = Self::new(config);
         self.gate = new.gate.inheriting(&self.gate);
         self.guards = new.guards.inheriting(&self.guards);
-        self.config = new.config;
     }
 
     /// Judges a frame: `None` = it is dropped; otherwise whether its readings may be used.
@@ -107,32 +81,20 @@ impl Intake {
         admitted.then_some(if usable { Ok(()) } else { Err(Fault::EndToEnd) })
     }
 
-    /// Passes the readings of an admitted frame to `each`.
-    #[inline]
-    pub(super) fn decode(&self, bus: BusIndex, frame: &Frame, each: impl FnMut(Reading)) {
-        self.config.input.decode(bus, frame, each);
-    }
-
-    /// Whether a frame is a command.
-    #[inline]
-    pub(super) fn is_command(&self, bus: BusIndex, frame: &Frame) -> bool {
-        self.config.commands.as_ref().is_some_and(|commands| commands.bus == bus && commands.plan.id() == frame.id())
-    }
-
     /// The command of a frame. One that is not intact, or that has no meaning, is reported at most once a second.
     pub(super) fn command(
         &mut self,
         now: Timestamp,
-        bus: BusIndex,
+        config: &CommandConfig,
         frame: &Frame,
         is_intact: bool,
         out: &mut Outputs,
     ) -> Option<Command> {
-        let fields = self.config.commands.as_ref().and_then(|commands| commands.plan.decode(frame).ok());
+        let fields = config.plan.decode(frame).ok();
         let command = fields.and_then(|fields| command_of(&fields)).filter(|_| is_intact);
         if command.is_none() && self.bad_command_at.is_none_or(|before| now.since(before) >= BAD_COMMAND_S) {
             self.bad_command_at = Some(now);
-            out.events.push(Event { time: now, kind: EventKind::BadCommand { bus, intact: is_intact } });
+            out.events.push(Event { time: now, kind: EventKind::BadCommand { bus: config.bus, intact: is_intact } });
         }
         command
     }
@@ -144,9 +106,9 @@ impl Intake {
     }
 
     /// The value of the rule about interfaces: for how long the worst of them has been out of order, s.
-    pub(super) fn bus_fault(&self, now: Timestamp) -> Observation {
-        let (fault_s, is_whole) = self.buses.worst_s(now, self.config.interfaces);
-        Observation { is_bound: !is_whole, ..Observation::new(fault_s) }
+    pub(super) fn bus_fault(&self, now: Timestamp, interfaces: usize) -> Observation {
+        let (fault_s, is_whole) = self.buses.worst_s(now, interfaces);
+        Observation::new(fault_s).of_part(!is_whole)
     }
 
     /// Finds periods without a frame, and floods that are over.
@@ -163,11 +125,6 @@ impl Intake {
         self.report(now, out);
     }
 
-    /// How long ago a command was rejected is not known any more.
-    pub(super) fn handle_unknown_gap(&mut self) {
-        self.bad_command_at = None;
-    }
-
     /// Per protected message: the count of each status.
     pub(super) fn protected(&self) -> impl Iterator<Item = GuardCounts> + '_ {
         self.guards.counts()
@@ -179,7 +136,7 @@ impl Intake {
     }
 
     pub(super) fn snapshot(&self) -> (IntakeState, Buses) {
-        let state = IntakeState { protected: self.guards.snapshot(), dropped: self.gate.counts().collect() };
+        let state = IntakeState { protected: self.guards.counts().collect(), dropped: self.gate.counts().collect() };
         (state, self.buses.clone())
     }
 
@@ -191,27 +148,16 @@ impl Intake {
 
     #[inline]
     fn report(&mut self, time: Timestamp, out: &mut Outputs) {
-        if self.guards.has_changes() || self.gate.has_changes() {
+        if !self.guards.changes.is_empty() || !self.gate.changes.is_empty() {
             self.report_changes(time, out);
         }
     }
 
     fn report_changes(&mut self, time: Timestamp, out: &mut Outputs) {
-        let protection = self.guards.take_changes().map(|c| EventKind::Protection {
-            bus: c.bus,
-            id: c.id,
-            status: c.status,
-            usable: c.usable,
-            count: c.count,
-        });
-        out.events.extend(protection.map(|kind| Event { time, kind }));
-        let floods = self.gate.take_changes().map(|c| EventKind::Flood {
-            bus: c.bus,
-            id: c.id,
-            active: c.active,
-            dropped: c.dropped,
-        });
-        out.events.extend(floods.map(|kind| Event { time, kind }));
+        let protection = self.guards.changes.drain(..).map(EventKind::Protection);
+        out.events.extend(
+            protection.chain(self.gate.changes.drain(..).map(EventKind::Flood)).map(|kind| Event { time, kind }),
+        );
     }
 }
 

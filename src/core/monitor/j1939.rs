@@ -57,11 +57,6 @@ impl J1939 {
         }
     }
 
-    /// The settings.
-    pub(super) fn config(&self) -> &J1939Config {
-        &self.config
-    }
-
     /// Takes other codes for the same node; `false` = it is another node.
     pub(super) fn reconfigure(&mut self, config: &J1939Config) -> bool {
         let is_same = (self.config.bus, self.config.node) == (config.bus, config.node);
@@ -76,13 +71,16 @@ impl J1939 {
     }
 
     pub(super) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
-        self.node.handle_gap(now, &mut self.out);
+        self.node.start(now, &mut self.out);
         self.dispatch_outputs(now, out);
     }
 
-    pub(super) fn handle_frame(&mut self, now: Timestamp, frame: &Frame, out: &mut Outputs) {
-        self.node.handle_frame(now, frame, &mut self.out);
-        self.dispatch_outputs(now, out);
+    /// Takes a frame, if it came on the node's interface.
+    pub(super) fn handle_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
+        if bus == self.config.bus {
+            self.node.handle_frame(now, frame, &mut self.out);
+            self.dispatch_outputs(now, out);
+        }
     }
 
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {

@@ -6,7 +6,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::estimation::{end_state, resistance};
+use super::estimation::resistance;
 use super::life::PackLife;
 use super::publisher::{Publisher, learned};
 use super::{EventKind, MonitorConfig};
@@ -15,7 +15,6 @@ use crate::can::encode::HealthFields;
 use crate::cell::{CellEstimator, CellModel, EstimatorBank};
 use crate::filter::ScalarGaussian;
 use crate::health::recharge::normalised_period;
-use crate::health::transition::TransitionOutcome;
 use crate::health::usable::usable_capacity;
 use crate::health::{
     CapacityUpdate, CellShare, HalfCycle, HealthConfig, Learner, ModeChange, PackState, RechargeAlarm, RechargeConfig,
@@ -39,7 +38,7 @@ pub(super) struct Learning {
 }
 
 /// The stage's part of the snapshot, without the cells.
-#[derive(Debug, Clone, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub(super) struct LearningState {
     pub(super) detector: TransitionDetector,
     pub(super) learner: Learner,
@@ -54,7 +53,7 @@ pub(super) struct LearningState {
 }
 
 /// Health of one cell.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct CellHealth {
     /// SOC that the last full charge left; 1 until there was one.
     pub(super) full_soc: f64,
@@ -62,6 +61,7 @@ pub(super) struct CellHealth {
     pub(super) tapered: bool,
     pub(super) usable: Option<ScalarGaussian>,
     /// Resistance relative to new after the last discharge.
+    #[serde(default)]
     pub(super) discharge_resistance: Option<ScalarGaussian>,
 }
 
@@ -73,15 +73,7 @@ impl Default for CellHealth {
 
 impl LearningState {
     fn new(config: &HealthConfig, cells: usize, initial_capacity: ScalarGaussian) -> Self {
-        Self {
-            detector: TransitionDetector::default(),
-            learner: Learner::new(&config.capacity, cells, initial_capacity),
-            learned_at: None,
-            recharge: RechargeTimer::default(),
-            recharge_period_s: None,
-            normalised_recharge: None,
-            pack: None,
-        }
+        Self { learner: Learner::new(&config.capacity, cells, initial_capacity), ..Self::default() }
     }
 
     /// Moves every stamp by `by_nanos`, onto another clock.
@@ -122,16 +114,6 @@ impl Learning {
     /// Published capacity of a cell.
     pub(super) fn capacity(&self, index: usize) -> ScalarGaussian {
         self.state.learner.capacity(&self.config.capacity, index)
-    }
-
-    /// Takes the pack current into the mode detector; `None` = stale.
-    pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>) -> TransitionOutcome {
-        self.state.detector.observe(&self.config.transition, now, current_a)
-    }
-
-    /// Marks where a mode begins that may follow the present one; `charge_as` is the charge counted so far.
-    pub(super) fn mark_candidate(&mut self, now: Timestamp, charge_as: f64, bank: &EstimatorBank) {
-        self.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
     }
 
     /// Ends a mode: its half-cycle, if it was one, teaches every cell.
@@ -215,7 +197,7 @@ impl Learning {
     /// the SOC has jumped, and what it crossed on the way was not charged.
     pub(super) fn handle_sample(&mut self, sample: &CellSample, was_reset: bool, model: &CellModel) {
         if was_reset {
-            self.state.recharge.discard();
+            self.state.recharge = RechargeTimer::default();
         }
         let (Some(usable), Some(current_a)) = (&self.config.usable, sample.current_a) else { return };
         let is_tapering = current_a < 0.0 && -current_a <= usable.taper_current_a;

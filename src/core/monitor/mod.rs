@@ -60,6 +60,7 @@ pub use view::{CellView, PackView, ReportedState};
 /// The pure core.
 #[derive(Debug)]
 pub struct Monitor {
+    config: MonitorConfig,
     clock: Clock,
     intake: Intake,
     stages: Stages,
@@ -70,7 +71,8 @@ pub struct Monitor {
 impl Monitor {
     /// A monitor without any knowledge of its pack.
     pub fn new(config: MonitorConfig) -> Self {
-        Self { clock: Clock::default(), intake: Intake::new(&config), stages: Stages::new(&config), pending: None }
+        let (intake, stages) = (Intake::new(&config), Stages::new(&config));
+        Self { config, clock: Clock::default(), intake, stages, pending: None }
     }
 
     /// Takes one input; appends its outputs to `out`. A tick before [`Monitor::next_due`] does nothing at all, so a
@@ -83,15 +85,15 @@ impl Monitor {
 
     fn dispatch(&mut self, input: Input<'_>, out: &mut Outputs) {
         let time = input.time();
-        if !self.clock.has_started() {
+        if !self.clock.has_started {
             self.start(time, out);
         }
         match input {
             Input::Frame { bus, frame, .. } => {
                 self.advance(time, out);
                 self.handle_frame(bus, frame, out);
-                if self.stages.sender.has_j1939() {
-                    self.stages.sender.handle_j1939_frame(self.clock.now(), bus, frame, out);
+                if self.stages.sender.j1939.is_some() {
+                    self.stages.sender.handle_j1939_frame(self.clock.now, bus, frame, out);
                     self.find_due();
                 }
             }
@@ -101,7 +103,7 @@ impl Monitor {
             | Input::Command { .. }
             | Input::Store { .. }
             | Input::Bus { .. } => {
-                self.stages.step_waiting(self.clock.now(), true, out);
+                self.stages.step_waiting(self.clock.now, true, out);
                 if matches!(input, Input::UnknownGap { .. }) {
                     self.handle_unknown_gap(time, out);
                 } else {
@@ -115,31 +117,32 @@ impl Monitor {
 
     /// Takes a frame: its readings to the stages, or its command.
     fn handle_frame(&mut self, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
-        let Self { clock, intake, stages, .. } = self;
-        let now = clock.now();
+        let Self { config, clock, intake, stages, .. } = self;
+        let now = clock.now;
         let Some(intact) = intake.admit(now, bus, frame, out) else { return };
-        if intake.is_command(bus, frame) {
-            match intake.command(now, bus, frame, intact.is_ok(), out) {
+        let is_command = |commands: &&CommandConfig| commands.bus == bus && commands.plan.id() == frame.id();
+        if let Some(commands) = config.commands.as_ref().filter(is_command) {
+            match intake.command(now, commands, frame, intact.is_ok(), out) {
                 Some(command) => stages.handle_command(now, Source::Bus(bus), command, out),
                 None => stages.statistics.bad_commands += 1,
             }
             return;
         }
-        intake.decode(bus, frame, |Reading { channel, value }| {
+        config.input.decode(bus, frame, |Reading { channel, value }| {
             stages.handle_reading(now, bus, Reading { channel, value: intact.and(value) }, out);
         });
     }
 
     /// Takes an input that is neither a frame nor a gap, at its time.
     fn handle_occasional(&mut self, input: Input<'_>, out: &mut Outputs) {
-        let Self { intake, stages, .. } = self;
-        let now = self.clock.now();
+        let Self { config, intake, stages, .. } = self;
+        let now = self.clock.now;
         match input {
             Input::Frame { .. } | Input::UnknownGap { .. } => {}
             Input::Tick { .. } => {
-                if stages.take_housekeeping_due(now) {
+                if stages.sender.take_housekeeping_due(now, HOUSEKEEPING_S) {
                     intake.poll(now, out);
-                    stages.keep_house(now, intake.bus_fault(now), out);
+                    stages.keep_house(now, intake.bus_fault(now, config.interfaces), out);
                 }
                 stages.send_due(now, out);
             }
@@ -151,7 +154,7 @@ impl Monitor {
             }
             Input::Bus { bus, event, .. } => {
                 intake.handle_bus_event(now, bus, event, out);
-                if event == BusEvent::Up && stages.sender.j1939().is_some_and(|j1939| j1939.config().bus == bus) {
+                if event == BusEvent::Up && config.j1939.as_ref().is_some_and(|j1939| j1939.bus == bus) {
                     stages.sender.claim_address(now, out);
                 }
             }
@@ -162,7 +165,7 @@ impl Monitor {
     /// uses estimates; a driver does after its last input.
     pub fn settle(&mut self, out: &mut Outputs) {
         let first_event = out.events.len();
-        self.stages.step_waiting(self.clock.now(), true, out);
+        self.stages.step_waiting(self.clock.now, true, out);
         self.stages.statistics.note_events(&out.events[first_event..]);
         self.find_due();
     }
@@ -174,15 +177,15 @@ impl Monitor {
     }
 
     fn find_due(&mut self) {
-        self.clock.due = self.clock.has_started().then(|| self.stages.sender.next_due());
+        self.clock.due = self.clock.has_started.then(|| self.stages.sender.next_due());
     }
 
     /// Begins at the time of the first input, with the stored state that waits, if there is one.
     fn start(&mut self, time: Timestamp, out: &mut Outputs) {
-        self.clock.start(time);
+        (self.clock.has_started, self.clock.now) = (true, time);
         self.stages.sender.restart(time);
         let beginning = self.apply_pending(time, out);
-        let (taken, stages) = (self.clock.now(), &mut self.stages);
+        let (taken, stages) = (self.clock.now, &mut self.stages);
         let away_s = time.since(taken);
         let was_brief = beginning != Beginning::RestoredAgeless && away_s <= ASLEEP_S;
         if beginning == Beginning::Restored {
@@ -219,7 +222,7 @@ impl Monitor {
     fn handle_jump(&mut self, jump: TimeJump, time: Timestamp, out: &mut Outputs) {
         match jump {
             TimeJump::Backwards { seconds } => {
-                self.stages.step_waiting(self.clock.now(), true, out);
+                self.stages.step_waiting(self.clock.now, true, out);
                 out.events.push(Event { time, kind: EventKind::TimeBackwards { seconds } });
                 self.handle_unknown_gap(time, out);
             }
@@ -227,7 +230,7 @@ impl Monitor {
                 self.fall_asleep(out);
                 out.events.push(Event { time, kind: EventKind::Gap { seconds: Some(seconds) } });
                 self.stages.wake(time, out);
-                self.clock.set(time);
+                self.clock.now = time;
             }
         }
         self.find_due();
@@ -235,7 +238,7 @@ impl Monitor {
 
     /// Ends what was under way: no input comes until the clock is set again.
     fn fall_asleep(&mut self, out: &mut Outputs) {
-        let now = self.clock.now();
+        let now = self.clock.now;
         self.stages.step_waiting(now, true, out);
         self.intake.restart(now, out);
         self.stages.fall_asleep(now, out);
@@ -244,9 +247,10 @@ impl Monitor {
     /// Continues at `time` after a gap of unknown length.
     fn handle_unknown_gap(&mut self, time: Timestamp, out: &mut Outputs) {
         self.fall_asleep(out);
-        self.intake.handle_unknown_gap();
-        self.stages.begin_unknown_gap(self.clock.now(), out);
-        self.clock.set(time);
+        // How long ago a command was rejected is not known any more.
+        self.intake.bad_command_at = None;
+        self.stages.begin_unknown_gap(self.clock.now, out);
+        self.clock.now = time;
         out.events.push(Event { time, kind: EventKind::Gap { seconds: None } });
         self.stages.end_unknown_gap(time, out);
     }

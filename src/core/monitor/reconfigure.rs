@@ -47,10 +47,10 @@ impl Monitor {
         now: Timestamp,
         out: &mut Outputs,
     ) -> Result<Reconfigured, ReconfigureError> {
-        let old = self.config();
-        old.check_fits(&config)?;
+        self.config.check_fits(&config)?;
+        let old = std::mem::replace(&mut self.config, config.clone());
         let first_event = out.events.len();
-        let at = self.clock.now();
+        let at = self.clock.now;
         if !old.estimates_as(&config) {
             // Earlier samples are judged by the earlier settings.
             self.stages.step_waiting(at, true, out);
@@ -62,7 +62,7 @@ impl Monitor {
         stages.sampling.reconfigure(&config);
         stages.sender.reconfigure(at, config.output.as_ref(), &stages.alarming.engine, out);
         if old.j1939 != config.j1939 {
-            stages.sender.reconfigure_j1939(at, &config, self.clock.has_started(), out);
+            stages.sender.reconfigure_j1939(at, &config, self.clock.has_started, out);
         }
         stages.learning.config = config.health;
         self.forget_measures(&old.health, out);
@@ -84,30 +84,9 @@ impl Monitor {
         Ok(Reconfigured { changed, alarms_ended })
     }
 
-    /// The present configuration, assembled from the stages.
-    fn config(&self) -> MonitorConfig {
-        let (intake, stages) = (self.intake.config(), &self.stages);
-        let bank = &stages.estimation.bank;
-        MonitorConfig {
-            interfaces: intake.interfaces,
-            input: intake.input.clone(),
-            guards: intake.guards.clone(),
-            identity_readings: stages.sampling.identity_readings(),
-            flood: intake.flood,
-            sample: stages.sampling.sampler.config().clone(),
-            model: bank.model().clone(),
-            estimator: *bank.config(),
-            health: stages.learning.config,
-            rules: stages.alarming.rules().to_vec(),
-            output: stages.sender.config().cloned(),
-            commands: intake.commands.clone(),
-            j1939: stages.sender.j1939().map(|j1939| j1939.config().clone()),
-        }
-    }
-
     /// Forgets values measured by another window or load, before new thresholds are set.
     fn forget_measures(&mut self, old: &HealthConfig, out: &mut Outputs) {
-        let now = self.clock.now();
+        let now = self.clock.now;
         let cells = self.stages.estimation.cell_indices();
         let (learning, mut publisher) = self.stages.learning_and_publisher(now, out);
         let new = learning.config;

@@ -17,7 +17,7 @@ pub(super) struct Sampling {
     pub(super) identity: Identity,
     identity_readings: u32,
     /// Whether a usable reading has come since the first input.
-    has_usable_reading: bool,
+    pub(super) has_usable_reading: bool,
     /// Changes of the input at hand, kept for their memory.
     changes: Vec<SignalChange>,
 }
@@ -25,29 +25,15 @@ pub(super) struct Sampling {
 /// The pack's identity as its signal gives it.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Identity {
-    known: Option<f64>,
+    pub(super) known: Option<f64>,
     /// Another number, and how many readings in a row have given it.
     #[serde(skip)]
     candidate: Option<(f64, u32)>,
 }
 
-/// A pack identity that was found.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct IdentityChange {
-    /// As the signal gives it.
-    pub(super) identity: f64,
-    /// Whether another pack was known before.
-    pub(super) is_replacement: bool,
-}
-
 impl Identity {
-    /// The known number; `None` = none yet.
-    pub(super) fn known(&self) -> Option<f64> {
-        self.known
-    }
-
     /// Takes a reading; the new number when `readings` in a row have given it.
-    fn observe(&mut self, value: f64, readings: u32) -> Option<IdentityChange> {
+    fn observe(&mut self, value: f64, readings: u32) -> Option<(f64, bool)> {
         if self.known == Some(value) {
             self.candidate = None;
             return None;
@@ -59,7 +45,7 @@ impl Identity {
         }
         let is_replacement = self.known.is_some();
         *self = Self { known: Some(value), candidate: None };
-        Some(IdentityChange { identity: value, is_replacement })
+        Some((value, is_replacement))
     }
 }
 
@@ -78,11 +64,6 @@ impl Sampling {
     pub(super) fn reconfigure(&mut self, config: &MonitorConfig) {
         self.sampler.reconfigure(&config.sample);
         self.identity_readings = config.identity_readings;
-    }
-
-    /// Readings in a row that give another identity.
-    pub(super) fn identity_readings(&self) -> u32 {
-        self.identity_readings
     }
 
     /// Takes the most frequent reading, an ordinary cell voltage; `None` = it may be anything else, and
@@ -108,8 +89,8 @@ impl Sampling {
         sample
     }
 
-    /// Takes a reading of the identity signal.
-    pub(super) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<IdentityChange> {
+    /// Takes a reading of the identity signal. Returns another identity, and whether another pack was known before.
+    pub(super) fn handle_identity(&mut self, reading: Result<f64, Fault>) -> Option<(f64, bool)> {
         let value = reading.ok().filter(|value| value.is_finite())?;
         self.identity.observe(value, self.identity_readings)
     }
@@ -118,11 +99,6 @@ impl Sampling {
     pub(super) fn poll(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sampler.poll(now, &mut self.changes);
         self.report(now, out);
-    }
-
-    /// Whether a usable reading has come since the first input. Values of a restored state do not count.
-    pub(super) fn has_usable_reading(&self) -> bool {
-        self.has_usable_reading
     }
 
     /// The channel of a cell's voltage.

@@ -7,10 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use super::j1939::J1939;
 use super::{Event, EventKind, MonitorConfig, Outputs, Transmit};
-use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, Severity};
+use crate::alarm::{Alarm, AlarmEngine, AlarmState, Rule, StoredAlarm};
 use crate::can::Frame;
 use crate::can::encode::{AlarmFields, HealthFields, OutputPlan, SendCounters, StatusFields};
-use crate::quantity::{BusIndex, CellIndex, Timestamp};
+use crate::quantity::{BusIndex, Timestamp};
 
 /// Period of a test's frames, s: a consumer that reads once a second receives several.
 const TEST_PERIOD_S: f64 = 0.1;
@@ -36,10 +36,10 @@ pub struct OutputConfig {
 #[derive(Debug)]
 pub(super) struct Sender {
     config: Option<OutputConfig>,
-    schedule: Schedule,
+    pub(super) schedule: Schedule,
     /// A running test of an alarm frame; it ends with the process.
     test: Option<AlarmTest>,
-    j1939: Option<J1939>,
+    pub(super) j1939: Option<J1939>,
 }
 
 /// A running test of an alarm frame.
@@ -62,14 +62,6 @@ pub(super) struct Schedule {
     /// Counters of the frames' end-to-end protection.
     #[serde(default)]
     counters: SendCounters,
-}
-
-/// Which cyclic frames are due now.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct DueFrames {
-    pub(super) status: bool,
-    pub(super) health: bool,
-    pub(super) alarm: bool,
 }
 
 impl Schedule {
@@ -110,16 +102,6 @@ impl Sender {
             test: None,
             j1939: config.j1939.clone().map(J1939::new),
         }
-    }
-
-    /// Settings of the cyclic frames.
-    pub(super) fn config(&self) -> Option<&OutputConfig> {
-        self.config.as_ref()
-    }
-
-    /// The J1939 node.
-    pub(super) fn j1939(&self) -> Option<&J1939> {
-        self.j1939.as_ref()
     }
 
     /// Other cyclic frames. Without any, a running test ends.
@@ -164,14 +146,6 @@ impl Sender {
         (schedule.housekeeping, schedule.status, schedule.health, schedule.alarm) = (now, now, now, now);
     }
 
-    pub(super) fn snapshot(&self) -> Schedule {
-        self.schedule.clone()
-    }
-
-    pub(super) fn restore(&mut self, schedule: Schedule) {
-        self.schedule = schedule;
-    }
-
     /// When a tick next does something.
     pub(super) fn next_due(&self) -> Timestamp {
         let schedule = &self.schedule;
@@ -186,14 +160,14 @@ impl Sender {
         take_due(&mut self.schedule.housekeeping, now, period_s)
     }
 
-    /// Which cyclic frames are due; `None` = none is configured.
-    pub(super) fn take_frames_due(&mut self, now: Timestamp) -> Option<DueFrames> {
+    /// Whether status, health and alarm frames are due; `None` = none is configured.
+    pub(super) fn take_frames_due(&mut self, now: Timestamp) -> Option<[bool; 3]> {
         let (config, schedule) = (self.config.as_ref()?, &mut self.schedule);
-        Some(DueFrames {
-            status: take_due(&mut schedule.status, now, config.status_period_s),
-            health: take_due(&mut schedule.health, now, config.health_period_s),
-            alarm: take_due(&mut schedule.alarm, now, config.alarm_period_s),
-        })
+        Some([
+            take_due(&mut schedule.status, now, config.status_period_s),
+            take_due(&mut schedule.health, now, config.health_period_s),
+            take_due(&mut schedule.alarm, now, config.alarm_period_s),
+        ])
     }
 
     /// Sends the status frame.
@@ -236,12 +210,8 @@ impl Sender {
     }
 
     /// Sends that no threshold watches an alarm any more: its state is not known.
-    pub(super) fn send_alarm_end(
-        &mut self,
-        now: Timestamp,
-        (rule, severity, cell): (Rule, Severity, Option<CellIndex>),
-        out: &mut Outputs,
-    ) {
+    pub(super) fn send_alarm_end(&mut self, now: Timestamp, alarm: &StoredAlarm, out: &mut Outputs) {
+        let StoredAlarm { rule, severity, cell, .. } = *alarm;
         let (rule, state, severity) = (rule as u8, Some(AlarmState::Unknown.wire_code()), Some(severity as u8));
         self.send_alarm_fields(now, &AlarmFields { rule, state, severity, cell, ..AlarmFields::default() }, out);
     }
@@ -314,12 +284,6 @@ impl Sender {
         self.send_alarm_fields(now, &AlarmFields { rule, state, test: true, ..AlarmFields::default() }, out);
     }
 
-    /// Whether there is a J1939 node.
-    #[inline]
-    pub(super) fn has_j1939(&self) -> bool {
-        self.j1939.is_some()
-    }
-
     /// Claims the J1939 address: at the start, after time asleep, when the interface is up again.
     pub(super) fn claim_address(&mut self, now: Timestamp, out: &mut Outputs) {
         if let Some(j1939) = &mut self.j1939 {
@@ -329,8 +293,8 @@ impl Sender {
 
     /// Passes a frame to the J1939 node, if it came on the node's interface.
     pub(super) fn handle_j1939_frame(&mut self, now: Timestamp, bus: BusIndex, frame: &Frame, out: &mut Outputs) {
-        if let Some(j1939) = self.j1939.as_mut().filter(|j1939| j1939.config().bus == bus) {
-            j1939.handle_frame(now, frame, out);
+        if let Some(j1939) = &mut self.j1939 {
+            j1939.handle_frame(now, bus, frame, out);
         }
     }
 

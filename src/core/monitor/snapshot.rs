@@ -62,11 +62,8 @@ struct StoredCell {
     estimator: CellState,
     consumed: Option<Consumed>,
     trusted: bool,
-    full_soc: f64,
-    tapered: bool,
-    usable: Option<ScalarGaussian>,
-    #[serde(default)]
-    discharge_resistance: Option<ScalarGaussian>,
+    #[serde(flatten)]
+    health: CellHealth,
     /// `None` in states of programs without forecasts: it begins with the next reading.
     #[serde(default)]
     forecast: Option<Forecast>,
@@ -76,22 +73,9 @@ struct StoredCell {
 /// Why a snapshot cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum RestoreError {
-    /// Written by another version.
-    #[error("snapshot version {found}, this program reads {allowed}")]
-    Version {
-        /// In the file.
-        found: u32,
-        /// Readable here.
-        allowed: u32,
-    },
-    /// Taken with another configuration.
-    #[error("snapshot is of {found}, the configuration has {allowed}")]
-    Shape {
-        /// In the file.
-        found: String,
-        /// Configured.
-        allowed: String,
-    },
+    /// Written by another version, or taken with another configuration.
+    #[error("{0}")]
+    Unfit(String),
     /// A number in it is impossible: it is damaged.
     #[error("snapshot is damaged: {what}{} = {found:?}, must be {allowed}", .cell.map(|cell| format!(" (cell {cell})")).unwrap_or_default())]
     Number {
@@ -140,15 +124,15 @@ impl Monitor {
         let (intake, buses) = self.intake.snapshot();
         Snapshot {
             version: SNAPSHOT_VERSION,
-            time: self.clock.now(),
+            time: self.clock.now,
             cells: (0..estimation.cells()).map(|cell| self.stages.stored_cell(cell)).collect(),
             waiting: estimation.batch.waiting.clone(),
             sampler: sampling.sampler.snapshot(),
             learning: learning.state.clone(),
-            updated_cells: estimation.batch.reported(),
-            time_backwards: self.clock.time_backwards(),
+            updated_cells: estimation.batch.reported,
+            time_backwards: self.clock.time_backwards,
             alarms: alarming.engine.snapshot(),
-            schedule: sender.snapshot(),
+            schedule: sender.schedule.clone(),
             intake,
             buses,
             identity: sampling.identity,
@@ -165,7 +149,10 @@ impl Monitor {
     /// damaged number leaves the others in doubt.
     pub fn restore(&mut self, snapshot: Snapshot, downtime: Downtime) -> Result<(), RestoreError> {
         if snapshot.version != SNAPSHOT_VERSION {
-            return Err(RestoreError::Version { found: snapshot.version, allowed: SNAPSHOT_VERSION });
+            let found = snapshot.version;
+            return Err(RestoreError::Unfit(format!(
+                "snapshot version {found}, this program reads {SNAPSHOT_VERSION}"
+            )));
         }
         let Stages { sampling, estimation, .. } = &self.stages;
         let (branches, cells) = (estimation.bank.model().branches.len(), estimation.cells());
@@ -175,10 +162,11 @@ impl Monitor {
             && snapshot.waiting_fits()
             && snapshot.cells.iter().all(|cell| CellEstimator::restore(&cell.estimator, branches).is_some());
         if !fits {
-            return Err(RestoreError::Shape {
-                found: format!("{} cells, another number of branches, or samples of no cell", snapshot.cells.len()),
-                allowed: format!("{cells} cells of {branches} branches"),
-            });
+            let found = snapshot.cells.len();
+            return Err(RestoreError::Unfit(format!(
+                "snapshot is of {found} cells, another number of branches, or samples of no cell, the configuration has \
+                 {cells} cells of {branches} branches"
+            )));
         }
         snapshot.check()?;
         self.pending = Some(PendingRestore { snapshot: Box::new(snapshot), downtime });
@@ -195,7 +183,7 @@ impl Monitor {
             Downtime::AsStamped | Downtime::Unknown => None,
         };
         snapshot.rebase(taken.unwrap_or(now).nanos().saturating_sub(snapshot.time.nanos()));
-        self.clock.restore(snapshot.time, snapshot.time_backwards);
+        (self.clock.now, self.clock.time_backwards) = (snapshot.time, snapshot.time_backwards);
         self.intake.restore(&snapshot.intake, std::mem::take(&mut snapshot.buses).restored(snapshot.time, now));
         self.stages.restore(*snapshot, now, out);
         if taken.is_some() { Beginning::Restored } else { Beginning::RestoredAgeless }
@@ -205,15 +193,11 @@ impl Monitor {
 impl Stages {
     fn stored_cell(&self, cell: usize) -> StoredCell {
         let Self { estimation, learning, .. } = self;
-        let health = &learning.cells[cell];
         StoredCell {
             estimator: estimation.bank.cell(cell).snapshot(),
             consumed: estimation.consumed(cell),
             trusted: estimation.is_trusted(cell),
-            full_soc: health.full_soc,
-            tapered: health.tapered,
-            usable: health.usable,
-            discharge_resistance: health.discharge_resistance,
+            health: learning.cells[cell],
             forecast: Some(learning.lives.cells[cell].forecast.clone()),
             updated_in_round: estimation.batch.has_reported(cell),
         }
@@ -224,7 +208,7 @@ impl Stages {
         let Self { sampling, estimation, learning, .. } = self;
         let branches = estimation.bank.model().branches.len();
         for (index, cell) in snapshot.cells.iter().enumerate() {
-            learning.cells[index] = cell.health();
+            learning.cells[index] = cell.health;
             learning.lives.cells[index] = cell.life(estimation.bank.model(), &learning.config);
             if let Some(estimator) = CellEstimator::restore(&cell.estimator, branches) {
                 estimation.bank.put(index, &estimator);
@@ -234,10 +218,10 @@ impl Stages {
         let cells = snapshot.cells.iter().map(|cell| (cell.consumed, cell.trusted));
         estimation.restore(cells, CellBatch::restore(has_reported, snapshot.waiting));
         // Its shape is checked in `Monitor::restore`.
-        let _ = sampling.sampler.restore(&snapshot.sampler);
+        sampling.sampler.restore(snapshot.sampler);
         sampling.identity = snapshot.identity;
         learning.state = snapshot.learning;
-        self.sender.restore(snapshot.schedule);
+        self.sender.schedule = snapshot.schedule;
         self.restore_alarms(now, &snapshot.alarms, out);
         self.statistics = snapshot.statistics;
         self.statistics.restores += 1;
@@ -251,7 +235,7 @@ impl Stages {
             let (active, occurrences) = (orphan.is_raised(), orphan.occurrences());
             let kind = EventKind::AlarmDropped { rule, severity, cell, active, occurrences };
             out.events.push(Event { time, kind });
-            self.sender.send_alarm_end(time, (rule, severity, cell), out);
+            self.sender.send_alarm_end(time, &orphan, out);
         }
     }
 }
@@ -304,18 +288,13 @@ impl LearningState {
 impl StoredCell {
     fn check(&self) -> Result<(), InvalidState> {
         self.estimator.check()?;
-        InvalidState::unless_number("the SOC of a full cell", self.full_soc)?;
-        check_positive("the usable capacity", self.usable)?;
-        check_positive("the resistance of discharge", self.discharge_resistance)?;
+        InvalidState::unless_number("the SOC of a full cell", self.health.full_soc)?;
+        check_positive("the usable capacity", self.health.usable)?;
+        check_positive("the resistance of discharge", self.health.discharge_resistance)?;
         self.forecast.iter().try_for_each(|forecast| forecast.check(Axis::Cycles))?;
         let Some(Consumed { charge_as, unmeasured_s, .. }) = self.consumed else { return Ok(()) };
         InvalidState::unless_number("the charge taken in", charge_as)?;
         InvalidState::unless_number("the unmeasured time taken in", unmeasured_s)
-    }
-
-    fn health(&self) -> CellHealth {
-        let Self { full_soc, tapered, usable, discharge_resistance, .. } = *self;
-        CellHealth { full_soc, tapered, usable, discharge_resistance }
     }
 
     fn life(&self, model: &CellModel, config: &HealthConfig) -> CellLife {

@@ -4,14 +4,13 @@
 //! input at hand.
 
 use super::alarming::Alarming;
-use super::clock::HOUSEKEEPING_S;
-use super::estimation::Estimation;
+use super::estimation::{Estimation, end_state};
 use super::learning::Learning;
 use super::publisher::Publisher;
 use super::sampling::Sampling;
 use super::sender::Sender;
 use super::{Command, Estimate, Event, EventKind, MonitorConfig, Outputs, Source, Statistics, Validity};
-use crate::alarm::{AlarmInput, Observation};
+use crate::alarm::{AlarmInput, CommandOutcome, Observation};
 use crate::can::encode::StatusFields;
 use crate::filter::ScalarGaussian;
 use crate::health::ModeChange;
@@ -81,11 +80,11 @@ impl Stages {
     }
 
     fn handle_identity(&mut self, now: Timestamp, bus: BusIndex, reading: Reading, out: &mut Outputs) {
-        let Some(found) = self.sampling.handle_identity(reading.value) else { return };
-        if found.is_replacement {
+        let Some((identity, is_replacement)) = self.sampling.handle_identity(reading.value) else { return };
+        if is_replacement {
             self.handle_command(now, Source::Bus(bus), Command::PackReplaced, out);
         }
-        out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity: found.identity } });
+        out.events.push(Event { time: now, kind: EventKind::PackIdentity { identity } });
     }
 
     /// Takes a sample: it waits until all cells have one, or its cell reports for the second time.
@@ -151,7 +150,8 @@ impl Stages {
 
     /// Takes the pack current into the mode detector; `None` = stale. A change of mode is learned from.
     pub(super) fn observe_current(&mut self, now: Timestamp, current_a: Option<f64>, out: &mut Outputs) {
-        let observed = self.learning.observe_current(now, current_a);
+        let Learning { config, state, .. } = &mut self.learning;
+        let observed = state.detector.observe(&config.transition, now, current_a);
         if observed.change.is_none() && !observed.candidate_begins {
             return;
         }
@@ -161,7 +161,8 @@ impl Stages {
         }
         if observed.candidate_begins {
             let (charge_as, _) = self.sampling.sampler.counted(now);
-            self.learning.mark_candidate(now, charge_as, &self.estimation.bank);
+            let bank = &self.estimation.bank;
+            self.learning.state.learner.mark_candidate(now, charge_as, |cell| end_state(bank, cell));
         }
     }
 
@@ -173,22 +174,17 @@ impl Stages {
     /// Executes a command.
     pub(super) fn handle_command(&mut self, now: Timestamp, source: Source, command: Command, out: &mut Outputs) {
         self.step_waiting(now, true, out);
-        let (changed, refused) = match command {
-            Command::Acknowledge(which) => {
-                let outcome = self.publisher(now, out).apply(AlarmInput::Acknowledge(which));
-                (outcome.changed, outcome.refused)
-            }
-            Command::Clear(which) => {
-                let outcome = self.publisher(now, out).apply(AlarmInput::Clear(which));
-                (outcome.changed, outcome.refused)
-            }
+        let CommandOutcome { changed, refused } = match command {
+            Command::Acknowledge(which) => self.publisher(now, out).apply(AlarmInput::Acknowledge(which)),
+            Command::Clear(which) => self.publisher(now, out).apply(AlarmInput::Clear(which)),
             Command::PackReplaced => {
                 self.replace_pack(now, out);
-                (u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX), 0)
+                let changed = u32::try_from(self.alarming.changes.len()).unwrap_or(u32::MAX);
+                CommandOutcome { changed, refused: 0 }
             }
             Command::Test { rule, seconds } => {
                 let has_output = self.sender.start_test(now, rule, seconds, &self.alarming.engine, out);
-                (0, u32::from(!has_output))
+                CommandOutcome { changed: 0, refused: u32::from(!has_output) }
             }
         };
         let mut publisher = self.publisher(now, out);
@@ -262,24 +258,19 @@ impl Stages {
         self.watch(now, bus_fault, out);
     }
 
-    /// Whether housekeeping is due.
-    pub(super) fn take_housekeeping_due(&mut self, now: Timestamp) -> bool {
-        self.sender.take_housekeeping_due(now, HOUSEKEEPING_S)
-    }
-
     /// Sends the frames that are due.
     pub(super) fn send_due(&mut self, now: Timestamp, out: &mut Outputs) {
         self.sender.poll_j1939(now, out);
-        let Some(due) = self.sender.take_frames_due(now) else { return };
-        if due.status {
+        let Some([is_status_due, is_health_due, is_alarm_due]) = self.sender.take_frames_due(now) else { return };
+        if is_status_due {
             let fields = self.status_fields();
             self.sender.send_status(now, &fields, out);
         }
-        if due.health {
+        if is_health_due {
             let fields = self.learning.health_fields(&self.estimation.bank);
             self.sender.send_health(now, &fields, out);
         }
-        if due.alarm {
+        if is_alarm_due {
             self.sender.send_next_alarm(now, &self.alarming.engine, out);
         }
         self.sender.continue_test(now, &self.alarming.engine, out);
@@ -289,7 +280,7 @@ impl Stages {
     pub(super) fn validity(&self) -> Validity {
         if self.learning.state.pack.is_none() {
             Validity::Unavailable
-        } else if !self.estimation.all_trusted() {
+        } else if !self.estimation.all_trusted {
             Validity::Untrusted
         } else if self.sampling.sampler.any_bad() {
             Validity::Degraded

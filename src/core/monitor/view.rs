@@ -80,12 +80,12 @@ pub struct ReportedState {
 impl Monitor {
     /// Time of the latest input.
     pub fn now(&self) -> Timestamp {
-        self.clock.now()
+        self.clock.now
     }
 
     /// Inputs with a time before that of an earlier one.
     pub fn time_backwards(&self) -> u64 {
-        self.clock.time_backwards()
+        self.clock.time_backwards
     }
 
     /// Per protected input message: the count of each status of its check.
@@ -105,7 +105,7 @@ impl Monitor {
 
     /// Whether a usable reading has come since the first input. Values of a restored state do not count.
     pub fn has_heard(&self) -> bool {
-        self.stages.sampling.has_usable_reading()
+        self.stages.sampling.has_usable_reading
     }
 
     /// Configured signals with a last good value that is too old: no reading came, or only bad ones. A signal without any
@@ -122,7 +122,7 @@ impl Monitor {
 
     /// Identity of the connected pack; `None` = no signal is configured, or it has not been read yet.
     pub fn pack_identity(&self) -> Option<f64> {
-        self.stages.sampling.identity.known()
+        self.stages.sampling.identity.known
     }
 
     /// The latest estimate of every cell, for live tables; `None` before its first. Samples since the last

@@ -163,26 +163,19 @@ impl Stages {
 
     fn watch_pack(&mut self, now: Timestamp, all_fresh: bool, out: &mut Outputs) {
         let spread = self.soc_spread(now, all_fresh);
-        let soc_low = spread.map_or(Observation::default(), |spread| Observation {
-            is_bound: !spread.is_whole,
-            ..Observation::new(Some(spread.lowest.mean)).with_std(spread.lowest.std())
-        });
-        let has_others = self.estimation.cells() > 1;
-        let imbalance = spread.filter(|_| has_others).map_or(Observation::default(), |spread| Observation {
-            is_bound: !spread.is_whole,
-            ..Observation::new(Some(spread.highest.mean - spread.lowest.mean))
-                .with_std((spread.highest.variance + spread.lowest.variance).sqrt())
+        let soc_low = spread.map(|spread| learned(spread.lowest).of_part(!spread.is_whole));
+        let imbalance = spread.filter(|_| self.estimation.cells() > 1).map(|spread| {
+            let SocSpread { lowest, highest, is_whole } = spread;
+            let std = (highest.variance + lowest.variance).sqrt();
+            Observation::new(Some(highest.mean - lowest.mean)).with_std(std).of_part(!is_whole)
         });
         let hottest = self.sampling.sampler.hottest_c(now);
-        let hottest = hottest.map_or(Observation::default(), |(hottest_c, is_whole)| Observation {
-            is_bound: !is_whole,
-            ..Observation::new(Some(hottest_c))
-        });
+        let hottest = hottest.map(|(hottest_c, is_whole)| Observation::new(Some(hottest_c)).of_part(!is_whole));
         let disagreement = self.disagreement(now);
         let mut publisher = self.publisher(now, out);
-        publisher.observe(Rule::SocLow, None, soc_low);
-        publisher.observe(Rule::CellImbalance, None, imbalance);
-        publisher.observe(Rule::TemperatureHigh, None, hottest);
+        publisher.observe(Rule::SocLow, None, soc_low.unwrap_or_default());
+        publisher.observe(Rule::CellImbalance, None, imbalance.unwrap_or_default());
+        publisher.observe(Rule::TemperatureHigh, None, hottest.unwrap_or_default());
         publisher.observe(Rule::BmsDisagrees, None, disagreement);
     }
 
@@ -240,7 +233,7 @@ impl Stages {
 
     /// Whether no cell's innovations can change an alarm or its trust: then they are only shown.
     pub(super) fn are_innovations_quiet(&self, out: &Outputs) -> bool {
-        self.estimation.all_trusted() && !out.want_alarm_inputs && {
+        self.estimation.all_trusted && !out.want_alarm_inputs && {
             let bank = &self.estimation.bank;
             let worst = bank.worst_nis();
             worst <= bank.config().consistency.limit && self.alarming.engine.is_quiet(Rule::EstimateUntrusted, worst)
@@ -286,20 +279,20 @@ impl Stages {
             let is_estimated = was_brief && self.estimation.bank.soc(index).is_some();
             let mean_nis = is_estimated.then(|| self.estimation.bank.mean_nis(index));
             let health = &self.learning.cells[index];
-            let (resistance, usable) = (health.discharge_resistance, health.usable);
+            let known = [
+                (Rule::CapacityLow, capacity.map(old)),
+                (
+                    Rule::EstimateUntrusted,
+                    mean_nis.map(|nis| Observation { is_new: false, ..Observation::new(Some(nis)) }),
+                ),
+                (Rule::ResistanceHigh, health.discharge_resistance.map(old)),
+                (Rule::UsableCapacityLow, health.usable.map(old)),
+            ];
             let mut publisher = self.publisher(now, out);
-            if let Some(capacity) = capacity {
-                publisher.observe(Rule::CapacityLow, cell, old(capacity));
-            }
-            if mean_nis.is_some() {
-                let mean_nis = Observation { value: mean_nis, ..Observation::default() };
-                publisher.observe(Rule::EstimateUntrusted, cell, mean_nis);
-            }
-            if let Some(resistance) = resistance {
-                publisher.observe(Rule::ResistanceHigh, cell, old(resistance));
-            }
-            if let Some(usable) = usable {
-                publisher.observe(Rule::UsableCapacityLow, cell, old(usable));
+            for (rule, observation) in known {
+                if let Some(observation) = observation {
+                    publisher.observe(rule, cell, observation);
+                }
             }
         }
         let period = self.learning.known_recharge_period();

@@ -14,4 +14,4 @@ pub mod signal;
 
 pub use config::{Limits, SampleConfig, VoltageSource};
 pub use counts::ReadingCounts;
-pub use sampler::{CellSample, Sampler, SamplerState, SignalChange, SignalCountMismatch};
+pub use sampler::{CellSample, Sampler, SamplerState, SignalChange};

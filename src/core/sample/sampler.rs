@@ -2,7 +2,7 @@
 //!
 //! In: readings with their time (V, A, degrees C). Out: a [`CellSample`] per good voltage, with the current and temperature
 //! that are fresh at that time, and the charge and unmeasured time counted up to it. A bad voltage makes no sample.
-//! Readings of channels without a use are counted ([`Sampler::unused_readings`]).
+//! Readings of channels without a use are counted ([`Sampler::reading_counts`]).
 //!
 //! Memory is one record per channel, sized at the start: a reading touches one whole record, so the records are stored
 //! together and not field by field. Nothing is allocated per reading.
@@ -94,16 +94,6 @@ impl SamplerState {
     }
 }
 
-/// Error of a stored state with another number of signals than the configuration.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("sample state has {found} signals, the configuration has {allowed}")]
-pub struct SignalCountMismatch {
-    /// Stored.
-    pub found: usize,
-    /// Configured.
-    pub allowed: usize,
-}
-
 /// The sample stage.
 #[derive(Debug, Clone)]
 pub struct Sampler {
@@ -176,7 +166,7 @@ impl Sampler {
     /// When the signals differ; the caller checks that.
     pub fn reconfigure(&mut self, config: &SampleConfig) {
         let state = std::mem::replace(self, Self::new(config.clone())).state;
-        assert!(self.restore(&state).is_ok(), "the same signals");
+        self.restore(state);
     }
 
     /// Handles a reading; returns a sample if it is a good voltage. Appends changes of the signal to `changes`.
@@ -301,15 +291,11 @@ impl Sampler {
         self.sensor_c(self.sensor_of(cell)?, now)
     }
 
-    /// Age of the last good value, s; from the start or the last waking when there is none since.
-    /// `None` = the channel has no use.
-    pub fn age_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        self.slot(channel).map(|slot| self.since(self.state.signals[slot].good_at(), now))
-    }
-
     /// Time since the channel's latest reading, good or bad, s (the value of the rule `input_missing`).
     pub fn silence_s(&self, channel: Channel, now: Timestamp) -> Option<f64> {
-        self.slot(channel).map(|slot| self.since(self.state.signals[slot].received_at(), now))
+        // `None` < `Some`: a stamp before the start or the last waking counts from there.
+        let since = self.state.signals[self.slot(channel)?].received.max(self.state.began);
+        Some(since.map_or(0.0, |from| now.since(from).max(0.0)))
     }
 
     /// Share of bad readings on a channel, fraction, forgotten over about
@@ -386,14 +372,14 @@ impl Sampler {
 
     /// Whether the channel has a reading, good or bad, since the start or the last waking.
     pub fn has_input_since_waking(&self, channel: Channel) -> bool {
-        self.slot(channel).is_some_and(|slot| self.state.signals[slot].received_at() >= self.state.began)
+        self.slot(channel).is_some_and(|slot| self.state.signals[slot].received >= self.state.began)
     }
 
     /// Whether every voltage has a fresh good reading.
     pub fn voltages_fresh(&self, now: Timestamp) -> bool {
         let first = 1 + self.sensors;
         let voltages = &self.state.signals[first..first + self.voltages];
-        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good_at()?)));
+        let oldest = voltages.iter().try_fold(now, |oldest, signal| Some(oldest.min(signal.good?.time)));
         oldest.is_some_and(|oldest| now.since(oldest) <= self.config.voltage.max_age_s)
     }
 
@@ -412,11 +398,6 @@ impl Sampler {
         state.signals.len() == self.state.signals.len()
     }
 
-    /// Readings of channels without a use.
-    pub fn unused_readings(&self) -> u64 {
-        self.state.unused_readings
-    }
-
     /// Readings by outcome.
     pub fn reading_counts(&self) -> ReadingCounts {
         ReadingCounts { unused: self.state.unused_readings, ..self.state.counts }
@@ -428,18 +409,12 @@ impl Sampler {
     }
 
     /// Restores a stored state (rebased by the caller). The downtime is unmeasured like any other hole.
-    ///
-    /// # Errors
-    /// When the state has another number of signals; the present state is kept.
-    pub fn restore(&mut self, state: &SamplerState) -> Result<(), SignalCountMismatch> {
-        let (found, allowed) = (state.signals.len(), self.state.signals.len());
-        if found != allowed {
-            return Err(SignalCountMismatch { found, allowed });
-        }
-        self.state.clone_from(state);
+    /// The caller checks that it [`fits`](Self::fits).
+    pub fn restore(&mut self, state: SamplerState) {
+        assert!(self.fits(&state), "a state of other signals");
+        self.state = state;
         self.bad_signals = self.state.signals.iter().filter(|signal| signal.is_bad()).count();
         (self.next_stale, self.shared.is_known) = (None, false);
-        Ok(())
     }
 
     #[inline]
@@ -494,11 +469,6 @@ impl Sampler {
         }
         self.state.latest = self.state.latest.max(time);
         self.state.latest
-    }
-
-    fn since(&self, stamp: Option<Timestamp>, now: Timestamp) -> f64 {
-        // `None` < `Some`: a stamp before the start or the last waking counts from there.
-        stamp.max(self.state.began).map_or(0.0, |from| now.since(from).max(0.0))
     }
 
     fn strings(&self) -> f64 {

@@ -29,15 +29,15 @@ pub const BAD_SHARE_READINGS: u32 = 100;
 
 /// A value and its time.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-struct TimedValue {
+pub(super) struct TimedValue {
     value: f64,
-    time: Timestamp,
+    pub(super) time: Timestamp,
 }
 
 /// State of one signal.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub(super) struct Signal {
-    good: Option<TimedValue>,
+    pub(super) good: Option<TimedValue>,
     /// Latest reading rejected for its rate.
     refused: Option<TimedValue>,
     /// Consecutive readings that agree with it.
@@ -48,7 +48,7 @@ pub(super) struct Signal {
     rests_since_s: f64,
     /// Time of the latest reading, good or bad.
     #[serde(rename = "heard")]
-    received: Option<Timestamp>,
+    pub(super) received: Option<Timestamp>,
     /// Present fault of the signal.
     fault: Option<Fault>,
     /// Bad readings since it turned bad.
@@ -129,16 +129,6 @@ impl Signal {
     #[inline]
     pub(super) fn fresh(&self, now: Timestamp, limits: &Limits) -> Option<f64> {
         self.good.filter(|good| now.since(good.time) <= limits.max_age_s).map(|good| good.value)
-    }
-
-    /// Time of the last good value.
-    pub(super) fn good_at(&self) -> Option<Timestamp> {
-        self.good.map(|good| good.time)
-    }
-
-    /// Time of the latest reading, good or bad.
-    pub(super) fn received_at(&self) -> Option<Timestamp> {
-        self.received
     }
 
     /// Time of the latest reading, and the share of bad readings; `None` = no reading since `began`.

@@ -79,7 +79,7 @@ impl Settings {
     /// The scenario's defaults for a cell of `capacity_ah`.
     pub fn of(scenario: Scenario, capacity_ah: f64) -> Self {
         let scale = capacity_ah / scenario.nominal_ah();
-        let paper = Self {
+        let mut s = Self {
             scenario,
             seed: 1,
             pack: PackSettings {
@@ -102,54 +102,43 @@ impl Settings {
             walk_steps: 1500,
         };
         match scenario {
-            Scenario::Paper => paper,
-            Scenario::Reference => reference(paper, scale),
-            Scenario::RandomWalk => random_walk(paper),
-            Scenario::EvDay => ev_day(paper, capacity_ah),
+            Scenario::Paper => {}
+            // One sensor error: the voltage noise that the example's filter assumes (R = 1e-3: 32 mV).
+            Scenario::Reference => {
+                s.pack.initial_soc = 1.0;
+                s.pack.ageing.capacity_loss_ah_per_cycle = scale;
+                let voltage = SensorError { noise_std: 0.032, ..SensorError::default() };
+                s.sensors = Sensors { voltage, ..Sensors::default() };
+                (s.end_capacity_ah, s.cycles) = (0.0, Some(10));
+            }
+            // Ageing so that one block of 1,500 loads (about 310 Ah) costs some 5 % capacity and 10 % resistance, as the
+            // measured cells lost.
+            Scenario::RandomWalk => {
+                s.pack.ageing = Ageing {
+                    capacity_loss_ah_per_ah: 3.4e-4,
+                    resistance_growth_per_ah: 3.2e-4 / (s.pack.capacity_ah / 2.1),
+                    ..Ageing::default()
+                };
+                (s.end_capacity_ah, s.cycles) = (0.0, Some(1));
+            }
+            Scenario::EvDay => s.set_ev_day(),
         }
+        s
     }
-}
 
-/// The example has one sensor error: the voltage noise that its filter assumes (R = 1e-3: 32 mV).
-fn reference(mut s: Settings, scale: f64) -> Settings {
-    s.pack.initial_soc = 1.0;
-    s.pack.ageing.capacity_loss_ah_per_cycle = scale;
-    s.sensors = Sensors { voltage: SensorError { noise_std: 0.032, ..SensorError::default() }, ..Sensors::default() };
-    s.end_capacity_ah = 0.0;
-    s.cycles = Some(10);
-    s
-}
-
-/// Ageing so that one block of 1,500 loads (about 310 Ah) costs some 5 % capacity and 10 % resistance, as the
-/// measured cells lost.
-fn random_walk(mut s: Settings) -> Settings {
-    s.pack.ageing = Ageing {
-        capacity_loss_ah_per_ah: 3.4e-4,
-        resistance_growth_per_ah: 3.2e-4 / (s.pack.capacity_ah / 2.1),
-        ..Ageing::default()
-    };
-    s.end_capacity_ah = 0.0;
-    s.cycles = Some(1);
-    s
-}
-
-/// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV, cells within 1 %.
-fn ev_day(mut s: Settings, capacity_ah: f64) -> Settings {
-    s.pack.cells = 96;
-    s.pack.initial_soc = 0.85;
-    s.pack.spread = Spread { capacity: 0.01, resistance: 0.03, soc: 0.005 };
-    s.pack.ageing = Ageing { capacity_loss_ah_per_ah: 1e-5, resistance_growth_per_ah: 1e-5, ..Ageing::default() };
-    s.sensors.current = SensorError {
-        noise_std: 0.002 * capacity_ah,
-        offset: 0.0005 * capacity_ah,
-        gain: 0.005,
-        ..SensorError::default()
-    };
-    s.sensors.voltage.noise_std = 0.001;
-    s.sensors.temperature.noise_std = 0.02; // at ten samples a second more would look like a jump of 5 K/s
-    s.current_period_ns = SECOND_NS / 100;
-    s.cell_period_ns = SECOND_NS / 10;
-    s.end_capacity_ah = 0.0;
-    s.duration_s = Some(86_400.0);
-    s
+    /// Current every 10 ms, cells every 100 ms; errors of a typical pack: 0.5 % gain, 1 mV, cells within 1 %.
+    fn set_ev_day(&mut self) {
+        let capacity_ah = self.pack.capacity_ah;
+        self.pack.cells = 96;
+        self.pack.initial_soc = 0.85;
+        self.pack.spread = Spread { capacity: 0.01, resistance: 0.03, soc: 0.005 };
+        self.pack.ageing =
+            Ageing { capacity_loss_ah_per_ah: 1e-5, resistance_growth_per_ah: 1e-5, ..Ageing::default() };
+        let (noise_std, offset) = (0.002 * capacity_ah, 0.0005 * capacity_ah);
+        self.sensors.current = SensorError { noise_std, offset, gain: 0.005, ..SensorError::default() };
+        self.sensors.voltage.noise_std = 0.001;
+        self.sensors.temperature.noise_std = 0.02; // at ten samples a second more would look like a jump of 5 K/s
+        (self.current_period_ns, self.cell_period_ns) = (SECOND_NS / 100, SECOND_NS / 10);
+        (self.end_capacity_ah, self.duration_s) = (0.0, Some(86_400.0));
+    }
 }

@@ -1,7 +1,5 @@
 //! The meaning of a configuration in words and numbers, for `packwatch check`.
 
-use std::ops::RangeInclusive;
-
 use serde::Serialize;
 
 use super::keys::TemperatureInput;
@@ -223,21 +221,19 @@ fn signal(raw: &RawTables, config: &Config, resolved: &ResolvedSignal<'_>) -> Si
 
 fn multiplex(resolved: &ResolvedSignal<'_>) -> String {
     let name = |message: &Message, index: usize| message.signals.get(index).map(|s| s.name.clone()).unwrap_or_default();
-    let range = |&(low, high): &(u64, u64)| if low == high { format!("{low}") } else { format!("{low}-{high}") };
-    let conditions = resolved.signal.multiplex.conditions.iter().map(|condition| {
-        let ranges: Vec<String> = condition.ranges.iter().map(range).collect();
+    let conditions = resolved.signal.conditions.iter().map(|condition| {
+        let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| span(low, high)).collect();
         format!("{} = {}", name(resolved.message, condition.selector), ranges.join(", "))
     });
     conditions.collect::<Vec<_>>().join(" and ")
 }
 
 fn serves(sensor: &TemperatureInput) -> String {
-    let range = |r: &RangeInclusive<u16>| match (r.start(), r.end()) {
-        (first, last) if first == last => format!("{first}"),
-        (first, last) => format!("{first}-{last}"),
-    };
     match &sensor.cells {
-        Some(cells) => format!("cells {}", cells.0.iter().map(range).collect::<Vec<_>>().join(", ")),
+        Some(cells) => format!(
+            "cells {}",
+            cells.0.iter().map(|cells| span(cells.start(), cells.end())).collect::<Vec<_>>().join(", ")
+        ),
         None => "all cells".to_owned(),
     }
 }
@@ -251,8 +247,12 @@ fn cell_list(cells: &[u16]) -> String {
             _ => runs.push((cell, cell)),
         }
     }
-    let run = |(first, last)| if first == last { format!("{first}") } else { format!("{first}-{last}") };
-    runs.into_iter().map(run).collect::<Vec<_>>().join(", ")
+    runs.iter().map(|(first, last)| span(first, last)).collect::<Vec<_>>().join(", ")
+}
+
+/// `1-3`, or `7` where both ends are one.
+fn span<T: PartialEq + std::fmt::Display>(first: &T, last: &T) -> String {
+    if first == last { format!("{first}") } else { format!("{first}-{last}") }
 }
 
 fn limits(config: &Config) -> Vec<String> {

@@ -5,7 +5,7 @@
 use super::Config;
 use super::document::Faults;
 use super::keys::{Alarm, J1939};
-use super::resolve::ResolvedSignal;
+use super::resolve::Checks;
 use super::tables::RawTables;
 use crate::alarm::{Direction, Rule, Severity};
 use crate::can::j1939::{Lamp, MAX_ADDRESS, Name, NameFields, NodeConfig, TroubleCode};
@@ -19,27 +19,23 @@ const FIRST_MAKER_SPN: u32 = 520_192;
 const TEST_FMI: u8 = 31;
 
 /// The node; `None` = there is none (not configured, silenced, or faults noted).
-pub(super) fn node(
-    raw: &RawTables,
-    found: &[ResolvedSignal<'_>],
-    output: Option<&OutputConfig>,
-    faults: &mut Faults,
-) -> Option<J1939Config> {
+pub(super) fn node(checks: &mut Checks<'_>, output: Option<&OutputConfig>) -> Option<J1939Config> {
+    let raw = checks.raw;
     let Some(keys) = &raw.j1939 else {
         if !raw.broken && !raw.is_written::<J1939>() {
             for alarm in raw.alarms.iter().filter(|alarm| alarm.spn.is_some() || alarm.fmi.is_some()) {
                 let key = if alarm.spn.is_some() { "spn" } else { "fmi" };
-                alarm.place.fault(faults, key, "must have a table [j1939], without it nothing is sent on J1939");
+                alarm.place.fault(checks.faults, key, "must have a table [j1939], without it nothing is sent on J1939");
             }
         }
         return None;
     };
-    let alarms = codes(&raw.alarms, faults);
-    let bus = bus(raw, keys, faults);
-    let node = NodeConfig { name: name(keys, faults)?, address: address(keys, faults)? };
-    check_ids(keys, &node, bus?, found, output, faults);
+    let alarms = codes(&raw.alarms, checks.faults);
+    let bus = bus(raw, keys, checks.faults);
+    let node = NodeConfig { name: name(keys, checks.faults)?, address: address(keys, checks.faults)? };
+    check_ids(keys, &node, bus?, output, checks);
     let test_code = TroubleCode::new(keys.test_spn, TEST_FMI, 0);
-    let test_code = test_code.map_err(|error| keys.place.fault(faults, "test_spn", &error.to_string())).ok()?;
+    let test_code = test_code.map_err(|error| keys.place.fault(checks.faults, "test_spn", &error.to_string())).ok()?;
     Some(J1939Config { bus: bus?, node, alarms: alarms?, test_code }).filter(|_| !raw.is_output_disabled())
 }
 
@@ -151,14 +147,8 @@ fn lamp(severity: Severity) -> Lamp {
 }
 
 /// No identifier of the node is one of an input or of a frame of `[output]` on its interface.
-fn check_ids(
-    keys: &J1939,
-    node: &NodeConfig,
-    bus: BusIndex,
-    found: &[ResolvedSignal<'_>],
-    output: Option<&OutputConfig>,
-    faults: &mut Faults,
-) {
+fn check_ids(keys: &J1939, node: &NodeConfig, bus: BusIndex, output: Option<&OutputConfig>, checks: &mut Checks<'_>) {
+    let Checks { found, faults, .. } = checks;
     let sent = node.sent_ids();
     if let Some(input) = found.iter().find(|f| f.bus == bus && sent.contains(&f.message.id)) {
         let (name, id) = (&input.message.name, input.message.id);

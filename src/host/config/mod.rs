@@ -62,7 +62,8 @@ pub use manual::manual;
 pub(crate) use partial::PartialConfig;
 pub(crate) use pattern::Pattern;
 pub use reference::reference;
-pub(crate) use resolve::{Databases, ResolvedSignal, input_map};
+use resolve::Checks;
+pub(crate) use resolve::{Databases, ResolvedSignal, channel_words, input_map};
 pub(crate) use tables::RawTables;
 
 /// A configuration that cannot be wrong.
@@ -160,11 +161,12 @@ fn read_config(path: &Path, read: ReadFile<'_>, faults: &mut Faults) -> Option<(
     let before = faults.len();
     let found = databases.as_ref().map(|databases| resolve::resolve(&raw, databases, faults)).unwrap_or_default();
     let inputs_whole = databases.is_some() && faults.len() == before && !raw.broken;
-    let mut guards = protect::guards(&raw, &found, inputs_whole, faults);
-    let laid_out = output::output(&raw, path, model.as_ref(), &found, read, faults);
-    let (commands, guard) = commands::commands(&raw, laid_out.as_ref(), &found, faults).unzip();
+    let checks = &mut Checks { raw: &raw, found: &found, faults };
+    let mut guards = protect::guards(checks, inputs_whole);
+    let laid_out = output::output(checks, path, model.as_ref(), read);
+    let (commands, guard) = commands::commands(checks, laid_out.as_ref()).unzip();
     guards.extend(guard);
-    let j1939 = j1939::node(&raw, &found, laid_out.as_ref().map(|(output, _)| output), faults);
+    let j1939 = j1939::node(checks, laid_out.as_ref().map(|(output, _)| output));
     let (output, output_layout) = laid_out.unzip();
     let outputs = output::uses(&raw, output.as_ref());
     let ranges = resolve::ranges(&found, raw.pack.as_ref()?.cells);

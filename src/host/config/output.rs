@@ -5,7 +5,7 @@ use std::path::Path;
 use super::describe::OutputUse;
 use super::document::Faults;
 use super::keys::{Commands, E2eKey, FrameKeys, Output};
-use super::resolve::{ResolvedSignal, check_no_input, read_dbc};
+use super::resolve::{Checks, check_no_input, read_dbc};
 use super::tables::RawTables;
 use super::{ReadFile, beside};
 
@@ -22,40 +22,42 @@ const FRAMES: [&str; 3] = ["status", "health", "alarm"];
 
 /// The sent frames and their layout; `None` = none (not configured, or faults noted).
 pub(super) fn output(
-    raw: &RawTables,
+    checks: &mut Checks<'_>,
     config: &Path,
     model: Option<&CellModel>,
-    found: &[ResolvedSignal<'_>],
     read: ReadFile<'_>,
-    faults: &mut Faults,
 ) -> Option<(OutputConfig, Database)> {
+    let raw = checks.raw;
     let keys = raw.output.as_ref().filter(|keys| keys.enabled)?;
     let command = raw.commands.as_ref().filter(|commands| commands.enabled);
-    let frames =
-        [raw.output_status.as_ref()?.frame(), raw.output_health.as_ref()?.frame(), raw.output_alarm.as_ref()?.frame()];
-    let [status, health, alarm] = frames.map(|frame| message_settings(&frame, faults));
+    let frames = [
+        raw.output_status.as_ref()?.config(),
+        raw.output_health.as_ref()?.config(),
+        raw.output_alarm.as_ref()?.config(),
+    ];
+    let [status, health, alarm] = frames.map(|frame| message_settings(&frame, checks.faults));
     let command_settings = match command {
-        Some(keys) => Some(message_settings(&keys.frame(), faults)?),
+        Some(keys) => Some(message_settings(&keys.config(), checks.faults)?),
         None => None,
     };
     let settings = LayoutSettings { status: status?, health: health?, alarm: alarm?, command: command_settings };
-    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::frame)).collect();
+    let laid_out: Vec<_> = frames.into_iter().chain(command.map(Commands::config)).collect();
     let own = match &keys.dbc {
-        Some(name) => Some(read_dbc(&beside(config, name), read, faults)?),
+        Some(name) => Some(read_dbc(&beside(config, name), read, checks.faults)?),
         None => None,
     };
     let rated = raw.pack.as_ref().and_then(|pack| pack.rated_capacity_ah).or(model.map(|m| m.rated_capacity_ah));
     // Without a usable cell model there is a fault already, and any layout shows what else is wrong.
     let rated_capacity_ah = rated.unwrap_or(1.0);
     let base = own.as_ref().map_or(LayoutBase::BuiltIn { rated_capacity_ah }, LayoutBase::Own);
-    let database = database(base, &settings, &laid_out, faults)?;
+    let database = database(base, &settings, &laid_out, checks.faults)?;
     let missing = |error: &String, faults: &mut Faults| keys.place.fault(faults, "dbc", error);
-    let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, faults))).ok()?;
+    let plan = OutputPlan::new(&database).map_err(|all| all.0.iter().for_each(|e| missing(e, checks.faults))).ok()?;
     let buses = buses(raw, keys);
-    check_ids(&frames, &plan, &buses, found, faults);
-    check_data_ids(&frames, &plan, faults);
+    check_ids(&frames, &plan, &buses, checks);
+    check_data_ids(&frames, &plan, checks.faults);
     for (_, frame) in plan.formats().iter().zip(&frames).filter(|(format, _)| **format != FrameFormat::Classic) {
-        raw.check_fd(frame.place, &buses, faults);
+        raw.check_fd(frame.place, &buses, checks.faults);
     }
     let [status_period_s, health_period_s, alarm_period_s] = plan.cycle_times_ms().map(|ms| f64::from(ms) / 1000.0);
     Some((OutputConfig { status_period_s, health_period_s, alarm_period_s, plan, buses }, database))
@@ -122,20 +124,14 @@ fn database(
 }
 
 /// Notes an identifier that is used twice or that an input has on the same interface.
-fn check_ids(
-    frames: &[FrameKeys<'_>; 3],
-    plan: &OutputPlan,
-    buses: &[BusIndex],
-    found: &[ResolvedSignal<'_>],
-    faults: &mut Faults,
-) {
+fn check_ids(frames: &[FrameKeys<'_>; 3], plan: &OutputPlan, buses: &[BusIndex], checks: &mut Checks<'_>) {
     let ids = plan.ids();
     for (index, (id, frame)) in ids.iter().zip(frames).enumerate() {
         if let Some(other) = ids[..index].iter().position(|other| other == id) {
             let what = format!("{} and {} frame would both be {id}, must differ", FRAMES[index], FRAMES[other]);
-            frame.place.fault(faults, "id", &what);
+            frame.place.fault(checks.faults, "id", &what);
         }
-        check_no_input(frame.place, *id, buses, found, faults);
+        check_no_input(frame.place, *id, buses, checks);
     }
 }
 

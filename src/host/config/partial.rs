@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::document::{Document, Faults};
-use super::resolve::{self, Databases, ResolvedSignal};
+use super::resolve::{self, Checks, Databases, ResolvedSignal};
 use super::tables::RawTables;
 use super::{Config, ConfigFaults, load, protect, read_file, read_model, read_text};
 use crate::can::guard::GuardConfig;
@@ -54,7 +54,10 @@ impl PartialConfig {
     pub(crate) fn guards(&self, signals: &[ResolvedSignal<'_>]) -> Vec<GuardConfig> {
         match &self.config {
             Some(config) => config.monitor.guards.clone(),
-            None => protect::guards(&self.raw, signals, false, &mut Faults::default()),
+            None => {
+                let checks = &mut Checks { raw: &self.raw, found: signals, faults: &mut Faults::default() };
+                protect::guards(checks, false)
+            }
         }
     }
 }

@@ -3,10 +3,8 @@
 use super::Config;
 use super::document::Faults;
 use super::keys::ProtectedInput;
-use super::resolve::ResolvedSignal;
+use super::resolve::{Checks, ResolvedSignal};
 use super::schema::did_you_mean;
-use super::tables::RawTables;
-use crate::can::MAX_DATA;
 use crate::can::dbc::{Message, Signal};
 use crate::can::e2e::{CheckConfig, Protection};
 use crate::can::guard::GuardConfig;
@@ -14,22 +12,18 @@ use crate::quantity::BusIndex;
 
 /// The protected messages; faults are noted. `inputs_whole`: every configured signal was found, so that a message that
 /// is not there is the fault of its name and not of another key.
-pub(super) fn guards(
-    raw: &RawTables,
-    found: &[ResolvedSignal<'_>],
-    inputs_whole: bool,
-    faults: &mut Faults,
-) -> Vec<GuardConfig> {
+pub(super) fn guards(checks: &mut Checks<'_>, inputs_whole: bool) -> Vec<GuardConfig> {
+    let (raw, found) = (checks.raw, checks.found);
     let mut guards: Vec<(GuardConfig, &ProtectedInput)> = Vec::new();
     for keys in &raw.protected {
-        check_profile(keys, faults);
+        check_profile(keys, checks.faults);
         let Some(bus) = raw.bus_of(keys.interface.as_deref()) else { continue };
         let inputs = found.iter().filter(|input| input.bus == bus && input.message.name == keys.message);
         let inputs: Vec<_> = inputs.collect();
         let Some(first) = inputs.first() else {
             if inputs_whole {
                 let there = found.iter().filter(|input| input.bus == bus).map(|input| input.message.name.as_str());
-                not_an_input(keys, there, faults);
+                not_an_input(keys, there, checks.faults);
             }
             continue;
         };
@@ -38,13 +32,13 @@ pub(super) fn guards(
                 "must be one message, is {} in {} and {} in {}",
                 first.message.id, first.file, other.message.id, other.file
             );
-            keys.place.fault(faults, "message", &what);
+            keys.place.fault(checks.faults, "message", &what);
         }
-        check_layout(keys, &inputs, faults);
+        check_layout(keys, &inputs, checks.faults);
         let guard = guard(keys, first, bus);
         if let Some((_, twin)) = guards.iter().find(|(other, _)| (other.bus, other.id) == (guard.bus, guard.id)) {
             let what = format!("must be protected once, is also in line {}", twin.place.line_of("message"));
-            keys.place.fault(faults, "message", &what);
+            keys.place.fault(checks.faults, "message", &what);
         }
         guards.push((guard, keys));
     }
@@ -100,7 +94,7 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
     let mut noted: Vec<&str> = Vec::new();
     for input in inputs {
         for signal in read_with(input.message, input.signal) {
-            if lies_in(signal, profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
+            if signal.layout.touches(profile.header_mask()) && !noted.contains(&signal.name.as_str()) {
                 noted.push(&signal.name);
                 let what = format!(
                     "must not lie in {}, which profile \"{}\" writes: {}.{} does",
@@ -117,15 +111,8 @@ fn check_layout(keys: &ProtectedInput, inputs: &[&ResolvedSignal<'_>], faults: &
 
 /// A signal and the multiplexors it depends on.
 fn read_with<'m>(message: &'m Message, signal: &'m Signal) -> impl Iterator<Item = &'m Signal> {
-    let selectors = signal.multiplex.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
+    let selectors = signal.conditions.iter().filter_map(|condition| message.signals.get(condition.selector));
     selectors.chain([signal])
-}
-
-/// Whether a signal has a bit in these of the first bytes: then it does not read 0 there.
-fn lies_in(signal: &Signal, mask: [u8; 3]) -> bool {
-    let mut payload = [0; MAX_DATA];
-    payload[..mask.len()].copy_from_slice(&mask);
-    signal.layout.plan().is_ok_and(|plan| plan.raw(&payload).is_ok_and(|code| code != 0))
 }
 
 fn header_words(mask: [u8; 3]) -> &'static str {

@@ -52,6 +52,13 @@ pub(crate) struct ResolvedSignal<'d> {
     pub not_available: Vec<u64>,
 }
 
+/// What later checks look at, and where they note what they find.
+pub(super) struct Checks<'a> {
+    pub raw: &'a RawTables,
+    pub found: &'a [ResolvedSignal<'a>],
+    pub faults: &'a mut Faults,
+}
+
 impl Databases {
     /// Reads the files; `None` when there is none or one is unusable (noted), for then names cannot be looked up.
     pub(super) fn load(config: &Path, names: &[String], read: ReadFile<'_>, faults: &mut Faults) -> Option<Self> {
@@ -229,7 +236,7 @@ fn is_named(full_name: &str, message: &Message, signal: &Signal) -> bool {
 }
 
 /// Name of a channel, for people (cells and sensors from 1).
-pub(super) fn channel_words(channel: Channel) -> String {
+pub(crate) fn channel_words(channel: Channel) -> String {
     match channel {
         Channel::Current => "pack current".to_owned(),
         Channel::Temperature(sensor) => format!("temperature {}", sensor.0 + 1),
@@ -242,16 +249,10 @@ pub(super) fn channel_words(channel: Channel) -> String {
 }
 
 /// Notes, at the key `id` of a frame's table, an identifier that an input has on one of these interfaces.
-pub(super) fn check_no_input(
-    place: &TablePlace,
-    id: CanId,
-    buses: &[BusIndex],
-    found: &[ResolvedSignal<'_>],
-    faults: &mut Faults,
-) {
-    if let Some(input) = found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
+pub(super) fn check_no_input(place: &TablePlace, id: CanId, buses: &[BusIndex], checks: &mut Checks<'_>) {
+    if let Some(input) = checks.found.iter().find(|input| buses.contains(&input.bus) && input.message.id == id) {
         let what = format!("must not be the identifier of an input, {} has {id}", input.message.name);
-        place.fault(faults, "id", &what);
+        place.fault(checks.faults, "id", &what);
     }
 }
 

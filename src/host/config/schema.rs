@@ -149,7 +149,7 @@ macro_rules! section {
     };
     (
         $(#[doc = $about:literal])+
-        $name:ident at $path:literal gives $target:ident, |$keys:ident $(, $argument:ident: $argument_type:ty)*| {
+        $name:ident at $path:literal gives $target:ident $(<$borrow:lifetime>)?, |$keys:ident $(, $argument:ident: $argument_type:ty)*| {
             $(
                 $(#[doc = $doc:literal])+
                 $key:ident : $type:ty, $unit:literal, $allowed:expr, $presence:expr
@@ -166,7 +166,7 @@ macro_rules! section {
 
         impl $name {
             /// The parameters these keys stand for.
-            pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target {
+            pub(crate) fn config(&self $(, $argument: $argument_type)*) -> $target $(<$borrow>)? {
                 let $keys = self;
                 $crate::config::schema::section!(
                     @fields $target $keys [] $( $key $([ $($field: $value)? ])?; )* $($( $more [$more: $more_value]; )*)?

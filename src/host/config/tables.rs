@@ -85,13 +85,13 @@ impl RawTables {
     /// The configured signal of a channel.
     pub(crate) fn source(&self, channel: Channel) -> Option<SignalSource<'_>> {
         match channel {
-            Channel::Current => self.current.as_ref().map(|keys| keys.source()),
-            Channel::Temperature(sensor) => self.temperatures.get(usize::from(sensor.0)).map(|keys| keys.source()),
-            Channel::PackVoltage => self.pack_voltage.as_ref().map(|keys| keys.source()),
-            Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.source()),
-            Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.source()),
-            Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.source()),
-            Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.source()),
+            Channel::Current => self.current.as_ref().map(|keys| keys.config()),
+            Channel::Temperature(sensor) => self.temperatures.get(usize::from(sensor.0)).map(|keys| keys.config()),
+            Channel::PackVoltage => self.pack_voltage.as_ref().map(|keys| keys.config()),
+            Channel::CellVoltage(_) => self.cell_voltage.as_ref().map(|keys| keys.config()),
+            Channel::ReportedSoc => self.reported_soc.as_ref().map(|keys| keys.config()),
+            Channel::ReportedSoh => self.reported_soh.as_ref().map(|keys| keys.config()),
+            Channel::PackIdentity => self.pack_identity.as_ref().map(|keys| keys.config()),
         }
     }
 

@@ -14,13 +14,19 @@ use serde_json::{Map, Value, json};
 
 use crate::alarm::{Alarm, Rule, Selector, Severity};
 use crate::monitor::{Command, MAX_TEST_S};
-use crate::quantity::{CellIndex, MAX_CELLS, Timestamp};
+use crate::quantity::{MAX_CELLS, Timestamp};
 
 /// Version of requests and answers.
 pub const VERSION: u64 = 1;
 
-/// Names of the requests.
-const REQUESTS: [&str; 5] = ["alarms", "acknowledge", "clear", "pack_replaced", "test"];
+/// Requests and the keys they may have.
+const REQUESTS: [(&str, &[&str]); 5] = [
+    ("alarms", &["all"]),
+    ("acknowledge", &["rule", "severity", "cell"]),
+    ("clear", &["rule", "severity", "cell"]),
+    ("pack_replaced", &[]),
+    ("test", &["rule", "seconds"]),
+];
 
 /// A request of a client.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -100,20 +106,34 @@ impl Request {
     /// The value found and the values allowed.
     pub fn parse(line: &[u8]) -> Result<Self, String> {
         let value: Value = serde_json::from_slice(line).map_err(|error| format!("no JSON document: {error}"))?;
-        let Value::Object(keys) = value else { return Err(format!("found {value}, must be a JSON object")) };
-        match keys.get("version") {
+        let Value::Object(mut keys) = value else { return Err(format!("found {value}, must be a JSON object")) };
+        match keys.remove("version") {
             Some(version) if version.as_u64() == Some(VERSION) => {}
-            found => return Err(must_be("version", found, &VERSION.to_string())),
+            found => return Err(must_be("version", found.as_ref(), &VERSION.to_string())),
         }
-        let name = keys.get("request").and_then(Value::as_str);
-        let only = |allowed: &[&str]| only_keys(&keys, allowed);
-        match name {
-            Some("alarms") => only(&["all"]).and_then(|()| Ok(Self::Alarms { all: flag(&keys, "all")? })),
-            Some("acknowledge") => selector(&keys).map(Command::Acknowledge).map(Self::Command),
-            Some("clear") => selector(&keys).map(Command::Clear).map(Self::Command),
-            Some("pack_replaced") => only(&[]).map(|()| Self::Command(Command::PackReplaced)),
-            Some("test") => only(&["rule", "seconds"]).and_then(|()| test(&keys)),
-            Some(_) | None => Err(must_be("request", keys.get("request"), &REQUESTS.join(", "))),
+        let request = keys.remove("request");
+        let name = request.as_ref().and_then(Value::as_str).unwrap_or_default();
+        let Some((_, allowed)) = REQUESTS.iter().find(|(known, _)| *known == name) else {
+            return Err(must_be("request", request.as_ref(), &REQUESTS.map(|(name, _)| name).join(", ")));
+        };
+        only_keys(&keys, allowed)?;
+        if name == "alarms" {
+            let all = keys.get("all").map_or(Ok(false), bool::deserialize);
+            return all.map(|all| Self::Alarms { all }).map_err(|error| format!("all: {error}"));
+        }
+        keys.insert("command".to_owned(), name.into());
+        let command = Command::deserialize(Value::Object(keys.clone())).map_err(|error| error.to_string())?;
+        match command {
+            Command::Acknowledge(Selector { cell: Some(cell), .. })
+            | Command::Clear(Selector { cell: Some(cell), .. })
+                if cell.index() >= MAX_CELLS =>
+            {
+                Err(must_be("cell", keys.get("cell"), &format!("0 to {}", MAX_CELLS - 1)))
+            }
+            Command::Test { seconds, .. } if !(0.0..=MAX_TEST_S).contains(&seconds) => {
+                Err(must_be("seconds", keys.get("seconds"), &format!("0 to {MAX_TEST_S}")))
+            }
+            command => Ok(Self::Command(command)),
         }
     }
 
@@ -121,13 +141,11 @@ impl Request {
     pub fn to_line(self) -> String {
         let mut keys = match self {
             Self::Alarms { all } => json!({ "request": "alarms", "all": all }),
-            Self::Command(Command::Acknowledge(which)) => selector_json("acknowledge", &which),
-            Self::Command(Command::Clear(which)) => selector_json("clear", &which),
-            Self::Command(Command::PackReplaced) => json!({ "request": "pack_replaced" }),
-            Self::Command(Command::Test { rule, seconds }) => {
-                json!({ "request": "test", "rule": rule, "seconds": seconds })
-            }
+            Self::Command(command) => json!(command),
         };
+        if let Some(name) = keys.as_object_mut().and_then(|keys| keys.remove("command")) {
+            keys["request"] = name;
+        }
         keys["version"] = json!(VERSION);
         format!("{keys}\n")
     }
@@ -181,59 +199,11 @@ fn must_be(key: &str, found: Option<&Value>, allowed: &str) -> String {
 }
 
 fn only_keys(keys: &Map<String, Value>, allowed: &[&str]) -> Result<(), String> {
-    let known = |key: &str| matches!(key, "version" | "request") || allowed.contains(&key);
-    match keys.keys().find(|key| !known(key)) {
+    match keys.keys().find(|key| !allowed.contains(&key.as_str())) {
         None => Ok(()),
         Some(key) if allowed.is_empty() => Err(format!("{key} is not a key of this request, it has none")),
         Some(key) => Err(format!("{key} is not a key of this request, must be {}", allowed.join(", "))),
     }
-}
-
-fn flag(keys: &Map<String, Value>, key: &str) -> Result<bool, String> {
-    match keys.get(key) {
-        None => Ok(false),
-        Some(Value::Bool(flag)) => Ok(*flag),
-        found => Err(must_be(key, found, "true or false")),
-    }
-}
-
-fn rule(found: &Value) -> Result<Rule, String> {
-    let named = |rule: &Rule| found.as_str() == Some(rule.name());
-    let fault = || must_be("rule", Some(found), &Rule::ALL.map(Rule::name).join(", "));
-    Rule::ALL.into_iter().find(named).ok_or_else(fault)
-}
-
-fn severity(found: &Value) -> Result<Severity, String> {
-    let named = |severity: &Severity| found.as_str() == Some(severity.name());
-    let fault = || must_be("severity", Some(found), &Severity::ALL.map(Severity::name).join(", "));
-    Severity::ALL.into_iter().find(named).ok_or_else(fault)
-}
-
-fn cell(found: &Value) -> Result<CellIndex, String> {
-    let number = found.as_u64().and_then(|number| u16::try_from(number).ok());
-    let cell = number.filter(|number| usize::from(*number) < MAX_CELLS).map(CellIndex);
-    cell.ok_or_else(|| must_be("cell", Some(found), &format!("0 to {}", MAX_CELLS - 1)))
-}
-
-fn selector(keys: &Map<String, Value>) -> Result<Selector, String> {
-    only_keys(keys, &["rule", "severity", "cell"])?;
-    let given = |key| keys.get(key).filter(|value| !value.is_null());
-    Ok(Selector {
-        rule: given("rule").map(rule).transpose()?,
-        severity: given("severity").map(severity).transpose()?,
-        cell: given("cell").map(cell).transpose()?,
-    })
-}
-
-fn selector_json(request: &str, which: &Selector) -> Value {
-    json!({ "request": request, "rule": which.rule, "severity": which.severity, "cell": which.cell })
-}
-
-fn test(keys: &Map<String, Value>) -> Result<Request, String> {
-    let rule = keys.get("rule").map_or_else(|| Err(must_be("rule", None, "a rule's name")), rule)?;
-    let seconds = keys.get("seconds").and_then(Value::as_f64).filter(|seconds| (0.0..=MAX_TEST_S).contains(seconds));
-    let fault = || must_be("seconds", keys.get("seconds"), &format!("0 to {MAX_TEST_S}"));
-    Ok(Request::Command(Command::Test { rule, seconds: seconds.ok_or_else(fault)? }))
 }
 
 #[cfg(test)]
@@ -241,6 +211,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::quantity::CellIndex;
 
     fn requests() -> Vec<Request> {
         let which = Selector { rule: Some(Rule::SocLow), severity: Some(Severity::Severe), cell: Some(CellIndex(3)) };
@@ -273,7 +244,10 @@ mod tests {
             fault(r#"{"version":1,"request":"reboot"}"#),
             r#"request = "reboot", must be alarms, acknowledge, clear, pack_replaced, test"#
         );
-        assert_eq!(fault(r#"{"version":1,"request":"alarms","all":1}"#), "all = 1, must be true or false");
+        assert_eq!(
+            fault(r#"{"version":1,"request":"alarms","all":1}"#),
+            "all: invalid type: integer `1`, expected a boolean"
+        );
         assert_eq!(
             fault(r#"{"version":1,"request":"clear","cells":1}"#),
             "cells is not a key of this request, must be rule, severity, cell"
@@ -284,11 +258,11 @@ mod tests {
         );
         assert!(
             fault(r#"{"version":1,"request":"clear","rule":"soc"}"#)
-                .starts_with(r#"rule = "soc", must be capacity_low, "#)
+                .starts_with("unknown variant `soc`, expected one of `capacity_low`, ")
         );
         assert_eq!(
             fault(r#"{"version":1,"request":"clear","severity":"bad"}"#),
-            r#"severity = "bad", must be info, warning, severe"#
+            "unknown variant `bad`, expected one of `info`, `warning`, `severe`"
         );
         assert_eq!(fault(r#"{"version":1,"request":"clear","cell":1024}"#), "cell = 1024, must be 0 to 1023");
         assert_eq!(
@@ -322,7 +296,7 @@ mod tests {
 
         #[test]
         fn any_keys_are_a_request_or_a_fault(
-            request in prop::sample::select(REQUESTS.to_vec()),
+            request in prop::sample::select(REQUESTS.map(|(name, _)| name).to_vec()),
             key in prop::sample::select(vec!["rule", "severity", "cell", "seconds", "all", "other"]),
             value in prop::sample::select(vec!["null", "1e400", "-1", "0.5", "\"soc_low\"", "\"severe\"", "[]", "true"]),
         ) {

@@ -11,8 +11,9 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::protocol::{Answer, Request};
-use super::{ControlSetting, MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
-use crate::io::unix_socket::{BindError, BoundSocket, SocketFile, bind};
+use super::{MAX_CONNECTIONS, MAX_REQUEST_BYTES, MAX_SILENCE, MODE, standard_path};
+use crate::io::place::PlaceSetting;
+use crate::io::unix_socket::{BoundSocket, SocketFile, bind};
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
 const ACCEPT_PAUSE: Duration = Duration::from_secs(1);
@@ -38,28 +39,14 @@ impl ControlServer {
     ///
     /// # Errors
     /// When another daemon uses it, or a requested one cannot be created.
-    pub async fn start(
-        setting: &ControlSetting,
-        requests: mpsc::Sender<PendingRequest>,
-    ) -> Result<Option<Self>, String> {
-        let (path, is_needed) = match setting {
-            ControlSetting::Off => return Ok(None),
-            ControlSetting::At(path) => (path.clone(), true),
-            ControlSetting::Standard => (standard_path(), false),
-        };
-        let shown = path.display();
+    pub async fn start(setting: &PlaceSetting, requests: mpsc::Sender<PendingRequest>) -> Result<Option<Self>, String> {
+        let Some((path, is_needed)) = setting.resolve(|| (standard_path(), false)) else { return Ok(None) };
         match bind(&path, MODE).await {
             Ok(bound) => {
-                Ok(Some(Self::serve(bound, requests, MAX_SILENCE).map_err(|error| format!("{shown}: {error}"))?))
+                let server = Self::serve(bound, requests, MAX_SILENCE);
+                server.map(Some).map_err(|error| format!("{}: {error}", path.display()))
             }
-            Err(BindError::Taken(owner)) => Err(format!(
-                "{shown}: {owner} listens there already; stop it, or start this one with --control and another path"
-            )),
-            Err(BindError::Io(error)) if is_needed => Err(format!("{shown}: {error}")),
-            Err(BindError::Io(error)) => {
-                tracing::info!(path = %shown, %error, "no control socket; name its path with --control");
-                Ok(None)
-            }
+            Err(error) => error.without_socket(&path, is_needed, "control"),
         }
     }
 

@@ -8,8 +8,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use tokio::signal::unix::{SignalKind, signal};
-use tokio::time::{Instant, sleep};
+use tokio::time::{Instant, sleep, timeout};
 
 use super::client::ControlClient;
 use super::protocol::{CommandOutcome, Request};
@@ -20,9 +19,11 @@ use crate::can::j1939::{Dm1Receiver, ReceivedDm1, TroubleCode};
 use crate::can::signal::SignalPlan;
 use crate::can::{CanId, Frame};
 use crate::config::{Config, InterfaceConfig};
-use crate::io::socket::CanListener;
-use crate::monitor::{Command, J1939Config};
-use crate::quantity::Timestamp;
+use crate::io::record::Record;
+use crate::io::socket::Tap;
+use crate::io::stop::Stop;
+use crate::monitor::{BusEvent, Command, J1939Config};
+use crate::quantity::{BusIndex, Timestamp};
 
 /// Period of reading the sockets; stamps are the kernel's, so nothing depends on it.
 const READ_PERIOD: Duration = Duration::from_millis(10);
@@ -48,7 +49,7 @@ pub struct ChannelReport {
     /// Statuses of the end-to-end check of all frames; `None` = they are not protected.
     pub protection: Option<StatusCounts>,
     /// Frames the kernel dropped.
-    pub dropped: u32,
+    pub dropped: u64,
     /// Why listening ended early.
     pub error: Option<String>,
 }
@@ -154,7 +155,7 @@ impl AlarmReader {
 
 /// One channel during the test.
 struct MonitoredChannel {
-    listener: CanListener,
+    tap: Tap,
     reader: ChannelReader,
     report: ChannelReport,
 }
@@ -162,14 +163,21 @@ struct MonitoredChannel {
 impl MonitoredChannel {
     /// Reads all received frames.
     fn read_all(&mut self, rule: Rule) {
+        let mut received = Vec::new();
         while self.report.error.is_none() {
-            match self.listener.next_frame() {
-                Ok(None) => break,
-                Ok(Some((time, frame))) => self.take(rule, time, &frame),
+            match self.tap.next(BusIndex(0), &mut received) {
+                Ok(true) => {}
+                Ok(false) => break,
                 Err(error) => self.report.error = Some(error.to_string()),
             }
         }
-        self.report.dropped = self.listener.dropped();
+        for record in &received {
+            match record {
+                Record::Frame { time, frame, .. } => self.take(rule, *time, frame),
+                Record::Bus { event: BusEvent::Dropped { frames }, .. } => self.report.dropped += frames,
+                _ => {}
+            }
+        }
     }
 
     fn take(&mut self, rule: Rule, time: Timestamp, frame: &Frame) {
@@ -271,23 +279,21 @@ fn open_alarms(
     message: &Message,
     reader: AlarmReader,
 ) -> Result<MonitoredChannel, String> {
-    let listener = CanListener::open(&interface.name, interface.fd, &[message.id], &[]);
-    let listener = listener.map_err(|error| error.to_string())?;
+    let tap = Tap::open_for(&interface.name, interface.fd, &[message.id], &[]).map_err(|error| error.to_string())?;
     let check = message.e2e.map(|protection| (CheckConfig::new(protection), Receiver::default()));
     let mut report = ChannelReport::new(interface, "alarm frame", message.id);
     report.protection = message.e2e.map(|_| StatusCounts::default());
-    Ok(MonitoredChannel { listener, reader: ChannelReader::Alarm { reader, check }, report })
+    Ok(MonitoredChannel { tap, reader: ChannelReader::Alarm { reader, check }, report })
 }
 
 /// Opens the channel of DM1. J1939 is classic CAN only.
 fn open_dm1(interface: &InterfaceConfig, j1939: &J1939Config) -> Result<MonitoredChannel, String> {
     let receiver = Dm1Receiver::new(j1939.node.address);
-    let listener = CanListener::open(&interface.name, false, &[], &receiver.patterns());
-    let listener = listener.map_err(|error| error.to_string())?;
+    let tap = Tap::open_for(&interface.name, false, &[], &receiver.patterns()).map_err(|error| error.to_string())?;
     let [id, ..] = j1939.node.sent_ids();
     let mut report = ChannelReport::new(interface, "J1939 DM1", id);
     report.test_code = Some(j1939.test_code);
-    Ok(MonitoredChannel { listener, reader: ChannelReader::Dm1 { receiver, test_code: j1939.test_code }, report })
+    Ok(MonitoredChannel { tap, reader: ChannelReader::Dm1 { receiver, test_code: j1939.test_code }, report })
 }
 
 async fn watch(
@@ -296,17 +302,12 @@ async fn watch(
     rule: Rule,
     duration: Duration,
 ) -> Result<(), String> {
-    let handler = |kind| signal(kind).map_err(|error| format!("cannot handle signals: {error}"));
-    let (mut interrupt, mut terminate) = (handler(SignalKind::interrupt())?, handler(SignalKind::terminate())?);
+    let mut stop = Stop::new(None).map_err(|error| format!("cannot handle signals: {error}"))?;
     send_test(client, rule, duration.as_secs_f64())?;
     let end = Instant::now() + duration;
     let mut outcome = Ok(());
     loop {
-        let is_stopped = tokio::select! {
-            _ = interrupt.recv() => true,
-            _ = terminate.recv() => true,
-            () = sleep(READ_PERIOD) => false,
-        };
+        let is_stopped = timeout(READ_PERIOD, stop.wait()).await.is_ok();
         if is_stopped {
             outcome = send_test(client, rule, 0.0);
             sleep(GRACE).await;

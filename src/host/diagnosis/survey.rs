@@ -13,7 +13,7 @@ use crate::config::{
     Config, ConfigFaults, Databases, PartialConfig, Pattern, RawTables, ResolvedSignal, SignalSource, TablePlace,
     input_map,
 };
-use crate::doctor::{Ages, InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
+use crate::doctor::{InterfacePlan, MessagePlan, OutputPlan, PackPlan, Plan, SignalPlan};
 use crate::quantity::{CellIndex, Channel, MAX_CELLS};
 
 /// Capacity where nothing states one, Ah: a car's cell.
@@ -79,7 +79,7 @@ fn plan(partial: &PartialConfig, found: &[ResolvedSignal<'_>]) -> Plan {
         signals,
         pack: pack_plan,
         limits: config.map(limits).unwrap_or_default(),
-        ages: ages(raw),
+        max_ages_s: max_ages_s(raw),
         guards: partial.guards(found),
         outputs: config.map(outputs).unwrap_or_default(),
         is_csv: false,
@@ -117,7 +117,7 @@ fn signal_plan(source: &SignalSource<'_>, message: &Message, signal: &Signal, bi
 /// Signals that fit the cells' pattern beyond the configured number, one after the other.
 fn more_cells(raw: &RawTables, databases: &Databases) -> Vec<SignalPlan> {
     let (Some(keys), Some(pack)) = (&raw.cell_voltage, &raw.pack) else { return Vec::new() };
-    let source = keys.source();
+    let source = keys.config();
     let (Ok(pattern), Some(bus)) = (Pattern::parse(source.signal), raw.bus_of(source.interface)) else {
         return Vec::new();
     };
@@ -163,12 +163,13 @@ fn messages(found: &[ResolvedSignal<'_>], signals: &[SignalPlan]) -> Vec<Message
     messages
 }
 
-fn ages(raw: &RawTables) -> Ages {
-    Ages {
-        current_s: raw.current_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
-        voltage_s: raw.voltage_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
-        temperature_s: raw.temperature_limits.as_ref().map_or(f64::INFINITY, |keys| keys.max_age_s),
-    }
+fn max_ages_s(raw: &RawTables) -> [Option<f64>; 3] {
+    let RawTables { current_limits, voltage_limits, temperature_limits, .. } = raw;
+    [
+        current_limits.as_ref().map(|keys| keys.max_age_s),
+        voltage_limits.as_ref().map(|keys| keys.max_age_s),
+        temperature_limits.as_ref().map(|keys| keys.max_age_s),
+    ]
 }
 
 fn limits(config: &Config) -> [(f64, f64); 3] {

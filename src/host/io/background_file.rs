@@ -10,6 +10,8 @@ use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use super::place::with_suffix;
+
 /// Bytes collected before they are sent to the thread, unless flushed.
 const PIECE_BYTES: usize = 64 * 1024;
 /// Pieces waiting at most: 4 MB, ten seconds of a full 1 Mbit/s bus.
@@ -99,9 +101,7 @@ fn keep_earlier(path: &Path) -> io::Result<()> {
     if !earlier.is_file() || earlier.len() == 0 {
         return Ok(());
     }
-    let mut kept = path.as_os_str().to_owned();
-    kept.push(".1");
-    std::fs::rename(path, kept)
+    std::fs::rename(path, with_suffix(path, ".1"))
 }
 
 impl Write for BackgroundFile {

@@ -164,6 +164,14 @@ impl<'a> Cursor<'a> {
         Err(LineError { column: self.at + 1, expected })
     }
 
+    fn expect<T>(&self, found: Option<T>, expected: &'static str) -> Result<T, LineError> {
+        found.ok_or(LineError { column: self.at + 1, expected })
+    }
+
+    fn demand(&mut self, byte: u8, expected: &'static str) -> Result<(), LineError> {
+        if self.take(byte) { Ok(()) } else { self.fail(expected) }
+    }
+
     fn peek(&self) -> Option<u8> {
         self.text.get(self.at).copied()
     }
@@ -190,32 +198,23 @@ impl<'a> Cursor<'a> {
     /// `(` seconds `.` six or nine digits `)`, to nanoseconds. A minus sign is taken too: it is what
     /// [`write_stamp`] writes for a time before the clock's origin.
     fn stamp(&mut self) -> Result<Timestamp, LineError> {
-        const WHOLE: &str = "seconds of 1 to 10 digits";
-        if !self.take(b'(') {
-            return self.fail("a stamp in parentheses");
-        }
+        self.demand(b'(', "a stamp in parentheses")?;
         let negative = self.take(b'-');
         let (seconds, digits) = self.decimal();
         if !(1..=10).contains(&digits) {
-            return self.fail(WHOLE);
+            return self.fail("seconds of 1 to 10 digits");
         }
-        if !self.take(b'.') {
-            return self.fail("a decimal point");
-        }
+        self.demand(b'.', "a decimal point")?;
         let (fraction, digits) = self.decimal();
         let nanos = match digits {
             6 => fraction * 1000,
             9 => fraction,
             _ => return self.fail("a fraction of 6 or 9 digits"),
         };
-        if !self.take(b')') {
-            return self.fail("a closing parenthesis after the stamp");
-        }
+        self.demand(b')', "a closing parenthesis after the stamp")?;
         let total = seconds.checked_mul(1_000_000_000).and_then(|s| s.checked_add(nanos));
-        match total {
-            Some(total) => Ok(Timestamp::from_nanos(if negative { -total } else { total })),
-            None => self.fail("a stamp below 9223372036 s"),
-        }
+        let total = self.expect(total, "a stamp below 9223372036 s")?;
+        Ok(Timestamp::from_nanos(if negative { -total } else { total }))
     }
 
     /// Decimal digits (saturating far above what a stamp may be) and how many there were.
@@ -230,9 +229,7 @@ impl<'a> Cursor<'a> {
     }
 
     fn spaces(&mut self, expected: &'static str) -> Result<(), LineError> {
-        if !self.take(b' ') {
-            return self.fail(expected);
-        }
+        self.demand(b' ', expected)?;
         while self.take(b' ') {}
         Ok(())
     }
@@ -283,8 +280,8 @@ impl<'a> Cursor<'a> {
     fn number(&mut self, digits: usize) -> Result<u32, LineError> {
         let mut value = 0;
         for _ in 0..digits {
-            let Some(digit) = self.hex() else { return self.fail("a hex digit") };
-            value = value << 4 | u32::from(digit);
+            let digit = self.hex();
+            value = value << 4 | u32::from(self.expect(digit, "a hex digit")?);
         }
         Ok(value)
     }
@@ -300,10 +297,7 @@ impl<'a> Cursor<'a> {
         let mut data = [0; MAX_DATA];
         let len = self.bytes(&mut data[..8])?;
         self.raw_length_code(len)?;
-        match Frame::classic(id, &data[..len]) {
-            Some(frame) => Ok(frame),
-            None => self.fail("at most 8 bytes"),
-        }
+        self.expect(Frame::classic(id, &data[..len]), "at most 8 bytes")
     }
 
     fn remote(&mut self, id: CanId) -> Result<Frame, LineError> {
@@ -315,10 +309,7 @@ impl<'a> Cursor<'a> {
             _ => 0,
         };
         self.raw_length_code(usize::from(len))?;
-        match Frame::remote(id, len) {
-            Some(frame) => Ok(frame),
-            None => self.fail("a length of 0 to 8"),
-        }
+        self.expect(Frame::remote(id, len), "a length of 0 to 8")
     }
 
     /// `_9` to `_F` after a length of 8: the length code that was on the wire; the payload is 8 bytes all the same.
@@ -326,13 +317,9 @@ impl<'a> Cursor<'a> {
         if len != 8 || !self.take(b'_') {
             return Ok(());
         }
-        match self.hex_at(0) {
-            9..=15 => {
-                self.at += 1;
-                Ok(())
-            }
-            _ => self.fail("a raw length code of 9 to F"),
-        }
+        let is_code = (9..=15).contains(&self.hex_at(0));
+        self.at += usize::from(is_code);
+        if is_code { Ok(()) } else { self.fail("a raw length code of 9 to F") }
     }
 
     fn fd(&mut self, id: CanId) -> Result<Frame, LineError> {
@@ -340,10 +327,7 @@ impl<'a> Cursor<'a> {
         let mut data = [0; MAX_DATA];
         let len = self.bytes(&mut data)?;
         let padded = if len <= 8 { len } else { FD_STEPS.into_iter().find(|&step| step >= len).unwrap_or(MAX_DATA) };
-        match Frame::fd(id, flags & 1 != 0, flags & 2 != 0, &data[..padded]) {
-            Some(frame) => Ok(frame),
-            None => self.fail("at most 64 bytes"),
-        }
+        self.expect(Frame::fd(id, flags & 1 != 0, flags & 2 != 0, &data[..padded]), "at most 64 bytes")
     }
 
     /// Bytes of two hex digits, dots between them allowed, as many as there are up to the room in `data`.
@@ -375,9 +359,7 @@ impl<'a> Cursor<'a> {
         self.at += 1;
         for (digits, end) in [(2, b':'), (2, b':'), (8, b'#')] {
             self.number(digits)?;
-            if !self.take(end) {
-                return self.fail("CAN XL's flags:sdt:af#");
-            }
+            self.demand(end, "CAN XL's flags:sdt:af#")?;
         }
         let mut data = [0; MAX_XL_DATA];
         match self.bytes(&mut data)? {
@@ -432,7 +414,7 @@ pub fn write_line(
     out.write_all(b" ")?;
     out.write_all(interface.as_bytes())?;
     out.write_all(b" ")?;
-    let mut text = FrameText::default();
+    let mut text = FrameText { bytes: [0; 8 + 3 + 2 * MAX_DATA + 1], len: 0 };
     text.frame(frame);
     text.push(b'\n');
     out.write_all(&text.bytes[..text.len])
@@ -455,12 +437,6 @@ pub fn write_stamp(out: &mut impl Write, time: Timestamp, digits: StampDigits) -
 struct FrameText {
     bytes: [u8; 8 + 3 + 2 * MAX_DATA + 1],
     len: usize,
-}
-
-impl Default for FrameText {
-    fn default() -> Self {
-        Self { bytes: [0; 8 + 3 + 2 * MAX_DATA + 1], len: 0 }
-    }
 }
 
 impl FrameText {

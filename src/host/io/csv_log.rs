@@ -39,17 +39,6 @@ pub struct RowTime {
     pub after_unknown_gap: bool,
 }
 
-/// Result of reading one row.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum RowResult {
-    /// A good row; its values are in [`CsvLog::values`].
-    Good(RowTime),
-    /// A row that cannot be used.
-    Bad(TableError),
-    /// The file has ended.
-    End,
-}
-
 /// A CSV file being read.
 pub struct CsvLog {
     table: Table,
@@ -86,28 +75,28 @@ impl CsvLog {
         Ok(Self { table, time_column, channels, charge_positive: options.charge_positive, sections, values })
     }
 
-    /// Reads one row into [`values`](Self::values).
+    /// Reads one row into [`values`](Self::values); `None` = the file has ended, an inner error = the row cannot be used.
     ///
     /// # Errors
     /// The source fails.
-    pub fn next_row(&mut self) -> Result<RowResult, TableError> {
-        let Some(row) = self.table.next_row()? else { return Ok(RowResult::End) };
+    pub fn next_row(&mut self) -> Result<Option<Result<RowTime, TableError>>, TableError> {
+        let Some(row) = self.table.next_row()? else { return Ok(None) };
         self.values.clear();
         let time_text = row.bytes(self.time_column).unwrap_or_default();
         let Some(time) = stamp::parse_seconds(time_text) else {
-            return Ok(RowResult::Bad(row.fault(self.time_column, "seconds as a finite number")));
+            return Ok(Some(Err(row.fault(self.time_column, "seconds as a finite number"))));
         };
         for &(channel, column) in &self.channels {
             let Some(value) = row.bytes(column).and_then(table::parse_field) else {
-                return Ok(RowResult::Bad(row.fault(column, "a finite number or an empty field")));
+                return Ok(Some(Err(row.fault(column, "a finite number or an empty field"))));
             };
             let flip = channel == Channel::Current && self.charge_positive;
             self.values.push((channel, if flip { value.map(|v| -v) } else { value }));
         }
         let Some(sections) = &mut self.sections else {
-            return Ok(RowResult::Good(RowTime { time, after_unknown_gap: false }));
+            return Ok(Some(Ok(RowTime { time, after_unknown_gap: false })));
         };
-        Ok(sections.place(&row, time).map_or_else(RowResult::Bad, RowResult::Good))
+        Ok(Some(sections.place(&row, time)))
     }
 }
 

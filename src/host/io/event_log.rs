@@ -4,8 +4,8 @@
 use std::io::{self, Write};
 
 use crate::alarm::{Change, Severity};
-use crate::can::CanId;
-use crate::can::e2e::Status;
+use crate::can::flood::FloodChange;
+use crate::can::guard::GuardChange;
 use crate::monitor::{BusEvent, Event, EventKind};
 use crate::quantity::{BusIndex, CellIndex, Timestamp};
 
@@ -80,13 +80,11 @@ impl EventLog {
             }
             EventKind::SignalBad { channel, fault } => tracing::warn!(?channel, ?fault, "signal bad"),
             EventKind::SignalGood { channel, bad_readings } => tracing::info!(?channel, bad_readings, "signal good"),
-            EventKind::Protection { bus, id, status, usable, count } => {
-                self.log_protection(bus, id, status, usable, count);
-            }
-            EventKind::Flood { bus, id, active: true, .. } => {
+            EventKind::Protection(change) => self.log_protection(change),
+            EventKind::Flood(FloodChange { bus, id, active: true, .. }) => {
                 tracing::warn!(interface = self.name(bus), %id, "frames come too fast, dropping");
             }
-            EventKind::Flood { bus, id, active: false, dropped } => {
+            EventKind::Flood(FloodChange { bus, id, dropped, .. }) => {
                 tracing::info!(interface = self.name(bus), %id, dropped, "frames no longer come too fast");
             }
             EventKind::FilterReset { cell } => tracing::warn!(cell = number(cell), "filter started again"),
@@ -139,7 +137,7 @@ impl EventLog {
         self.interfaces.get(bus.index()).map_or("?", String::as_str)
     }
 
-    fn log_protection(&self, bus: BusIndex, id: CanId, status: Status, usable: bool, count: u64) {
+    fn log_protection(&self, GuardChange { bus, id, status, usable, count }: GuardChange) {
         let (interface, status) = (self.name(bus), status.name());
         if usable {
             tracing::info!(interface, %id, status, failed = count, "protected message usable again");

@@ -22,64 +22,55 @@
 use std::io::{self, Write};
 
 use super::candump::{self, LineError, StampDigits};
-use crate::monitor::{BusEvent, Command, Downtime, Input};
-use crate::quantity::Timestamp;
+use super::record::Record;
+use crate::monitor::{BusEvent, Downtime, Input};
+use crate::quantity::{BusIndex, Timestamp};
 
 /// First line of every journal.
 pub const HEADER: &str = "PACKWATCH-JOURNAL 1";
 
-/// A journal line other than a frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Mark<'a> {
-    Tick { time: Timestamp },
-    Bus { time: Timestamp, interface: &'a [u8], event: BusEvent },
-    Gap { time: Timestamp },
-    Restore { time: Timestamp, away: Downtime },
-    Command { time: Timestamp, command: Command },
-    Store { time: Timestamp, works: bool },
-    Reload { time: Timestamp },
+/// Words that lines other than frames begin with.
+const KEYWORDS: [&[u8]; 7] = [b"TICK", b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"];
+
+/// Whether a line that does not begin with `(` is one of the journal's.
+pub fn is_mark(line: &[u8]) -> bool {
+    line.iter().position(|&b| b == b' ').is_some_and(|space| KEYWORDS.contains(&&line[..space]))
 }
 
-/// Reads a journal line that does not begin with `(`; `None` = not a line of the journal.
+/// Reads such a line; `None` = of an interface that `bus` does not know.
 ///
 /// # Errors
-/// When the line begins as one of the journal's and breaks its grammar.
-pub fn parse_mark(line: &[u8]) -> Result<Option<Mark<'_>>, LineError> {
+/// When the line breaks the journal's grammar.
+pub fn parse_mark(line: &[u8], bus: impl FnOnce(&[u8]) -> Option<BusIndex>) -> Result<Option<Record>, LineError> {
     let line = line.strip_suffix(b"\r").unwrap_or(line);
-    let Some(space) = memchr::memchr(b' ', line) else { return Ok(None) };
-    let keyword = &line[..space];
-    if ![&b"TICK"[..], b"BUS", b"GAP", b"RESTORE", b"COMMAND", b"STORE", b"RELOAD"].contains(&keyword) {
-        return Ok(None);
-    }
+    let space = memchr::memchr(b' ', line).unwrap_or(line.len());
     let shifted = |e: LineError| LineError { column: e.column + space + 1, ..e };
-    let (time, rest) = candump::parse_stamp(&line[space + 1..]).map_err(shifted)?;
-    let fail = |expected| Err(LineError { column: line.len() - rest.len() + 1, expected });
+    let (time, rest) = candump::parse_stamp(line.get(space + 1..).unwrap_or_default()).map_err(shifted)?;
     let rest_text = rest.strip_prefix(b" ").unwrap_or_default();
-    match keyword {
-        b"TICK" | b"GAP" | b"RELOAD" if !rest.is_empty() => fail("the line's end after the stamp"),
-        b"TICK" => Ok(Some(Mark::Tick { time })),
-        b"GAP" => Ok(Some(Mark::Gap { time })),
-        b"RELOAD" => Ok(Some(Mark::Reload { time })),
-        b"RESTORE" => match parse_away(rest_text) {
-            Some(away) => Ok(Some(Mark::Restore { time, away })),
-            None => fail("seconds away, - or unknown"),
-        },
-        b"COMMAND" => match serde_json::from_slice(rest_text) {
-            Ok(command) => Ok(Some(Mark::Command { time, command })),
-            Err(_) => fail("a command as JSON"),
-        },
-        b"STORE" => match rest_text {
-            b"works" => Ok(Some(Mark::Store { time, works: true })),
-            b"fails" => Ok(Some(Mark::Store { time, works: false })),
-            _ => fail("works or fails"),
-        },
+    let alone = |record: Record| rest.is_empty().then_some(record);
+    let (record, expected) = match &line[..space] {
+        b"TICK" => (alone(Record::Tick { time }), "the line's end after the stamp"),
+        b"GAP" => (alone(Record::UnknownGap { time }), "the line's end after the stamp"),
+        b"RELOAD" => (alone(Record::Reload { time }), "the line's end after the stamp"),
+        b"RESTORE" => (parse_away(rest_text).map(|away| Record::Restore { time, away }), "seconds away, - or unknown"),
+        b"COMMAND" => {
+            let command = serde_json::from_slice(rest_text).ok();
+            (command.map(|command| Record::Command { time, command }), "a command as JSON")
+        }
+        b"STORE" => {
+            let works = [(&b"works"[..], true), (b"fails", false)].into_iter().find(|(word, _)| *word == rest_text);
+            (works.map(|(_, works)| Record::Store { time, works }), "works or fails")
+        }
         _ => match parse_bus(rest_text) {
-            Some((interface, event)) => Ok(Some(Mark::Bus { time, interface, event })),
-            None => {
-                fail("an interface and up, down, missing, dropped N, error_frame CLASS (8 hex digits) or send_failed N")
-            }
+            Some((interface, event)) => return Ok(bus(interface).map(|bus| Record::Bus { time, bus, event })),
+            None => (
+                None,
+                "an interface and up, down, missing, dropped N, error_frame CLASS (8 hex digits) or send_failed N",
+            ),
         },
-    }
+    };
+    let column = line.len() - rest.len() + 1;
+    record.map(Some).ok_or(LineError { column, expected })
 }
 
 fn parse_away(text: &[u8]) -> Option<Downtime> {
@@ -124,8 +115,7 @@ impl<W: Write> JournalWriter<W> {
     /// # Errors
     /// Those of the file.
     pub fn restored(&mut self, now: Timestamp, away: Downtime) -> io::Result<()> {
-        self.mark("RESTORE", now)?;
-        writeln!(self.out, " {away}")
+        write_mark(&mut self.out, "RESTORE", now, format_args!(" {away}"))
     }
 
     /// Notes that another configuration is in force.
@@ -133,8 +123,7 @@ impl<W: Write> JournalWriter<W> {
     /// # Errors
     /// Those of the file.
     pub fn reloaded(&mut self, time: Timestamp) -> io::Result<()> {
-        self.mark("RELOAD", time)?;
-        self.out.write_all(b"\n")
+        write_mark(&mut self.out, "RELOAD", time, "")
     }
 
     /// Appends one input, as the core receives it.
@@ -147,26 +136,17 @@ impl<W: Write> JournalWriter<W> {
                 let interface = name(&self.interfaces, bus.index())?;
                 candump::write_line(&mut self.out, time, StampDigits::Nanos, interface, frame)
             }
-            Input::Tick { time } => {
-                self.mark("TICK", time)?;
-                self.out.write_all(b"\n")
-            }
-            Input::UnknownGap { time } => {
-                self.mark("GAP", time)?;
-                self.out.write_all(b"\n")
-            }
+            Input::Tick { time } => write_mark(&mut self.out, "TICK", time, ""),
+            Input::UnknownGap { time } => write_mark(&mut self.out, "GAP", time, ""),
             Input::Command { time, command } => {
-                self.mark("COMMAND", time)?;
-                writeln!(self.out, " {}", serde_json::to_string(&command)?)
+                write_mark(&mut self.out, "COMMAND", time, format_args!(" {}", serde_json::to_string(&command)?))
             }
             Input::Store { time, works } => {
-                self.mark("STORE", time)?;
-                writeln!(self.out, " {}", if works { "works" } else { "fails" })
+                write_mark(&mut self.out, "STORE", time, if works { " works" } else { " fails" })
             }
             Input::Bus { time, bus, event } => {
-                self.mark("BUS", time)?;
                 let interface = name(&self.interfaces, bus.index())?;
-                write_bus(&mut self.out, interface, event)
+                write_mark(&mut self.out, "BUS", time, format_args!(" {interface} {}", bus_words(event)))
             }
         }
     }
@@ -183,11 +163,12 @@ impl<W: Write> JournalWriter<W> {
     pub fn into_inner(self) -> W {
         self.out
     }
+}
 
-    fn mark(&mut self, keyword: &str, time: Timestamp) -> io::Result<()> {
-        write!(self.out, "{keyword} ")?;
-        candump::write_stamp(&mut self.out, time, StampDigits::Nanos)
-    }
+fn write_mark(out: &mut impl Write, keyword: &str, time: Timestamp, rest: impl std::fmt::Display) -> io::Result<()> {
+    write!(out, "{keyword} ")?;
+    candump::write_stamp(out, time, StampDigits::Nanos)?;
+    writeln!(out, "{rest}")
 }
 
 fn name(interfaces: &[String], index: usize) -> io::Result<&str> {
@@ -197,13 +178,13 @@ fn name(interfaces: &[String], index: usize) -> io::Result<&str> {
     })
 }
 
-fn write_bus(out: &mut impl Write, interface: &str, event: BusEvent) -> io::Result<()> {
+fn bus_words(event: BusEvent) -> String {
     match event {
-        BusEvent::Up => writeln!(out, " {interface} up"),
-        BusEvent::Down => writeln!(out, " {interface} down"),
-        BusEvent::Missing => writeln!(out, " {interface} missing"),
-        BusEvent::Dropped { frames } => writeln!(out, " {interface} dropped {frames}"),
-        BusEvent::SendFailed { frames } => writeln!(out, " {interface} send_failed {frames}"),
-        BusEvent::ErrorFrame { class } => writeln!(out, " {interface} error_frame {class:08X}"),
+        BusEvent::Up => "up".to_owned(),
+        BusEvent::Down => "down".to_owned(),
+        BusEvent::Missing => "missing".to_owned(),
+        BusEvent::Dropped { frames } => format!("dropped {frames}"),
+        BusEvent::SendFailed { frames } => format!("send_failed {frames}"),
+        BusEvent::ErrorFrame { class } => format!("error_frame {class:08X}"),
     }
 }

@@ -4,8 +4,6 @@
 //! a log, or a CSV section without a start time, whose stamps begin before the record so far is moved to one second
 //! after it, and an unknown gap is put before it. Everything that becomes no record is counted in [`LogCounts`].
 
-mod record;
-
 use std::collections::{BTreeMap, VecDeque};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,16 +12,16 @@ use std::sync::atomic::AtomicU64;
 use serde::Serialize;
 
 use super::candump::{self, Line, fast_line};
-use super::csv_log::{CsvLog, CsvOptions, RowResult};
-use super::journal::{self, Mark};
+use super::csv_log::{CsvLog, CsvOptions, RowTime};
+use super::journal;
 use super::lines::{self, Lines, RawLine};
-use super::table::TableError;
 use crate::can::Frame;
 use crate::can::decode::Channel;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
-pub use record::{Batch, Record};
+pub use super::record::{Batch, Record};
+pub use super::table::TableError as LogError;
 
 /// Distance between the records so far and a part with an unknown gap before it.
 const UNKNOWN_GAP_NS: i64 = 1_000_000_000;
@@ -32,17 +30,6 @@ const MAX_FOREIGN_NAMES: usize = 64;
 
 /// Most interfaces, configured and adopted: a log has a handful.
 pub const MAX_ADOPTED: usize = 64;
-
-/// Reason why reading cannot continue, with file and line.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct LogError(pub String);
-
-impl From<TableError> for LogError {
-    fn from(error: TableError) -> Self {
-        Self(error.0)
-    }
-}
 
 /// Encodes the values of a CSV row in the frames that carry them; returns how many values no frame can carry.
 pub type RowEncoder = Box<dyn FnMut(&[(Channel, Option<f64>)], &mut Vec<(BusIndex, Frame)>) -> usize>;
@@ -98,12 +85,6 @@ pub struct LogSource {
     csv: CsvOptions,
     state: ReadState,
     read_bytes: Arc<AtomicU64>,
-}
-
-impl std::fmt::Debug for LogSource {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("LogSource").field("files", &self.files).finish_non_exhaustive()
-    }
 }
 
 struct OpenLog {
@@ -193,7 +174,7 @@ impl LogSource {
                 return Ok(Some(record));
             }
             if let Some(OpenLog { form: LogForm::Text { lines, .. }, .. }) = &mut self.current
-                && let mut slot = [record::UNUSED]
+                && let mut slot = [Record::UNUSED]
                 && self.state.fast_records(lines, &mut slot) > 0
             {
                 return Ok(Some(slot[0]));
@@ -342,21 +323,16 @@ impl ReadState {
             };
             self.counts.lines += 1;
             let record = match candump::parse_line(bytes) {
-                Ok(Line::Other) if journal => match journal::parse_mark(bytes) {
-                    Ok(mark) => self.mark_record(mark),
-                    Err(error) => {
-                        self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
-                        None
-                    }
-                },
-                Ok(line) => self.line_record(&line),
-                Err(error) => {
-                    self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?;
-                    None
+                Ok(Line::Other) if journal && journal::is_mark(bytes) => {
+                    journal::parse_mark(bytes, |interface| self.bus(interface))
                 }
+                Ok(line) => Ok(self.line_record(&line)),
+                Err(error) => Err(error),
             };
-            if record.is_some() {
-                return Ok(record);
+            match record {
+                Ok(Some(record)) => return Ok(Some(record)),
+                Ok(None) => {}
+                Err(error) => self.bad(|| format!("{name}:{number}: {}", error.describe(bytes)))?,
             }
         }
     }
@@ -391,25 +367,6 @@ impl ReadState {
         }
     }
 
-    fn mark_record(&mut self, mark: Option<Mark<'_>>) -> Option<Record> {
-        match mark {
-            Some(Mark::Tick { time }) => Some(Record::Tick { time }),
-            Some(Mark::Gap { time }) => Some(Record::UnknownGap { time }),
-            Some(Mark::Restore { time, away }) => Some(Record::Restore { time, away }),
-            Some(Mark::Command { time, command }) => Some(Record::Command { time, command }),
-            Some(Mark::Reload { time }) => Some(Record::Reload { time }),
-            Some(Mark::Store { time, works }) => Some(Record::Store { time, works }),
-            Some(Mark::Bus { time, interface, event }) => {
-                let bus = self.bus(interface)?;
-                Some(Record::Bus { time, bus, event })
-            }
-            None => {
-                self.counts.ignored_lines += 1;
-                None
-            }
-        }
-    }
-
     /// The interface's number; one that is not configured is counted.
     fn bus(&mut self, interface: &[u8]) -> Option<BusIndex> {
         let name = String::from_utf8_lossy(interface);
@@ -430,23 +387,23 @@ impl ReadState {
     /// The next good row's time on the file's own clock.
     fn next_row(&mut self, log: &mut CsvLog) -> Result<Option<Timestamp>, LogError> {
         loop {
-            match log.next_row() {
-                Ok(RowResult::Good(row)) => {
-                    self.counts.lines += 1;
-                    if row.after_unknown_gap {
-                        (self.fresh, self.unknown) = (true, true);
-                    }
-                    return Ok(Some(row.time));
-                }
-                Ok(RowResult::Bad(error)) => {
-                    self.counts.lines += 1;
-                    self.bad(|| error.0)?;
-                }
-                Ok(RowResult::End) => return Ok(None),
+            let row = match log.next_row() {
+                Ok(None) => return Ok(None),
+                Ok(Some(row)) => row,
                 Err(error) => {
                     self.bad(|| error.0)?;
                     return Ok(None);
                 }
+            };
+            self.counts.lines += 1;
+            match row {
+                Ok(RowTime { time, after_unknown_gap }) => {
+                    if after_unknown_gap {
+                        (self.fresh, self.unknown) = (true, true);
+                    }
+                    return Ok(Some(time));
+                }
+                Err(error) => self.bad(|| error.0)?,
             }
         }
     }

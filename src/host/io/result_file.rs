@@ -5,7 +5,10 @@
 
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
+
+use super::place::with_suffix;
 
 /// Bytes collected before a system call.
 const BUFFER: usize = 256 * 1024;
@@ -16,29 +19,7 @@ pub struct ResultFile {
     path: PathBuf,
     /// Path of the incomplete file; `None` = written in place.
     part: Option<PathBuf>,
-    out: BufWriter<Target>,
-}
-
-#[derive(Debug)]
-enum Target {
-    Stdout(io::Stdout),
-    File(File),
-}
-
-impl Write for Target {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        match self {
-            Self::Stdout(out) => out.write(bytes),
-            Self::File(out) => out.write(bytes),
-        }
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        match self {
-            Self::Stdout(out) => out.flush(),
-            Self::File(out) => out.flush(),
-        }
-    }
+    out: BufWriter<File>,
 }
 
 impl ResultFile {
@@ -47,16 +28,15 @@ impl ResultFile {
     /// # Errors
     /// When it cannot be created; the message names it.
     pub fn create(path: &Path) -> io::Result<Self> {
-        let (target, part) = if path == Path::new("-") {
-            (Target::Stdout(io::stdout()), None)
+        let (file, part): (File, _) = if path == Path::new("-") {
+            (io::stdout().as_fd().try_clone_to_owned()?.into(), None)
         } else if fs::metadata(path).is_ok_and(|m| !m.is_file()) {
-            (Target::File(fs::OpenOptions::new().write(true).open(path).map_err(|e| named(path, e))?), None)
+            (File::options().write(true).open(path).map_err(|e| named(path, e))?, None)
         } else {
-            let mut part = path.as_os_str().to_owned();
-            part.push(".part");
-            (Target::File(File::create(&part).map_err(|e| named(path, e))?), Some(PathBuf::from(part)))
+            let part = with_suffix(path, ".part");
+            (File::create(&part).map_err(|e| named(path, e))?, Some(part))
         };
-        Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(BUFFER, target) })
+        Ok(Self { path: path.to_owned(), part, out: BufWriter::with_capacity(BUFFER, file) })
     }
 
     /// Completes the file: everything written, on the disk, under its name.
@@ -66,9 +46,7 @@ impl ResultFile {
     pub fn finish(mut self) -> io::Result<()> {
         self.out.flush().map_err(|e| named(&self.path, e))?;
         let Some(part) = self.part.as_ref() else { return Ok(()) };
-        if let Target::File(file) = self.out.get_ref() {
-            file.sync_data().map_err(|e| named(&self.path, e))?;
-        }
+        self.out.get_ref().sync_data().map_err(|e| named(&self.path, e))?;
         fs::rename(part, &self.path).map_err(|e| named(&self.path, e))?;
         self.part = None;
         // The new name itself must survive a power cut too.

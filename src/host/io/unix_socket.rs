@@ -9,6 +9,8 @@ use std::time::Duration;
 use tokio::net::{UnixListener, UnixStream};
 use tokio::time::timeout;
 
+use super::place::first_folder;
+
 /// Longest wait for an earlier daemon's socket: one that is stopped has a full queue and does not accept.
 const LOOK: Duration = Duration::from_secs(1);
 
@@ -17,33 +19,7 @@ const STANDARD_FOLDER: &str = "/run/packwatch";
 
 /// Default folder of the sockets: the one systemd made, else `/run/packwatch`.
 pub fn runtime_folder() -> PathBuf {
-    let folders = std::env::var_os("RUNTIME_DIRECTORY").filter(|folders| !folders.is_empty());
-    // systemd puts a colon between several; the first is the unit's own.
-    let folder = folders.and_then(|folders| std::env::split_paths(&folders).next());
-    folder.unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
-}
-
-/// Place of a socket of the daemon.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum SocketSetting {
-    /// In `$RUNTIME_DIRECTORY` under systemd, else in `/run/packwatch`; where that cannot be made, the daemon runs
-    /// without.
-    Standard,
-    /// There is none.
-    Off,
-    /// There, or the daemon does not start.
-    At(PathBuf),
-}
-
-impl SocketSetting {
-    /// As written on the command line: a path, or `none`.
-    pub fn from_path(path: Option<PathBuf>) -> Self {
-        match path {
-            None => Self::Standard,
-            Some(path) if path.as_os_str() == "none" => Self::Off,
-            Some(path) => Self::At(path),
-        }
-    }
+    first_folder("RUNTIME_DIRECTORY").unwrap_or_else(|| PathBuf::from(STANDARD_FOLDER))
 }
 
 /// A bound socket and its file, which is removed on drop.
@@ -72,6 +48,26 @@ pub enum BindError {
 impl From<io::Error> for BindError {
     fn from(error: io::Error) -> Self {
         Self::Io(error)
+    }
+}
+
+impl BindError {
+    /// What it means for a server whose path `--OPTION` names: `None` = it runs without, which is logged.
+    ///
+    /// # Errors
+    /// When another daemon uses the socket, or it is needed.
+    pub fn without_socket<T>(self, path: &Path, is_needed: bool, option: &str) -> Result<Option<T>, String> {
+        let shown = path.display();
+        match self {
+            Self::Taken(owner) => Err(format!(
+                "{shown}: {owner} listens there already; stop it, or start this one with --{option} and another path"
+            )),
+            Self::Io(error) if is_needed => Err(format!("{shown}: {error}")),
+            Self::Io(error) => {
+                tracing::info!(path = %shown, %error, "no {option} socket; name its path with --{option}");
+                Ok(None)
+            }
+        }
     }
 }
 

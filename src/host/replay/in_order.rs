@@ -3,88 +3,25 @@
 //! Promise: the number of threads, not of items, bounds the waiting results: no thread begins an item far beyond the first
 //! one that is not done.
 
-use std::collections::VecDeque;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Mutex, PoisonError};
 use std::thread;
 
 /// Items per thread that may be begun beyond the first one not returned, so that a long item does not stop the others soon.
 const AHEAD: usize = 4;
 
-/// State shared by the threads.
-struct Schedule<R> {
-    /// The next item to begin.
-    next: usize,
-    /// The first item whose result was not returned.
-    first: usize,
-    /// Results from that one on, of those that are done.
-    done: VecDeque<Option<R>>,
-    /// Whether no further item is begun.
-    stopped: bool,
+/// Items not begun, and where the receivers of their results are queued in the same order.
+struct Schedule<'a, T, R> {
+    items: std::slice::Iter<'a, T>,
+    results: SyncSender<Receiver<R>>,
 }
 
-struct SharedSchedule<R> {
-    state: Mutex<Schedule<R>>,
-    changed: Condvar,
-}
-
-/// Stops the others when its thread panics, so that none waits for a result that will not come.
-struct PanicGuard<'a, R>(&'a SharedSchedule<R>);
-
-impl<R> Drop for PanicGuard<'_, R> {
-    fn drop(&mut self) {
-        if thread::panicking() {
-            self.0.lock().stopped = true;
-            self.0.changed.notify_all();
-        }
-    }
-}
-
-impl<R> SharedSchedule<R> {
-    fn lock(&self) -> MutexGuard<'_, Schedule<R>> {
-        // No thread panics while holding it.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    fn wait<'a>(&self, state: MutexGuard<'a, Schedule<R>>) -> MutexGuard<'a, Schedule<R>> {
-        self.changed.wait(state).unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// The next item to work on; blocks while too many results are waiting.
-    fn begin(&self, items: usize, ahead: usize) -> Option<usize> {
-        let mut state = self.lock();
-        while !state.stopped && state.next < items && state.next >= state.first + ahead {
-            state = self.wait(state);
-        }
-        let index = state.next;
-        state.next += 1;
-        (!state.stopped && index < items).then_some(index)
-    }
-
-    fn put(&self, index: usize, result: R) {
-        let mut state = self.lock();
-        let place = index - state.first;
-        if state.done.len() <= place {
-            state.done.resize_with(place + 1, || None);
-        }
-        state.done[place] = Some(result);
-        self.changed.notify_all();
-    }
-
-    /// The next result in order; `None` when a thread has failed.
-    fn take(&self) -> Option<R> {
-        let mut state = self.lock();
-        loop {
-            if let Some(result) = state.done.front_mut().and_then(Option::take) {
-                state.done.pop_front();
-                state.first += 1;
-                self.changed.notify_all();
-                return Some(result);
-            }
-            if state.stopped {
-                return None;
-            }
-            state = self.wait(state);
-        }
+impl<'a, T, R> Schedule<'a, T, R> {
+    /// The next item and the place of its result; waits while too many wait before it. `None` = nothing more is wanted.
+    fn begin(&mut self) -> Option<(&'a T, SyncSender<R>)> {
+        let item = self.items.next()?;
+        let (result, receiver) = sync_channel(1);
+        self.results.send(receiver).ok().map(|()| (item, result))
     }
 }
 
@@ -97,24 +34,21 @@ pub fn in_order<T: Sync, R: Send>(
     mut take: impl FnMut(&T, R) -> bool,
 ) {
     let jobs = jobs.clamp(1, items.len().max(1));
-    let state = Schedule { next: 0, first: 0, done: VecDeque::new(), stopped: false };
-    let shared = SharedSchedule { state: Mutex::new(state), changed: Condvar::new() };
+    // One receiver is out of the queue, being waited for.
+    let (results, queue) = sync_channel(AHEAD * jobs - 1);
+    let schedule = Mutex::new(Schedule { items: items.iter(), results });
+    let begin = || schedule.lock().unwrap_or_else(PoisonError::into_inner).begin();
     thread::scope(|scope| {
         for _ in 0..jobs {
             scope.spawn(|| {
-                let _guard = PanicGuard(&shared);
-                while let Some(index) = shared.begin(items.len(), AHEAD * jobs) {
-                    shared.put(index, work(&items[index]));
+                while let Some((item, result)) = begin() {
+                    let _ = result.send(work(item)); // not received when no more results are wanted
                 }
             });
         }
-        for item in items {
-            if !shared.take().is_some_and(|result| take(item, result)) {
-                break;
-            }
-        }
-        shared.lock().stopped = true;
-        shared.changed.notify_all();
+        let queue = queue; // dropped with this block, so that no thread waits for room in it
+        // A thread that panics drops its place without a result.
+        let _ = items.iter().try_for_each(|item| take(item, queue.recv().ok()?.recv().ok()?).then_some(()));
     });
 }
 

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::{CellSummary, DroppedSummary, ProtectedSummary};
+use super::{CellSummary, ProtectedSummary};
 use crate::alarm::Change;
 use crate::io::log::LogCounts;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::CellIndex;
+use crate::status::document::MessageFlood;
 
 /// Raised alarms listed one by one; all are counted.
 const MAX_LISTED_ALARMS: usize = 1000;
@@ -32,7 +33,7 @@ pub struct ReplaySummary {
     /// Protected input messages.
     pub protected: Vec<ProtectedSummary>,
     /// Messages with more frames than the configured rate.
-    pub dropped: Vec<DroppedSummary>,
+    pub dropped: Vec<MessageFlood>,
     /// Events by kind.
     pub events: BTreeMap<&'static str, u64>,
     /// The first 1,000 alarms raised.
@@ -85,15 +86,15 @@ pub(super) fn note_event(
             summary.bad_readings += bad_readings;
             "signal_good"
         }
-        EventKind::Protection { usable, .. } => {
-            if usable {
+        EventKind::Protection(change) => {
+            if change.usable {
                 "protection_usable"
             } else {
                 "protection_failed"
             }
         }
-        EventKind::Flood { active, .. } => {
-            if active {
+        EventKind::Flood(change) => {
+            if change.active {
                 "flood_begun"
             } else {
                 "flood_over"

@@ -13,6 +13,7 @@ use crate::io::candump::{self, StampDigits};
 use crate::io::clock::MappedClock;
 use crate::io::event_log::{self, EventLog};
 use crate::io::journal::JournalWriter;
+use crate::io::place::with_suffix;
 use crate::io::snapshot_file;
 use crate::io::socket::LinkOutput;
 use crate::monitor::{Downtime, Input, Monitor, MonitorConfig, Outputs, Reconfigured, Transmit};
@@ -20,13 +21,15 @@ use crate::quantity::Timestamp;
 use crate::status::collect::RecentEvents;
 use crate::status::document::StoreStatus;
 use crate::store::commit_barrier::CommitBarrier;
-use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress, with_suffix};
+use crate::store::{DATABASE_SOURCE, StateCandidate, Store, StoreProgress};
 
 /// The core with everything that receives its outputs.
 #[derive(Debug)]
 pub(super) struct Engine {
     pub(super) monitor: Monitor,
     pub(super) outputs: Outputs,
+    /// Where its frames go; empty before the start and after the stop.
+    pub(super) links: Vec<LinkOutput>,
     record: Option<JournalWriter<BackgroundFile>>,
     frames: Option<BackgroundFile>,
     events: Option<BackgroundFile>,
@@ -73,12 +76,8 @@ impl Engine {
             store.set_state_aside(why, now);
         }
         let mut record = open_journal(service.record.as_deref(), &names)?;
-        let mut has_lost_file = false;
-        let marked = record.as_mut().zip(downtime).map(|(journal, downtime)| journal.restored(now, downtime));
-        if let Some(Err(error)) = marked {
-            tracing::error!(%error, "recording stopped");
-            (record, has_lost_file) = (None, true);
-        }
+        let has_lost_file = downtime
+            .is_some_and(|downtime| write_or_stop(&mut record, "record", |journal| journal.restored(now, downtime)));
         let frames = service.frames.as_deref().map(create).transpose()?;
         let events = service.events.as_deref().map(create).transpose()?;
         let log = EventLog::new(names.clone());
@@ -91,6 +90,7 @@ impl Engine {
         Ok(Self {
             monitor,
             outputs: Outputs::default(),
+            links: Vec::new(),
             record,
             frames,
             events,
@@ -110,42 +110,33 @@ impl Engine {
     }
 
     /// Journals one input, passes it to the core and dispatches its outputs.
-    pub(super) fn handle(&mut self, input: &Input<'_>, links: &[LinkOutput]) {
-        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.append(input)) {
-            self.stop_recording(&error);
-        }
+    pub(super) fn handle(&mut self, input: &Input<'_>) {
+        self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.append(input));
         self.outputs.clear();
         self.monitor.handle(*input, &mut self.outputs);
         self.is_fresh |= matches!(input, Input::Frame { .. });
-        self.dispatch_outputs(input.time(), links);
+        self.dispatch_outputs(input.time());
     }
 
     /// Gives the core another configuration, and journals that.
     ///
     /// # Errors
     /// Why the core rejects it; then nothing has changed.
-    pub(super) fn reconfigure(
-        &mut self,
-        config: MonitorConfig,
-        time: Timestamp,
-        links: &[LinkOutput],
-    ) -> Result<Reconfigured, Vec<String>> {
+    pub(super) fn reconfigure(&mut self, config: MonitorConfig, time: Timestamp) -> Result<Reconfigured, Vec<String>> {
         self.outputs.clear();
         let changed =
             self.monitor.reconfigure(config, time, &mut self.outputs).map_err(|error| vec![error.to_string()])?;
-        if let Some(Err(error)) = self.record.as_mut().map(|journal| journal.reloaded(time)) {
-            self.stop_recording(&error);
-        }
-        self.dispatch_outputs(time, links);
+        self.has_lost_file |= write_or_stop(&mut self.record, "record", |journal| journal.reloaded(time));
+        self.dispatch_outputs(time);
         Ok(changed)
     }
 
     /// Sends the core's frames to the interfaces and its events to the log, and both to their files.
-    fn dispatch_outputs(&mut self, time: Timestamp, links: &[LinkOutput]) {
+    fn dispatch_outputs(&mut self, time: Timestamp) {
         self.commit_learned(time);
         for transmit in &self.outputs.frames {
             if !self.barrier.hold(transmit) {
-                send(links, transmit);
+                send(&self.links, transmit);
             }
             let Some(name) = self.names.get(transmit.bus.index()) else { continue };
             let write =
@@ -175,11 +166,11 @@ impl Engine {
     }
 
     /// Handles progress or failure of the store.
-    pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp, links: &[LinkOutput]) {
-        self.barrier.release(progress.ticket, |transmit| send(links, transmit));
+    pub(super) fn handle_store_progress(&mut self, progress: StoreProgress, time: Timestamp) {
+        self.barrier.release(progress.ticket, |transmit| send(&self.links, transmit));
         self.store_works = progress.works;
         self.progress = Some(progress);
-        self.report_store_health(time, links);
+        self.report_store_health(time);
     }
 
     /// The store, for the status document.
@@ -203,14 +194,14 @@ impl Engine {
     }
 
     /// Sends all held frames: the daemon stops.
-    pub(super) fn release_all(&mut self, links: &[LinkOutput]) {
-        self.barrier.release(u64::MAX, |transmit| send(links, transmit));
+    pub(super) fn release_all(&mut self) {
+        self.barrier.release(u64::MAX, |transmit| send(&self.links, transmit));
     }
 
     /// Sends frames that have waited too long, and gives the store its checkpoints; called with every tick.
-    pub(super) fn poll_store(&mut self, time: Timestamp, links: &[LinkOutput]) {
+    pub(super) fn poll_store(&mut self, time: Timestamp) {
         if let Some(ticket) = self.barrier.overdue(Instant::now()) {
-            self.barrier.release(ticket, |transmit| send(links, transmit));
+            self.barrier.release(ticket, |transmit| send(&self.links, transmit));
             tracing::warn!("the disk is slow: announced before it was stored");
             self.late += 1;
             self.store_works = false;
@@ -220,16 +211,16 @@ impl Engine {
         {
             self.is_fresh = false;
         }
-        self.report_store_health(time, links);
+        self.report_store_health(time);
     }
 
     /// Reports to the core whether files can be written, when that has changed.
-    pub(super) fn report_store_health(&mut self, time: Timestamp, links: &[LinkOutput]) {
+    pub(super) fn report_store_health(&mut self, time: Timestamp) {
         // The lost file may be the journal; the core gets the input anyway.
         let works = self.store_works && !self.has_lost_file;
         if self.reported_works != Some(works) {
             self.reported_works = Some(works);
-            self.handle(&Input::Store { time, works }, links);
+            self.handle(&Input::Store { time, works });
         }
     }
 
@@ -240,15 +231,8 @@ impl Engine {
         }
     }
 
-    fn stop_recording(&mut self, error: &io::Error) {
-        tracing::error!(%error, "recording stopped");
-        (self.record, self.has_lost_file) = (None, true);
-    }
-
     pub(super) fn flush(&mut self) {
-        if let Some(Err(error)) = self.record.as_mut().map(JournalWriter::flush) {
-            self.stop_recording(&error);
-        }
+        self.has_lost_file |= write_or_stop(&mut self.record, "record", JournalWriter::flush);
         self.has_lost_file |= write_or_stop(&mut self.frames, "frames", Write::flush);
         self.has_lost_file |= write_or_stop(&mut self.events, "events", Write::flush);
     }
@@ -301,11 +285,7 @@ fn restore_first_valid(
 }
 
 /// Writes to a file, if there is one. A file that cannot be written is closed; then returns `true`.
-fn write_or_stop(
-    file: &mut Option<BackgroundFile>,
-    what: &str,
-    write: impl FnOnce(&mut BackgroundFile) -> io::Result<()>,
-) -> bool {
+fn write_or_stop<F>(file: &mut Option<F>, what: &str, write: impl FnOnce(&mut F) -> io::Result<()>) -> bool {
     let Some(Err(error)) = file.as_mut().map(write) else { return false };
     tracing::error!(what, %error, "file closed: it cannot be written");
     *file = None;

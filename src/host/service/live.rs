@@ -11,19 +11,19 @@ use tokio::time::{Instant, MissedTickBehavior, interval, timeout};
 use super::engine::Engine;
 use super::reload::{Reload, ReloadStep, log_outcome};
 use super::status_publisher::StatusPublisher;
-use super::stop::Stop;
 use super::{INBOX, ServiceError, notify};
 use crate::control::protocol::{Answer, Request};
 use crate::control::{PendingRequest, answer};
 use crate::io::clock::MappedClock;
+use crate::io::record::Record;
 use crate::io::snapshot_file;
-use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::io::stop::Stop;
 use crate::logging;
 use crate::monitor::{Command, Input, TICK_PERIOD_MS};
 use crate::quantity::Timestamp;
 use crate::store::StoreProgress;
 
-/// LinkMessage items handled between two checks of the timer: under one tick's time of a full bus.
+/// Records handled between two checks of the timer: under one tick's time of a full bus.
 const BATCH: usize = 256;
 /// Time for the interfaces to send queued frames when the daemon stops.
 const DRAIN_LIMIT: Duration = Duration::from_millis(500);
@@ -36,12 +36,11 @@ const FLUSH_PERIOD: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct ServiceLoop {
     pub(super) engine: Engine,
-    pub(super) inbox: mpsc::Receiver<LinkMessage>,
+    pub(super) inbox: mpsc::Receiver<Record>,
     pub(super) requests: mpsc::Receiver<PendingRequest>,
     pub(super) reload: Reload,
     pub(super) clock: MappedClock,
-    pub(super) outputs: Vec<LinkOutput>,
-    pub(super) batch: Vec<LinkMessage>,
+    pub(super) batch: Vec<Record>,
     pub(super) left_out_reported: Instant,
     pub(super) status_publisher: StatusPublisher,
 }
@@ -63,7 +62,7 @@ impl ServiceLoop {
                     self.status_publisher.note_tick(now);
                     let time = self.tick().await;
                     self.notify_manager(now);
-                    self.status_publisher.publish(&self.engine, &self.outputs, now, time);
+                    self.status_publisher.publish(&self.engine, now, time);
                     if watchdog.is_some_and(|period| now.duration_since(fed) >= period) {
                         notify(&[NotifyState::Watchdog]);
                         fed = now;
@@ -74,7 +73,7 @@ impl ServiceLoop {
                     }
                 }
                 progress = next_progress(&mut stored) => {
-                    self.engine.handle_store_progress(progress, self.clock.now(), &self.outputs);
+                    self.engine.handle_store_progress(progress, self.clock.now());
                 }
                 // At most one request per connection waits.
                 Some(request) = self.requests.recv() => self.answer(request).await,
@@ -111,8 +110,8 @@ impl ServiceLoop {
     async fn tick(&mut self) -> Timestamp {
         self.drain().await;
         let time = self.clock.now();
-        self.engine.poll_store(time, &self.outputs);
-        self.engine.handle(&Input::Tick { time }, &self.outputs);
+        self.engine.poll_store(time);
+        self.engine.handle(&Input::Tick { time });
         time
     }
 
@@ -134,7 +133,7 @@ impl ServiceLoop {
     async fn apply_command(&mut self, command: Command) -> Answer {
         self.drain().await;
         let time = self.clock.now();
-        self.engine.handle(&Input::Command { time, command }, &self.outputs);
+        self.engine.handle(&Input::Command { time, command });
         let Engine { monitor, outputs, .. } = &self.engine;
         answer::outcome(monitor.alarms(), &command, &outputs.events, time)
     }
@@ -158,21 +157,14 @@ impl ServiceLoop {
 
     /// Handles a batch in the order of time; items of one interface keep their order.
     fn handle_batch(&mut self) {
-        self.batch.sort_by_key(|received| received.time);
-        let mut has_frame = false;
+        self.batch.sort_by_key(Record::time);
         for received in &self.batch {
-            let LinkMessage { time, bus, what } = *received;
-            let input = match &what {
-                LinkEvent::Frame(frame) => Input::Frame { time, bus, frame },
-                LinkEvent::Event(event) => Input::Bus { time, bus, event: *event },
-            };
-            self.engine.handle(&input, &self.outputs);
-            has_frame |= matches!(what, LinkEvent::Frame(_));
+            if let Some(input) = received.input() {
+                self.engine.handle(&input);
+            }
         }
         // Outputs leave after the last item: then all frames have their estimates.
-        if has_frame {
-            self.status_publisher.note_frames(&self.batch, self.clock.now());
-        }
+        self.status_publisher.note_frames(&self.batch, self.clock.now());
         self.batch.clear();
     }
 
@@ -188,7 +180,7 @@ impl ServiceLoop {
         let mut file = None;
         let taken = read.and_then(|config| {
             file = config.file;
-            self.engine.reconfigure(config.monitor, time, &self.outputs)
+            self.engine.reconfigure(config.monitor, time)
         });
         log_outcome(&taken);
         self.status_publisher.note_reload(if taken.is_ok() { Ok(file) } else { Err(()) });
@@ -214,8 +206,8 @@ impl ServiceLoop {
 
     /// Sends queued frames, closes the files and stores the state.
     pub(super) async fn finish(mut self, mut links: JoinSet<()>, snapshot: Option<&Path>) -> Result<(), ServiceError> {
-        self.engine.release_all(&self.outputs);
-        self.outputs.clear();
+        self.engine.release_all();
+        self.engine.links.clear();
         self.inbox.close();
         let drained = async { while links.join_next().await.is_some() {} };
         if timeout(DRAIN_LIMIT, drained).await.is_err() {

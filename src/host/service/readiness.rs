@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use crate::config::channel_words;
+use crate::io::socket::LinkState;
 use crate::monitor::{BusEvent, Event, EventKind, Monitor};
 use crate::quantity::Channel;
 
@@ -22,16 +24,6 @@ const MAX_NAMED: usize = 3;
 /// Longest line, bytes: a datagram to the service manager carries more, a terminal does not show more.
 const MAX_LINE: usize = 1500;
 
-/// The last state of an interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum InterfaceState {
-    /// No event yet.
-    Unknown,
-    Up,
-    Down,
-    Missing,
-}
-
 /// A report to the service manager.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct ManagerUpdate {
@@ -44,7 +36,7 @@ pub(super) struct ManagerUpdate {
 /// See the module.
 #[derive(Debug)]
 pub(super) struct Readiness {
-    interfaces: Vec<(String, InterfaceState)>,
+    interfaces: Vec<(String, LinkState)>,
     began: Instant,
     timeout: Duration,
     /// Time from the start to the first usable reading.
@@ -67,7 +59,7 @@ impl Readiness {
     /// Readiness of a service that starts now with these interfaces and waits this long for its first reading.
     pub(super) fn new(names: &[String], timeout: Duration, restored: Option<String>, now: Instant) -> Self {
         Self {
-            interfaces: names.iter().map(|name| (name.clone(), InterfaceState::Unknown)).collect(),
+            interfaces: names.iter().map(|name| (name.clone(), LinkState::Unknown)).collect(),
             began: now,
             timeout,
             first_after: None,
@@ -88,9 +80,9 @@ impl Readiness {
         match event.kind {
             EventKind::Bus { bus, what } => {
                 let state = match what {
-                    BusEvent::Up => InterfaceState::Up,
-                    BusEvent::Down => InterfaceState::Down,
-                    BusEvent::Missing => InterfaceState::Missing,
+                    BusEvent::Up => LinkState::Up,
+                    BusEvent::Down => LinkState::Down,
+                    BusEvent::Missing => LinkState::Missing,
                     BusEvent::Dropped { .. } | BusEvent::ErrorFrame { .. } | BusEvent::SendFailed { .. } => return,
                 };
                 if let Some(interface) = self.interfaces.get_mut(bus.index()) {
@@ -194,13 +186,13 @@ impl Readiness {
         let mut problems = Vec::new();
         for (name, interface) in &self.interfaces {
             match interface {
-                InterfaceState::Missing => problems.push(format!("{name} is missing")),
-                InterfaceState::Down => problems.push(format!("{name} is down")),
-                InterfaceState::Up | InterfaceState::Unknown => {}
+                LinkState::Missing => problems.push(format!("{name} is missing")),
+                LinkState::Down => problems.push(format!("{name} is down")),
+                LinkState::Up | LinkState::Unknown => {}
             }
         }
         if !self.lost.is_empty() && self.first_after.is_some() {
-            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| signal_name(channel)).collect();
+            let mut names: Vec<_> = self.lost.iter().take(MAX_NAMED).map(|&channel| channel_words(channel)).collect();
             if self.lost.len() > MAX_NAMED {
                 names.push("...".to_owned());
             }
@@ -230,19 +222,6 @@ fn describe_duration(seconds: f64) -> String {
         s if s < 7200.0 => format!("{:.0} min", s / 60.0),
         s if s < 2.0 * DAY_S => format!("{:.0} h", s / 3600.0),
         s => format!("{:.0} days", s / DAY_S),
-    }
-}
-
-/// A signal in words; cells and sensors count from 1.
-fn signal_name(channel: Channel) -> String {
-    match channel {
-        Channel::Current => "current".to_owned(),
-        Channel::Temperature(sensor) => format!("temperature {}", sensor.index() + 1),
-        Channel::PackVoltage => "pack voltage".to_owned(),
-        Channel::CellVoltage(cell) => format!("voltage of cell {}", cell.index() + 1),
-        Channel::ReportedSoc => "reported SOC".to_owned(),
-        Channel::ReportedSoh => "reported SOH".to_owned(),
-        Channel::PackIdentity => "pack identity".to_owned(),
     }
 }
 

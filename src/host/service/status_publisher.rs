@@ -3,7 +3,7 @@
 use tokio::time::Instant;
 
 use super::engine::Engine;
-use crate::io::socket::{LinkEvent, LinkMessage, LinkOutput};
+use crate::io::record::Record;
 use crate::monitor::TICK_PERIOD_MS;
 use crate::quantity::Timestamp;
 use crate::status::PERIOD;
@@ -36,9 +36,9 @@ impl StatusPublisher {
     }
 
     /// Counts the frames of a batch, which have their estimates at `now`.
-    pub(super) fn note_frames(&mut self, batch: &[LinkMessage], now: Timestamp) {
-        let frames = batch.iter().filter(|received| matches!(received.what, LinkEvent::Frame(_)));
-        frames.for_each(|received| self.latency.record(now.since(received.time)));
+    pub(super) fn note_frames(&mut self, batch: &[Record], now: Timestamp) {
+        let frames = batch.iter().filter(|received| matches!(received, Record::Frame { .. }));
+        frames.for_each(|received| self.latency.record(now.since(received.time())));
     }
 
     /// Counts a reload; `Ok` = the configuration was applied.
@@ -53,7 +53,7 @@ impl StatusPublisher {
     }
 
     /// Publishes a document, if a period has passed at the tick that was due at `tick`.
-    pub(super) fn publish(&mut self, engine: &Engine, links: &[LinkOutput], tick: Instant, now: Timestamp) {
+    pub(super) fn publish(&mut self, engine: &Engine, tick: Instant, now: Timestamp) {
         let Some(server) = &self.server else { return };
         if self.published.is_some_and(|published| tick.duration_since(published) < PERIOD) {
             return;
@@ -62,7 +62,7 @@ impl StatusPublisher {
         let sources = Sources {
             identity: &self.identity,
             monitor: &engine.monitor,
-            links,
+            links: &engine.links,
             before: self.before.get_or_insert_with(|| CounterBaseline::of(&engine.monitor)),
             counters: self.counters,
             latency: &self.latency,

@@ -1,7 +1,6 @@
 //! Collects the status document from the core, the interfaces and the loop's counters: copies structs, serialises nothing.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use super::document::{
@@ -15,7 +14,7 @@ use crate::control::answer;
 use crate::filter::ScalarGaussian;
 use crate::health::RemainingLife;
 use crate::io::clock::Reading;
-use crate::io::socket::{LinkCounters, LinkOutput};
+use crate::io::socket::{LinkHealth, LinkOutput};
 use crate::monitor::{BusStatistics, CellView, Event, EventKind, Monitor, Statistics};
 use crate::quantity::{BusIndex, Timestamp};
 use crate::sample::ReadingCounts;
@@ -142,7 +141,8 @@ impl Sources<'_> {
 
     fn interfaces(&self, core: &Statistics) -> Vec<InterfaceStatus> {
         let each = self.identity.interfaces.iter().zip(self.links).enumerate();
-        each.map(|(bus, (name, link))| interface(name, link.counters(), core.buses.get(bus))).collect()
+        each.map(|(bus, (name, link))| interface(name, link.health(), core.buses.get(bus).copied().unwrap_or_default()))
+            .collect()
     }
 
     fn protection(&self) -> Vec<MessageProtection> {
@@ -167,23 +167,9 @@ impl Sources<'_> {
     }
 }
 
-fn interface(name: &str, counters: &LinkCounters, core: Option<&BusStatistics>) -> InterfaceStatus {
-    let of = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-    let core = core.copied().unwrap_or_default();
-    InterfaceStatus {
-        name: name.to_owned(),
-        state: counters.state(),
-        reconnects: counters.reconnects(),
-        frames: core.frames,
-        error_frames: core.error_frames,
-        bus_offs: core.bus_offs,
-        kernel_dropped: of(&counters.kernel_dropped),
-        queue_dropped: of(&counters.inbox_full),
-        malformed: of(&counters.malformed),
-        sent: of(&counters.sent),
-        send_queue_full: of(&counters.send_queue_full),
-        send_failed: of(&counters.send_failed),
-    }
+fn interface(name: &str, health: LinkHealth, received: BusStatistics) -> InterfaceStatus {
+    let LinkHealth { state, ups, counts } = health;
+    InterfaceStatus { name: name.to_owned(), state, reconnects: ups.saturating_sub(1), received, link: counts }
 }
 
 /// A finite number, or none.

@@ -15,8 +15,8 @@ use sha2::{Digest, Sha256};
 use super::counters::{ClientCounts, Latency, ServiceCounters};
 use crate::alarm::{Alarm, Severity};
 use crate::control::protocol::UnknownAlarms;
-use crate::io::socket::LinkState;
-use crate::monitor::{Statistics, Validity};
+use crate::io::socket::{LinkCounts, LinkState};
+use crate::monitor::{BusStatistics, Statistics, Validity};
 use crate::quantity::{Mode, Timestamp};
 use crate::sample::ReadingCounts;
 
@@ -85,23 +85,11 @@ pub struct InterfaceStatus {
     /// Times it came up again.
     pub reconnects: u64,
     /// Frames received.
-    pub frames: u64,
-    /// Error frames.
-    pub error_frames: u64,
-    /// Error frames that report bus-off.
-    pub bus_offs: u64,
-    /// Frames dropped by the kernel: its receive buffer was full.
-    pub kernel_dropped: u64,
-    /// Frames dropped by the daemon: its queue was full.
-    pub queue_dropped: u64,
-    /// Malformed frames.
-    pub malformed: u64,
-    /// Frames sent.
-    pub sent: u64,
-    /// Frames not sent: the queue to the interface was full.
-    pub send_queue_full: u64,
-    /// Frames not sent: the kernel rejected them, or they had waited too long.
-    pub send_failed: u64,
+    #[serde(flatten)]
+    pub received: BusStatistics,
+    /// Frames sent and lost.
+    #[serde(flatten)]
+    pub link: LinkCounts,
 }
 
 /// The pack, as its limiting cells determine it.

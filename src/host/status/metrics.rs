@@ -189,18 +189,19 @@ fn interfaces(families: &mut Families<'_>, document: &StatusDocument) -> fmt::Re
         families.counter(name, help, all.iter().map(|it| (named(&it.name), of(it))))
     };
     counts("interface_reconnects", "Times the interface came up again", |it| it.reconnects)?;
-    counts("interface_received_frames", "Frames received", |it| it.frames)?;
-    counts("interface_error_frames", "Error frames", |it| it.error_frames)?;
-    counts("interface_bus_offs", "Error frames that report bus-off", |it| it.bus_offs)?;
-    counts("interface_sent_frames", "Frames sent", |it| it.sent)?;
+    counts("interface_received_frames", "Frames received", |it| it.received.frames)?;
+    counts("interface_error_frames", "Error frames", |it| it.received.error_frames)?;
+    counts("interface_bus_offs", "Error frames that report bus-off", |it| it.received.bus_offs)?;
+    counts("interface_sent_frames", "Frames sent", |it| it.link.sent)?;
     let with = |name: &str, reason: &str| vec![("interface", name.to_owned()), ("reason", reason.to_owned())];
     let dropped = all.iter().flat_map(|it| {
-        let reasons = [("kernel", it.kernel_dropped), ("queue", it.queue_dropped), ("malformed", it.malformed)];
+        let reasons =
+            [("kernel", it.link.kernel_dropped), ("queue", it.link.queue_dropped), ("malformed", it.link.malformed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
     families.counter("interface_dropped_frames", "Received frames that were lost", dropped)?;
     let unsent = all.iter().flat_map(|it| {
-        let reasons = [("queue", it.send_queue_full), ("kernel", it.send_failed)];
+        let reasons = [("queue", it.link.send_queue_full), ("kernel", it.link.send_failed)];
         reasons.map(|(reason, count)| (with(&it.name, reason), count))
     });
     families.counter("interface_unsent_frames", "Frames that could not be sent", unsent)?;
@@ -222,6 +223,7 @@ fn message(interface: &str, id: &str) -> Labels {
 
 fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
     let number = |cell: Option<u16>| cell.map(|cell| f64::from(cell) + 1.0);
+    let life = &pack.remaining;
     let rows = [
         ("pack_soc", "ratio", "State of charge", pack.soc),
         ("pack_soc_std", "ratio", "Standard deviation of the state of charge", pack.soc_std),
@@ -234,29 +236,24 @@ fn pack(families: &mut Families<'_>, pack: &PackStatus) -> fmt::Result {
         ("pack_capacity_std", "amperehours", "Standard deviation of the weakest cell's capacity", pack.capacity_std_ah),
         ("pack_soh", "ratio", "Capacity relative to rated", pack.soh),
         ("pack_shortest_lived_cell", "", "Number of the cell whose life ends first", number(pack.shortest_lived_cell)),
-        (
-            "pack_remaining_cycles",
-            "",
-            "Equivalent full cycles until its end of life, median",
-            pack.remaining.remaining_cycles,
-        ),
+        ("pack_remaining_cycles", "", "Equivalent full cycles until its end of life, median", life.remaining_cycles),
         (
             "pack_remaining_cycles_low",
             "",
             "5 % quantile of the cycles until the end of life",
-            pack.remaining.remaining_cycles_low,
+            life.remaining_cycles_low,
         ),
         (
             "pack_remaining_cycles_high",
             "",
             "95 % quantile of the cycles until the end of life",
-            pack.remaining.remaining_cycles_high,
+            life.remaining_cycles_high,
         ),
         (
             "pack_remaining_life",
             "seconds",
             "Time until the end of life at the recent use, median",
-            pack.remaining.remaining_days.map(|d| 86_400.0 * d),
+            life.remaining_days.map(|d| 86_400.0 * d),
         ),
         ("pack_usable_capacity", "amperehours", "Least usable capacity", pack.usable_capacity_ah),
         (

@@ -2,9 +2,8 @@
 
 use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -17,7 +16,8 @@ use tokio::time::{Instant, timeout};
 use super::counters::ClientCounts;
 use super::document::StatusDocument;
 use super::{MAX_CLIENTS, MAX_SILENCE, MODE, STALE, standard_path, stream_path};
-use crate::io::unix_socket::{BindError, BoundSocket, SocketSetting, bind};
+use crate::io::place::PlaceSetting;
+use crate::io::unix_socket::{BindError, BoundSocket, bind};
 use crate::monitor::Event;
 
 /// Pause after a connection could not be accepted (no descriptor left): an immediate retry would fail too.
@@ -47,27 +47,6 @@ impl Draft {
     }
 }
 
-/// Counts of clients; written by the thread, read by the loop.
-#[derive(Debug, Default)]
-pub(super) struct ClientCounters {
-    connected: AtomicU64,
-    served: AtomicU64,
-    refused: AtomicU64,
-    dropped: AtomicU64,
-}
-
-impl ClientCounters {
-    fn document(&self) -> ClientCounts {
-        let of = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        ClientCounts {
-            connected: of(&self.connected),
-            served: of(&self.served),
-            refused: of(&self.refused),
-            dropped: of(&self.dropped),
-        }
-    }
-}
-
 /// A serialised document and its time.
 #[derive(Debug, Clone)]
 struct PublishedLine {
@@ -82,7 +61,7 @@ type Latest = watch::Receiver<Option<PublishedLine>>;
 pub struct StatusServer {
     /// `None` only during the drop.
     drafts: Option<mpsc::Sender<Box<Draft>>>,
-    counters: Arc<ClientCounters>,
+    counters: Arc<Mutex<ClientCounts>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -91,26 +70,14 @@ impl StatusServer {
     ///
     /// # Errors
     /// When another daemon uses them, or a requested one cannot be created.
-    pub fn start(setting: &SocketSetting) -> Result<Option<Self>, String> {
-        let (path, is_needed) = match setting {
-            SocketSetting::Off => return Ok(None),
-            SocketSetting::At(path) => (path.clone(), true),
-            SocketSetting::Standard => (standard_path(), false),
-        };
-        let shown = path.display().to_string();
-        match Self::open(path, Limits { max_silence: MAX_SILENCE, stale: STALE }) {
+    pub fn start(setting: &PlaceSetting) -> Result<Option<Self>, String> {
+        let Some((path, is_needed)) = setting.resolve(|| (standard_path(), false)) else { return Ok(None) };
+        match Self::open(path.clone(), Limits { max_silence: MAX_SILENCE, stale: STALE }) {
             Ok(server) => {
-                tracing::info!(path = shown, "status socket open");
+                tracing::info!(path = %path.display(), "status socket open");
                 Ok(Some(server))
             }
-            Err(BindError::Taken(owner)) => Err(format!(
-                "{shown}: {owner} listens there already; stop it, or start this one with --status and another path"
-            )),
-            Err(BindError::Io(error)) if is_needed => Err(format!("{shown}: {error}")),
-            Err(BindError::Io(error)) => {
-                tracing::info!(path = shown, %error, "no status socket; name its path with --status");
-                Ok(None)
-            }
+            Err(error) => error.without_socket(&path, is_needed, "status"),
         }
     }
 
@@ -118,7 +85,7 @@ impl StatusServer {
         // One waits while another is serialised.
         let (drafts, offered) = mpsc::channel(1);
         let (ready, opened) = sync_channel(1);
-        let counters = Arc::new(ClientCounters::default());
+        let counters = Arc::<Mutex<ClientCounts>>::default();
         let context = ClientContext { counters: Arc::clone(&counters), limits };
         let builder = std::thread::Builder::new().name("status".to_owned()).stack_size(STACK_BYTES);
         let thread = builder.spawn(move || run(path, context, offered, &ready))?;
@@ -136,7 +103,7 @@ impl StatusServer {
 
     /// Counts of clients so far.
     pub fn clients(&self) -> ClientCounts {
-        self.counters.document()
+        *self.counters.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -160,8 +127,14 @@ struct Limits {
 /// Shared by all clients.
 #[derive(Debug, Clone)]
 struct ClientContext {
-    counters: Arc<ClientCounters>,
+    counters: Arc<Mutex<ClientCounts>>,
     limits: Limits,
+}
+
+impl ClientContext {
+    fn count(&self, note: impl FnOnce(&mut ClientCounts)) {
+        note(&mut self.counters.lock().unwrap_or_else(PoisonError::into_inner));
+    }
 }
 
 /// Runs the thread.
@@ -210,7 +183,7 @@ async fn serve([once, stream]: [BoundSocket; 2], context: &ClientContext, mut dr
                 }
             }
         }
-        context.counters.connected.store(clients.len() as u64, Ordering::Relaxed);
+        context.count(|counts| counts.connected = clients.len() as u64);
     }
 }
 
@@ -252,12 +225,12 @@ async fn admit(
             None
         }
         Ok(_) if connected >= MAX_CLIENTS => {
-            context.counters.refused.fetch_add(1, Ordering::Relaxed);
+            context.count(|counts| counts.refused += 1);
             refusals.note();
             None
         }
         Ok(client) => {
-            context.counters.served.fetch_add(1, Ordering::Relaxed);
+            context.count(|counts| counts.served += 1);
             Some(client)
         }
     }
@@ -296,7 +269,7 @@ async fn send_line(client: &mut UnixStream, line: &[u8], context: &ClientContext
     match timeout(context.limits.max_silence, client.write_all(line)).await {
         Ok(written) => written.is_ok(),
         Err(_) => {
-            context.counters.dropped.fetch_add(1, Ordering::Relaxed);
+            context.count(|counts| counts.dropped += 1);
             false
         }
     }

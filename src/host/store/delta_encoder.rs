@@ -64,18 +64,12 @@ impl DeltaEncoder {
             let record = packed::delta(&parts, &base.parts, base.serial);
             ((record.len() as f64) <= MAX_DELTA * base.full_bytes as f64).then_some(record)
         });
-        match record {
-            Some(record) => {
-                let room = self.delta_room.max(record.len().next_multiple_of(ROOM_STEP));
-                EncodedState { serial, is_full: false, length: record.len(), bytes: padded(record, room), parts }
-            }
-            None => {
-                let record = packed::full(&parts);
-                let room = record.len().next_multiple_of(ROOM_STEP);
-                let length = record.len();
-                EncodedState { serial: serial + 1, is_full: true, length, bytes: padded(record, room), parts }
-            }
-        }
+        let is_full = record.is_none();
+        let mut bytes = record.unwrap_or_else(|| packed::full(&parts));
+        let length = bytes.len();
+        let room = length.next_multiple_of(ROOM_STEP);
+        bytes.resize(if is_full { room } else { room.max(self.delta_room) }, 0);
+        EncodedState { serial: serial + i64::from(is_full), is_full, length, bytes, parts }
     }
 
     /// Notes that a record is on the disk.
@@ -90,11 +84,6 @@ impl DeltaEncoder {
             self.delta_room = packed.bytes.len();
         }
     }
-}
-
-fn padded(mut record: Vec<u8>, room: usize) -> Vec<u8> {
-    record.resize(room, 0);
-    record
 }
 
 #[cfg(test)]

@@ -25,6 +25,7 @@ use super::salvage;
 use super::stamp::Stamp;
 use super::state_slots::StateRecord;
 use super::wal::{self, Fault};
+use crate::io::place::with_suffix;
 
 /// Name of the database.
 pub(super) const DATABASE: &str = "packwatch.db";
@@ -301,13 +302,6 @@ fn move_over(from: &Path, to: &Path) -> io::Result<()> {
 
 fn unavailable(error: io::Error) -> OpenError {
     OpenError::Unavailable(format!("the replacement of a damaged database: {error}"))
-}
-
-/// A path with a suffix appended to its name.
-pub fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(suffix);
-    PathBuf::from(name)
 }
 
 fn name_of(path: &Path) -> String {

@@ -1,7 +1,7 @@
 //! Selects the events that the history keeps, and those that are committed at once.
 //!
 //! An alarm that flickers must not wear out the flash, and must not delay another alarm. In: the events of one input.
-//! Out: a [`CommitDecision`] with rows. Bounded by token buckets; times are the events'.
+//! Out: rows to commit now, if any. Bounded by token buckets; times are the events'.
 
 use std::collections::BTreeMap;
 
@@ -41,17 +41,6 @@ struct WrittenLife {
     token_bucket: TokenBucket,
 }
 
-/// Whether the events of one input are committed.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum CommitDecision {
-    /// Nothing was learned, and no alarm changed.
-    Nothing,
-    /// Commit the state now, with these rows, which may be none.
-    Commit(Vec<HistoryRow>),
-    /// Alarms that come too often: their rows wait.
-    Deferred,
-}
-
 /// Selects the events that the history keeps.
 #[derive(Debug)]
 pub(super) struct HistoryFilter {
@@ -77,16 +66,15 @@ impl Default for HistoryFilter {
 }
 
 impl HistoryFilter {
-    /// Decides about the events of one input; waiting rows go with those that are committed.
-    pub(super) fn take(&mut self, events: &[Event]) -> CommitDecision {
-        let Some(now) = events.iter().find(|event| is_learned(&event.kind)).map(|event| event.time) else {
-            return CommitDecision::Nothing;
-        };
+    /// The rows to commit with the state now, which may be none, with those that waited; `None` = nothing was learned and no
+    /// alarm changed, or only alarms that come too often, whose rows wait.
+    pub(super) fn take(&mut self, events: &[Event]) -> Option<Vec<HistoryRow>> {
+        let now = events.iter().find(|event| is_learned(&event.kind))?.time;
         let learned = || events.iter().map(|event| event.kind).filter(is_learned);
         let may_wait = learned().all(|kind| EventSubject::of(&kind).is_some());
         if may_wait && !self.may_commit(learned().filter_map(|kind| EventSubject::of(&kind)), now) {
             learned().for_each(|kind| self.defer(kind));
-            return CommitDecision::Deferred;
+            return None;
         }
         let mut rows = self.for_checkpoint(now);
         for kind in learned() {
@@ -97,7 +85,7 @@ impl HistoryFilter {
                 rows.push(row);
             }
         }
-        CommitDecision::Commit(rows)
+        Some(rows)
     }
 
     /// Takes the waiting rows, if a checkpoint may write them.
@@ -206,10 +194,7 @@ mod tests {
     fn take(history_filter: &mut HistoryFilter, seconds: f64, kinds: &[EventKind]) -> Option<usize> {
         let time = Timestamp::from_secs(seconds);
         let events: Vec<Event> = kinds.iter().map(|&kind| Event { time, kind }).collect();
-        match history_filter.take(&events) {
-            CommitDecision::Commit(rows) => Some(rows.len()),
-            CommitDecision::Nothing | CommitDecision::Deferred => None,
-        }
+        history_filter.take(&events).map(|rows| rows.len())
     }
 
     #[test]

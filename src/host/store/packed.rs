@@ -47,7 +47,7 @@ pub(super) struct DamagedRecord(&'static str);
 /// Encodes the whole state.
 pub(super) fn full(parts: &JsonParts) -> Vec<u8> {
     let mut record = vec![FULL];
-    push_section(&mut record, &parts.skeleton);
+    push_section(&mut record, &parts.skeleton, &[]);
     push_numbers(&mut record, parts, &vec![0; parts.bits.len()], |bits| bits);
     sealed(record, 0)
 }
@@ -56,10 +56,10 @@ pub(super) fn full(parts: &JsonParts) -> Vec<u8> {
 pub(super) fn delta(parts: &JsonParts, base: &JsonParts, serial: i64) -> Vec<u8> {
     let mut record = vec![DELTA];
     if parts.skeleton == base.skeleton {
-        push_section(&mut record, &[]);
+        push_section(&mut record, &[], &[]);
         push_numbers(&mut record, parts, &base.bits, rounded);
     } else {
-        push_skeleton(&mut record, &parts.skeleton, &base.skeleton);
+        push_section(&mut record, &parts.skeleton, &base.skeleton);
         push_numbers(&mut record, parts, &base.aligned_to(&parts.skeleton), rounded);
     }
     sealed(record, serial)
@@ -68,7 +68,7 @@ pub(super) fn delta(parts: &JsonParts, base: &JsonParts, serial: i64) -> Vec<u8>
 /// Reads a full record.
 pub(super) fn read_full(record: &[u8]) -> Result<JsonParts, DamagedRecord> {
     let mut reader = RecordReader::open(record, FULL, 0)?;
-    let mut parts = JsonParts::of_skeleton(reader.section()?);
+    let mut parts = JsonParts::of_skeleton(reader.section(&[])?);
     let zeros = vec![0; parts.bits.len()];
     reader.numbers(&mut parts, &zeros, |bits| bits)?;
     Ok(parts)
@@ -77,7 +77,7 @@ pub(super) fn read_full(record: &[u8]) -> Result<JsonParts, DamagedRecord> {
 /// Reads a delta record to `base`, the full record of number `serial`.
 pub(super) fn read_delta(record: &[u8], base: &JsonParts, serial: i64) -> Result<JsonParts, DamagedRecord> {
     let mut reader = RecordReader::open(record, DELTA, serial)?;
-    let skeleton = reader.skeleton(&base.skeleton)?;
+    let skeleton = reader.section(&base.skeleton)?;
     if skeleton.is_empty() {
         let mut parts = JsonParts { bits: vec![0; base.bits.len()], ..base.clone() };
         reader.numbers(&mut parts, &base.bits, rounded)?;
@@ -134,12 +134,12 @@ fn push_numbers(record: &mut Vec<u8>, parts: &JsonParts, base: &[u64], round: fn
         }
         seen.insert(bits, index);
     }
-    push_section(record, &marks);
-    push_section(record, &references);
+    push_section(record, &marks, &[]);
+    push_section(record, &references, &[]);
     for numbers in [&floats, &whole] {
         for byte in 0..8 {
             let lane: Vec<u8> = numbers.iter().map(|number| number.to_le_bytes()[byte]).collect();
-            push_section(record, &lane);
+            push_section(record, &lane, &[]);
         }
     }
 }
@@ -160,18 +160,9 @@ fn push_varint(out: &mut Vec<u8>, mut value: u64) {
     out.push(value as u8);
 }
 
-/// Appends a list, compressed where that is shorter.
-fn push_section(record: &mut Vec<u8>, bytes: &[u8]) {
-    let packed = zstd::bulk::compress(bytes, LEVEL).ok();
-    push_packed(record, bytes, packed);
-}
-
-fn push_skeleton(record: &mut Vec<u8>, skeleton: &[u8], base: &[u8]) {
-    let packed = zstd::bulk::Compressor::with_dictionary(LEVEL, base).and_then(|mut c| c.compress(skeleton)).ok();
-    push_packed(record, skeleton, packed);
-}
-
-fn push_packed(record: &mut Vec<u8>, bytes: &[u8], packed: Option<Vec<u8>>) {
+/// Appends a list, compressed with a dictionary (empty = none) where that is shorter.
+fn push_section(record: &mut Vec<u8>, bytes: &[u8], dictionary: &[u8]) {
+    let packed = zstd::bulk::Compressor::with_dictionary(LEVEL, dictionary).and_then(|mut c| c.compress(bytes)).ok();
     let packed = packed.filter(|packed| packed.len() < bytes.len());
     let stored = packed.as_deref().unwrap_or(bytes);
     push_varint(record, bytes.len() as u64);
@@ -222,40 +213,28 @@ impl<'a> RecordReader<'a> {
         Err(DamagedRecord("a number in it does not end"))
     }
 
-    /// The stored bytes of the next list, and its length.
-    fn stored(&mut self) -> Result<(&'a [u8], usize), DamagedRecord> {
+    /// The next list, which was compressed with a dictionary (empty = none).
+    fn section(&mut self, dictionary: &[u8]) -> Result<Vec<u8>, DamagedRecord> {
         let length = usize::try_from(self.varint()?).unwrap_or(usize::MAX);
         let stored = usize::try_from(self.varint()?).unwrap_or(usize::MAX);
         if stored > self.rest.len() || length > MAX_SECTION_BYTES {
             return Err(DamagedRecord("a list in it is too long"));
         }
-        let (bytes, rest) = self.rest.split_at(stored);
+        let (stored, rest) = self.rest.split_at(stored);
         self.rest = rest;
-        Ok((bytes, length))
-    }
-
-    fn section(&mut self) -> Result<Vec<u8>, DamagedRecord> {
-        let (stored, length) = self.stored()?;
         if stored.len() == length {
             return Ok(stored.to_vec());
         }
-        zstd::bulk::decompress(stored, length).map_err(|_| DamagedRecord("a list in it does not unpack"))
-    }
-
-    fn skeleton(&mut self, base: &[u8]) -> Result<Vec<u8>, DamagedRecord> {
-        let (stored, length) = self.stored()?;
-        if stored.len() == length {
-            return Ok(stored.to_vec());
-        }
-        let unpacked = zstd::bulk::Decompressor::with_dictionary(base).and_then(|mut d| d.decompress(stored, length));
-        unpacked.map_err(|_| DamagedRecord("its skeleton does not unpack"))
+        let unpacked =
+            zstd::bulk::Decompressor::with_dictionary(dictionary).and_then(|mut d| d.decompress(stored, length));
+        unpacked.map_err(|_| DamagedRecord("a list in it does not unpack"))
     }
 
     /// The numbers of `parts`, whose kinds are known.
     fn numbers(&mut self, parts: &mut JsonParts, base: &[u64], round: fn(u64) -> u64) -> Result<(), DamagedRecord> {
         const MISSING: DamagedRecord = DamagedRecord("a number in it is missing");
-        let marks = self.section()?;
-        let references = self.section()?;
+        let marks = self.section(&[])?;
+        let references = self.section(&[])?;
         let mut references = RecordReader { rest: &references };
         let mut floats = self.lanes()?.into_iter();
         let mut whole = self.lanes()?.into_iter();
@@ -285,7 +264,7 @@ impl<'a> RecordReader<'a> {
     fn lanes(&mut self) -> Result<Vec<u64>, DamagedRecord> {
         let mut numbers = Vec::new();
         for byte in 0..8 {
-            let lane = self.section()?;
+            let lane = self.section(&[])?;
             if byte == 0 {
                 numbers = vec![0_u64; lane.len()];
             }

@@ -25,32 +25,22 @@ impl JsonParts {
     /// Splits a compact JSON document; `None` when a number in it cannot be read.
     pub(super) fn of(json: &[u8]) -> Option<Self> {
         let mut parts = Self { skeleton: Vec::with_capacity(json.len()), ..Self::default() };
-        let mut at = 0;
-        while let Some(&byte) = json.get(at) {
-            let end = token_end(json, at);
-            if byte == b'-' || byte.is_ascii_digit() {
-                let (kind, bits) = number(&json[at..end])?;
+        for token in tokens(json) {
+            if token[0] == b'-' || token[0].is_ascii_digit() {
+                let (kind, bits) = number(token)?;
                 parts.skeleton.push(kind);
                 parts.kinds.push(kind);
                 parts.bits.push(bits);
             } else {
-                parts.skeleton.extend_from_slice(&json[at..end]);
+                parts.skeleton.extend_from_slice(token);
             }
-            at = end;
         }
         Some(parts)
     }
 
     /// A skeleton with all numbers 0.
     pub(super) fn of_skeleton(skeleton: Vec<u8>) -> Self {
-        let mut kinds = Vec::new();
-        let mut at = 0;
-        while let Some(&byte) = skeleton.get(at) {
-            if is_placeholder(byte) {
-                kinds.push(byte);
-            }
-            at = token_end(&skeleton, at);
-        }
+        let kinds: Vec<u8> = tokens(&skeleton).map(|token| token[0]).filter(|&byte| is_placeholder(byte)).collect();
         Self { skeleton, bits: vec![0; kinds.len()], kinds }
     }
 
@@ -58,14 +48,11 @@ impl JsonParts {
     pub(super) fn join(&self) -> Vec<u8> {
         let mut json = Vec::with_capacity(self.skeleton.len() + 10 * self.bits.len());
         let mut numbers = self.kinds.iter().zip(&self.bits);
-        let mut at = 0;
-        while let Some(&byte) = self.skeleton.get(at) {
-            let end = token_end(&self.skeleton, at);
-            match if is_placeholder(byte) { numbers.next() } else { None } {
+        for token in tokens(&self.skeleton) {
+            match if is_placeholder(token[0]) { numbers.next() } else { None } {
                 Some((kind, bits)) => write_number(&mut json, *kind, *bits),
-                None => json.extend_from_slice(&self.skeleton[at..end]),
+                None => json.extend_from_slice(token),
             }
-            at = end;
         }
         json
     }
@@ -82,17 +69,21 @@ const fn is_placeholder(byte: u8) -> bool {
     matches!(byte, FLOAT | INT | BIG)
 }
 
-/// End of the string, number or single byte that begins at `at`.
-fn token_end(text: &[u8], at: usize) -> usize {
-    let rest = &text[at + 1..];
-    let length = match text[at] {
-        b'"' => string_length(rest),
-        byte if byte == b'-' || byte.is_ascii_digit() => {
-            rest.iter().take_while(|b| matches!(b, b'0'..=b'9' | b'.' | b'e' | b'E' | b'+' | b'-')).count()
-        }
-        _ => 0,
-    };
-    at + 1 + length
+/// The strings, numbers and other single bytes of a JSON text, in order.
+fn tokens(mut text: &[u8]) -> impl Iterator<Item = &[u8]> {
+    std::iter::from_fn(move || {
+        let (first, rest) = text.split_first()?;
+        let length = match first {
+            b'"' => string_length(rest),
+            b'-' | b'0'..=b'9' => {
+                rest.iter().take_while(|b| matches!(b, b'0'..=b'9' | b'.' | b'e' | b'E' | b'+' | b'-')).count()
+            }
+            _ => 0,
+        };
+        let (token, after) = text.split_at(1 + length);
+        text = after;
+        Some(token)
+    })
 }
 
 /// Bytes up to and including the closing quote.
@@ -136,12 +127,10 @@ fn paths(skeleton: &[u8]) -> Vec<u64> {
     // Each open object or list: its path, the present key or index, and whether it is an object.
     let mut open: Vec<(u64, u64, bool)> = Vec::new();
     let mut key_next = false;
-    let mut at = 0;
-    while let Some(&byte) = skeleton.get(at) {
-        let end = token_end(skeleton, at);
+    for token in tokens(skeleton) {
         let here = open.last().map_or(0, |&(path, step, _)| mix(path, step));
-        match byte {
-            b'{' | b'[' => {
+        match token[0] {
+            byte @ (b'{' | b'[') => {
                 key_next = byte == b'{';
                 open.push((here, 0, key_next));
             }
@@ -157,13 +146,12 @@ fn paths(skeleton: &[u8]) -> Vec<u64> {
             b'"' if key_next => {
                 key_next = false;
                 if let Some((_, step, _)) = open.last_mut() {
-                    *step = skeleton[at..end].iter().fold(0, |hash, &byte| mix(hash, u64::from(byte)));
+                    *step = token.iter().fold(0, |hash, &byte| mix(hash, u64::from(byte)));
                 }
             }
-            _ if is_placeholder(byte) => found.push(here),
+            byte if is_placeholder(byte) => found.push(here),
             _ => {}
         }
-        at = end;
     }
     found
 }

@@ -8,11 +8,12 @@ use rusqlite::{Connection, OpenFlags};
 
 use super::chain::hex;
 use super::document::StateDocument;
-use super::folder::{DATABASE, with_suffix};
+use super::folder::DATABASE;
 use super::rows::HistoryTable;
 use super::schema;
 use super::state_slots::{STATE, read_document};
 use super::verify::{self, ChainReport};
+use crate::io::place::with_suffix;
 
 /// Largest database that is copied for reading, with its log, bytes: a temporary folder has room for it.
 const MAX_COPY_BYTES: u64 = 256 << 20;
@@ -25,7 +26,7 @@ pub struct HistoryReader {
     connection: Connection,
     path: PathBuf,
     /// Folder of the copy it reads, when the original cannot be read in its place.
-    copy: Option<PathBuf>,
+    _copy: Option<TemporaryCopy>,
 }
 
 /// A selection of rows.
@@ -88,7 +89,7 @@ impl HistoryReader {
             return Err(named("no history there; name the folder of the daemon with --state".to_owned()));
         }
         let (connection, copy) = open_read_only(&path, max_copy_bytes).map_err(named)?;
-        let reader = Self { connection, path: path.clone(), copy };
+        let reader = Self { connection, path: path.clone(), _copy: copy };
         let version = schema::version(&reader.connection).map_err(|error| named(error.to_string()))?;
         let known = schema::known(schema::MIGRATIONS);
         if version > known || version == 0 {
@@ -188,14 +189,6 @@ impl HistoryReader {
     }
 }
 
-impl Drop for HistoryReader {
-    fn drop(&mut self) {
-        if let Some(folder) = &self.copy {
-            let _ = fs::remove_dir_all(folder);
-        }
-    }
-}
-
 fn json(value: Value) -> serde_json::Value {
     match value {
         Value::Null => serde_json::Value::Null,
@@ -208,17 +201,15 @@ fn json(value: Value) -> serde_json::Value {
 
 /// Opens the database for reading, next to a daemon that writes. On a disk that cannot be written, where SQLite cannot
 /// create its index of the log, opens a copy.
-fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<PathBuf>), String> {
+fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Option<TemporaryCopy>), String> {
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
-    let readable = |connection: &Connection| -> rusqlite::Result<()> {
+    let open = |path: &Path, flags: OpenFlags| -> rusqlite::Result<Connection> {
+        let connection = Connection::open_with_flags(path, flags)?;
         connection.busy_timeout(std::time::Duration::from_secs(1))?;
-        connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))
-    };
-    let first = Connection::open_with_flags(path, flags).and_then(|connection| {
-        readable(&connection)?;
+        connection.query_row("SELECT count(*) FROM sqlite_schema", [], |_| Ok(()))?;
         Ok(connection)
-    });
-    let error = match first {
+    };
+    let error = match open(path, flags) {
         Ok(connection) => return Ok((connection, None)),
         Err(error) => error,
     };
@@ -229,21 +220,22 @@ fn open_read_only(path: &Path, max_copy_bytes: u64) -> Result<(Connection, Optio
     let folder = copy_to_temporary(path, max_copy_bytes)
         .map_err(|copying| format!("{error}; and it cannot be copied: {copying}"))?;
     // A copy can be written: SQLite creates its index there.
-    let opened = Connection::open(folder.join(DATABASE)).and_then(|connection| {
-        readable(&connection)?;
-        Ok(connection)
-    });
-    match opened {
-        Ok(connection) => Ok((connection, Some(folder))),
-        Err(error) => {
-            let _ = fs::remove_dir_all(&folder);
-            Err(error.to_string())
-        }
+    let opened = open(&folder.0.join(DATABASE), OpenFlags::default());
+    opened.map(|connection| (connection, Some(folder))).map_err(|error| error.to_string())
+}
+
+/// A copy of the database, which is removed on drop.
+#[derive(Debug)]
+struct TemporaryCopy(PathBuf);
+
+impl Drop for TemporaryCopy {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
 /// Copies a database and its log into a new folder in the temporary folder.
-fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<PathBuf> {
+fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<TemporaryCopy> {
     let log_bytes = fs::metadata(with_suffix(path, "-wal")).map_or(0, |file| file.len());
     let bytes = fs::metadata(path)?.len() + log_bytes;
     if bytes > max_bytes {
@@ -251,18 +243,12 @@ fn copy_to_temporary(path: &Path, max_bytes: u64) -> std::io::Result<PathBuf> {
     }
     let folder = std::env::temp_dir().join(format!("packwatch-history-{}", std::process::id()));
     fs::create_dir(&folder)?;
-    let copied = fs::copy(path, folder.join(DATABASE)).and_then(|_| {
-        match fs::copy(with_suffix(path, "-wal"), with_suffix(&folder.join(DATABASE), "-wal")) {
-            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(()),
-            result => result.map(drop),
-        }
-    });
-    match copied {
-        Ok(()) => Ok(folder),
-        Err(error) => {
-            let _ = fs::remove_dir_all(&folder);
-            Err(error)
-        }
+    let folder = TemporaryCopy(folder);
+    let copy = folder.0.join(DATABASE);
+    fs::copy(path, &copy)?;
+    match fs::copy(with_suffix(path, "-wal"), with_suffix(&copy, "-wal")) {
+        Err(error) if error.kind() != std::io::ErrorKind::NotFound => Err(error),
+        _ => Ok(folder),
     }
 }
 
@@ -279,7 +265,6 @@ mod tests {
         let refused = copy_to_temporary(&path, 1000).unwrap_err().to_string();
         assert_eq!(refused, "1100 bytes, at most 1000 are copied");
         let copy = copy_to_temporary(&path, 1100).unwrap();
-        assert!(with_suffix(&copy.join(DATABASE), "-wal").exists());
-        fs::remove_dir_all(copy).unwrap();
+        assert!(with_suffix(&copy.0.join(DATABASE), "-wal").exists());
     }
 }

@@ -5,7 +5,7 @@ use std::path::Path;
 use super::database::Database;
 use super::document::StateDocument;
 use super::folder::{self, DATABASE, Folder};
-use super::history_filter::{CommitDecision, HistoryFilter};
+use super::history_filter::HistoryFilter;
 use super::rows::{HistoryRow, RowBatch};
 use super::stamp::Stamp;
 use super::state_slots::StateRecord;
@@ -45,10 +45,7 @@ impl Recorder {
 
     /// Writes the rows of one input's events, and the checkpoint when it is due.
     pub fn record(&mut self, events: &[Event], monitor: &Monitor, now: Timestamp) -> Result<(), String> {
-        let rows = match self.history_filter.take(events) {
-            CommitDecision::Commit(rows) => Some(rows),
-            CommitDecision::Nothing | CommitDecision::Deferred => None,
-        };
+        let rows = self.history_filter.take(events);
         let is_due = now.since(*self.checkpointed.get_or_insert(now)) >= self.checkpoint_s;
         if rows.is_none() && !is_due {
             return Ok(());

@@ -3,8 +3,9 @@
 //! The folder is in memory and lives as long as the boot (systemd keeps it over restarts of the service). A separate
 //! thread writes the latest state, so that a slow disk elsewhere does not delay it.
 
-use std::path::PathBuf;
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 use super::document::StateDocument;
@@ -15,64 +16,47 @@ pub(super) const FILE_NAME: &str = "state.json";
 /// Writes the state of the second.
 #[derive(Debug)]
 pub(super) struct RuntimeState {
-    shared: Arc<Shared>,
+    latest: Arc<Mutex<Option<StateDocument>>>,
+    /// One word that a state waits; `None` only during the drop.
+    wake: Option<SyncSender<()>>,
     writer: Option<JoinHandle<()>>,
-}
-
-#[derive(Debug, Default)]
-struct Shared {
-    next: Mutex<PendingDocument>,
-    wake: Condvar,
-}
-
-#[derive(Debug, Default)]
-struct PendingDocument {
-    document: Option<StateDocument>,
-    stop: bool,
 }
 
 impl RuntimeState {
     /// Starts the thread that writes `path`.
     pub(super) fn start(path: PathBuf) -> std::io::Result<Self> {
-        let shared = Arc::new(Shared::default());
-        let theirs = Arc::clone(&shared);
-        let writer = std::thread::Builder::new().name("state".to_owned()).spawn(move || write_all(&path, &theirs))?;
-        Ok(Self { shared, writer: Some(writer) })
+        let (latest, (wake, woken)) = (Arc::default(), sync_channel(1));
+        let theirs = Arc::clone(&latest);
+        let thread = std::thread::Builder::new().name("state".to_owned());
+        let writer = thread.spawn(move || write_all(&path, &theirs, &woken))?;
+        Ok(Self { latest, wake: Some(wake), writer: Some(writer) })
     }
 
     /// Queues the latest state; it replaces one that still waits.
     pub(super) fn put(&self, document: StateDocument) {
-        self.shared.next.lock().unwrap_or_else(PoisonError::into_inner).document = Some(document);
-        self.shared.wake.notify_one();
+        *self.latest.lock().unwrap_or_else(PoisonError::into_inner) = Some(document);
+        let _ = self.wake.as_ref().map(|wake| wake.try_send(()));
     }
 }
 
 impl Drop for RuntimeState {
     fn drop(&mut self) {
-        self.shared.next.lock().unwrap_or_else(PoisonError::into_inner).stop = true;
-        self.shared.wake.notify_one();
+        self.wake = None;
         // The folder is in memory: the thread ends within milliseconds.
         let _ = self.writer.take().map(JoinHandle::join);
     }
 }
 
-fn write_all(path: &std::path::Path, shared: &Shared) {
+fn write_all(path: &Path, latest: &Mutex<Option<StateDocument>>, woken: &Receiver<()>) {
     let mut failing = false;
-    loop {
-        let next = shared.next.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut next = shared
-            .wake
-            .wait_while(next, |next| next.document.is_none() && !next.stop)
-            .unwrap_or_else(PoisonError::into_inner);
-        let Some(document) = next.document.take() else { return };
-        drop(next);
-        match document.write(path) {
-            Ok(()) => failing = false,
-            Err(error) if !failing => {
-                failing = true;
-                tracing::warn!(path = %path.display(), %error, "state of the second not written");
-            }
-            Err(_) => {}
+    for () in woken {
+        let document = latest.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let written = document.map_or(Ok(()), |document| document.write(path));
+        if let Err(error) = &written
+            && !failing
+        {
+            tracing::warn!(path = %path.display(), %error, "state of the second not written");
         }
+        failing = written.is_err();
     }
 }

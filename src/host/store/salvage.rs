@@ -258,17 +258,6 @@ fn next(old: &Connection, sources: &mut [TableSource]) -> Option<(HistoryTable, 
     source.page.pop_front().map(|row| (source.table, row))
 }
 
-/// The result of checking a row's hash.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Evidence {
-    /// Its hash is good.
-    Verified,
-    /// It has no hash, or the row before it is lost.
-    Unchecked,
-    /// The damage has changed it.
-    Refused,
-}
-
 /// Writes the new file.
 struct Copier<'a> {
     connection: &'a Connection,
@@ -284,40 +273,36 @@ struct Copier<'a> {
 
 impl Copier<'_> {
     fn copy_checked(&mut self, table: HistoryTable, row: &SalvagedRow) -> rusqlite::Result<()> {
-        let evidence = self.check(table, row);
-        if evidence != Evidence::Refused && self.copy(table, row, evidence)? {
-            self.saved.count(table);
-        } else {
-            self.saved.refused += 1;
+        match self.check(table, row) {
+            Some(is_verified) if self.copy(table, row, is_verified)? => self.saved.count(table),
+            _ => self.saved.refused += 1,
         }
         Ok(())
     }
 
-    fn check(&mut self, table: HistoryTable, row: &SalvagedRow) -> Evidence {
+    /// Whether the row's hash is good, or not to be checked: it has none, or the row before it is lost. `None` = the damage has
+    /// changed the row.
+    fn check(&mut self, table: HistoryTable, row: &SalvagedRow) -> Option<bool> {
         if table == HistoryTable::HalfCycle {
-            return Evidence::Unchecked;
+            return Some(false);
         }
-        let (seq, Some(hash)) = (row.key.0, row.hash) else { return Evidence::Refused };
-        let evidence = match self.before {
-            Some((before, _)) if seq <= before => return Evidence::Refused,
+        let (seq, hash) = (row.key.0, row.hash?);
+        let is_verified = match self.before {
+            Some((before, _)) if seq <= before => return None,
             Some((before, before_hash)) if seq - 1 == before => {
                 let chained: Vec<Value> = row.moment.iter().chain(&row.values).cloned().collect();
-                if chain::link(&before_hash, table, seq, &chained) == hash {
-                    Evidence::Verified
-                } else {
-                    Evidence::Refused
-                }
+                (chain::link(&before_hash, table, seq, &chained) == hash).then_some(true)
             }
-            _ => Evidence::Unchecked,
+            _ => Some(false),
         };
         self.before = Some((seq, hash));
-        evidence
+        is_verified
     }
 
     /// Copies a row with its moment; `false` = the moment is lost, or the row breaks a rule of the layout.
-    fn copy(&mut self, table: HistoryTable, row: &SalvagedRow, evidence: Evidence) -> rusqlite::Result<bool> {
+    fn copy(&mut self, table: HistoryTable, row: &SalvagedRow, is_verified: bool) -> rusqlite::Result<bool> {
         let Some((id, stamp, pack)) = moment_of(&row.moment) else { return Ok(false) };
-        if evidence == Evidence::Verified {
+        if is_verified {
             let replaces = table == HistoryTable::Reset && row.values.iter().any(is_replacement);
             self.packs = self.packs.max(pack + i64::from(replaces));
         } else if !(1..=self.packs).contains(&pack) {

@@ -14,6 +14,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use crate::io::clock::Reading;
+use crate::monitor::Downtime;
 use crate::quantity::Timestamp;
 
 /// A wall clock before this (2024-01-01) has not been set.
@@ -124,15 +125,6 @@ impl WallClock {
     }
 }
 
-/// Time since a state was stored.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Age {
-    /// Seconds.
-    Seconds(f64),
-    /// The clocks do not give it.
-    Unknown,
-}
-
 impl Stamp {
     /// Now, with the inputs' clock at `time`.
     pub(super) fn now(time: Timestamp, boot: BootId) -> Self {
@@ -151,18 +143,18 @@ impl Stamp {
     }
 
     /// Time from this moment to `now`.
-    pub(super) fn age(&self, now: &Self, wall: WallClock) -> Age {
+    pub(super) fn age(&self, now: &Self, wall: WallClock) -> Downtime {
         let seconds = |from: i64, to: i64| to.saturating_sub(from) as f64 / 1e9;
         if self.same_boot(now) {
-            return Age::Seconds(seconds(self.boottime_ns, now.boottime_ns).max(0.0));
+            return Downtime::Seconds(seconds(self.boottime_ns, now.boottime_ns).max(0.0));
         }
         let can_be = now.wall_ns > self.wall_ns && self.wall_ns >= SANE_WALL_NS;
         match wall {
             // It was stored before this boot, so the age is at least the uptime.
             WallClock::Reliable if can_be => {
-                Age::Seconds(seconds(self.wall_ns, now.wall_ns).max(seconds(0, now.boottime_ns)))
+                Downtime::Seconds(seconds(self.wall_ns, now.wall_ns).max(seconds(0, now.boottime_ns)))
             }
-            WallClock::Reliable | WallClock::Unverified => Age::Unknown,
+            WallClock::Reliable | WallClock::Unverified => Downtime::Unknown,
         }
     }
 }
@@ -182,7 +174,7 @@ mod tests {
     fn within_one_boot_the_wall_clock_is_ignored() {
         for wall_s in [0, 1_800_000_000, 4_000_000_000] {
             let now = stamp(1, 130, wall_s);
-            assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unverified), Age::Seconds(30.0));
+            assert_eq!(stamp(1, 100, 1_800_000_000).age(&now, WallClock::Unverified), Downtime::Seconds(30.0));
         }
     }
 
@@ -190,24 +182,24 @@ mod tests {
     fn across_boots_only_a_plausible_wall_clock_counts() {
         let stored = stamp(1, 100, 1_800_000_000);
         let age = |stored: Stamp, now: Stamp| stored.age(&now, WallClock::Reliable);
-        assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Age::Seconds(600.0));
-        assert_eq!(age(stored, stamp(2, 5, 1_799_999_999)), Age::Unknown, "before what was stored");
-        assert_eq!(age(stored, stamp(2, 5, 30)), Age::Unknown, "1970");
-        assert_eq!(age(stamp(1, 100, 30), stamp(2, 5, 1_800_000_000)), Age::Unknown, "stored in 1970");
-        assert_eq!(age(stamp(0, 100, 30), stamp(0, 130, 60)), Age::Unknown, "boots that are not known");
+        assert_eq!(age(stored, stamp(2, 5, 1_800_000_600)), Downtime::Seconds(600.0));
+        assert_eq!(age(stored, stamp(2, 5, 1_799_999_999)), Downtime::Unknown, "before what was stored");
+        assert_eq!(age(stored, stamp(2, 5, 30)), Downtime::Unknown, "1970");
+        assert_eq!(age(stamp(1, 100, 30), stamp(2, 5, 1_800_000_000)), Downtime::Unknown, "stored in 1970");
+        assert_eq!(age(stamp(0, 100, 30), stamp(0, 130, 60)), Downtime::Unknown, "boots that are not known");
     }
 
     #[test]
     fn a_state_of_an_earlier_boot_is_at_least_as_old_as_this_one() {
         let stored = stamp(1, 100, 1_800_000_000);
-        assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Reliable), Age::Seconds(3_600.0));
+        assert_eq!(stored.age(&stamp(2, 3_600, 1_800_000_020), WallClock::Reliable), Downtime::Seconds(3_600.0));
     }
 
     #[test]
     fn a_saved_clock_does_not_turn_a_week_off_into_seconds() {
         // Without a hardware clock: the time of the last save, 20 s after the last checkpoint.
         let (stored, now) = (stamp(1, 100, 1_800_000_000), stamp(2, 5, 1_800_000_020));
-        assert_eq!(stored.age(&now, WallClock::Unverified), Age::Unknown);
+        assert_eq!(stored.age(&now, WallClock::Unverified), Downtime::Unknown);
     }
 
     #[test]

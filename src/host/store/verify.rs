@@ -1,7 +1,7 @@
 //! Checks the hash chain of the history, row by row, up to the first row that was changed.
 
 use rusqlite::types::Value;
-use rusqlite::{Connection, Rows, Statement};
+use rusqlite::{Connection, Statement};
 use serde::Serialize;
 
 use super::chain::{Hash, hex, link};
@@ -52,18 +52,28 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
         .filter(|table| table.is_in(version))
         .map(|table| connection.prepare(&rows_sql(table, "ORDER BY r.seq")).map(|statement| (table, statement)))
         .collect::<rusqlite::Result<_>>()?;
-    let mut cursors = statements
-        .iter_mut()
-        .map(|(table, statement)| Cursor::new(*table, statement))
-        .collect::<rusqlite::Result<Vec<_>>>()?;
+    let mut tables = Vec::new();
+    for (table, statement) in &mut statements {
+        let columns = MOMENT_COLUMNS + table.columns().len();
+        let rows = statement.query_map([], move |row| {
+            let values = (2..2 + columns).map(|index| row.get(index)).collect::<rusqlite::Result<_>>()?;
+            Ok(ChainLink { seq: row.get(0)?, hash: row.get(1)?, values })
+        })?;
+        tables.push((*table, rows.peekable()));
+    }
     let mut before: Hash = [0; 32];
     let mut seq = 0;
     let broken = loop {
         seq += 1;
-        let next = cursors.iter_mut().filter(|c| c.next.is_some()).min_by_key(|c| c.next.as_ref().map(|row| row.seq));
-        let Some(cursor) = next else { break judge_end(&meta, seq - 1, &before) };
-        let table = cursor.table;
-        let Some(row) = cursor.advance()? else { break None };
+        let heads = tables.iter_mut().filter_map(|(table, rows)| {
+            // A row that cannot be read comes first.
+            let head = rows.peek()?.as_ref().map_or(i64::MIN, |row| row.seq);
+            Some((head, *table, rows))
+        });
+        let Some((_, table, rows)) = heads.min_by_key(|(head, ..)| *head) else {
+            break judge_end(&meta, seq - 1, &before);
+        };
+        let Some(row) = rows.next().transpose()? else { break None };
         match judge(table, seq, &row, &before) {
             Ok(hash) => before = hash,
             Err(broken) => break Some(broken),
@@ -71,34 +81,6 @@ pub(super) fn verify(connection: &Connection) -> rusqlite::Result<ChainReport> {
     };
     let good_rows = if broken.is_some() { (seq - 1).min(meta.head.count) } else { seq - 1 };
     Ok(ChainReport { good_rows, rows: meta.head.count, head: hex(&meta.head.hash), broken })
-}
-
-/// One table's rows in order.
-struct Cursor<'a> {
-    table: HistoryTable,
-    rows: Rows<'a>,
-    next: Option<ChainLink>,
-}
-
-impl<'a> Cursor<'a> {
-    fn new(table: HistoryTable, statement: &'a mut Statement<'_>) -> rusqlite::Result<Self> {
-        let mut cursor = Self { table, rows: statement.query([])?, next: None };
-        cursor.advance()?;
-        Ok(cursor)
-    }
-
-    /// Takes the next row and reads the one after it.
-    fn advance(&mut self) -> rusqlite::Result<Option<ChainLink>> {
-        let columns = MOMENT_COLUMNS + self.table.columns().len();
-        let after = match self.rows.next()? {
-            None => None,
-            Some(row) => {
-                let values = (2..2 + columns).map(|index| row.get(index)).collect::<rusqlite::Result<_>>()?;
-                Some(ChainLink { seq: row.get(0)?, hash: row.get(1)?, values })
-            }
-        };
-        Ok(std::mem::replace(&mut self.next, after))
-    }
 }
 
 /// Returns the row's hash if it is row `seq` of the chain and unchanged.

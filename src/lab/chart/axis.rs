@@ -6,27 +6,12 @@ use crate::quantity::Timestamp;
 const MINUTE: f64 = 60.0;
 const HOUR: f64 = 3600.0;
 const DAY: f64 = 86_400.0;
-/// Steps of a date axis below a month, s.
-const STEPS_S: [f64; 19] = [
-    1.0,
-    5.0,
-    15.0,
-    30.0,
-    MINUTE,
-    5.0 * MINUTE,
-    15.0 * MINUTE,
-    30.0 * MINUTE,
-    HOUR,
-    2.0 * HOUR,
-    3.0 * HOUR,
-    4.0 * HOUR,
-    6.0 * HOUR,
-    12.0 * HOUR,
-    DAY,
-    2.0 * DAY,
-    5.0 * DAY,
-    10.0 * DAY,
-    20.0 * DAY,
+/// Steps of a date axis below a month: units, s, and how many of them.
+const STEPS: [(f64, &[f64]); 4] = [
+    (1.0, &[1.0, 5.0, 15.0, 30.0]),
+    (MINUTE, &[1.0, 5.0, 15.0, 30.0]),
+    (HOUR, &[1.0, 2.0, 3.0, 4.0, 6.0, 12.0]),
+    (DAY, &[1.0, 2.0, 5.0, 10.0, 20.0]),
 ];
 /// Steps above, months.
 const STEPS_MONTHS: [i64; 7] = [1, 2, 3, 6, 12, 24, 60];
@@ -54,10 +39,16 @@ pub struct Axis {
     pub range: Option<(f64, f64)>,
 }
 
+impl<T: Into<String>> From<T> for Axis {
+    fn from(label: T) -> Self {
+        Self { label: label.into(), ..Self::default() }
+    }
+}
+
 impl Axis {
     /// Numbers, as far as the data go.
     pub fn number(label: &str) -> Self {
-        Self { label: label.to_owned(), ..Self::default() }
+        label.into()
     }
 
     pub fn within(self, low: f64, high: f64) -> Self {
@@ -120,7 +111,8 @@ fn number_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
 
 fn date_ticks((low, high): (f64, f64), count: f64) -> Vec<(f64, String)> {
     let raw = (high - low) / count.max(1.0);
-    match STEPS_S.into_iter().find(|step| *step >= raw) {
+    let mut steps = STEPS.iter().flat_map(|(unit, counts)| counts.iter().map(move |count| count * unit));
+    match steps.find(|step| *step >= raw) {
         Some(step) => {
             let first = (low / step).ceil();
             (0..=count.ceil() as usize)

@@ -129,6 +129,11 @@ impl Area {
 }
 
 impl Chart {
+    /// A chart without a description.
+    pub fn new(title: impl Into<String>, x: impl Into<Axis>, y: impl Into<Axis>, layers: Vec<Layer>) -> Self {
+        Self { title: title.into(), description: String::new(), x: x.into(), y: y.into(), layers }
+    }
+
     /// The elements, and the height they take.
     pub(super) fn draw(&self, size: Size) -> (String, f64) {
         let mut svg = Svg::default();

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::FitOutcome;
-use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture};
+use crate::chart::{self, Chart, Format, Ink, Layer, Picture};
 use crate::error::LabError;
 use crate::ident::pass::residuals;
 
@@ -36,11 +36,10 @@ fn panel(outcome: &FitOutcome, number: usize) -> Picture {
         begin_s = time_s;
     }
     let name = file.path.file_name().unwrap_or_default().to_string_lossy();
-    Picture::Chart(Chart {
-        title: format!("{name}: RMSE {:.1} mV", 1e3 * file.residual.rmse_v),
-        x: Axis::number("time, h"),
-        y: Axis::number("measured - model, mV"),
-        layers: vec![Layer::line("", Ink::Blue, points)],
-        ..Chart::default()
-    })
+    Picture::Chart(Chart::new(
+        format!("{name}: RMSE {:.1} mV", 1e3 * file.residual.rmse_v),
+        "time, h",
+        "measured - model, mV",
+        vec![Layer::line("", Ink::Blue, points)],
+    ))
 }

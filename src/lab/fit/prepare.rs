@@ -2,9 +2,7 @@
 
 use super::FitRequest;
 use crate::error::LabError;
-use crate::ident::RawRows;
-use crate::ident::ageing::{self, HalfCycle};
-use crate::ident::anchor::Stretch;
+use crate::ident::ageing;
 use crate::ident::fit::{self, FittedTables, OcvCurve, Residual};
 use crate::ident::grid::Grid;
 use crate::ident::record::{self, Limits, Record};
@@ -28,7 +26,6 @@ pub(super) struct AnchoredPart {
     /// Number of its file.
     pub(super) file: usize,
     part: MeasuredPart,
-    soc: Vec<f64>,
     judged: Vec<bool>,
     /// Weight of each second; `None` = by the SOC it covers and the kind of test.
     scale: Option<f64>,
@@ -62,15 +59,6 @@ fn clean(part: &MeasuredPart) -> MeasuredPart {
     clean
 }
 
-fn stretch(part: &MeasuredPart) -> Stretch<'_> {
-    Stretch {
-        time_s: &part.time_s,
-        current_a: &part.current_a,
-        voltage_v: &part.voltage_v,
-        discharged_ah: &part.discharged_ah,
-    }
-}
-
 /// Determines everything but the grid.
 pub(super) fn prepare(
     request: &FitRequest,
@@ -91,7 +79,7 @@ pub(super) fn prepare(
     }
     let mut tests = slow.iter().map(|file| slow_test(file, voltage_v.1)).collect::<Result<Vec<_>, _>>()?;
     tests.sort_by(|a, b| a.temperature_c.total_cmp(&b.temperature_c));
-    let mut taken = taken_out(request, files, voltage_v.1)?;
+    let taken = taken_out(request, files, voltage_v.1)?;
     let deepest_ah = taken.iter().flat_map(|(_, _, out)| out).fold(0.0_f64, |most, ah| most.max(*ah));
     let nearest = tests.iter().min_by(|a, b| (a.temperature_c - 25.0).abs().total_cmp(&(b.temperature_c - 25.0).abs()));
     let capacity_ah = match (request.capacity_ah, nearest) {
@@ -108,12 +96,9 @@ pub(super) fn prepare(
     if capacity_ah <= 0.0 {
         return Err(LabError("no discharge in the data".into()));
     }
-    let sources = taken.drain(..).map(|(file, part, out_ah)| AnchoredPart {
-        file,
-        soc: out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect(),
-        part,
-        judged: vec![],
-        scale: None,
+    let sources = taken.into_iter().map(|(file, mut part, out_ah)| {
+        part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
+        AnchoredPart { file, part, judged: vec![], scale: None }
     });
     let mut sources: Vec<AnchoredPart> = sources.collect();
     let slow_sources =
@@ -132,7 +117,7 @@ fn taken_out(request: &FitRequest, files: &[MeasuredFile], voltage_max_v: f64) -
     for (number, file) in files.iter().enumerate() {
         for part in file.parts.iter().map(clean).filter(|part| !part.time_s.is_empty()) {
             let hint_ah = request.capacity_ah.or(request.rated_ah).unwrap_or_else(|| rough_capacity(&part));
-            match stretch(&part).taken_out_ah(voltage_max_v, hint_ah) {
+            match part.taken_out_ah(voltage_max_v, hint_ah) {
                 Ok(out_ah) => taken.push((number, part, out_ah)),
                 Err(error) => refused.push(format!("{}{}: {error}", file.path.display(), key_text(&part))),
             }
@@ -186,7 +171,7 @@ fn cycle_limits(files: &[MeasuredFile], first: usize) -> Option<(f64, f64)> {
     };
     let sorted = |discharge: bool| {
         let sign = if discharge { 1.0 } else { -1.0 };
-        let own = early().filter(|part| (part.kind == "discharge") == discharge);
+        let own = early().filter(|part| part.is_discharge() == discharge);
         let mut all: Vec<f64> = own.map(|part| extreme(part, sign)).filter(|v| v.is_finite()).collect();
         all.sort_by(f64::total_cmp);
         all
@@ -219,7 +204,7 @@ fn slow_test(file: &MeasuredFile, voltage_max_v: f64) -> Result<SlowDischarge, L
     if part.time_s.is_empty() {
         return Err(fail("no row with current and voltage".into()));
     }
-    let out_ah = stretch(&part).taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(|e| fail(e.to_string()))?;
+    let out_ah = part.taken_out_ah(voltage_max_v, rough_capacity(&part)).map_err(fail)?;
     let begin = part.current_a.iter().position(|&i| i > 0.0).ok_or_else(|| fail("no discharge".into()))?;
     let len = part.current_a[begin..].iter().take_while(|&&i| i > 0.0).count();
     let mut test = SlowDischarge { temperature_c: 0.0, out_ah: vec![], voltage_v: vec![] };
@@ -246,14 +231,14 @@ fn slow_source(
     voltage_max_v: f64,
     capacity_ah: f64,
 ) -> Result<AnchoredPart, LabError> {
-    let part = clean(&file.parts[0]);
-    let out_ah = stretch(&part).taken_out_ah(voltage_max_v, capacity_ah);
+    let mut part = clean(&file.parts[0]);
+    let out_ah = part.taken_out_ah(voltage_max_v, capacity_ah);
     let out_ah = out_ah.map_err(|e| LabError(format!("{}: {e}", file.path.display())))?;
     let most = out_ah.iter().enumerate().fold(0, |most, (k, ah)| if *ah > out_ah[most] { k } else { most });
     // Rows after the discharge are not judged.
     let judged = (0..out_ah.len()).map(|k| k <= most).collect();
-    let soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
-    Ok(AnchoredPart { file: number, part, soc, judged, scale: None })
+    part.soc = out_ah.iter().map(|ah| 1.0 - ah / capacity_ah).collect();
+    Ok(AnchoredPart { file: number, part, judged, scale: None })
 }
 
 fn need_cycles(files: &[MeasuredFile]) -> Result<(), LabError> {
@@ -279,33 +264,17 @@ fn ageing_sources(
                 early.push(clean(part));
             }
         }
-        let cycles: Vec<HalfCycle<'_>> = early.iter().map(half_cycle).collect();
-        let (capacity_ah, anchored) = ageing::anchor(&cycles, voltage_v).map_err(|e| fail(e.to_string()))?;
+        let (capacity_ah, anchored) = ageing::anchor(&early, voltage_v).map_err(fail)?;
         prepared.capacity_ah += capacity_ah / files.len() as f64;
         let mut early: Vec<Option<MeasuredPart>> = early.into_iter().map(Some).collect();
         for half in anchored {
             let Some(mut part) = early[half.index].take() else { continue };
-            let scale = if part.kind == "discharge" { 1.0 } else { AGEING_CHARGE_SCALE };
-            part.current_a = half.current_a;
-            prepared.sources.push(AnchoredPart {
-                file: number,
-                part,
-                soc: half.soc,
-                judged: half.judged,
-                scale: Some(scale),
-            });
+            let scale = Some(if part.is_discharge() { 1.0 } else { AGEING_CHARGE_SCALE });
+            (part.current_a, part.soc) = (half.current_a, half.soc);
+            prepared.sources.push(AnchoredPart { file: number, part, judged: half.judged, scale });
         }
     }
     Ok(prepared)
-}
-
-fn half_cycle(part: &MeasuredPart) -> HalfCycle<'_> {
-    HalfCycle {
-        discharge: part.kind == "discharge",
-        time_s: &part.time_s,
-        current_a: &part.current_a,
-        voltage_v: &part.voltage_v,
-    }
 }
 
 impl FitInputs {
@@ -316,16 +285,7 @@ impl FitInputs {
             voltage_high_v: self.voltage_v.1 + CREDIBLE_BEYOND_V.1,
             capacity_ah: self.capacity_ah,
         };
-        let record = |source: &AnchoredPart| {
-            let raw = RawRows {
-                time_s: &source.part.time_s,
-                current_a: &source.part.current_a,
-                voltage_v: &source.part.voltage_v,
-                temperature_c: &source.part.temperature_c,
-                soc: &source.soc,
-            };
-            Record::prepare(&raw, &source.judged, grid, &limits)
-        };
+        let record = |source: &AnchoredPart| Record::prepare(&source.part, &source.judged, grid, &limits);
         let records: Vec<Record> = self.sources.iter().map(record).collect();
         // Where there are no drives, the tests count in full.
         let most = records.iter().map(record::share).fold(0.0, f64::max);
@@ -338,9 +298,9 @@ impl FitInputs {
     /// Residuals of the discharges and of the charges.
     pub(super) fn by_kind(&self, records: &[Record], fitted: &FittedTables) -> (Residual, Residual) {
         let of_kind = |discharge: bool| {
-            let own = self.sources.iter().zip(records).filter(|(s, _)| (s.part.kind == "discharge") == discharge);
+            let own = self.sources.iter().zip(records).filter(|(s, _)| s.part.is_discharge() == discharge);
             let own: Vec<Record> = own.map(|(_, record)| record.clone()).collect();
-            fit::judge(&own, &fitted.tables).1
+            fit::judge(&own, &fitted.tables)
         };
         (of_kind(true), of_kind(false))
     }

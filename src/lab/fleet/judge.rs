@@ -19,14 +19,15 @@
 use serde::Serialize;
 
 use super::track::Track;
-use super::truth::{Truth, TruthKind};
+use super::truth::{EndOfLifeSource, Truth};
 use super::variant_batch::{AlarmHistory, Raise};
 
 use crate::alarm::{Rule, RuleConfig};
 use crate::quantity::Timestamp;
 
 /// Longest time from a true raise to the end of life.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Horizon {
     /// In equivalent full cycles.
     Cycles(f64),
@@ -148,7 +149,7 @@ impl LogLife<'_> {
     }
 
     fn false_raises(&self, config: &RuleConfig, history: &AlarmHistory) -> Option<usize> {
-        let truth = self.truth.filter(|truth| truth.kind == TruthKind::Capacity)?;
+        let truth = self.truth.filter(|truth| truth.kind == EndOfLifeSource::Truth)?;
         let is_false = |raise: &&Raise| {
             let true_ah = raise.cell.and_then(|cell| truth.capacity_ah(cell, raise.time));
             true_ah.is_some_and(|true_ah| true_ah > config.threshold)
@@ -161,7 +162,6 @@ impl LogLife<'_> {
 mod tests {
     use super::*;
     use crate::alarm::{Comparison, Severity};
-    use crate::fleet::track::CapacityKind;
     use crate::monitor::{Event, EventKind};
     use crate::quantity::{CellIndex, Mode};
 
@@ -173,7 +173,7 @@ mod tests {
 
     /// One equivalent full cycle a day.
     fn track() -> Track {
-        let mut track = Track::new(1.0, CapacityKind::Capacity);
+        let mut track = Track::new(1.0, EndOfLifeSource::Learned);
         for end in 1..=100 {
             let kind = EventKind::HalfCycle {
                 cell: CellIndex(0),

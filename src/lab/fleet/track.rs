@@ -5,23 +5,15 @@
 
 use std::collections::BTreeMap;
 
+use super::truth::EndOfLifeSource;
 use crate::monitor::{Event, EventKind};
 use crate::quantity::{CellIndex, Timestamp};
-
-/// Which learned capacity is followed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CapacityKind {
-    /// At the configured load.
-    Usable,
-    /// Between the open-circuit voltages.
-    Capacity,
-}
 
 /// Charge moved and capacities learned up to now.
 #[derive(Debug, Clone)]
 pub struct Track {
     rated_ah: f64,
-    learned: CapacityKind,
+    learned: EndOfLifeSource,
     moved_ah: BTreeMap<CellIndex, f64>,
     capacity_ah: BTreeMap<CellIndex, f64>,
     /// Ends of half-cycles: time and equivalent full cycles so far.
@@ -31,7 +23,7 @@ pub struct Track {
 }
 
 impl Track {
-    pub fn new(rated_ah: f64, learned: CapacityKind) -> Self {
+    pub fn new(rated_ah: f64, learned: EndOfLifeSource) -> Self {
         let none = BTreeMap::new();
         Self { rated_ah, learned, moved_ah: none.clone(), capacity_ah: none, cycles: Vec::new(), weakest: Vec::new() }
     }
@@ -42,11 +34,8 @@ impl Track {
             match event.kind {
                 EventKind::HalfCycle { cell, charge_ah, .. } => self.move_charge(event.time, cell, charge_ah),
                 EventKind::Capacity { cell, capacity_ah, usable_capacity_ah, .. } => {
-                    let learned = match self.learned {
-                        CapacityKind::Usable => usable_capacity_ah,
-                        CapacityKind::Capacity => Some(capacity_ah),
-                    };
-                    self.learn(event.time, cell, learned);
+                    let is_usable = self.learned == EndOfLifeSource::LearnedUsable;
+                    self.learn(event.time, cell, if is_usable { usable_capacity_ah } else { Some(capacity_ah) });
                 }
                 EventKind::PackReplaced { .. } => self.capacity_ah.clear(),
                 _ => {}
@@ -92,7 +81,7 @@ impl Track {
     }
 
     /// Which capacity it follows.
-    pub fn learned(&self) -> CapacityKind {
+    pub fn learned(&self) -> EndOfLifeSource {
         self.learned
     }
 
@@ -145,7 +134,7 @@ mod tests {
 
     #[test]
     fn cycles_are_charge_over_twice_the_rated_capacity_and_run_between_ends() {
-        let mut track = Track::new(2.0, CapacityKind::Capacity);
+        let mut track = Track::new(2.0, EndOfLifeSource::Learned);
         track.observe(&[half_cycle(100.0, 0, 2.0), half_cycle(100.0, 1, 1.0), half_cycle(200.0, 0, 1.0)]);
         let at = |time_s| track.cycles_at(Timestamp::from_secs(time_s));
         assert_eq!((at(99.0), at(100.0), at(150.0), at(300.0)), (0.0, 0.5, 0.625, 0.75));
@@ -154,7 +143,7 @@ mod tests {
 
     #[test]
     fn the_end_is_when_the_weakest_cell_falls_below_for_good() {
-        let mut track = Track::new(2.0, CapacityKind::Usable);
+        let mut track = Track::new(2.0, EndOfLifeSource::LearnedUsable);
         let lives = [(1.0, 0, 1.4), (1.0, 1, 1.6), (2.0, 0, 1.6), (3.0, 1, 1.45), (4.0, 0, 1.55), (5.0, 1, 1.4)];
         track.observe(&lives.map(|(time_s, cell, ah)| learned(time_s, cell, ah)));
         assert_eq!(track.stays_below(1.4), Some((Timestamp::from_secs(3.0), CellIndex(1))));

@@ -9,6 +9,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
+
 use crate::io::table::{Table, TableError};
 use crate::quantity::{CellIndex, Timestamp};
 use crate::score::CycleTable;
@@ -20,20 +22,40 @@ const ENDINGS: [&str; 3] = [".truth.csv", "_truth.csv", CYCLES];
 const CYCLES: &str = "_cycles.csv";
 const COMPRESSED: [&str; 3] = ["", ".gz", ".zst"];
 
-/// Which capacity the truth describes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TruthKind {
-    /// Between the open-circuit voltages.
-    Capacity,
-    /// As published.
+/// Which capacity says when a life ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub enum EndOfLifeSource {
+    /// The true capacity.
+    #[serde(rename = "true_capacity")]
+    Truth,
+    /// Published capacities.
+    #[serde(rename = "published_capacity")]
     Published,
+    /// The usable capacity learned.
+    #[serde(rename = "learned_usable_capacity")]
+    LearnedUsable,
+    /// The capacity learned.
+    #[serde(rename = "learned_capacity")]
+    Learned,
+}
+
+impl EndOfLifeSource {
+    /// Words for tables.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Truth => "the true capacity",
+            Self::Published => "published capacities",
+            Self::LearnedUsable => "the learned usable capacity",
+            Self::Learned => "the learned capacity",
+        }
+    }
 }
 
 /// The true capacities of a log.
 #[derive(Debug, Clone)]
 pub struct Truth {
     /// Which capacity it describes.
-    pub kind: TruthKind,
+    pub kind: EndOfLifeSource,
     /// Per cell, in the order of time.
     cells: BTreeMap<CellIndex, Vec<(Timestamp, f64)>>,
     span: (Timestamp, Timestamp),
@@ -62,7 +84,7 @@ impl Truth {
         let points: Vec<_> = table.discharges.iter().filter_map(|d| Some((d.start, d.capacity_ah?))).collect();
         let span = points.first().zip(points.last()).map(|(first, last)| (first.0, last.0));
         let span = span.ok_or_else(|| TableError(format!("{}: no discharge has a capacity", path.display())))?;
-        Ok(Self { kind: TruthKind::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
+        Ok(Self { kind: EndOfLifeSource::Published, cells: BTreeMap::from([(CellIndex(0), points)]), span })
     }
 
     /// Returns when the first cell fell below `end_ah`, and which cell.
@@ -104,7 +126,7 @@ fn read_simulated(mut table: Table, [time, cell, capacity]: [usize; 3]) -> Resul
         }
     }
     let span = span.ok_or_else(|| table.header().file_fault("no row, must have one per time and cell"))?;
-    Ok(Truth { kind: TruthKind::Capacity, cells, span })
+    Ok(Truth { kind: EndOfLifeSource::Truth, cells, span })
 }
 
 /// Finds the truth next to each of the logs, where there is one.
@@ -163,7 +185,7 @@ mod tests {
         assert_eq!(truth.falls_below(1.4), None);
         assert_eq!(truth.capacity_ah(CellIndex(0), Timestamp::from_secs(2.5)), Some(1.9));
         assert_eq!(truth.capacity_ah(CellIndex(0), Timestamp::from_secs(0.5)), None, "not known yet");
-        assert_eq!(truth.kind, TruthKind::Capacity);
+        assert_eq!(truth.kind, EndOfLifeSource::Truth);
     }
 
     #[test]
@@ -172,7 +194,7 @@ mod tests {
             read("cycle,type,start,capacity_ah_source\n1,discharge,100,1.5\n2,charge,150,\n3,discharge,200,1.3\n");
         let truth = truth.expect("reads");
         assert_eq!(truth.falls_below(1.4), Some((Timestamp::from_secs(200.0), CellIndex(0))));
-        assert_eq!(truth.kind, TruthKind::Published);
+        assert_eq!(truth.kind, EndOfLifeSource::Published);
     }
 
     #[test]

@@ -10,8 +10,8 @@ use serde::Serialize;
 
 use super::drive::{DriveSummary, LogAccess, drive};
 use super::judge::{AlarmScore, Horizon, LogLife, judge};
-use super::track::{CapacityKind, Track};
-use super::truth::{Truth, TruthKind};
+use super::track::Track;
+use super::truth::{EndOfLifeSource, Truth};
 use super::variant_batch::VariantBatch;
 use super::variants::VariantGrid;
 
@@ -42,35 +42,6 @@ pub struct WhatifSettings<'a> {
     pub horizon: Option<Horizon>,
     /// Threads; `None` = all cores.
     pub jobs: Option<usize>,
-}
-
-/// Source of the end of life.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub enum EndOfLifeSource {
-    /// The true capacity.
-    #[serde(rename = "true_capacity")]
-    Truth,
-    /// Published capacities.
-    #[serde(rename = "published_capacity")]
-    Published,
-    /// The usable capacity learned.
-    #[serde(rename = "learned_usable_capacity")]
-    LearnedUsable,
-    /// The capacity learned.
-    #[serde(rename = "learned_capacity")]
-    CapacityKind,
-}
-
-impl EndOfLifeSource {
-    /// Words for tables.
-    pub const fn words(self) -> &'static str {
-        match self {
-            Self::Truth => "the true capacity",
-            Self::Published => "published capacities",
-            Self::LearnedUsable => "the learned usable capacity",
-            Self::CapacityKind => "the learned capacity",
-        }
-    }
 }
 
 /// The end of a life.
@@ -185,7 +156,7 @@ fn replay(
     let (mut batch, _) = watch(grid, number);
     let mut engines = batch.engines(monitor.sample.cells);
     let is_usable = settings.judges_usable && monitor.health.usable.is_some();
-    let learned = if is_usable { CapacityKind::Usable } else { CapacityKind::Capacity };
+    let learned = if is_usable { EndOfLifeSource::LearnedUsable } else { EndOfLifeSource::Learned };
     let mut track = Track::new(monitor.model.rated_capacity_ah, learned);
     let out = Outputs { want_alarm_inputs: true, ..Outputs::default() };
     let source = (settings.access.open)(config, &job.log);
@@ -263,15 +234,8 @@ fn judge_log(
 type End = Option<(crate::quantity::Timestamp, crate::quantity::CellIndex)>;
 
 fn end_of_life(track: &Track, truth: Option<&Truth>, end_ah: f64) -> (EndOfLifeSource, End) {
-    match (truth, track.learned()) {
-        (Some(truth), _) => {
-            let by = match truth.kind {
-                TruthKind::Capacity => EndOfLifeSource::Truth,
-                TruthKind::Published => EndOfLifeSource::Published,
-            };
-            (by, truth.falls_below(end_ah))
-        }
-        (None, CapacityKind::Usable) => (EndOfLifeSource::LearnedUsable, track.stays_below(end_ah)),
-        (None, CapacityKind::Capacity) => (EndOfLifeSource::CapacityKind, track.stays_below(end_ah)),
+    match truth {
+        Some(truth) => (truth.kind, truth.falls_below(end_ah)),
+        None => (track.learned(), track.stays_below(end_ah)),
     }
 }

@@ -134,7 +134,6 @@ pub fn run(
     watcher: &mut ProgressCallback<'_>,
     done: &mut dyn FnMut(usize, usize),
 ) -> Result<TableForecast, LabError> {
-    check(plan)?;
     let windows = LagWindows::new(table, plan.lags);
     let origin = ((table.len() as f64 * plan.origin).round() as usize).clamp(1, table.len().max(1));
     let from = windows.last_before(origin).ok_or_else(|| {
@@ -155,19 +154,6 @@ pub fn run(
         outputs.push(OutputForecast { name: table.names[column].clone(), column, horizons });
     }
     Ok(TableForecast { origin, from, outputs })
-}
-
-fn check(plan: &ForecastPlan) -> Result<(), LabError> {
-    let range = |what: &str, found: usize, most: usize| match (1..=most).contains(&found) {
-        true => Ok(()),
-        false => Err(LabError(format!("{what} = {found}, must be 1 to {most}"))),
-    };
-    range("lags", plan.lags, MAX_LAGS)?;
-    range("steps", plan.steps, MAX_STEPS)?;
-    if !(plan.origin > 0.0 && plan.origin <= 1.0) {
-        return Err(LabError(format!("origin = {}, must be above 0 and at most 1", plan.origin)));
-    }
-    Ok(())
 }
 
 /// Fit and forecasts of one column, `steps` rows ahead.
@@ -207,7 +193,7 @@ impl HorizonTask<'_> {
             calibrated: spread.count(),
             factor: spread.factor,
             fit_s,
-            jitter: model.jitter(),
+            jitter: model.outcome.jitter,
             at_origin,
             held_out,
             score,

@@ -78,19 +78,20 @@ fn scatter(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let label = if every == 1 { "held-out row".to_owned() } else { format!("held-out row, one of {every}") };
     let s = &validated.score;
     let (kernel, rmse, inside) = (&validated.kernel, s.rmse, 100.0 * s.coverage_95);
-    Chart {
-        title: format!(
-            "{}, {kernel}: predicted against measured; RMSE {rmse:.4}, {inside:.1} % inside the interval",
-            stem(output)
-        ),
-        x: Axis::number(&format!("measured {}", table::label(output))),
-        y: Axis::number(&format!("predicted {}", table::label(output))),
-        layers: vec![
-            points(&label, Ink::Blue, pairs),
-            Layer::line("equal", Ink::Plain, ends.into_iter().map(|end| (end, end))),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        points(&label, Ink::Blue, pairs),
+        Layer::line("equal", Ink::Plain, ends.into_iter().map(|end| (end, end))),
+    ];
+    let title = format!(
+        "{}, {kernel}: predicted against measured; RMSE {rmse:.4}, {inside:.1} % inside the interval",
+        stem(output)
+    );
+    Chart::new(
+        title,
+        format!("measured {}", table::label(output)),
+        format!("predicted {}", table::label(output)),
+        layers,
+    )
 }
 
 fn stem(output: &str) -> String {
@@ -101,17 +102,13 @@ fn stretch(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
     let begin = (truth.len() / 2).saturating_sub(STRETCH / 2);
     let rows = begin..(begin + STRETCH).min(truth.len());
     let at = |row: usize| &validated.folds.predictions[row];
-    Chart {
-        title: format!("Rows {} to {}, each predicted without itself", rows.start + 1, rows.end),
-        x: Axis::number("row"),
-        y: Axis::number(&table::label(output)),
-        layers: vec![
-            band(rows.clone().map(|row| (row as f64 + 1.0, at(row).low_95, at(row).high_95))),
-            Layer::line("predicted", Ink::Blue, rows.clone().map(|row| (row as f64 + 1.0, at(row).mean))),
-            points("measured", Ink::Orange, rows.clone().map(|row| (row as f64 + 1.0, truth[row]))),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        band(rows.clone().map(|row| (row as f64 + 1.0, at(row).low_95, at(row).high_95))),
+        Layer::line("predicted", Ink::Blue, rows.clone().map(|row| (row as f64 + 1.0, at(row).mean))),
+        points("measured", Ink::Orange, rows.clone().map(|row| (row as f64 + 1.0, truth[row]))),
+    ];
+    let title = format!("Rows {} to {}, each predicted without itself", rows.start + 1, rows.end);
+    Chart::new(title, "row", table::label(output), layers)
 }
 
 fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
@@ -123,16 +120,15 @@ fn errors(validated: &CrossValidation, truth: &[f64], output: &str) -> Chart {
         let mean = chunk.iter().map(half).sum::<f64>() / chunk.len() as f64;
         ((k * width) as f64 + chunk.len() as f64 / 2.0, -mean, mean)
     });
-    Chart {
-        title: "Error of every row (the outermost of many at one place), and the width of the interval".to_owned(),
-        x: Axis::number("row"),
-        y: Axis::number(&format!("predicted - measured, {}", table::label(output).split(", ").nth(1).unwrap_or(""))),
-        layers: vec![
-            points("error", Ink::Orange, all().map(|(row, (y, p))| (row as f64 + 1.0, p.mean - y))),
-            band(halves),
-        ],
-        ..Chart::default()
-    }
+    let layers =
+        vec![points("error", Ink::Orange, all().map(|(row, (y, p))| (row as f64 + 1.0, p.mean - y))), band(halves)];
+    let title = "Error of every row (the outermost of many at one place), and the width of the interval";
+    Chart::new(
+        title,
+        "row",
+        format!("predicted - measured, {}", table::label(output).split(", ").nth(1).unwrap_or("")),
+        layers,
+    )
 }
 
 fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) -> Chart {
@@ -145,52 +141,45 @@ fn fan(data: &ColumnTable, forecast: &TableForecast, output: &OutputForecast) ->
     let now = [(0.0, value(from), value(from))];
     let fan = output.horizons.iter().map(|h| (at(h), h.at_origin.low_95, h.at_origin.high_95));
     let mean = output.horizons.iter().map(|h| (at(h), h.at_origin.mean));
-    Chart {
-        title: format!("{}: forecast from row {} without any later data", stem(&output.name), from + 1),
-        x: Axis::number("rows from the origin"),
-        y: Axis::number(&table::label(&output.name)),
-        layers: vec![
-            band(now.into_iter().chain(fan)),
-            Layer::line("measured", Ink::Plain, rows.map(|row| (x(row), value(row)))),
-            Layer::line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        band(now.into_iter().chain(fan)),
+        Layer::line("measured", Ink::Plain, rows.map(|row| (x(row), value(row)))),
+        Layer::line("forecast", Ink::Blue, [(0.0, value(from))].into_iter().chain(mean)),
+    ];
+    let title = format!("{}: forecast from row {} without any later data", stem(&output.name), from + 1);
+    Chart::new(title, "rows from the origin", table::label(&output.name), layers)
 }
 
 fn growth(output: &OutputForecast) -> Chart {
     let over = |value: &dyn Fn(&HorizonForecast) -> Option<f64>| -> Vec<(f64, f64)> {
         output.horizons.iter().filter_map(|h| Some((h.steps as f64, value(h)?))).collect()
     };
-    Chart {
-        title: "Error of the forecasts made after the origin".to_owned(),
-        x: Axis::number("rows ahead"),
-        y: Axis::number(&format!("RMSE, {}", table::label(&output.name).split(", ").nth(1).unwrap_or(""))),
-        layers: vec![
-            Layer::line("persistence", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
-            Layer::line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
-            Layer::line(
-                "half of the mean 95 % interval",
-                Ink::Green,
-                over(&|h| h.score.map(|s| s.mean_width_95 / 2.0)).into_iter(),
-            ),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        Layer::line("persistence", Ink::Grey, over(&|h| h.persistence_rmse).into_iter()),
+        Layer::line("forecast", Ink::Blue, over(&|h| h.score.map(|s| s.rmse)).into_iter()),
+        Layer::line(
+            "half of the mean 95 % interval",
+            Ink::Green,
+            over(&|h| h.score.map(|s| s.mean_width_95 / 2.0)).into_iter(),
+        ),
+    ];
+    let title = "Error of the forecasts made after the origin";
+    Chart::new(
+        title,
+        "rows ahead",
+        format!("RMSE, {}", table::label(&output.name).split(", ").nth(1).unwrap_or("")),
+        layers,
+    )
 }
 
 fn coverage(output: &OutputForecast) -> Chart {
     let inside = |h: &HorizonForecast| h.score.map(|s| (h.steps as f64, 100.0 * s.coverage_95));
-    Chart {
-        title: "Part of the measured values inside the 95 % interval".to_owned(),
-        x: Axis::number("rows ahead"),
-        y: Axis::number("inside, %").within(0.0, 100.0),
-        layers: vec![
-            Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
-            Layer::line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
+        Layer::line("forecast", Ink::Blue, output.horizons.iter().filter_map(inside)),
+    ];
+    let title = "Part of the measured values inside the 95 % interval";
+    Chart::new(title, "rows ahead", Axis::number("inside, %").within(0.0, 100.0), layers)
 }
 
 /// Forecasts of the last horizon against what came, over the rows they are for.
@@ -198,19 +187,15 @@ fn held_out(data: &ColumnTable, output: &OutputForecast) -> Chart {
     let Some(horizon) = output.horizons.iter().rfind(|h| h.score.is_some()) else { return Chart::default() };
     let for_row = |row: usize| (row + horizon.steps) as f64 + 1.0;
     let all = || horizon.held_out.iter();
-    Chart {
-        title: format!("{} rows ahead: forecast and measured", horizon.steps),
-        x: Axis::number("row"),
-        y: Axis::number(&table::label(&output.name)),
-        layers: vec![
-            band(all().map(|(row, p)| (for_row(*row), p.low_95, p.high_95))),
-            Layer::line(
-                "measured",
-                Ink::Plain,
-                all().map(|(row, _)| (for_row(*row), data.row(row + horizon.steps)[output.column])),
-            ),
-            Layer::line("forecast", Ink::Blue, all().map(|(row, p)| (for_row(*row), p.mean))),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        band(all().map(|(row, p)| (for_row(*row), p.low_95, p.high_95))),
+        Layer::line(
+            "measured",
+            Ink::Plain,
+            all().map(|(row, _)| (for_row(*row), data.row(row + horizon.steps)[output.column])),
+        ),
+        Layer::line("forecast", Ink::Blue, all().map(|(row, p)| (for_row(*row), p.mean))),
+    ];
+    let title = format!("{} rows ahead: forecast and measured", horizon.steps);
+    Chart::new(title, "row", table::label(&output.name), layers)
 }

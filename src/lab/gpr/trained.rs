@@ -91,8 +91,8 @@ impl TrainedModel {
             return Err(fail(format!("line 1: found {found:?}, must be {:?}", (FORMAT, VERSION))));
         }
         let model = Model::load(rest, threads).map_err(|fault| fail(format!("from line 2 on: {fault}")))?;
-        if model.dimensions() != names.inputs.len() {
-            let (found, allowed) = (names.inputs.len(), model.dimensions());
+        if model.spec.dimensions != names.inputs.len() {
+            let (found, allowed) = (names.inputs.len(), model.spec.dimensions);
             return Err(fail(format!("line 1: {found} inputs, must be {allowed} as the model has")));
         }
         Ok(Self { output: names.output, inputs: names.inputs, model })

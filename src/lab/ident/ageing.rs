@@ -5,7 +5,7 @@
 //! from cycle to cycle and the charger's own gain error out of the curves. Charge left below the cut-off under load is
 //! assumed to be [`SOC_LEFT`]. Half-cycles before the first discharge have no known beginning and are left out.
 
-use super::charge_ah;
+use super::{MeasuredPart, charge_ah};
 
 /// SOC left at the cut-off under load when new.
 const SOC_LEFT: f64 = 0.045;
@@ -18,19 +18,6 @@ const STEP_PER_AH: f64 = 0.25;
 /// Recovery with the load off after the cut-off is slower than any branch here: not judged below this SOC.
 const RECOVERY_SOC: f64 = 0.5;
 
-/// One half-cycle as measured: slices of equal length.
-#[derive(Debug, Clone, Copy)]
-pub struct HalfCycle<'a> {
-    /// A discharge, else a charge.
-    pub discharge: bool,
-    /// Seconds.
-    pub time_s: &'a [f64],
-    /// Current, A, positive = discharge.
-    pub current_a: &'a [f64],
-    /// Terminal voltage, V.
-    pub voltage_v: &'a [f64],
-}
-
 /// A half-cycle with its SOC.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnchoredHalfCycle {
@@ -42,22 +29,6 @@ pub struct AnchoredHalfCycle {
     pub soc: Vec<f64>,
     /// Whether the row's voltage is judged.
     pub judged: Vec<bool>,
-}
-
-/// Why the cycles cannot be used.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum AgeingError {
-    /// Nothing to anchor on.
-    #[error("no discharge among the first cycles")]
-    NoDischarge,
-    /// A discharge that does not go down to the knee.
-    #[error("discharge number {number} does not fall to {knee_v:.2} V under load: its end is no anchor")]
-    NoKnee {
-        /// Counted from 1.
-        number: usize,
-        /// Voltage of the knee.
-        knee_v: f64,
-    },
 }
 
 /// A charge that puts in this much of what was missing has filled the cell; any other is left out.
@@ -73,13 +44,17 @@ struct Marks {
 ///
 /// # Errors
 /// No discharge, or one without a knee.
-pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, Vec<AnchoredHalfCycle>), AgeingError> {
-    let first = cycles.iter().position(|cycle| cycle.discharge).ok_or(AgeingError::NoDischarge)?;
+pub fn anchor(cycles: &[MeasuredPart], voltage_v: (f64, f64)) -> Result<(f64, Vec<AnchoredHalfCycle>), String> {
+    let first = cycles.iter().position(MeasuredPart::is_discharge).ok_or("no discharge among the first cycles")?;
     let knee_v = voltage_v.0 + KNEE_SHARE * (voltage_v.1 - voltage_v.0);
-    let discharges = cycles.iter().filter(|cycle| cycle.discharge);
+    let discharges = cycles.iter().filter(|cycle| cycle.is_discharge());
     let marks: Vec<Marks> = discharges
         .enumerate()
-        .map(|(n, cycle)| marks(cycle, knee_v, voltage_v.0).ok_or(AgeingError::NoKnee { number: n + 1, knee_v }))
+        .map(|(n, cycle)| {
+            marks(cycle, knee_v, voltage_v.0).ok_or_else(|| {
+                format!("discharge number {} does not fall to {knee_v:.2} V under load: its end is no anchor", n + 1)
+            })
+        })
         .collect::<Result<_, _>>()?;
     let mean = |value: &dyn Fn(&Marks) -> f64| marks.iter().map(value).sum::<f64>() / marks.len() as f64;
     let beyond_ah = mean(&|m| m.cut_off_ah - m.knee_ah);
@@ -91,8 +66,8 @@ pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, V
             continue;
         }
         let current_a = without_load_pulses(cycle, capacity_ah);
-        let out_ah = charge_ah(cycle.time_s, &current_a);
-        let soc: Vec<f64> = if cycle.discharge {
+        let out_ah = charge_ah(&cycle.time_s, &current_a);
+        let soc: Vec<f64> = if cycle.is_discharge() {
             let per_ah = (1.0 - knee_soc) / marks[number].knee_ah;
             number += 1;
             out_ah.iter().map(|ah| 1.0 - ah * per_ah).collect()
@@ -105,18 +80,18 @@ pub fn anchor(cycles: &[HalfCycle<'_>], voltage_v: (f64, f64)) -> Result<(f64, V
             out_ah.iter().map(|ah| left + (1.0 - left) * ah / all_ah).collect()
         };
         left = soc[soc.len() - 1];
-        let judged = judged(cycle.discharge, &current_a, &soc, capacity_ah);
+        let judged = judged(cycle.is_discharge(), &current_a, &soc, capacity_ah);
         anchored.push(AnchoredHalfCycle { index, current_a, soc, judged });
     }
     Ok((capacity_ah, anchored))
 }
 
-fn marks(cycle: &HalfCycle<'_>, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
+fn marks(cycle: &MeasuredPart, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
     let mut sorted = cycle.current_a.to_vec();
     sorted.sort_by(f64::total_cmp);
     let loaded_a = LOADED_SHARE * sorted.get(sorted.len() / 2)?;
     let loaded: Vec<usize> = (0..cycle.time_s.len()).filter(|&k| cycle.current_a[k] > loaded_a).collect();
-    let out_ah = charge_ah(cycle.time_s, cycle.current_a);
+    let out_ah = charge_ah(&cycle.time_s, &cycle.current_a);
     let crossing = |level_v: f64| {
         let at = loaded.iter().position(|&k| cycle.voltage_v[k] <= level_v)?;
         let (k, before) = (loaded[at], loaded[at.checked_sub(1)?]);
@@ -128,8 +103,8 @@ fn marks(cycle: &HalfCycle<'_>, knee_v: f64, cut_off_v: f64) -> Option<Marks> {
 }
 
 /// Chargers test themselves with a short load: no charge worth counting, and no trapezoid over seconds.
-fn without_load_pulses(cycle: &HalfCycle<'_>, capacity_ah: f64) -> Vec<f64> {
-    let pulse = |i: f64| !cycle.discharge && i > STEP_PER_AH * capacity_ah;
+fn without_load_pulses(cycle: &MeasuredPart, capacity_ah: f64) -> Vec<f64> {
+    let pulse = |i: f64| !cycle.is_discharge() && i > STEP_PER_AH * capacity_ah;
     cycle.current_a.iter().map(|&i| if pulse(i) { 0.0 } else { i }).collect()
 }
 
@@ -147,15 +122,18 @@ fn judged(discharge: bool, current_a: &[f64], soc: &[f64], capacity_ah: f64) -> 
 mod tests {
     use super::*;
 
+    fn half_cycle(kind: &str, time_s: &[f64], current_a: &[f64], voltage_v: &[f64]) -> MeasuredPart {
+        let [time_s, current_a, voltage_v] = [time_s, current_a, voltage_v].map(<[f64]>::to_vec);
+        MeasuredPart { kind: kind.to_owned(), time_s, current_a, voltage_v, ..MeasuredPart::default() }
+    }
+
     #[test]
     fn knees_lie_at_one_soc_and_a_charge_ends_full_whatever_its_charger_counts() {
         let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
         let fall = |k: f64| if k < 90.0 { 4.2 - 0.01 * k } else { 3.3 - 0.06 * (k - 90.0) };
         let voltage_v: Vec<f64> = (0..=100).map(|k| fall(f64::from(k))).collect();
-        let discharge = |current_a| HalfCycle { discharge: true, time_s: &time_s, current_a, voltage_v: &voltage_v };
-        let (fresh, faded, charging) = ([2.0; 101], [1.9; 101], [-2.1; 101]);
-        let charge = HalfCycle { discharge: false, current_a: &charging, ..discharge(&fresh) };
-        let cycles = [discharge(&fresh), charge, discharge(&faded)];
+        let half = |kind, current_a| half_cycle(kind, &time_s, &[current_a; 101], &voltage_v);
+        let cycles = [half("discharge", 2.0), half("charge", -2.1), half("discharge", 1.9)];
         let (capacity_ah, anchored) = anchor(&cycles, (2.7, 4.2)).expect("anchored");
         assert!((capacity_ah - 1.95 / 0.955).abs() < 1e-9, "{capacity_ah}");
         let knee = 95;
@@ -168,14 +146,12 @@ mod tests {
     fn an_aborted_charge_is_left_out_and_changes_nothing() {
         let time_s: Vec<f64> = (0..=100).map(|k| 36.0 * f64::from(k)).collect();
         let voltage_v: Vec<f64> = (0..=100).map(|k| 4.2 - 0.016 * f64::from(k)).collect();
-        let (out, back) = ([2.0; 101], [-2.0; 101]);
-        let discharge = HalfCycle { discharge: true, time_s: &time_s, current_a: &out, voltage_v: &voltage_v };
-        let charge = HalfCycle { discharge: false, current_a: &back, ..discharge };
-        let one_row = HalfCycle { time_s: &[0.0], current_a: &[-1.0], voltage_v: &[3.5], ..charge };
-        let trickle = [-0.01; 101];
-        let aborted = HalfCycle { current_a: &trickle, ..charge };
-        let whole = anchor(&[discharge, charge, discharge], (2.7, 4.2)).expect("anchored");
-        let found = anchor(&[discharge, one_row, aborted, charge, discharge], (2.7, 4.2)).expect("anchored");
+        let half = |kind, current_a| half_cycle(kind, &time_s, &[current_a; 101], &voltage_v);
+        let (discharge, charge) = (half("discharge", 2.0), half("charge", -2.0));
+        let one_row = half_cycle("charge", &[0.0], &[-1.0], &[3.5]);
+        let aborted = half("charge", -0.01);
+        let whole = anchor(&[discharge.clone(), charge.clone(), discharge.clone()], (2.7, 4.2)).expect("anchored");
+        let found = anchor(&[discharge.clone(), one_row, aborted, charge, discharge], (2.7, 4.2)).expect("anchored");
         assert_eq!(found.0, whole.0);
         let socs = |anchored: &[AnchoredHalfCycle]| anchored.iter().map(|a| a.soc.clone()).collect::<Vec<_>>();
         assert_eq!(socs(&found.1), socs(&whole.1));
@@ -184,13 +160,8 @@ mod tests {
 
     #[test]
     fn a_discharge_without_a_knee_is_refused() {
-        let cycle = HalfCycle {
-            discharge: true,
-            time_s: &[0.0, 100.0, 200.0],
-            current_a: &[2.0; 3],
-            voltage_v: &[4.0, 3.9, 3.8],
-        };
-        let error = anchor(&[cycle], (2.7, 4.2)).expect_err("no knee").to_string();
+        let cycle = half_cycle("discharge", &[0.0, 100.0, 200.0], &[2.0; 3], &[4.0, 3.9, 3.8]);
+        let error = anchor(&[cycle], (2.7, 4.2)).expect_err("no knee");
         assert_eq!(error, "discharge number 1 does not fall to 3.00 V under load: its end is no anchor");
     }
 }

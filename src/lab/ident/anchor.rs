@@ -7,7 +7,7 @@
 //!    A counter that begins higher was reset at full, so the cell is no longer full: rejected.
 //! 3. Without a counter the current is integrated from 1.
 
-use super::charge_ah;
+use super::{MeasuredPart, charge_ah};
 
 /// A resting full cell is at most this far below the highest voltage, V: relaxation, cold charge that ended early.
 const REST_SAG_V: f64 = 0.1;
@@ -18,52 +18,22 @@ const LOAD_SHARE: f64 = 0.02;
 /// A counter that begins within this share of the capacity counts from the full cell.
 const COUNTER_NEAR: f64 = 0.003;
 
-/// Why a stretch has no SOC.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum AnchorError {
-    /// It does not begin full.
-    #[error("begins at {voltage_v} V, expected a full cell (at least {needed_v:.2} V): its SOC is unknown")]
-    NotFull {
-        /// First voltage, V.
-        voltage_v: f64,
-        /// Least voltage of a full cell, V.
-        needed_v: f64,
-    },
-    /// Its counter shows that charge was taken out before.
-    #[error("discharged_ah begins at {counter_ah} Ah, expected 0 or below: charge was taken out before the first row")]
-    TakenBefore {
-        /// First value, Ah.
-        counter_ah: f64,
-    },
-}
-
-/// The rows of a stretch: slices of equal length, not empty.
-#[derive(Debug, Clone, Copy)]
-pub struct Stretch<'a> {
-    /// Seconds.
-    pub time_s: &'a [f64],
-    /// Current, A, positive = discharge.
-    pub current_a: &'a [f64],
-    /// Terminal voltage, V.
-    pub voltage_v: &'a [f64],
-    /// The cycler's counter, Ah taken out; NaN in its first row = there is none.
-    pub discharged_ah: &'a [f64],
-}
-
-impl Stretch<'_> {
+impl MeasuredPart {
     /// Charge taken out since full at every row, Ah.
     ///
     /// # Errors
-    /// The stretch does not begin full, or its beginning is unknown.
-    pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, AnchorError> {
+    /// It does not begin full, or its beginning is unknown.
+    pub fn taken_out_ah(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<Vec<f64>, String> {
         self.begins_full(voltage_max_v, capacity_hint_ah)?;
         if self.discharged_ah[0].is_nan() {
-            return Ok(charge_ah(self.time_s, self.current_a));
+            return Ok(charge_ah(&self.time_s, &self.current_a));
         }
         let first_ah = self.discharged_ah[0];
         let near_ah = COUNTER_NEAR * capacity_hint_ah;
         if first_ah > near_ah {
-            return Err(AnchorError::TakenBefore { counter_ah: first_ah });
+            return Err(format!(
+                "discharged_ah begins at {first_ah} Ah, expected 0 or below: charge was taken out before the first row"
+            ));
         }
         let zero_ah = if first_ah >= -near_ah { 0.0 } else { first_ah };
         let mut last = first_ah - zero_ah;
@@ -75,11 +45,13 @@ impl Stretch<'_> {
         Ok(self.discharged_ah.iter().map(|&counter| hold(counter)).collect())
     }
 
-    fn begins_full(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<(), AnchorError> {
+    fn begins_full(&self, voltage_max_v: f64, capacity_hint_ah: f64) -> Result<(), String> {
         let loaded = self.current_a[0] > LOAD_SHARE * capacity_hint_ah;
         let needed_v = voltage_max_v - if loaded { LOAD_SAG_V } else { REST_SAG_V };
         let voltage_v = self.voltage_v[0];
-        if voltage_v >= needed_v { Ok(()) } else { Err(AnchorError::NotFull { voltage_v, needed_v }) }
+        (voltage_v >= needed_v).then_some(()).ok_or_else(|| {
+            format!("begins at {voltage_v} V, expected a full cell (at least {needed_v:.2} V): its SOC is unknown")
+        })
     }
 }
 
@@ -87,14 +59,11 @@ impl Stretch<'_> {
 mod tests {
     use super::*;
 
-    fn taken_out(voltage_v: f64, current_a: f64, counter: [f64; 2]) -> Result<Vec<f64>, AnchorError> {
-        let stretch = Stretch {
-            time_s: &[0.0, 3600.0],
-            current_a: &[current_a; 2],
-            voltage_v: &[voltage_v; 2],
-            discharged_ah: &counter,
-        };
-        stretch.taken_out_ah(4.2, 2.0)
+    fn taken_out(voltage_v: f64, current_a: f64, counter: [f64; 2]) -> Result<Vec<f64>, String> {
+        let mut part = MeasuredPart::default();
+        part.push(0.0, current_a, voltage_v, f64::NAN, counter[0]);
+        part.push(3600.0, current_a, voltage_v, f64::NAN, counter[1]);
+        part.taken_out_ah(4.2, 2.0)
     }
 
     #[test]
@@ -106,7 +75,11 @@ mod tests {
 
     #[test]
     fn a_counter_that_shows_charge_taken_out_is_refused() {
-        assert_eq!(taken_out(4.15, 0.1, [0.12, 0.5]), Err(AnchorError::TakenBefore { counter_ah: 0.12 }));
+        let refused = taken_out(4.15, 0.1, [0.12, 0.5]).expect_err("taken before");
+        assert!(
+            refused.starts_with("discharged_ah begins at 0.12 Ah, expected 0 or below: charge was taken"),
+            "{refused}"
+        );
     }
 
     #[test]
@@ -116,7 +89,7 @@ mod tests {
 
     #[test]
     fn a_beginning_that_is_not_full_is_refused() {
-        let refused = taken_out(3.45, 0.0, [0.0, -2.3]).expect_err("not full").to_string();
+        let refused = taken_out(3.45, 0.0, [0.0, -2.3]).expect_err("not full");
         assert!(refused.starts_with("begins at 3.45 V, expected a full cell (at least 4.10 V)"), "{refused}");
     }
 }

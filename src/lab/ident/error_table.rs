@@ -148,7 +148,7 @@ fn fill(grid: &Grid, rows: &[Option<Vec<f64>>]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ident::RawRows;
+    use crate::ident::MeasuredPart;
     use crate::ident::fit::Residual;
     use crate::ident::parameters::ParameterTables;
     use crate::ident::record::Limits;
@@ -167,24 +167,12 @@ mod tests {
         let tables = ParameterTables { ocv_v: vec![3.6; 2], r0_ohm: vec![0.0; 2], r_ohm: vec![], tau_s: vec![] };
         let time_s: Vec<f64> = (0..=3600).map(f64::from).collect();
         let soc: Vec<f64> = time_s.iter().map(|t| 1.0 - t / 3600.0).collect();
-        let raw = RawRows {
-            time_s: &time_s,
-            current_a: &[2.0; 3601],
-            voltage_v: &[3.61; 3601],
-            temperature_c: &[25.0; 3601],
-            soc: &soc,
-        };
+        let [current_a, voltage_v, temperature_c] = [2.0, 3.61, 25.0].map(|value| vec![value; 3601]);
+        let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
         let limits = Limits { voltage_low_v: 2.0, voltage_high_v: 5.0, capacity_ah: 2.0 };
         let record = Record::prepare(&raw, &[], &grid, &limits);
-        let fit = FittedTables {
-            grid,
-            tables,
-            residuals: vec![],
-            total: Residual::default(),
-            visits_s: vec![],
-            passes: 0,
-            converged: true,
-        };
+        let fit =
+            FittedTables { grid, tables, total: Residual::default(), visits_s: vec![], passes: 0, converged: true };
         let error_v = |files: [usize; 4], share: f64| {
             let judged = files.map(|file| WeightedRecord { record: &record, file, share });
             table(&fit, &judged, 2.0)

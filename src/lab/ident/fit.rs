@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::grid::{Grid, GridPoint, arrhenius, interpolate};
+use super::grid::{Grid, arrhenius, interpolate};
 use super::parameters::{Layout, ParameterTables};
 use super::pass::{NormalEquations, accumulate, residuals, visits};
 use super::prior::{Prior, PriorDeviations, per_node};
@@ -75,8 +75,6 @@ pub struct FittedTables {
     pub grid: Grid,
     /// Values in node order.
     pub tables: ParameterTables,
-    /// Per record, in their order.
-    pub residuals: Vec<Residual>,
     /// Over all records.
     pub total: Residual,
     /// Seconds of data near each node.
@@ -87,24 +85,11 @@ pub struct FittedTables {
     pub converged: bool,
 }
 
-/// Why there is no fit.
-#[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum FitError {
-    /// Too few rows.
-    #[error("{found} rows can be judged, at least {MIN_ROWS} are needed")]
-    TooFewRows {
-        /// Judged rows.
-        found: usize,
-    },
-    /// The equations have no finite value at the start.
-    #[error(
-        "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number"
-    )]
-    NotFinite,
-    /// The current never changes enough to determine a resistance.
-    #[error("the current does not change: no resistance can be separated from the open-circuit voltage")]
-    NoExcitation,
-}
+/// The equations have no finite value at the start.
+const NOT_FINITE: &str =
+    "the data or the starting values are not finite: two slow tests at one temperature, or a value that is no number";
+/// The current never changes enough to determine a resistance.
+const NO_EXCITATION: &str = "the current does not change: no resistance can be separated from the open-circuit voltage";
 
 /// Fits tables to `records` with weights `scale` per record; `progress` receives the pass number and the cost.
 ///
@@ -115,10 +100,10 @@ pub fn fit(
     records: &[Record],
     scale: &[f64],
     progress: impl FnMut(usize, f64),
-) -> Result<FittedTables, FitError> {
+) -> Result<FittedTables, String> {
     let judged = records.iter().flat_map(|r| &r.rows).filter(|row| row.weight_s > 0.0).count();
     if judged < MIN_ROWS {
-        return Err(FitError::TooFewRows { found: judged });
+        return Err(format!("{judged} rows can be judged, at least {MIN_ROWS} are needed"));
     }
     let layout = Layout::new(&settings.grid, settings.tau_s.len());
     let start = start(settings, &layout, records)?;
@@ -132,15 +117,14 @@ pub fn fit(
         normal
     };
     if !evaluate(&start).cost.is_finite() {
-        return Err(FitError::NotFinite);
+        return Err(NOT_FINITE.to_owned());
     }
     let solution = minimise(&space, &start, evaluate, progress);
     let tables = ParameterTables::new(&layout, &solution.theta);
-    let (each, total) = judge(records, &tables);
+    let total = judge(records, &tables);
     let all: Vec<&Record> = records.iter().collect();
     Ok(FittedTables {
         grid: settings.grid.clone(),
-        residuals: each,
         total,
         visits_s: visits(&all, layout.nodes),
         tables,
@@ -183,13 +167,13 @@ fn sum_of_groups(groups: &[Group<'_>], layout: &Layout, theta: &[f64]) -> Normal
 }
 
 /// Starting values: OCV of the slow test or a straight line, resistances from steps of current.
-fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, FitError> {
+fn start(settings: &FitSettings, layout: &Layout, records: &[Record]) -> Result<Vec<f64>, String> {
     let grid = &settings.grid;
     let mut theta = match settings.ocv.is_empty() {
         true => grid.temperature_c.iter().flat_map(|_| straight_ocv(settings)).collect(),
         false => ocv_nodes(grid, &settings.ocv),
     };
-    let r0_ohm = resistance_of_steps(records).ok_or(FitError::NoExcitation)?;
+    let r0_ohm = resistance_of_steps(records).ok_or(NO_EXCITATION)?;
     let ln_r = |ohm: f64| per_node(grid, |t| libm::log(ohm * arrhenius(t)));
     theta.extend(ln_r(r0_ohm));
     for &tau_s in &settings.tau_s {
@@ -273,19 +257,17 @@ fn space(settings: &FitSettings, layout: &Layout, start: &[f64]) -> Space {
     Space { low, high, rising }
 }
 
-/// Residuals of every record and of all together.
-pub fn judge(records: &[Record], tables: &ParameterTables) -> (Vec<Residual>, Residual) {
+/// Residual of all records together.
+pub fn judge(records: &[Record], tables: &ParameterTables) -> Residual {
     let mut total = ResidualSums::default();
-    let each = records.iter().map(|record| {
+    for record in records {
         let mut sums = ResidualSums::default();
         for (row, e) in record.rows.iter().zip(residuals(record, tables)) {
             sums.add(row.weight_s, e);
         }
         total.join(&sums);
-        sums.residual()
-    });
-    let each = each.collect();
-    (each, total.residual())
+    }
+    total.residual()
 }
 
 /// Running sums of weighted residuals.
@@ -356,13 +338,6 @@ impl FittedTables {
         let at = self.grid.place(soc, self.grid.temperature_c[row]);
         let values = &self.tables.ocv_v[row * self.grid.soc.len()..][..self.grid.soc.len()];
         values[at.s] + at.beyond_s * (values[at.s + 1] - values[at.s])
-    }
-
-    /// The model's resistance once all branches have settled, ohm, at a place.
-    pub fn settled_ohm(&self, place: &GridPoint) -> f64 {
-        let corners = self.grid.resistance_corners(place);
-        let branches: f64 = self.tables.r_ohm.iter().map(|r| corners.at(r)).sum();
-        corners.at(&self.tables.r0_ohm) + branches
     }
 }
 

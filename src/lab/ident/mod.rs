@@ -18,19 +18,51 @@ pub mod record;
 pub mod solve;
 pub mod thermal;
 
-/// Rows of one stretch of one file as measured, time rising or equal, no holes. Slices of equal length.
-#[derive(Debug, Clone, Copy)]
-pub struct RawRows<'a> {
-    /// Seconds since its beginning.
-    pub time_s: &'a [f64],
+/// A stretch of rows over which time runs on.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct MeasuredPart {
+    /// Its key in the part column; empty where there is none.
+    pub key: String,
+    /// Value of the `type` column in its first row: `charge`, `discharge`; empty where there is none.
+    pub kind: String,
+    /// Seconds since the part's own beginning.
+    pub time_s: Vec<f64>,
     /// Current, A, positive = discharge.
-    pub current_a: &'a [f64],
+    pub current_a: Vec<f64>,
     /// Terminal voltage, V.
-    pub voltage_v: &'a [f64],
-    /// Cell temperature, degrees C.
-    pub temperature_c: &'a [f64],
-    /// State of charge, fraction.
-    pub soc: &'a [f64],
+    pub voltage_v: Vec<f64>,
+    /// Cell temperature, degrees C; NaN where there is none.
+    pub temperature_c: Vec<f64>,
+    /// The cycler's own counter, Ah taken out; NaN where there is none.
+    pub discharged_ah: Vec<f64>,
+    /// State of charge, fraction; empty until it is determined.
+    pub soc: Vec<f64>,
+}
+
+impl MeasuredPart {
+    /// Whether it is a discharge, as far as its column `type` says so.
+    pub(crate) fn is_discharge(&self) -> bool {
+        self.kind == "discharge"
+    }
+
+    /// Rows.
+    pub fn len(&self) -> usize {
+        self.time_s.len()
+    }
+
+    /// Adds a row.
+    pub(crate) fn push(&mut self, time_s: f64, current_a: f64, voltage_v: f64, temperature_c: f64, discharged_ah: f64) {
+        self.time_s.push(time_s);
+        self.current_a.push(current_a);
+        self.voltage_v.push(voltage_v);
+        self.temperature_c.push(temperature_c);
+        self.discharged_ah.push(discharged_ah);
+    }
+
+    /// Whether it has no rows.
+    pub fn is_empty(&self) -> bool {
+        self.time_s.is_empty()
+    }
 }
 
 /// Charge taken out since the first row at every row, Ah, by the trapezoidal rule; gaps count like any other step.

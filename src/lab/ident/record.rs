@@ -6,7 +6,7 @@
 //! pulse's edge are kept, and at gaps. Over a gap in which charge was moved that the rows do not show, the branches
 //! start again relaxed.
 
-use super::RawRows;
+use super::MeasuredPart;
 use super::grid::{Corners, Grid};
 
 /// Longest block, s: time constants of interest are several times longer, drives change about once a second.
@@ -79,7 +79,7 @@ pub struct Limits {
 
 impl Record {
     /// Prepares a stretch. `judged[k]` = false keeps raw row k's current but not its voltage; empty = all are judged.
-    pub fn prepare(raw: &RawRows<'_>, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
+    pub fn prepare(raw: &MeasuredPart, judged: &[bool], grid: &Grid, limits: &Limits) -> Self {
         let largest_a = raw.current_a.iter().fold(0.0_f64, |most, i| most.max(i.abs()));
         let ends = block_ends(raw, largest_a);
         let mut record = Self { raw_rows: raw.time_s.len(), ..Self::default() };
@@ -145,8 +145,8 @@ pub fn weight(record: &Record) -> f64 {
 }
 
 /// The raw rows at which blocks end; the first row is a block of its own.
-fn block_ends(raw: &RawRows<'_>, largest_a: f64) -> Vec<usize> {
-    let (time_s, current_a) = (raw.time_s, raw.current_a);
+fn block_ends(raw: &MeasuredPart, largest_a: f64) -> Vec<usize> {
+    let (time_s, current_a) = (&raw.time_s, &raw.current_a);
     let (mut ends, mut last, mut last_step_s) = (vec![0], 0, f64::NEG_INFINITY);
     for k in 1..time_s.len() {
         let step = (current_a[k] - current_a[k - 1]).abs() > EDGE_SHARE * largest_a;
@@ -166,7 +166,7 @@ fn block_ends(raw: &RawRows<'_>, largest_a: f64) -> Vec<usize> {
     ends
 }
 
-fn block_row(raw: &RawRows<'_>, before: usize, end: usize, grid: &Grid) -> FitRow {
+fn block_row(raw: &MeasuredPart, before: usize, end: usize, grid: &Grid) -> FitRow {
     let dt_s = raw.time_s[end] - raw.time_s[before];
     let charge_as: f64 = (before + 1..=end)
         .map(|k| 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * (raw.time_s[k] - raw.time_s[k - 1]))
@@ -189,7 +189,7 @@ fn block_row(raw: &RawRows<'_>, before: usize, end: usize, grid: &Grid) -> FitRo
 }
 
 /// Whether the SOC change over a gap differs from the charge that the current at its ends implies.
-fn hides_charge(raw: &RawRows<'_>, before: usize, end: usize, capacity_ah: f64) -> bool {
+fn hides_charge(raw: &MeasuredPart, before: usize, end: usize, capacity_ah: f64) -> bool {
     (before + 1..=end).any(|k| {
         let dt_s = raw.time_s[k] - raw.time_s[k - 1];
         let shown = 0.5 * (raw.current_a[k] + raw.current_a[k - 1]) * dt_s / 3600.0 / capacity_ah;
@@ -218,7 +218,8 @@ mod tests {
 
     fn prepare(time_s: &[f64], current_a: &[f64], voltage_v: &[f64], soc: &[f64]) -> Record {
         let temperature_c = vec![25.0; time_s.len()];
-        let raw = RawRows { time_s, current_a, voltage_v, temperature_c: &temperature_c, soc };
+        let [time_s, current_a, voltage_v, soc] = [time_s, current_a, voltage_v, soc].map(<[f64]>::to_vec);
+        let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
         Record::prepare(&raw, &[], &grid(), &LIMITS)
     }
 

@@ -20,37 +20,21 @@ const CREDIBLE: [(f64, f64); 2] = [(5.0, 1e5), (0.05, 200.0)];
 /// that share, without a trace in the residuals; this range detects it.
 const CELL_J_PER_K_WH: (f64, f64) = (2.5, 12.5);
 
-/// Why there are no thermal parameters.
-#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
-pub enum ThermalFitError {
-    /// Too little warming, or no answer.
-    #[error("no thermal parameters: no file warms enough to determine them")]
-    NoWarming,
-    /// The sensor does not show the cell's own temperature.
-    #[error(
-        "no thermal parameters: {found_j_per_k:.0} J/K fits, a cell of {energy_wh:.1} Wh has {} to {} J/K per Wh; \
-         the sensor does not see the cell's warming alone",
-        CELL_J_PER_K_WH.0,
-        CELL_J_PER_K_WH.1
-    )]
-    NoCell {
-        /// Heat capacity that fits, J/K.
-        found_j_per_k: f64,
-        /// Energy of the cell, Wh.
-        energy_wh: f64,
-    },
-}
-
 /// Fits both; `energy_wh` = what the cell stores.
 ///
 /// # Errors
 /// No discharge warms enough, or the result is not credible for a cell.
-pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, ThermalFitError> {
-    let thermal = medians(records, tables).ok_or(ThermalFitError::NoWarming)?;
+pub fn fit(records: &[Record], tables: &ParameterTables, energy_wh: f64) -> Result<Thermal, String> {
+    let thermal = medians(records, tables).ok_or("no thermal parameters: no file warms enough to determine them")?;
     let found_j_per_k = thermal.heat_capacity_j_per_k;
     let (least, most) = CELL_J_PER_K_WH;
-    let a_cell = (least..=most).contains(&(found_j_per_k / energy_wh));
-    if a_cell { Ok(thermal) } else { Err(ThermalFitError::NoCell { found_j_per_k, energy_wh }) }
+    let is_cell = (least..=most).contains(&(found_j_per_k / energy_wh));
+    is_cell.then_some(thermal).ok_or_else(|| {
+        format!(
+            "no thermal parameters: {found_j_per_k:.0} J/K fits, a cell of {energy_wh:.1} Wh has {least} to {most} J/K per Wh; \
+             the sensor does not see the cell's warming alone"
+        )
+    })
 }
 
 fn medians(records: &[Record], tables: &ParameterTables) -> Option<Thermal> {
@@ -102,7 +86,7 @@ fn warms(record: &Record) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ident::RawRows;
+    use crate::ident::MeasuredPart;
     use crate::ident::grid::Grid;
     use crate::ident::record::Limits;
 
@@ -117,20 +101,15 @@ mod tests {
             let warm = |t: f64| 25.0 + 4.0 + (start_c - 29.0) * libm::exp(-t / 400.0);
             let temperature_c: Vec<f64> = time_s.iter().map(|&t| warm(t)).collect();
             // 0.4 W through 10 K/W with 40 J/K.
-            let raw = RawRows {
-                time_s: &time_s,
-                current_a: &[2.0; 3000],
-                voltage_v: &[3.4; 3000],
-                temperature_c: &temperature_c,
-                soc: &soc,
-            };
+            let (current_a, voltage_v) = (vec![2.0; 3000], vec![3.4; 3000]);
+            let raw = MeasuredPart { time_s, current_a, voltage_v, temperature_c, soc, ..MeasuredPart::default() };
             Record::prepare(&raw, &[], &grid, &limits)
         };
         let records = [record(25.0), record(25.0), record(15.0)];
         let found = fit(&records, &tables, 7.2).expect("warms");
         assert!((found.heat_capacity_j_per_k - 40.0).abs() < 0.4, "{found:?}");
         assert!((found.resistance_k_per_w - 10.0).abs() < 0.1, "{found:?}");
-        let refused = fit(&records, &tables, 2.9).expect_err("13.8 J/K per Wh").to_string();
+        let refused = fit(&records, &tables, 2.9).expect_err("13.8 J/K per Wh");
         assert!(refused.contains("40 J/K fits, a cell of 2.9 Wh has 2.5 to 12.5 J/K per Wh"), "{refused}");
     }
 }

@@ -95,6 +95,11 @@ impl TimeAxis {
     }
 }
 
+/// A chart with all its words.
+fn chart(title: impl Into<String>, about: &str, x: Axis, y: impl Into<Axis>, layers: Vec<Layer>) -> Option<Picture> {
+    Some(Picture::Chart(Chart { description: about.to_owned(), ..Chart::new(title, x, y, layers) }))
+}
+
 fn levels(data: &Data, context: &PageContext<'_>, rule: Rule) -> impl Iterator<Item = Layer> {
     thresholds(data, context, rule).into_iter().map(|(value, severity)| {
         let ink = ink_of(&severity);
@@ -168,13 +173,9 @@ fn soc(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let mut layers = vec![Layer::band("95 % interval", Ink::Blue, range(&bins, &clock, |bin| bin.soc_band, 100.0))];
     layers.extend(true_soc(context, &clock, data.ends_s()?));
     layers.push(Layer::line(words, Ink::Blue, zigzag(&range(&bins, &clock, |bin| bin.soc, 100.0))));
-    Some(Picture::Chart(Chart {
-        title: "State of charge over the whole record".to_owned(),
-        description: format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s()),
-        x: clock.axis,
-        y: Axis::number("SOC, %").within(-5.0, 105.0),
-        layers,
-    }))
+    let title = "State of charge over the whole record";
+    let description = format!("Lowest and highest estimated SOC of every {:.0} s, in percent", life.width_s());
+    chart(title, &description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
 }
 
 fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
@@ -194,13 +195,9 @@ fn soc_recent(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     } else {
         layers.push(Layer::line("estimate", Ink::Blue, zigzag(&soc)));
     }
-    Some(Picture::Chart(Chart {
-        title: "State of charge in the last half-cycles".to_owned(),
-        description: "Estimated SOC with its 95 % interval, in percent".to_owned(),
-        x: clock.axis,
-        y: Axis::number("SOC, %").within(-5.0, 105.0),
-        layers,
-    }))
+    let title = "State of charge in the last half-cycles";
+    let description = "Estimated SOC with its 95 % interval, in percent";
+    chart(title, description, clock.axis, Axis::number("SOC, %").within(-5.0, 105.0), layers)
 }
 
 /// The worst cell with its 95 % interval, and the range over the cells of a pack.
@@ -250,13 +247,9 @@ fn capacity(data: &Data, context: &PageContext<'_>, outlook: Option<&Outlook>) -
     layers.extend(end.map(|end| Layer::new("end of life", Ink::Grey, end)));
     layers.extend(limits);
     layers.extend(raised(data, &clock, Rule::CapacityLow));
-    Some(Picture::Chart(Chart {
-        title: "Capacity between full and empty, over life".to_owned(),
-        description: "Learned capacity of the weakest cell with its 95 % interval, Ah".to_owned(),
-        y: within_reason(&steps, &layers, "capacity, Ah"),
-        x: clock.axis,
-        layers,
-    }))
+    let title = "Capacity between full and empty, over life";
+    let description = "Learned capacity of the weakest cell with its 95 % interval, Ah";
+    chart(title, description, clock.axis, within_reason(&steps, &layers, "capacity, Ah"), layers)
 }
 
 /// Returns an axis over the filtered values with their interval: single half-cycles may lie far outside.
@@ -323,13 +316,9 @@ fn usable(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let load = context.config.and_then(|config| config.monitor.health.usable).map_or(String::new(), |usable| {
         format!(" at {} A, {} \u{b0}C, down to {} V", usable.current_a, usable.temperature_c, usable.cutoff_v)
     });
-    Some(Picture::Chart(Chart {
-        title: format!("Usable capacity{load}, over life"),
-        description: "What the weakest cell gives under load, with its 95 % interval, Ah".to_owned(),
-        y: within_reason(&steps, &layers, "usable capacity, Ah"),
-        x: clock.axis,
-        layers,
-    }))
+    let title = format!("Usable capacity{load}, over life");
+    let description = "What the weakest cell gives under load, with its 95 % interval, Ah";
+    chart(title, description, clock.axis, within_reason(&steps, &layers, "usable capacity, Ah"), layers)
 }
 
 fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
@@ -376,8 +365,8 @@ fn recharge(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let window =
         window.map_or(String::new(), |w| format!(" from {:.0} to {:.0} % SOC", 100.0 * w.from_soc, 100.0 * w.to_soc));
     let title = if is_stored { "Duration of each charge".to_owned() } else { format!("Recharge period{window}") };
-    let description = "Minutes a charge took, as it was and as the reference charger would take".to_owned();
-    Some(Picture::Chart(Chart { title, description, x: clock.axis, y: Axis::number("minutes"), layers }))
+    let description = "Minutes a charge took, as it was and as the reference charger would take";
+    chart(title, description, clock.axis, "minutes", layers)
 }
 
 fn resistance(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
@@ -389,13 +378,8 @@ fn resistance(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     let mut layers = worst(data, &clock, &steps, Ink::Purple, "highest");
     layers.extend(levels(data, context, Rule::ResistanceHigh));
     layers.extend(raised(data, &clock, Rule::ResistanceHigh));
-    Some(Picture::Chart(Chart {
-        title: "Resistance over life".to_owned(),
-        description: "Resistance of the worst cell relative to a new one, with its 95 % interval".to_owned(),
-        x: clock.axis,
-        y: Axis::number("resistance, times new"),
-        layers,
-    }))
+    let description = "Resistance of the worst cell relative to a new one, with its 95 % interval";
+    chart("Resistance over life", description, clock.axis, "resistance, times new", layers)
 }
 
 fn temperature(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
@@ -417,13 +401,8 @@ fn temperature(data: &Data, context: &PageContext<'_>) -> Option<Picture> {
     }
     layers.extend(levels(data, context, Rule::TemperatureHigh));
     layers.extend(raised(data, &clock, Rule::TemperatureHigh));
-    Some(Picture::Chart(Chart {
-        title: "Temperature".to_owned(),
-        description: "Cell temperature, degrees C".to_owned(),
-        x: clock.axis,
-        y: Axis::number("temperature, \u{b0}C"),
-        layers,
-    }))
+    let description = "Cell temperature, degrees C";
+    chart("Temperature", description, clock.axis, "temperature, \u{b0}C", layers)
 }
 
 fn alarms(data: &Data) -> Option<Picture> {
@@ -499,13 +478,10 @@ fn innovation(data: &Data) -> Option<Picture> {
     let life = data.trace.life.as_ref()?;
     let clock = TimeAxis::of(data);
     let band = range(&filled(life.iter()), &clock, |bin| bin.innovation_v, 1e3);
-    Some(Picture::Chart(Chart {
-        title: "Innovation: measured minus expected voltage".to_owned(),
-        description: "Lowest and highest innovation over the cells, mV".to_owned(),
-        x: clock.axis,
-        y: Axis::number("mV"),
-        layers: vec![Layer::line("lowest to highest", Ink::Grey, zigzag(&band))],
-    }))
+    let layers = vec![Layer::line("lowest to highest", Ink::Grey, zigzag(&band))];
+    let title = "Innovation: measured minus expected voltage";
+    let description = "Lowest and highest innovation over the cells, mV";
+    chart(title, description, clock.axis, "mV", layers)
 }
 
 fn coverage(data: &Data) -> Option<Picture> {
@@ -519,11 +495,7 @@ fn coverage(data: &Data) -> Option<Picture> {
         Layer::line("within their own 95 % interval", Ink::Blue, line),
         Layer::new("95 %", Ink::Grey, Shape::Level(95.0)),
     ];
-    Some(Picture::Chart(Chart {
-        title: "Coverage of the estimator's 95 % interval".to_owned(),
-        description: "Share of voltage readings within the 95 % interval the filter expected, percent".to_owned(),
-        x: clock.axis,
-        y: Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest),
-        layers,
-    }))
+    let title = "Coverage of the estimator's 95 % interval";
+    let description = "Share of voltage readings within the 95 % interval the filter expected, percent";
+    chart(title, description, clock.axis, Axis::number("readings, %").within(lowest, 102.0 - 0.02 * lowest), layers)
 }

@@ -51,11 +51,10 @@ fn grow(range: &mut (f64, f64), (low, high): (f64, f64)) {
 
 impl TraceBin {
     fn take(&mut self, e: &Estimate) {
-        grow(&mut self.soc, (e.soc, e.soc));
-        grow(&mut self.soc_band, (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std));
-        grow(&mut self.temperature_c, (e.measured.temperature_c, e.measured.temperature_c));
-        grow(&mut self.innovation_v, (e.innovation_v, e.innovation_v));
-        self.health.take(e);
+        let [soc, temperature_c, innovation_v] =
+            [e.soc, e.measured.temperature_c, e.innovation_v].map(|value| (value, value));
+        let soc_band = (e.soc - OF_95 * e.soc_std, e.soc + OF_95 * e.soc_std);
+        self.join(&Self { soc, soc_band, temperature_c, innovation_v, health: Consistency::of(e) });
     }
 }
 
@@ -70,15 +69,13 @@ impl Bin for TraceBin {
 }
 
 impl Consistency {
-    fn take(&mut self, e: &Estimate) {
+    fn of(e: &Estimate) -> Self {
         let parts = e.innovation_v / e.innovation_std_v;
         if !parts.is_finite() {
-            return;
+            return Self::default();
         }
-        self.count += 1;
-        self.inside += u64::from(parts.abs() <= OF_95);
-        self.gated += u64::from(!e.accepted);
-        self.squares += parts * parts;
+        let (inside, gated) = (u64::from(parts.abs() <= OF_95), u64::from(!e.accepted));
+        Self { count: 1, inside, gated, squares: parts * parts }
     }
 
     fn add(&mut self, other: &Self) {
@@ -122,7 +119,7 @@ impl Trace {
         if self.cells.len() <= cell {
             self.cells.resize(cell + 1, Consistency::default());
         }
-        self.cells[cell].take(estimate);
+        self.cells[cell].add(&Consistency::of(estimate));
     }
 
     /// Starts the bins of a charge or discharge.

@@ -47,6 +47,22 @@ pub struct Case {
     pub seed: Option<u64>,
 }
 
+impl Case {
+    /// The case in words; two of them name an error of the capacity and one of the current.
+    pub fn words(&self, separator: &str, [capacity, current]: [&str; 2]) -> String {
+        let mut words = vec![match self.start {
+            Start::Full => "full".to_owned(),
+            Start::Middle => "middle".to_owned(),
+        }];
+        words.extend(self.soc_error_points.map(|points| format!("told {points:+}")));
+        let (percent, ampere) = (self.capacity_error_percent, self.current_offset_a);
+        words.extend((percent != 0.0).then(|| format!("{capacity} {percent:+} %")));
+        words.extend((ampere != 0.0).then(|| format!("{current} {ampere:+} A")));
+        words.extend(self.seed.map(|seed| format!("windows {seed}")));
+        words.join(separator)
+    }
+}
+
 /// One file in one case.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct CaseScore {
@@ -279,7 +295,7 @@ impl<'a> CaseRun<'a> {
 
     fn finish(mut self, case: &Case) -> Result<CaseScore, LabError> {
         if let Some((_, latest)) = self.span {
-            self.feeder.finish(latest);
+            self.feeder.unknown_gap(latest);
             self.take_events();
         }
         let (job, settings, last) = (self.job, self.settings, self.last);

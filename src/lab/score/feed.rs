@@ -58,11 +58,6 @@ impl Feeder {
         self.monitor.handle(Input::UnknownGap { time }, &mut self.out);
     }
 
-    /// Ends the record at its last row with a gap, which completes the current half-cycle.
-    pub(super) fn finish(&mut self, latest: Timestamp) {
-        self.unknown_gap(latest);
-    }
-
     fn send_ticks(&mut self) {
         while let Some(time) = self.ticks.pop(self.monitor.next_due()) {
             self.monitor.handle(Input::Tick { time }, &mut self.out);

@@ -4,8 +4,11 @@ use std::path::{Path, PathBuf};
 
 use super::life::{DischargeScore, LifeScore};
 use super::soc::SocSample;
-use super::{Case, STD_OF_95, Start};
+use super::{Case, STD_OF_95};
 use crate::chart::{self, Axis, Chart, Format, Ink, Layer, Picture, PlotError};
+
+/// Words for an error of the capacity and one of the current.
+const WORDS: [&str; 2] = ["capacity", "current"];
 
 /// Draws the run and gives the file's path.
 pub(super) fn draw(
@@ -15,29 +18,17 @@ pub(super) fn draw(
     samples: &[SocSample],
     life: Option<&LifeScore>,
 ) -> Result<PathBuf, PlotError> {
-    let title = format!("{name}, {}", describe(case, ", "));
+    let title = format!("{name}, {}", case.words(", ", WORDS));
     let mut panels = Vec::new();
     if !samples.is_empty() {
         panels.extend([soc_panel(&title, samples), error_panel(samples)]);
     }
     panels.extend(life.into_iter().flat_map(|life| life_panels(&title, &life.each)));
-    let path = folder.join(format!("{}_{}.svg", name.replace('/', "_"), describe(case, "_").replace([' ', '%'], "")));
+    let path =
+        folder.join(format!("{}_{}.svg", name.replace('/', "_"), case.words("_", WORDS).replace([' ', '%'], "")));
     let pictures: Vec<Picture> = panels.into_iter().map(Picture::Chart).collect();
     chart::write_stack(&path, &pictures, Format::Svg)?;
     Ok(path)
-}
-
-/// Describes a case in words.
-pub(super) fn describe(case: &Case, separator: &str) -> String {
-    let mut words = vec![match case.start {
-        Start::Full => "full".to_owned(),
-        Start::Middle => "middle".to_owned(),
-    }];
-    words.extend(case.soc_error_points.map(|points| format!("told {points:+}")));
-    words.extend((case.capacity_error_percent != 0.0).then(|| format!("capacity {:+} %", case.capacity_error_percent)));
-    words.extend((case.current_offset_a != 0.0).then(|| format!("current {:+} A", case.current_offset_a)));
-    words.extend(case.seed.map(|seed| format!("windows {seed}")));
-    words.join(separator)
 }
 
 fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
@@ -48,17 +39,12 @@ fn band(points: impl Iterator<Item = (f64, f64, f64)>) -> Layer {
 
 fn soc_panel(title: &str, samples: &[SocSample]) -> Chart {
     let over = |value: fn(&SocSample) -> f64| samples.iter().map(move |s| (s.time_s / 3600.0, value(s)));
-    Chart {
-        title: title.to_owned(),
-        x: Axis::number("time since the start, h"),
-        y: Axis::number("SOC, %").within(-10.0, 110.0),
-        layers: vec![
-            band(samples.iter().map(|s| (s.time_s / 3600.0, 100.0 * s.soc, s.half_width_points()))),
-            Layer::line("truth", Ink::Plain, over(|s| 100.0 * s.truth)),
-            Layer::line("estimate", Ink::Orange, over(|s| 100.0 * s.soc)),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        band(samples.iter().map(|s| (s.time_s / 3600.0, 100.0 * s.soc, s.half_width_points()))),
+        Layer::line("truth", Ink::Plain, over(|s| 100.0 * s.truth)),
+        Layer::line("estimate", Ink::Orange, over(|s| 100.0 * s.soc)),
+    ];
+    Chart::new(title.to_owned(), "time since the start, h", Axis::number("SOC, %").within(-10.0, 110.0), layers)
 }
 
 fn error_panel(samples: &[SocSample]) -> Chart {
@@ -66,30 +52,20 @@ fn error_panel(samples: &[SocSample]) -> Chart {
     let later = &samples[samples.len() / 2..];
     let reach = later.iter().map(|s| s.error_points().abs().max(s.half_width_points())).fold(1.0, f64::max) * 1.5;
     let inside = move |value: f64| value.clamp(-reach, reach);
-    Chart {
-        x: Axis::number("time since the start, h"),
-        y: Axis::number("SOC error, points").within(-reach, reach),
-        layers: vec![
-            band(samples.iter().map(|s| (s.time_s / 3600.0, 0.0, inside(s.half_width_points())))),
-            Layer::line(
-                "estimate - truth",
-                Ink::Orange,
-                samples.iter().map(|s| (s.time_s / 3600.0, inside(s.error_points()))),
-            ),
-        ],
-        ..Chart::default()
-    }
+    let layers = vec![
+        band(samples.iter().map(|s| (s.time_s / 3600.0, 0.0, inside(s.half_width_points())))),
+        Layer::line(
+            "estimate - truth",
+            Ink::Orange,
+            samples.iter().map(|s| (s.time_s / 3600.0, inside(s.error_points()))),
+        ),
+    ];
+    Chart::new("", "time since the start, h", Axis::number("SOC error, points").within(-reach, reach), layers)
 }
 
 fn life_panels(title: &str, each: &[DischargeScore]) -> [Chart; 3] {
     let number = |d: &DischargeScore| d.number as f64;
-    let panel = |title: &str, y_label: &str, layers| Chart {
-        title: title.to_owned(),
-        x: Axis::number("discharge"),
-        y: Axis::number(y_label),
-        layers,
-        ..Chart::default()
-    };
+    let panel = |title: &str, y_label: &str, layers| Chart::new(title.to_owned(), "discharge", y_label, layers);
     let usable = panel(
         title,
         "usable capacity, Ah",

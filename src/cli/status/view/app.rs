@@ -3,9 +3,11 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
+use ratatui::crossterm::event::KeyCode;
+
 use crate::quantity::Timestamp;
 use crate::status::STALE;
-use crate::status::document::StatusDocument;
+use crate::status::document::{CellStatus, StatusDocument};
 
 /// Documents kept for the plots: four minutes.
 pub(super) const HISTORY: usize = 240;
@@ -17,35 +19,6 @@ pub(super) enum FeedUpdate {
     StatusDocument(Box<StatusDocument>),
     /// The connection failed: why.
     Lost(String),
-}
-
-/// The action of a key.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Key {
-    /// Quit.
-    Quit,
-    /// To the page on the right.
-    NextPage,
-    /// To the page on the left.
-    PreviousPage,
-    /// A row up.
-    Up,
-    /// A row down.
-    Down,
-    /// A cell to the left.
-    Left,
-    /// A cell to the right.
-    Right,
-    /// A screen up.
-    PageUp,
-    /// A screen down.
-    PageDown,
-    /// To the first.
-    First,
-    /// To the last.
-    Last,
-    /// Show the other quantity.
-    Quantity,
 }
 
 /// The pages.
@@ -84,21 +57,18 @@ pub(super) enum Quantity {
     Voltage,
 }
 
-/// A cell's values at one document.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct CellPoint {
-    soc: Option<f32>,
-    voltage_v: Option<f32>,
-}
-
-impl CellPoint {
-    pub(super) fn get(self, quantity: Quantity) -> Option<f64> {
-        match quantity {
-            Quantity::Soc => self.soc.map(f64::from),
-            Quantity::Voltage => self.voltage_v.map(f64::from),
+impl Quantity {
+    /// Its value in a cell.
+    pub(super) fn of(self, cell: &CellStatus) -> Option<f64> {
+        match self {
+            Self::Soc => cell.soc,
+            Self::Voltage => cell.voltage_v,
         }
     }
 }
+
+/// A cell's values at one document, a quantity after the other.
+pub(super) type CellPoint = [Option<f32>; 2];
 
 /// The view.
 #[derive(Debug)]
@@ -189,20 +159,16 @@ impl App {
                 points.pop_front();
             }
             // The plots are a few dots high, so single precision suffices.
-            points.push_back(CellPoint {
-                soc: cell.soc.map(|soc| soc as f32),
-                voltage_v: cell.voltage_v.map(|v| v as f32),
-            });
+            points.push_back([Quantity::Soc, Quantity::Voltage].map(|quantity| Some(quantity.of(cell)? as f32)));
         }
     }
 
     /// Performs the action of a key.
-    pub(super) fn handle_key(&mut self, key: Key) {
+    pub(super) fn handle_key(&mut self, key: KeyCode) {
         match key {
-            Key::Quit => {}
-            Key::NextPage => self.turn_to(self.page.step(1)),
-            Key::PreviousPage => self.turn_to(self.page.step(Page::ALL.len() - 1)),
-            Key::Quantity => {
+            KeyCode::Tab => self.turn_to(self.page.step(1)),
+            KeyCode::BackTab => self.turn_to(self.page.step(Page::ALL.len() - 1)),
+            KeyCode::Char('v') => {
                 self.quantity = match self.quantity {
                     Quantity::Soc => Quantity::Voltage,
                     Quantity::Voltage => Quantity::Soc,
@@ -222,17 +188,17 @@ impl App {
     }
 }
 
-fn moved(at: usize, key: Key, row: usize, screen: usize, last: usize) -> usize {
+fn moved(at: usize, key: KeyCode, row: usize, screen: usize, last: usize) -> usize {
     let to = match key {
-        Key::Up => at.saturating_sub(row),
-        Key::Down => at + row,
-        Key::Left => at.saturating_sub(1),
-        Key::Right => at + 1,
-        Key::PageUp => at.saturating_sub(screen),
-        Key::PageDown => at + screen,
-        Key::First => 0,
-        Key::Last => last,
-        Key::Quit | Key::NextPage | Key::PreviousPage | Key::Quantity => at,
+        KeyCode::Up => at.saturating_sub(row),
+        KeyCode::Down => at + row,
+        KeyCode::Left => at.saturating_sub(1),
+        KeyCode::Right => at + 1,
+        KeyCode::PageUp => at.saturating_sub(screen),
+        KeyCode::PageDown => at + screen,
+        KeyCode::Home => 0,
+        KeyCode::End => last,
+        _ => at,
     };
     to.min(last)
 }

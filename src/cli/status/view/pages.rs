@@ -13,7 +13,7 @@ use super::theme::{Theme, clock};
 use crate::cli::status::table::alarm_line;
 use crate::cli::status::{number, shown, with_std, word};
 use crate::quantity::Timestamp;
-use crate::status::document::{CellStatus, StatusDocument};
+use crate::status::document::StatusDocument;
 
 /// Width of a row's first cell number in the map.
 const LABEL: usize = 5;
@@ -35,13 +35,6 @@ pub(super) fn page(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocume
     app.scroll = app.scroll.min(lines.len().saturating_sub(app.page_lines));
     let shown: Vec<Line<'_>> = lines.into_iter().skip(app.scroll).take(app.page_lines).collect();
     frame.render_widget(Paragraph::new(shown), area);
-}
-
-fn of(cell: &CellStatus, quantity: Quantity) -> Option<f64> {
-    match quantity {
-        Quantity::Soc => cell.soc,
-        Quantity::Voltage => cell.voltage_v,
-    }
 }
 
 fn cells(frame: &mut Frame<'_>, app: &mut App, document: &StatusDocument, theme: Theme, area: Rect) {
@@ -88,7 +81,7 @@ impl Grid {
 
 fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: usize) -> Vec<Line<'static>> {
     let cells = &document.cells;
-    let known = ValueRange::of(cells.iter().filter_map(|cell| of(cell, app.quantity)));
+    let known = ValueRange::of(cells.iter().filter_map(|cell| app.quantity.of(cell)));
     let (title, scale) = match (app.quantity, known) {
         (Quantity::Soc, Some(known)) => (
             format!("SOC {:.1} to {:.1} %, bars from 0 to 100 %", 100.0 * known.least, 100.0 * known.greatest),
@@ -107,7 +100,7 @@ fn map(app: &App, document: &StatusDocument, theme: Theme, grid: &Grid, lines: u
         let from = row * grid.per_row;
         let mut spans = vec![Span::raw(format!("{:>4} ", from + 1))];
         for (index, cell) in cells.iter().enumerate().skip(from).take(grid.per_row) {
-            let share = of(cell, app.quantity).and_then(|value| scale?.share(value));
+            let share = app.quantity.of(cell).and_then(|value| scale?.share(value));
             let bars = bar(share).to_string().repeat((grid.cell_width - 1).max(1));
             let mut style = match cell.trusted {
                 Some(false) => theme.colour(Color::Red).add_modifier(Modifier::UNDERLINED),
@@ -149,7 +142,8 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
             with_std(cell.capacity_ah, cell.capacity_std_ah, 2, " Ah"),
         );
         let width = usize::from(area.width).saturating_sub(row.chars().count());
-        let points = app.history.get(index).map(|points| points.iter().map(|point| point.get(app.quantity)));
+        let points =
+            app.history.get(index).map(|points| points.iter().map(|point| point[app.quantity as usize].map(f64::from)));
         let plotted = points.map_or_else(String::new, |points| sparkline(points, width.min(super::app::HISTORY)));
         let style = if index == app.selected { Style::new().add_modifier(Modifier::BOLD) } else { Style::new() };
         text.push(Line::from(vec![Span::styled(row, style), Span::styled(plotted, theme.colour(Color::Cyan))]));
@@ -161,8 +155,11 @@ fn list(app: &App, document: &StatusDocument, theme: Theme, area: Rect) -> Vec<L
 fn plot(frame: &mut Frame<'_>, app: &App, theme: Theme, area: Rect) {
     let Some(points) = app.history.get(app.selected) else { return };
     let width = usize::from(area.width.saturating_sub(2));
-    let values: Vec<Option<f64>> =
-        points.iter().skip(points.len().saturating_sub(width)).map(|point| point.get(app.quantity)).collect();
+    let values: Vec<Option<f64>> = points
+        .iter()
+        .skip(points.len().saturating_sub(width))
+        .map(|point| point[app.quantity as usize].map(f64::from))
+        .collect();
     let Some(scale) = ValueRange::of(values.iter().copied().flatten()) else { return };
     let cell = app.selected + 1;
     let title = match app.quantity {
@@ -211,15 +208,15 @@ fn interfaces(document: &StatusDocument, theme: Theme) -> Vec<Line<'static>> {
         };
         text.push(Line::from(vec![Span::raw(format!("{} ", it.name)), Span::styled(word(it.state), style)]));
         let rows = [
-            ("frames in", it.frames),
-            ("lost by the kernel", it.kernel_dropped),
-            ("lost by our queue", it.queue_dropped),
-            ("no frames", it.malformed),
-            ("frames out", it.sent),
-            ("not sent, queue full", it.send_queue_full),
-            ("not sent, kernel", it.send_failed),
-            ("error frames", it.error_frames),
-            ("bus-off", it.bus_offs),
+            ("frames in", it.received.frames),
+            ("lost by the kernel", it.link.kernel_dropped),
+            ("lost by our queue", it.link.queue_dropped),
+            ("no frames", it.link.malformed),
+            ("frames out", it.link.sent),
+            ("not sent, queue full", it.link.send_queue_full),
+            ("not sent, kernel", it.link.send_failed),
+            ("error frames", it.received.error_frames),
+            ("bus-off", it.received.bus_offs),
             ("came back", it.reconnects),
         ];
         text.extend(rows.map(|(name, count)| count_line(name, count)));

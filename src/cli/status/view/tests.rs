@@ -68,8 +68,8 @@ fn screens_of_the_cells() {
     }
     let mut app = watched(1024, 3);
     drawn(&mut app, SMALL);
-    app.handle_key(Key::Quantity);
-    app.handle_key(Key::Last);
+    app.handle_key(KeyCode::Char('v'));
+    app.handle_key(KeyCode::End);
     check("cells_1024_80x24_voltage_last", &mut app, SMALL);
 }
 
@@ -77,11 +77,11 @@ fn screens_of_the_cells() {
 fn screens_of_the_other_pages() {
     let mut app = watched(96, 3);
     for page in [Page::Alarms, Page::Interfaces, Page::Counts, Page::Events] {
-        app.handle_key(Key::NextPage);
+        app.handle_key(KeyCode::Tab);
         assert_eq!(app.page, page);
         check(&format!("{}_80x24", page.name()), &mut app, SMALL);
     }
-    app.handle_key(Key::NextPage);
+    app.handle_key(KeyCode::Tab);
     assert_eq!(app.page, Page::Cells);
 }
 
@@ -138,14 +138,21 @@ fn every_size_and_every_key_is_handled_without_a_fault() {
         let mut app = watched(cells, 2);
         for size in [(1, 1), (40, 12), (41, 13), (57, 30), (200, 12), (80, 24), (300, 100)] {
             for _ in Page::ALL {
-                for key in
-                    [Key::Last, Key::PageDown, Key::Down, Key::Right, Key::Up, Key::PageUp, Key::Left, Key::First]
-                {
+                for key in [
+                    KeyCode::End,
+                    KeyCode::PageDown,
+                    KeyCode::Down,
+                    KeyCode::Right,
+                    KeyCode::Up,
+                    KeyCode::PageUp,
+                    KeyCode::Left,
+                    KeyCode::Home,
+                ] {
                     drawn(&mut app, size);
                     app.handle_key(key);
                     assert!(app.selected < usize::from(cells));
                 }
-                app.handle_key(Key::NextPage);
+                app.handle_key(KeyCode::Tab);
             }
         }
     }
@@ -166,7 +173,7 @@ fn without_colour_there_is_none() {
     app.has_colour = false;
     for _ in Page::ALL {
         assert_eq!(colours(&drawn(&mut app, SMALL)), 0, "{:?}", app.page);
-        app.handle_key(Key::NextPage);
+        app.handle_key(KeyCode::Tab);
     }
     assert!(Timestamp::ZERO < feed::now());
 }
@@ -174,8 +181,8 @@ fn without_colour_there_is_none() {
 #[test]
 fn keys_mean_what_the_help_says() {
     let key = |code| meaning(KeyEvent::new(code, KeyModifiers::NONE));
-    assert_eq!(key(KeyCode::Char('q')), Some(Key::Quit));
-    assert_eq!(key(KeyCode::Tab), Some(Key::NextPage));
+    assert_eq!(key(KeyCode::Char('q')), Some(KeyCode::Esc));
+    assert_eq!(key(KeyCode::Tab), Some(KeyCode::Tab));
     assert_eq!(key(KeyCode::Char('x')), None);
-    assert_eq!(meaning(KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL)), Some(Key::Quit));
+    assert_eq!(meaning(KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL)), Some(KeyCode::Esc));
 }

@@ -3,6 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use super::super::AlarmInput;
 use super::super::{Comparison, Direction};
 use super::*;
 
@@ -209,8 +210,9 @@ fn thresholds_with_an_unknown_value_are_counted_and_named_in_turn() {
     assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 1), Some((Rule::CapacityLow, Some(CellIndex(1))))));
     see(&mut engine, at(0.0), Rule::CapacityLow, Some(CellIndex(1)), Some(1.6), &mut changes);
     assert_eq!((engine.unknown(), named(&engine, 0)), ((2, 0), None));
-    engine.set_inputs_valid(at(1.0), Rule::CapacityLow, CELL, false, &mut changes);
-    engine.set_inputs_valid(at(1.0), Rule::SocLow, None, false, &mut changes);
+    let lost = |rule, cell| AlarmInput::InputsValid { rule, cell, valid: false };
+    engine.apply(at(1.0), &lost(Rule::CapacityLow, CELL), &mut changes);
+    engine.apply(at(1.0), &lost(Rule::SocLow, None), &mut changes);
     assert_eq!(engine.unknown(), (2, 1), "only a learned value outlives its inputs and waits for them");
     assert_eq!(changes, []);
 }
@@ -229,16 +231,25 @@ fn commands_reach_the_alarms_meant_and_refuse_those_that_are_not_healthy() {
     see(&mut engine, at(0.0), Rule::SocLow, None, Some(0.05), &mut changes);
     changes.clear();
     let cell_1 = Selector { cell: Some(CellIndex(1)), ..Selector::default() };
-    assert_eq!(engine.acknowledge(&cell_1, &mut changes), CommandOutcome { changed: 1, refused: 0 });
-    assert_eq!(engine.acknowledge(&cell_1, &mut changes), CommandOutcome::default());
+    assert_eq!(
+        engine.apply(at(1.0), &AlarmInput::Acknowledge(cell_1), &mut changes),
+        CommandOutcome { changed: 1, refused: 0 }
+    );
+    assert_eq!(engine.apply(at(1.0), &AlarmInput::Acknowledge(cell_1), &mut changes), CommandOutcome::default());
     let capacity = Selector { rule: Some(Rule::CapacityLow), ..Selector::default() };
-    assert_eq!(engine.clear(&capacity, &mut changes), CommandOutcome { changed: 1, refused: 1 });
+    assert_eq!(
+        engine.apply(at(1.0), &AlarmInput::Clear(capacity), &mut changes),
+        CommandOutcome { changed: 1, refused: 1 }
+    );
     let heard: Vec<_> = changes.iter().map(|c| (c.change, c.alarm.cell, c.alarm.state)).collect();
     assert_eq!(
         heard,
         [(Change::Acknowledged, Some(CellIndex(1)), AlarmState::Active), (Change::Cleared, CELL, AlarmState::Inactive),]
     );
-    assert_eq!(engine.clear(&Selector::default(), &mut changes), CommandOutcome { changed: 1, refused: 2 });
+    assert_eq!(
+        engine.apply(at(1.0), &AlarmInput::Clear(Selector::default()), &mut changes),
+        CommandOutcome { changed: 1, refused: 2 }
+    );
     assert_eq!(engine.get(Rule::CapacityLow, CELL).map(|alarm| alarm.occurrences), Some(0), "forgotten");
     assert_eq!(engine.count(), 2);
 }

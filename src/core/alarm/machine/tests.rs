@@ -13,6 +13,15 @@ const STATES: [AlarmState; 8] = [
     AlarmState::Latched,
     AlarmState::Cleared,
 ];
+
+/// Input of an alarm machine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum MachineInput {
+    Check(LimitCheck),
+    Acknowledge,
+    Clear,
+}
+
 const INPUTS: [MachineInput; 6] = [
     MachineInput::Check(LimitCheck::Beyond),
     MachineInput::Check(LimitCheck::Between),

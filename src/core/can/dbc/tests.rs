@@ -65,7 +65,7 @@ SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
 "#,
     )
     .unwrap();
-    let deep = &db.signal("M.Deep").unwrap().1.multiplex.conditions;
+    let deep = &db.signal("M.Deep").unwrap().1.conditions;
     assert_eq!(
         deep,
         &[
@@ -73,7 +73,7 @@ SG_MUL_VAL_ 1 Deep Inner 0-3, 7-9;
             MuxCondition { selector: 0, ranges: vec![(0, 3), (7, 9)] }
         ]
     );
-    assert!(db.signal("M.Plain").unwrap().1.multiplex.conditions.is_empty());
+    assert!(db.signal("M.Plain").unwrap().1.conditions.is_empty());
     assert!(db.signal("M.Inner").unwrap().1.is_multiplexor);
 }
 

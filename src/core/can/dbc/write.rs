@@ -189,7 +189,7 @@ fn write_message(message: &Message, text: &mut String) {
 
 /// ` M`, ` m3`, ` m3M` or nothing.
 fn indicator(signal: &Signal) -> String {
-    let code = signal.multiplex.conditions.last().and_then(|condition| condition.ranges.first()).map(|range| range.0);
+    let code = signal.conditions.last().and_then(|condition| condition.ranges.first()).map(|range| range.0);
     match (code, signal.is_multiplexor) {
         (None, false) => String::new(),
         (None, true) => " M".to_owned(),
@@ -200,8 +200,8 @@ fn indicator(signal: &Signal) -> String {
 
 /// Whether `m3` is not sufficient: ranges, nested multiplexors, or several next to each other.
 fn needs_ranges(message: &Message) -> bool {
-    let mut conditions = message.signals.iter().map(|signal| signal.multiplex.conditions.as_slice());
-    let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.multiplex.conditions.is_empty());
+    let mut conditions = message.signals.iter().map(|signal| signal.conditions.as_slice());
+    let plain = message.signals.iter().filter(|signal| signal.is_multiplexor && signal.conditions.is_empty());
     let is_simple = |chain: &[MuxCondition]| match chain {
         [] => true,
         [condition] => matches!(condition.ranges.as_slice(), [(low, high)] if low == high),
@@ -212,7 +212,7 @@ fn needs_ranges(message: &Message) -> bool {
 
 fn write_ranges(message: &Message, text: &mut String) {
     for signal in &message.signals {
-        let Some(condition) = signal.multiplex.conditions.last() else { continue };
+        let Some(condition) = signal.conditions.last() else { continue };
         let Some(selector) = message.signals.get(condition.selector) else { continue };
         let ranges: Vec<String> = condition.ranges.iter().map(|(low, high)| format!("{low}-{high}")).collect();
         let (id, ranges) = (message.id.dbc_number(), ranges.join(", "));

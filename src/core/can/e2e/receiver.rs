@@ -119,8 +119,7 @@ impl StatusCounts {
 }
 
 /// State of one message's receiver.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Receiver {
     /// Counter of the last valid frame; `None` = none yet.
     last_valid: Option<u8>,
@@ -130,8 +129,6 @@ pub struct Receiver {
     no_new_or_repeated: u8,
     /// Valid frames still required.
     sync: u8,
-    /// Frames lost before the last valid one.
-    lost: u8,
     counts: StatusCounts,
 }
 
@@ -170,11 +167,6 @@ impl Receiver {
         &self.counts
     }
 
-    /// Frames lost before the last one that was OK or OKSOMELOST (or SYNC).
-    pub const fn lost(&self) -> u8 {
-        self.lost
-    }
-
     /// Each call may stand for a lost frame.
     fn grow(&mut self, profile: Profile, calls: u64) {
         self.max_delta = grown(self.max_delta, calls, profile.max_counter());
@@ -206,7 +198,6 @@ impl Receiver {
             return Status::WrongSequence;
         }
         self.accept(config, counter);
-        self.lost = delta - 1;
         match (self.synchronise(config), delta) {
             (true, _) => Status::Sync,
             (false, 1) => Status::Ok,

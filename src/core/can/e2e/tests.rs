@@ -58,7 +58,10 @@ fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
         let needed = profile.header_bytes();
         for found in 0..needed {
             let mut short = vec![0xAA; found];
-            assert_eq!(protection.protect(&mut short, 0), Err(ProtectError::Short { found, needed }));
+            assert_eq!(
+                protection.protect(&mut short, 0).unwrap_err().to_string(),
+                format!("payload of {found} bytes, this profile needs {needed} or more")
+            );
             assert_eq!(short, vec![0xAA; found]);
             assert_eq!(protection.verified_counter(&short), None);
         }
@@ -66,7 +69,7 @@ fn what_cannot_be_protected_is_an_error_and_stays_as_it_was() {
     }
     let mut payload = [0xAA; 8];
     let protection = Protection { profile: Profile::P01A, data_id: 1 };
-    assert_eq!(protection.protect(&mut payload, 15), Err(ProtectError::Counter { found: 15, max: 14 }));
+    assert_eq!(protection.protect(&mut payload, 15).unwrap_err().to_string(), "end-to-end counter 15, must be 0 to 14");
     assert_eq!(payload, [0xAA; 8]);
 }
 

@@ -36,28 +36,9 @@ pub struct CommandFields {
 }
 
 /// Why a frame is not a command.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum CommandFault {
-    /// Another message, or a remote request.
-    #[error("is not the command message")]
-    OtherMessage,
-    /// Too short.
-    #[error("has {found} bytes, must have {allowed}")]
-    Short {
-        /// Bytes it has.
-        found: usize,
-        /// Bytes it must have.
-        allowed: usize,
-    },
-    /// A code without meaning.
-    #[error("{signal} is {code}, which has no meaning")]
-    Meaningless {
-        /// Name of the signal.
-        signal: &'static str,
-        /// Its code.
-        code: u64,
-    },
-}
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct CommandFault(String);
 
 /// The command frame, ready for reading.
 #[derive(Debug, Clone, PartialEq)]
@@ -122,25 +103,31 @@ impl CommandPlan {
     /// When it is another message, too short, or has a code without meaning.
     pub fn decode(&self, frame: &Frame) -> Result<CommandFields, CommandFault> {
         if frame.id() != self.id || frame.kind() == FrameKind::Remote {
-            return Err(CommandFault::OtherMessage);
+            return Err(CommandFault("is not the command message".to_owned()));
         }
         let payload = frame.data();
-        let short = CommandFault::Short { found: payload.len(), allowed: self.len };
         if payload.len() < self.len {
-            return Err(short);
+            return Err(CommandFault(format!("has {} bytes, must have {}", payload.len(), self.len)));
         }
-        let command = match self.command.raw(payload).map_err(|_| short)? {
+        // Every signal lies within the message: none is missing here.
+        let command = match self.command.raw(payload).unwrap_or(0) {
             1 => Command::Acknowledge,
             2 => Command::Clear,
             3 => Command::PackReplaced,
-            code => return Err(CommandFault::Meaningless { signal: "Command", code }),
+            code => return Err(CommandFault::meaningless("Command", code)),
         };
         Ok(CommandFields {
             command,
-            rule: self.rule.read(payload, short)?.and_then(|code| u8::try_from(code).ok()),
-            severity: self.severity.read(payload, short)?.and_then(|code| u8::try_from(code).ok()),
-            cell: self.cell.read(payload, short)?.and_then(|code| u16::try_from(code).ok()).map(CellIndex),
+            rule: self.rule.read(payload)?,
+            severity: self.severity.read(payload)?,
+            cell: self.cell.read(payload)?.map(CellIndex),
         })
+    }
+}
+
+impl CommandFault {
+    fn meaningless(signal: &str, code: u64) -> Self {
+        Self(format!("{signal} is {code}, which has no meaning"))
     }
 }
 
@@ -155,12 +142,11 @@ impl SelectorSignal {
         Some(Self { name, plan, all, codes })
     }
 
-    fn read(&self, payload: &[u8], short: CommandFault) -> Result<Option<u64>, CommandFault> {
-        let code = self.plan.raw(payload).map_err(|_| short)?;
-        match code {
+    fn read<T: TryFrom<u64>>(&self, payload: &[u8]) -> Result<Option<T>, CommandFault> {
+        match self.plan.raw(payload).unwrap_or(u64::MAX) {
             code if Some(code) == self.all => Ok(None),
-            code if self.codes.contains(&code) => Ok(Some(code)),
-            code => Err(CommandFault::Meaningless { signal: self.name, code }),
+            code if self.codes.contains(&code) => Ok(T::try_from(code).ok()),
+            code => Err(CommandFault::meaningless(self.name, code)),
         }
     }
 }
@@ -174,7 +160,7 @@ fn signal(message: &Message, name: &str, faults: &mut Vec<String>) -> Option<(Si
     };
     let all = signal.values.iter().find(|(_, word)| word == "all").and_then(|(code, _)| u64::try_from(*code).ok());
     match signal.layout.plan() {
-        Ok(_) if !signal.multiplex.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
+        Ok(_) if !signal.conditions.is_empty() => fault(": multiplexed, must always be there".to_owned()),
         Ok(plan) if plan.bytes_needed() > usize::from(message.len_bytes) => {
             fault(format!(": reaches past the message's {} bytes", message.len_bytes));
         }
@@ -221,16 +207,17 @@ mod tests {
             ([1, 15, 0, 2047], "Rule", 15),
             ([1, 31, 0, 1024], "Cell", 1024),
         ] {
-            assert_eq!(plan().decode(&frame(codes)), Err(CommandFault::Meaningless { signal, code }));
+            assert_eq!(plan().decode(&frame(codes)), Err(CommandFault::meaningless(signal, code)));
         }
     }
 
     #[test]
     fn another_message_and_a_short_one_are_refused() {
+        let refusal = |frame: &Frame| plan().decode(frame).unwrap_err().to_string();
         let other = Frame::classic(CanId::Standard(1714), &[0xFF; 8]).unwrap();
-        assert_eq!(plan().decode(&other), Err(CommandFault::OtherMessage));
-        assert_eq!(plan().decode(&Frame::remote(CanId::Standard(1715), 8).unwrap()), Err(CommandFault::OtherMessage));
+        assert_eq!(refusal(&other), "is not the command message");
+        assert_eq!(refusal(&Frame::remote(CanId::Standard(1715), 8).unwrap()), "is not the command message");
         let short = Frame::classic(CanId::Standard(1715), &[0; 7]).unwrap();
-        assert_eq!(plan().decode(&short), Err(CommandFault::Short { found: 7, allowed: 8 }));
+        assert_eq!(refusal(&short), "has 7 bytes, must have 8");
     }
 }

@@ -244,7 +244,7 @@ fn set_header(message: &mut Message) {
     let places: Vec<Option<usize>> = places.collect();
     let kept = std::mem::replace(&mut message.signals, header).into_iter().filter(is_kept);
     message.signals.extend(kept.map(|mut signal| {
-        for condition in &mut signal.multiplex.conditions {
+        for condition in &mut signal.conditions {
             condition.selector = places.get(condition.selector).copied().flatten().unwrap_or(condition.selector);
         }
         signal
@@ -282,7 +282,7 @@ fn header_signal(name: &str, start_bit: u16, length_bits: u16, comment: &str) ->
         },
         unit: String::new(),
         receivers: Vec::new(),
-        multiplex: Default::default(),
+        conditions: Vec::new(),
         is_multiplexor: false,
         values: Vec::new(),
         comment: Some(comment.to_owned()),
@@ -306,7 +306,7 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
         );
     }
     let in_header = |signal: &&Signal| {
-        !HEADER_SIGNALS.contains(&signal.name.as_str()) && touches(&signal.layout, profile.header_mask())
+        !HEADER_SIGNALS.contains(&signal.name.as_str()) && signal.layout.touches(profile.header_mask())
     };
     for signal in message.signals.iter().filter(in_header) {
         let what = format!(
@@ -317,18 +317,6 @@ fn check_header(message: &Message, protection: Protection, fault: &mut impl FnMu
         );
         fault("e2e", what);
     }
-}
-
-/// Whether one of the signal's bits is in the mask, which is of the payload's first bytes.
-fn touches(layout: &SignalLayout, mask: [u8; 3]) -> bool {
-    let (first, last) = layout.span();
-    let bit_of = |place: u32| match layout.byte_order {
-        ByteOrder::LittleEndian => place % 8,
-        ByteOrder::BigEndian => 7 - place % 8,
-    };
-    (0..)
-        .zip(mask)
-        .any(|(byte, mask)| (first.max(8 * byte)..=last.min(8 * byte + 7)).any(|p| mask >> bit_of(p) & 1 == 1))
 }
 
 /// Steps of signals in Ah: the smallest of 1, 2, 5, 10, ... times the built-in one with which the largest value the

@@ -157,7 +157,7 @@ impl OutputField {
         if plan.bytes_needed() > usize::from(message.len_bytes) {
             return Err(format!("reaches past the message's {} bytes", message.len_bytes));
         }
-        let pages = match signal.multiplex.conditions.as_slice() {
+        let pages = match signal.conditions.as_slice() {
             [] => Vec::new(),
             [condition] => condition.ranges.clone(),
             _ => return Err("nested multiplexing, must be one multiplexor".to_owned()),

@@ -90,7 +90,7 @@ fn next(state: ClaimState, event: ClaimEvent) -> (ClaimState, ClaimAnswer) {
 pub(super) struct AddressClaim {
     name: Name,
     address: u8,
-    state: ClaimState,
+    pub(super) state: ClaimState,
     /// When contention ends, while claiming.
     unopposed_at: Timestamp,
     /// Time to send a claim (in state lost: "cannot claim").
@@ -111,10 +111,6 @@ impl AddressClaim {
             last_sent: None,
             is_first: false,
         }
-    }
-
-    pub(super) const fn state(&self) -> ClaimState {
-        self.state
     }
 
     /// Starts, or starts again after time without listening.
@@ -290,7 +286,7 @@ mod tests {
     fn an_equal_name_from_another_node_silences_this_one() {
         let mut claim = claimed(10);
         assert_eq!(claim.contend(at(1000), name(10)), Some(NodeEvent::AddressLost { to: name(10) }));
-        assert_eq!(claim.state(), ClaimState::Lost);
+        assert_eq!(claim.state, ClaimState::Lost);
     }
 
     #[test]

@@ -109,10 +109,9 @@ pub(super) struct Codes {
 }
 
 impl Codes {
-    /// Takes the active codes. Returns the number of codes that could not be followed.
-    pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) -> usize {
+    /// Takes the active codes; at most [`MAX_FOLLOWED`] are followed.
+    pub(super) fn set(&mut self, now: Timestamp, active: &[ActiveCode], all_known: bool) {
         self.forget_settled(now);
-        let mut not_followed = 0;
         self.all_known = all_known;
         for followed in &mut self.followed {
             followed.is_active = false;
@@ -121,13 +120,12 @@ impl Codes {
             match self.followed.iter().position(|followed| followed.code.is_same_failure(active.code)) {
                 Some(index) => self.followed[index].activate(active),
                 None if self.followed.len() < MAX_FOLLOWED => self.followed.push(FollowedCode::new(active)),
-                None => not_followed += 1,
+                None => {}
             }
         }
         for followed in &mut self.followed {
             followed.settle_lamp();
         }
-        not_followed
     }
 
     /// Removes codes that are inactive and no longer sent.
@@ -217,7 +215,7 @@ mod tests {
 
     /// Sets, and shows what may be shown.
     fn step(codes: &mut Codes, ms: i64, now_active: &[ActiveCode]) -> Vec<u32> {
-        assert_eq!(codes.set(at(ms), now_active, true), 0);
+        codes.set(at(ms), now_active, true);
         codes.show(at(ms));
         codes.sent(at(ms));
         codes.shown().iter().map(|code| code.spn()).collect()
@@ -333,7 +331,8 @@ mod tests {
     fn memory_is_bounded_and_given_back() {
         let mut codes = Codes::default();
         let many: Vec<_> = (1..=70).map(|spn| active(spn, Lamp::Amber, 1)).collect();
-        assert_eq!(codes.set(at(0), &many, true), 6);
+        codes.set(at(0), &many, true);
+        assert_eq!(codes.followed.len(), MAX_FOLLOWED);
         codes.show(at(0));
         codes.sent(at(0));
         step(&mut codes, 1000, &[]);

@@ -44,5 +44,5 @@ pub use id::{
     PGN_TRANSPORT_CONTROL, PGN_TRANSPORT_DATA,
 };
 pub use name::{Name, NameFields, OutOfRange};
-pub use node::{Node, NodeConfig, NodeCounters, NodeOutputs};
+pub use node::{Node, NodeConfig, NodeOutputs};
 pub use trouble_code::{DmPayload, Lamp, LampState, Lamps, MAX_CODES, TroubleCode, dm_codes, dm_payload};

@@ -58,17 +58,6 @@ impl NodeConfig {
     }
 }
 
-/// Messages the node could not handle or send.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct NodeCounters {
-    /// Claims and requests that are too short.
-    pub malformed_frames: u64,
-    /// Requests without answer: too many at a time, or the address was lost before.
-    pub answers_dropped: u64,
-    /// Codes left out, summed over messages.
-    pub codes_left_out: u64,
-}
-
 /// Output of the node; the caller empties it.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct NodeOutputs {
@@ -101,7 +90,6 @@ pub struct Node {
     next_answer_at: Timestamp,
     polled_at: Timestamp,
     codes_left_out: usize,
-    counters: NodeCounters,
 }
 
 impl Node {
@@ -120,7 +108,6 @@ impl Node {
             next_answer_at: LONG_AGO,
             polled_at: LONG_AGO,
             codes_left_out: 0,
-            counters: NodeCounters::default(),
         }
     }
 
@@ -134,12 +121,6 @@ impl Node {
         self.poll(now, out);
     }
 
-    /// After time without listening (sleep, the interface was away): another node may have claimed the address, so it is
-    /// claimed again, also after a loss.
-    pub fn handle_gap(&mut self, now: Timestamp, out: &mut NodeOutputs) {
-        self.start(now, out);
-    }
-
     /// Sets the codes to send: active ones and previously active ones, most severe or latest first, and whether every value
     /// that could raise one is known. The next [`poll`](Self::poll) sends them.
     pub fn set_codes(
@@ -149,8 +130,7 @@ impl Node {
         previously_active: &[TroubleCode],
         all_known: bool,
     ) {
-        let left_out = self.codes.set(now, active, all_known);
-        self.counters.codes_left_out += count(left_out);
+        self.codes.set(now, active, all_known);
         self.previously_active.clear();
         self.previously_active.extend_from_slice(previously_active);
     }
@@ -169,23 +149,17 @@ impl Node {
     }
 
     fn handle_claim(&mut self, now: Timestamp, frame: &Frame, out: &mut NodeOutputs) {
-        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else {
-            self.counters.malformed_frames += 1;
-            return;
-        };
+        let Ok(bytes) = <[u8; 8]>::try_from(frame.data()) else { return };
         out.events.extend(self.claim.contend(now, Name::from_bytes(bytes)));
-        if self.claim.state() == ClaimState::Lost {
+        if self.claim.state == ClaimState::Lost {
             self.fall_silent();
         }
     }
 
     fn handle_request(&mut self, now: Timestamp, frame: &Frame, header: Header) {
-        let &[low, middle, high, ..] = frame.data() else {
-            self.counters.malformed_frames += 1;
-            return;
-        };
+        let &[low, middle, high, ..] = frame.data() else { return };
         let is_for_all = header.destination == GLOBAL_ADDRESS;
-        let answer = match (pgn_of([low, middle, high]), self.claim.state()) {
+        let answer = match (pgn_of([low, middle, high]), self.claim.state) {
             // After a loss the address belongs to another node: only requests to all are for this one.
             (PGN_ADDRESS_CLAIMED, ClaimState::Lost) if !is_for_all => return,
             (PGN_ADDRESS_CLAIMED, ClaimState::Idle | ClaimState::Claiming | ClaimState::Claimed | ClaimState::Lost) => {
@@ -198,13 +172,8 @@ impl Node {
             (pgn, ClaimState::Claimed) => PendingAnswer::Refusal { pgn, to: header.source },
         };
         // The answer is a broadcast: one serves all requesters.
-        if self.answers.contains(&answer) {
-            return;
-        }
-        if self.answers.len() < MAX_WAITING_ANSWERS {
+        if !self.answers.contains(&answer) && self.answers.len() < MAX_WAITING_ANSWERS {
             self.answers.push_back(answer);
-        } else {
-            self.counters.answers_dropped += 1;
         }
     }
 
@@ -281,8 +250,8 @@ impl Node {
     fn send_dm1(&mut self, now: Timestamp, out: &mut NodeOutputs) {
         self.codes.show(now);
         let payload = dm_payload(self.codes.lamps(), &self.codes.shown());
-        if payload.left_out() != self.codes_left_out {
-            self.codes_left_out = payload.left_out();
+        if payload.left_out != self.codes_left_out {
+            self.codes_left_out = payload.left_out;
             out.events.push(NodeEvent::CodesLeftOut { codes: self.codes_left_out });
         }
         self.send(now, PGN_DM1, payload, out);
@@ -292,7 +261,6 @@ impl Node {
     }
 
     fn send(&mut self, now: Timestamp, pgn: u32, payload: DmPayload, out: &mut NodeOutputs) {
-        self.counters.codes_left_out += count(payload.left_out());
         if payload.as_slice().len() <= 8 {
             let id = can_id(PRIORITY, pgn, GLOBAL_ADDRESS, self.address);
             out.frames.extend(Frame::classic(id, payload.as_slice()));
@@ -350,15 +318,10 @@ impl Node {
 
     /// Whether only address claims may be sent: the node does not have its address.
     pub fn is_silent(&self) -> bool {
-        match self.claim.state() {
+        match self.claim.state {
             ClaimState::Idle | ClaimState::Claiming | ClaimState::Lost => true,
             ClaimState::Claimed => false,
         }
-    }
-
-    /// Counters since the beginning.
-    pub fn counters(&self) -> NodeCounters {
-        self.counters
     }
 
     /// Extended identifiers the node must receive, as identifier and mask at any priority: claims of its address, requests
@@ -375,13 +338,8 @@ impl Node {
     /// Drops the transfer and the waiting answers.
     fn fall_silent(&mut self) {
         self.transfer = None;
-        self.counters.answers_dropped += count(self.answers.len());
         self.answers.clear();
     }
-}
-
-fn count(items: usize) -> u64 {
-    u64::try_from(items).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]

@@ -22,10 +22,9 @@ use kernel::{INFORMATION_S, KernelConstants, LOAD_A, MEAN_NIS, REST_S, at};
 use super::cell_estimator::{CellEstimator, thermal_c};
 use super::filter::Filter;
 use super::memory::Memory;
-use super::state_vector::{CAPACITY, LOG_RESISTANCE, widened};
+use super::state_vector::{LOG_RESISTANCE, widened};
 use super::step::{CellStep, StepResult};
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::{CellModel, MAX_BRANCHES};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::ScalarGaussian;
 
 /// The estimators of a pack's cells.
@@ -208,13 +207,6 @@ impl EstimatorBank {
     pub fn log_resistance(&self, cell: usize) -> ScalarGaussian {
         let CellSlot { memory, has_filter, .. } = &self.cells[cell];
         if *has_filter { self.marginal(cell, LOG_RESISTANCE) } else { memory.log_resistance }
-    }
-
-    /// Capacity in the filter's present state, Ah.
-    #[inline]
-    pub fn capacity(&self, cell: usize) -> ScalarGaussian {
-        let CellSlot { memory, has_filter, .. } = &self.cells[cell];
-        if *has_filter { self.marginal(cell, CAPACITY) } else { memory.capacity }
     }
 
     /// Branch voltages, V; NaN beyond the model's branches and before the first voltage.

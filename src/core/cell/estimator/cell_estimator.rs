@@ -12,8 +12,7 @@ use super::state_vector::{
 };
 use super::step::{CellStep, StepResult};
 use crate::cell::circuit;
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::{CellModel, MAX_BRANCHES};
+use crate::cell::{CellModel, EstimatorConfig, MAX_BRANCHES};
 use crate::filter::{FilterError, ScalarGaussian, Update};
 
 /// The estimator of one cell.
@@ -78,10 +77,7 @@ impl CellEstimator {
     /// Starts SOC and branches from the voltage; keeps the learned resistance and capacity.
     fn start(&mut self, model: &CellModel, config: &EstimatorConfig, step: &CellStep) {
         let first = self.filter.is_none();
-        if let Some(filter) = &self.filter {
-            self.memory.capacity = each!(filter, x => marginal(x, CAPACITY));
-            self.memory.log_resistance = each!(filter, x => marginal(x, LOG_RESISTANCE));
-        }
+        (self.memory.capacity, self.memory.log_resistance) = (self.capacity(), self.log_resistance());
         self.memory.reset_unusable(config);
         let temperature_c = self.memory.temperature_c.unwrap_or(step.ambient_c);
         let configured = config.initial.soc.filter(|_| first);
@@ -142,7 +138,7 @@ impl CellEstimator {
 
     /// State of charge; `None` before the first voltage.
     pub fn soc(&self) -> Option<ScalarGaussian> {
-        let soc = self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, 0)))?;
+        let soc = self.marginal(0)?;
         let variance = self.memory.downtime_std_if_any().map_or(soc.variance, |std| widened(soc.variance, square(std)));
         Some(ScalarGaussian { variance, ..soc })
     }
@@ -158,14 +154,16 @@ impl CellEstimator {
 
     /// ln of the resistance relative to new.
     pub fn log_resistance(&self) -> ScalarGaussian {
-        self.filter
-            .as_ref()
-            .map_or(self.memory.log_resistance, |filter| each!(filter, x => marginal(x, LOG_RESISTANCE)))
+        self.marginal(LOG_RESISTANCE).unwrap_or(self.memory.log_resistance)
     }
 
     /// Capacity in the filter's present state, Ah.
     pub fn capacity(&self) -> ScalarGaussian {
-        self.filter.as_ref().map_or(self.memory.capacity, |filter| each!(filter, x => marginal(x, CAPACITY)))
+        self.marginal(CAPACITY).unwrap_or(self.memory.capacity)
+    }
+
+    fn marginal(&self, state: usize) -> Option<ScalarGaussian> {
+        self.filter.as_ref().map(|filter| each!(filter, x => marginal(x, state)))
     }
 
     /// Covariance of capacity (Ah) and ln(resistance).

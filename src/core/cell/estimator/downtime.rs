@@ -22,8 +22,7 @@ use nalgebra::SMatrix;
 use super::filter::update;
 use super::noise::VoltageReading;
 use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square, widened};
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::CellModel;
+use crate::cell::{CellModel, EstimatorConfig};
 use crate::filter::{FilterError, Gaussian, Update};
 
 /// Prior probability that the cell was used during downtime.

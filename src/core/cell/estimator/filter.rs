@@ -8,8 +8,7 @@ use super::noise::{self, VoltageReading};
 use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square, widened};
 use super::step::CellStep;
 use crate::cell::circuit::{self, BranchAt};
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::CellModel;
+use crate::cell::{CellModel, EstimatorConfig};
 use crate::filter::{FilterError, Gaussian, ScalarGaussian, SigmaPointWeights, Update};
 
 /// Largest standard deviation that a load through a gap adds to the SOC, fraction.

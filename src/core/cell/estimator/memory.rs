@@ -7,8 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::state_vector::{KNOWN_VARIANCE, square};
 use super::step::CellStep;
-use crate::cell::config::{CapacityState, EstimatorConfig};
-use crate::cell::model::CellModel;
+use crate::cell::{CapacityState, CellModel, EstimatorConfig};
 use crate::filter::{ScalarGaussian, Update};
 use crate::quantity::InvalidState;
 

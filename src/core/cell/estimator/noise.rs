@@ -12,8 +12,7 @@
 use nalgebra::SMatrix;
 
 use super::state_vector::{BRANCHES, CAPACITY, LOG_RESISTANCE, square};
-use crate::cell::config::EstimatorConfig;
-use crate::cell::model::{CellModel, ERROR_WINDOW_S, GridPosition, TemperaturePosition};
+use crate::cell::{CellModel, ERROR_WINDOW_S, EstimatorConfig, GridPosition, TemperaturePosition};
 use crate::filter::{Gaussian, MeasurementNoise};
 
 /// Longest time of the resistance's random walk between two readings, s: it does not age in a gap.

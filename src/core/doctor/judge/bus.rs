@@ -1,12 +1,12 @@
 //! Interfaces, identifiers, error frames, foreign senders, end-to-end checks.
 
-use super::context::Judge;
+use super::context::{Judge, error, find, note, warning};
 use super::words::{count, number, seconds};
 use crate::can::CanId;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::guard::GuardConfig;
 use crate::doctor::plan::MessagePlan;
-use crate::doctor::report::{Finding, Topic};
+use crate::doctor::report::{Finding, Severity, Topic};
 use crate::doctor::watch::{BusStats, ProtectionStats};
 use crate::quantity::BusIndex;
 
@@ -53,31 +53,28 @@ fn best_other<'d>(judge: &Judge<'d>, index: usize, wanted: &[&MessagePlan]) -> O
 fn interface(judge: &mut Judge<'_>, index: usize) {
     let (bus, wanted) = (&judge.doctor.buses[index], messages_of(judge, bus_index(index)));
     if bus.error_frames > 0 {
-        judge.add(error_frames(bus));
+        error_frames(judge, bus);
     }
     if bus.dropped > 0 {
-        let note = Finding::note(Topic::Interface, format!("{}: frames were lost", bus.name))
+        note(judge, Topic::Interface, format!("{}: frames were lost", bus.name))
             .seen(format!("{} lost before they were read", count(bus.dropped, "frame")))
             .advice("periods appear too long; check the load of this computer");
-        judge.add(note);
     }
     if bus.frames > 0 || wanted.is_empty() {
         return;
     }
     judge.explained.extend(wanted.iter().map(|message| (message.bus, message.id)));
     if let Some((BusStats { name, .. }, found)) = best_other(judge, index, &wanted) {
-        let finding = Finding::error(Topic::Interface, format!("the pack is on {name}, not on {}", bus.name))
+        error(judge, Topic::Interface, format!("the pack is on {name}, not on {}", bus.name))
             .seen(format!("no frame on {}; {found} of {} configured messages on {name}", bus.name, wanted.len()))
             .why("the identifiers of the DBC are there, on the other bus")
             .change(&interface_table(index), "name", format!("{name:?}"));
-        judge.add(finding);
     } else if bus.error_frames == 0 {
-        let finding = silent_interface(judge, bus, &interface_table(index));
-        judge.add(finding);
+        silent_interface(judge, bus, &interface_table(index));
     }
 }
 
-fn silent_interface(judge: &Judge<'_>, bus: &BusStats, table: &str) -> Finding {
+fn silent_interface(judge: &mut Judge<'_>, bus: &BusStats, table: &str) {
     let (state, advice) = match (bus.is_missing, bus.is_down) {
         (true, _) => ("does not exist", "create it, plug the adapter in, or name another"),
         (_, true) => ("is down", "bring it up: ip link set NAME up type can bitrate RATE"),
@@ -93,14 +90,15 @@ fn silent_interface(judge: &Judge<'_>, bus: &BusStats, table: &str) -> Finding {
     } else {
         format!("{} had some, none of this pack", busy.join(", "))
     };
-    Finding::error(Topic::Interface, format!("{} {state}", bus.name))
-        .seen(format!("no frame on {} in {}; {others}", bus.name, seconds(judge.doctor.seconds())))
+    let span = seconds(judge.doctor.seconds());
+    error(judge, Topic::Interface, format!("{} {state}", bus.name))
+        .seen(format!("no frame on {} in {span}; {others}", bus.name))
         .why("the configured signals are expected there")
         .change(table, "name", "the interface the pack is on")
-        .advice(advice)
+        .advice(advice);
 }
 
-fn error_frames(bus: &BusStats) -> Finding {
+fn error_frames(judge: &mut Judge<'_>, bus: &BusStats) {
     let (name, classes) = (&bus.name, bus.error_classes);
     let share = bus.error_frames as f64 / (bus.frames + bus.error_frames) as f64;
     let hint = match classes {
@@ -108,20 +106,22 @@ fn error_frames(bus: &BusStats) -> Finding {
         _ if classes & CLASS_ACK != 0 => "no node acknowledged the sent frames",
         _ => "received bits were invalid",
     };
-    let finding = if bus.frames == 0 {
-        Finding::error(Topic::BitRate, format!("{name}: only error frames: wrong bit rate?"))
-            .why(format!("{hint}, and no valid frame was received"))
+    let (severity, what, why) = if bus.frames == 0 {
+        (Severity::Error, "only error frames: wrong bit rate?", ", and no valid frame was received")
     } else if share > MANY_ERRORS {
-        Finding::warning(Topic::BitRate, format!("{name}: many error frames"))
-            .why(format!("{hint}; frames are received, so the bit rate is right and the wiring is not"))
+        let why = "; frames are received, so the bit rate is right and the wiring is not";
+        (Severity::Warning, "many error frames", why)
     } else {
-        Finding::note(Topic::BitRate, format!("{name}: some error frames")).why(hint)
+        (Severity::Note, "some error frames", "")
     };
     let (errors, data) = (count(bus.error_frames, "error frame"), count(bus.frames, "data frame"));
-    finding.seen(format!("{errors} and {data}")).advice(
-        "check the bit rate first (ip -details link show), then the termination (60 ohm between CAN_H and CAN_L) and \
-         the plug",
-    )
+    find(judge, severity, Topic::BitRate, format!("{name}: {what}"))
+        .seen(format!("{errors} and {data}"))
+        .why(format!("{hint}{why}"))
+        .advice(
+            "check the bit rate first (ip -details link show), then the termination (60 ohm between CAN_H and CAN_L) \
+             and the plug",
+        );
 }
 
 /// Messages that came in another form or on another bus.
@@ -130,24 +130,23 @@ fn messages(judge: &mut Judge<'_>, index: usize) {
     let is_fd = |message: &&&MessagePlan| bus.ids.get(&message.id).is_some_and(|stats| stats.fd > 0);
     let fd: Vec<&str> = wanted.iter().filter(is_fd).map(|message| message.name.as_str()).collect();
     if !judge.plan.interfaces[index].fd && !fd.is_empty() {
-        let finding = Finding::error(Topic::Fd, format!("{}: messages of the pack are CAN FD frames", bus.name))
+        error(judge, Topic::Fd, format!("{}: messages of the pack are CAN FD frames", bus.name))
             .seen(format!("{} came as FD frames", fd.join(", ")))
             .why("with fd = false the kernel does not deliver them to the service")
             .change(&interface_table(index), "fd", "true");
-        judge.add(finding);
     }
     if bus.frames == 0 {
         return;
     }
     for message in wanted.into_iter().filter(|message| !bus.ids.contains_key(&message.id)) {
-        if let Some(finding) = other_kind(bus, message).or_else(|| on_other_bus(judge, message)) {
+        if other_kind(judge, bus, message).is_some() || on_other_bus(judge, message).is_some() {
             judge.explained.insert((message.bus, message.id));
-            judge.add(finding);
         }
     }
 }
 
-fn other_kind(bus: &BusStats, MessagePlan { id, name, .. }: &MessagePlan) -> Option<Finding> {
+fn other_kind(judge: &mut Judge<'_>, bus: &BusStats, message: &MessagePlan) -> Option<()> {
+    let MessagePlan { id, name, .. } = message;
     let other = match *id {
         CanId::Standard(raw) => CanId::extended(u32::from(raw)),
         CanId::Extended(raw) => CanId::standard(raw),
@@ -158,24 +157,27 @@ fn other_kind(bus: &BusStats, MessagePlan { id, name, .. }: &MessagePlan) -> Opt
         CanId::Extended(_) => ("a 29-bit", "an 11-bit"),
     };
     let title = format!("{name} comes with {found} identifier, the DBC says {wanted} one");
-    let finding = Finding::error(Topic::IdKind, title)
+    error(judge, Topic::IdKind, title)
         .seen(format!("{frames} of {other} on {}, none of {id}", bus.name))
         .why("identifiers of both kinds may have the same number and are different messages; bit 31 in the DBC decides")
         .advice(format!("in the DBC: BO_ {} {name}: ...", other.dbc_number()));
-    Some(finding)
+    Some(())
 }
 
-fn on_other_bus(judge: &Judge<'_>, message: &MessagePlan) -> Option<Finding> {
+fn on_other_bus(judge: &mut Judge<'_>, message: &MessagePlan) -> Option<()> {
     let MessagePlan { bus, id, ref name, .. } = *message;
     let other = judge.other_bus(bus, id)?;
     let (frames, here) = (count(other.ids.get(&id)?.count, "frame"), judge.interface(bus));
-    let finding = Finding::error(Topic::Interface, format!("{name} is on {}, not on {here}", other.name))
-        .seen(format!("{frames} of {id} on {}, none on {here}", other.name))
-        .why("the identifier is there, on the other bus (which may use it for another message: look at the values)");
     let signals = judge.plan.signals.iter().filter(|s| (s.binding.bus, s.binding.id) == (bus, id));
     let mut tables: Vec<&str> = signals.map(|signal| signal.table.as_str()).collect();
     tables.dedup();
-    Some(tables.into_iter().fold(finding, |f, table| f.change(table, "interface", format!("{:?}", other.name))))
+    let finding = error(judge, Topic::Interface, format!("{name} is on {}, not on {here}", other.name))
+        .seen(format!("{frames} of {id} on {}, none on {here}", other.name))
+        .why("the identifier is there, on the other bus (which may use it for another message: look at the values)");
+    for table in tables {
+        finding.change(table, "interface", format!("{:?}", other.name));
+    }
+    Some(())
 }
 
 /// Another node sends with an identifier of the daemon's frames.
@@ -185,12 +187,11 @@ fn conflicts(judge: &mut Judge<'_>) {
         for bus in output.buses.iter().filter_map(|bus| buses.get(bus.index())) {
             let Some(stats) = bus.ids.get(&output.id) else { continue };
             let title = format!("another node sends with {}, the identifier of the {} frame", output.id, output.name);
-            let finding = Finding::warning(Topic::Conflict, title)
+            warning(judge, Topic::Conflict, title)
                 .seen(format!("{} of {} on {}", count(stats.count, "frame"), output.id, bus.name))
                 .why("two senders of one identifier destroy each other's frames, and receivers take one for the other")
                 .change(&output.table, "id", "an identifier that no other node uses")
                 .advice("ignore this if packwatch itself was running at that time");
-            judge.add(finding);
         }
     }
 }
@@ -210,16 +211,18 @@ fn protection(judge: &mut Judge<'_>) {
             continue;
         }
         let counts: Vec<String> = stats.counts.iter().map(|(status, count)| format!("{status} {count}")).collect();
-        let finding = Finding::error(Topic::Protection, format!("{name} fails its end-to-end check")).seen(format!(
-            "{} of {all} frames fail: {}",
-            stats.bad,
-            counts.join(", ")
-        ));
-        judge.add(why_failing(finding, &format!("input.protected[{}]", index + 1), guard, stats));
+        let finding = error(judge, Topic::Protection, format!("{name} fails its end-to-end check"));
+        finding.seen(format!("{} of {all} frames fail: {}", stats.bad, counts.join(", ")));
+        why_failing(finding, &format!("input.protected[{}]", index + 1), guard, stats);
     }
 }
 
-fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, stats: &ProtectionStats) -> Finding {
+fn why_failing<'f>(
+    finding: &'f mut Finding,
+    table: &str,
+    guard: &GuardConfig,
+    stats: &ProtectionStats,
+) -> &'f mut Finding {
     let Protection { profile, data_id } = guard.check.protection;
     let fits = |protection: Protection| stats.payloads.iter().all(|p| protection.verified_counter(p).is_some());
     let profiles = [Profile::P01A, Profile::P01C, Profile::P05];
@@ -234,11 +237,8 @@ fn why_failing(finding: Finding, table: &str, guard: &GuardConfig, stats: &Prote
         others.find(|other| data_id <= other.max_data_id() && fits(Protection { profile: *other, data_id }))
     {
         let name = other.name();
-        return finding.why(format!("with profile {name} every frame is right")).change(
-            table,
-            "profile",
-            format!("{name:?}"),
-        );
+        finding.why(format!("with profile {name} every frame is right"));
+        return finding.change(table, "profile", format!("{name:?}"));
     }
     let found = profiles.into_iter().find_map(|profile| {
         let id = (0..=profile.max_data_id()).find(|&data_id| fits(Protection { profile, data_id }))?;

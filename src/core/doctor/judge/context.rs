@@ -35,6 +35,31 @@ pub(super) struct Judge<'d> {
     pub(super) is_mixed_up: bool,
 }
 
+/// Adds an error; its texts follow.
+pub(super) fn error<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+    find(judge, Severity::Error, topic, title)
+}
+
+/// Adds a warning; its texts follow.
+pub(super) fn warning<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+    find(judge, Severity::Warning, topic, title)
+}
+
+/// Adds a note; its texts follow.
+pub(super) fn note<'j>(judge: &'j mut Judge<'_>, topic: Topic, title: impl Into<String>) -> &'j mut Finding {
+    find(judge, Severity::Note, topic, title)
+}
+
+/// Adds a finding; its texts follow.
+pub(super) fn find<'j>(
+    judge: &'j mut Judge<'_>,
+    severity: Severity,
+    topic: Topic,
+    title: impl Into<String>,
+) -> &'j mut Finding {
+    judge.report.add(Finding::new(severity, topic, title))
+}
+
 impl<'d> Judge<'d> {
     pub(super) fn new(doctor: &'d Doctor) -> Self {
         let report = Report { seconds: doctor.seconds(), frames: doctor.frames, ..Report::default() };
@@ -47,10 +72,6 @@ impl<'d> Judge<'d> {
             current_factor: 1.0,
             is_mixed_up: false,
         }
-    }
-
-    pub(super) fn add(&mut self, finding: Finding) {
-        self.report.add(finding);
     }
 
     pub(super) fn fine(&mut self, text: String) {

@@ -1,6 +1,6 @@
 //! Sign of the current, and resistance: whether voltages follow the current as the cell model's do.
 
-use super::context::{EXPLAINED, Judge};
+use super::context::{EXPLAINED, Judge, error, find, warning};
 use super::drift::Drift;
 use super::unit::unit_of;
 use super::words::{milli, number, percent, seconds, toml};
@@ -29,7 +29,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
     let slope = cell_slope(judge).filter(|slope| slope.certainty() >= 1.0 && slope.r2 >= 0.2);
     if let Some(slope) = slope {
         if slope.ohm < 0.0 {
-            inverted_by_steps(judge, signal, &slope);
+            let why = "a discharge lowers the voltage: the signal counts charge where discharge is configured";
+            inverted(judge, signal, risen_by_steps(&slope), why);
         } else {
             let drop = milli(slope.ohm);
             judge.fine(format!(
@@ -38,7 +39,8 @@ pub(super) fn check(judge: &mut Judge<'_>) {
         }
         resistance(judge, &slope);
     } else if let Some(drift) = drift.filter(Drift::is_opposite) {
-        inverted_by_drift(judge, signal, &drift);
+        let why = "a discharge lowers the voltage; judged from steady runs, which are less certain than steps";
+        inverted(judge, signal, drifted_against(&drift), why);
     } else if drift.is_some_and(|drift| drift.is_along()) {
         judge.fine("the sign of the current is right: the voltage drifts with it".to_owned());
     } else if series.extent.range() * judge.current_factor > SMALLEST_STEP * judge.pack_ah() {
@@ -61,37 +63,34 @@ fn cell_slope(judge: &Judge<'_>) -> Option<Slope> {
     Some(Slope { ohm: slope.ohm * by, std_ohm: slope.std_ohm * by, largest_a, ..slope })
 }
 
-fn inverted_by_steps(judge: &mut Judge<'_>, signal: &SignalPlan, slope: &Slope) {
+fn risen_by_steps(slope: &Slope) -> String {
     let (steps, largest, rise) = (slope.points, number(slope.largest_a), milli(-slope.ohm));
     let (sigma, explained) = (number(slope.t().abs().min(999.0).floor()), percent(slope.r2));
-    let finding = Finding::error(Topic::CurrentSign, "the sign of the current is inverted")
-        .seen(format!(
-            "over {steps} steps of up to {largest} A the cells' voltage rises by {rise} mV per ampere of discharge \
-             ({sigma} sigma, {explained} % of its changes explained)"
-        ))
-        .why("a discharge lowers the voltage: the signal counts charge where discharge is configured");
-    judge.add(sign_change(judge, finding, signal));
+    format!(
+        "over {steps} steps of up to {largest} A the cells' voltage rises by {rise} mV per ampere of discharge \
+         ({sigma} sigma, {explained} % of its changes explained)"
+    )
 }
 
-fn inverted_by_drift(judge: &mut Judge<'_>, signal: &SignalPlan, drift: &Drift) {
+fn drifted_against(drift: &Drift) -> String {
     let (span, against, expected) = (seconds(drift.seconds), milli(drift.against_v), milli(drift.expected_v));
-    let finding = Finding::error(Topic::CurrentSign, "the sign of the current is inverted")
-        .seen(format!(
-            "in {span} of steady current the voltage drifted {against} mV against the current ({expected} mV with it \
-             would fit the cell model)"
-        ))
-        .why("a discharge lowers the voltage; judged from steady runs, which are less certain than steps");
-    judge.add(sign_change(judge, finding, signal));
+    format!(
+        "in {span} of steady current the voltage drifted {against} mV against the current ({expected} mV with it \
+         would fit the cell model)"
+    )
 }
 
-fn sign_change(judge: &Judge<'_>, finding: Finding, signal: &SignalPlan) -> Finding {
-    if judge.plan.is_csv {
-        return finding.advice(
+fn inverted(judge: &mut Judge<'_>, signal: &SignalPlan, seen: String, why: &str) {
+    let is_csv = judge.plan.is_csv;
+    let finding = error(judge, Topic::CurrentSign, "the sign of the current is inverted").seen(seen).why(why);
+    if is_csv {
+        finding.advice(
             "the file's columns have the program's own units: replay it with --csv-sign charge (or without, if it was given)",
         );
+    } else {
+        let is_charge = signal.binding.scale < 0.0;
+        finding.change(&signal.table, "positive", if is_charge { "\"discharge\"" } else { "\"charge\"" });
     }
-    let is_charge = signal.binding.scale < 0.0;
-    finding.change(&signal.table, "positive", if is_charge { "\"discharge\"" } else { "\"charge\"" })
 }
 
 fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
@@ -117,12 +116,11 @@ fn resistance(judge: &mut Judge<'_>, slope: &Slope) {
         current_unit(judge, seen, power_of_ten(ohm / (fast * settled).sqrt()), ratio);
     } else if ratio >= ODD_RATIO {
         let title = format!("resistance {} times {direction} than the cell model's", number(ratio));
-        let finding = Finding::warning(Topic::CellModel, title)
+        warning(judge, Topic::CellModel, title)
             .seen(seen)
             .why(why)
             .change_cell_model()
             .advice("the estimator learns a resistance of 0.3 to 3 times the model's by itself");
-        judge.add(finding);
     } else if slope.ohm > 0.0 {
         judge.fine(format!("the resistance is of the right size: {seen}"));
     }
@@ -145,25 +143,30 @@ fn current_unit(judge: &mut Judge<'_>, seen: String, factor: f64, ratio: f64) {
     judge.current_factor *= factor;
     let severity = if (0.05..20.0).contains(&factor) { Severity::Warning } else { Severity::Error };
     let why = format!("{} times off: no cell ages or cools this far", number(ratio));
-    judge.add(wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why));
+    wrong_unit_or_cell(judge, signal, factor, severity).seen(seen).why(why);
 }
 
 /// A current that is off by `factor`: by its unit, or because the cell is another. Where the DBC says ampere and nothing
 /// is scaled, the reading is probably right and the cell comes first.
-pub(super) fn wrong_unit_or_cell(judge: &Judge<'_>, signal: &SignalPlan, factor: f64, severity: Severity) -> Finding {
+pub(super) fn wrong_unit_or_cell<'j>(
+    judge: &'j mut Judge<'_>,
+    signal: &SignalPlan,
+    factor: f64,
+    severity: Severity,
+) -> &'j mut Finding {
     let times = number(factor.max(1.0 / factor));
     let size = if factor < 1.0 { "larger" } else { "smaller" };
     let is_ampere = unit_of(&signal.unit).is_some_and(|(_, unit, _)| unit == 1.0) && signal.scale == 1.0;
     let (scale, strings) = (toml(signal.scale * factor), judge.plan.pack.strings);
     if is_ampere {
         let title = format!("the cells are about {times} times {size} than the cell model's");
-        return Finding::new(severity, Topic::CellModel, title).change_cell_model().advice(format!(
+        return find(judge, severity, Topic::CellModel, title).change_cell_model().advice(format!(
             "or {} is off by that factor (scale = {scale}), or pack.strings is not {strings}",
             signal.name
         ));
     }
     let mark = if severity == Severity::Warning { "?" } else { "" };
-    Finding::new(severity, Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
+    find(judge, severity, Topic::Unit, format!("pack current: off by a factor of {times}{mark}"))
         .change(&signal.table, "scale", scale)
         .advice(format!(
             "or the cells are {times} times {size} than the cell model's, or pack.strings is not {strings}"

@@ -1,9 +1,9 @@
 //! Signals that stand still while others move, and cells that respond unlike the others.
 
-use super::context::{EXPLAINED, Judge, SignalSeries};
+use super::context::{EXPLAINED, Judge, SignalSeries, error, warning};
 use super::words::{channels, count, milli, number, ranges};
 use crate::doctor::plan::Kind;
-use crate::doctor::report::{Finding, Topic};
+use crate::doctor::report::Topic;
 use crate::doctor::response::Slope;
 use crate::doctor::series::Series;
 use crate::quantity::Channel;
@@ -35,12 +35,11 @@ fn voltages(judge: &mut Judge<'_>) {
     let (signal, series) = still[0];
     let list: Vec<Channel> = still.iter().map(|(signal, _)| signal.binding.channel).collect();
     let (value, readings) = (number(series.extent.last), count(series.count(), "reading"));
-    let finding = Finding::error(Topic::Frozen, format!("{} never moves", channels(&list)))
+    error(judge, Topic::Frozen, format!("{} never moves", channels(&list)))
         .seen(format!("{} is {value} in all of {readings}", signal.name))
         .why(if is_all { "the current moved, and a voltage must follow it" } else { "the other cells moved" })
         .change(&signal.table, "signal", "the signal that is measured, not a default or a copy")
         .advice("or its sender repeats an old value");
-    judge.add(finding);
 }
 
 fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
@@ -52,11 +51,10 @@ fn pack_current(judge: &mut Judge<'_>, (signal, series): SignalSeries<'_>) {
     }
     let (value, step) = (number(series.extent.last), milli(step_v));
     let readings = count(series.count(), "reading");
-    let finding = Finding::error(Topic::Frozen, "the pack current never moves")
+    error(judge, Topic::Frozen, "the pack current never moves")
         .seen(format!("{} is {value} A in all of {readings}, while the cells step by up to {step} mV", signal.name))
         .why("only a current moves voltages this fast")
         .change(&signal.table, "signal", "the signal of the current that is measured");
-    judge.add(finding);
 }
 
 /// Cells with a voltage that does not follow the current as the others do.
@@ -77,9 +75,8 @@ pub(super) fn check_response(judge: &mut Judge<'_>) {
     let numbers: Vec<usize> = odd.iter().map(|(cell, _)| *cell).collect();
     let (first, ratio) = (odd[0].0, number(odd[0].1));
     let title = format!("cell {} follows the current unlike the others", ranges(&numbers));
-    let finding = Finding::warning(Topic::Cell, title)
+    warning(judge, Topic::Cell, title)
         .seen(format!("cell {first} moves {ratio} times as far as the median cell"))
         .why("a loose connection (more), another signal in its place or an old value repeated (less)")
         .advice("check the connection of that cell and its signal in the DBC");
-    judge.add(finding);
 }

@@ -45,7 +45,7 @@ impl Doctor {
         values::check_limits(&mut judge);
         electrical::check(&mut judge);
         timing::check(&mut judge);
-        let awake_s = self.clock.awake_s;
+        let awake_s = self.awake_s;
         if self.frames > 0 && awake_s < SHORT_S {
             let span = words::seconds(awake_s);
             judge.unjudged(format!("frames came for only {span}: listen longer to judge periods and cells"));

@@ -1,11 +1,11 @@
 //! Open-circuit voltage against the cell model, current offset, noise, and the results of the estimator.
 
-use super::context::Judge;
+use super::context::{Judge, error, note, warning};
 use super::drift::Drift;
 use super::words::{milli, number, percent, seconds, toml};
 use crate::cell::CellModel;
 use crate::doctor::plan::Kind;
-use crate::doctor::report::{Finding, Topic};
+use crate::doctor::report::Topic;
 use crate::doctor::series::Series;
 
 pub(super) fn check(judge: &mut Judge<'_>, drift: Option<Drift>) {
@@ -28,28 +28,25 @@ fn open_circuit(judge: &mut Judge<'_>, model: &CellModel, drift: Option<Drift>) 
     if highest > full_v + 0.06 || lowest < empty_v - 0.06 {
         let off_v = if highest > full_v + 0.06 { highest } else { lowest };
         let (off, low, high) = (number(off_v), number(empty_v), number(full_v));
-        let finding = Finding::error(Topic::CellModel, "the resting voltage is not on the cell model's curve")
+        error(judge, Topic::CellModel, "the resting voltage is not on the cell model's curve")
             .seen(format!("{off} V at rest; {} runs from {low} to {high} V", model.name))
             .why("a rested cell shows its open-circuit voltage: this is another chemistry, or another number of cells")
             .change("pack", "cell_model", chemistry(off_v));
-        judge.add(finding);
     } else if let Some(drift) = drift.filter(is_flat) {
         let (span, expected) = (seconds(drift.seconds), milli(drift.expected_v));
         let moved = milli(drift.expected_v * drift.ratio.max(0.0));
-        let finding = Finding::warning(Topic::CellModel, "the voltage is much flatter than the cell model's")
+        warning(judge, Topic::CellModel, "the voltage is much flatter than the cell model's")
             .seen(format!("in {span} of steady current it moved {moved} of the {expected} mV the model expects"))
             .why("a curve this flat is an iron-phosphate cell's (LFP), or the cells are much larger")
             .change_cell_model();
-        judge.add(finding);
     } else if let Some(cell_v) = judge.cell_voltage().filter(|v| is_like_iron_phosphate(judge, model, *v)) {
         let (voltage, soc) = (number(cell_v), per_cent(cell_v));
         let title = "either the pack is nearly empty, or its cells are iron phosphate (LFP)";
-        let finding = Finding::note(Topic::CellModel, title)
+        note(judge, Topic::CellModel, title)
             .seen(format!("the median cell has {voltage} V; by {} that is {soc} %", model.name))
             .why("iron-phosphate cells stay near 3.3 V from full to empty")
             .change_cell_model()
             .advice("compare with the SOC the vehicle shows");
-        judge.add(finding);
     } else if let Some(last_v) = rests.next_back() {
         let (voltage, soc) = (number(last_v), per_cent(last_v));
         judge.fine(format!("{voltage} V at rest: {soc} % by the cell model; compare with the SOC the vehicle shows"));
@@ -85,12 +82,11 @@ fn offset(judge: &mut Judge<'_>) {
     let proposed = signal.offset - offset_a * signal.binding.scale.signum();
     let (span, voltage) = (seconds(longest.seconds), number(longest.end_v));
     let title = format!("the current stays at {offset} A while the voltage rests");
-    let finding = Finding::note(Topic::CurrentOffset, title)
+    note(judge, Topic::CurrentOffset, title)
         .seen(format!("for {span} at {voltage} V; the pack counts as resting up to {band} A"))
         .why("either a load draws it, or it is the sensor's offset")
         .change(&signal.table, "offset", toml(proposed))
         .advice("only if the contactors are open and the current must be zero; otherwise raise transition.dead_band_a");
-    judge.add(finding);
 }
 
 fn noise(judge: &mut Judge<'_>) {
@@ -100,11 +96,10 @@ fn noise(judge: &mut Judge<'_>) {
     };
     if configured_v > 0.0 && noise_v > 4.0 * configured_v {
         let (measured, configured) = (milli(noise_v), milli(configured_v));
-        let finding = Finding::note(Topic::Noise, "voltages are noisier than configured")
+        note(judge, Topic::Noise, "voltages are noisier than configured")
             .seen(format!("about {measured} mV from reading to reading, {configured} mV configured"))
             .why("the estimate follows noise that is not configured")
             .change("estimator", "voltage_noise_v", toml((noise_v * 1e4).round() / 1e4));
-        judge.add(finding);
     }
 }
 
@@ -119,11 +114,10 @@ pub(super) fn check_estimator(judge: &mut Judge<'_>) {
     let bias = milli(stats.innovation_sum / stats.estimates as f64);
     if rejected > 0.1 && !judge.has(&[Topic::CellModel, Topic::Cell, Topic::Frozen, Topic::CellCount]) {
         let share = percent(rejected);
-        let finding = Finding::warning(Topic::CellModel, "the estimator rejects many voltages")
+        warning(judge, Topic::CellModel, "the estimator rejects many voltages")
             .seen(format!("{share} % of {} readings beyond its gate, {bias} mV off in the mean", stats.estimates))
             .why("the model's voltages and the measured ones do not agree")
             .change_cell_model();
-        judge.add(finding);
     } else {
         let share = percent(1.0 - rejected);
         judge.fine(format!("the estimator runs: {share} % of its readings accepted, {bias} mV off in the mean"));

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use super::context::Judge;
+use super::context::{Judge, error, find};
 use super::words::{channels, number, seconds};
 use crate::can::CanId;
 use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::{Finding, Severity, Topic};
+use crate::doctor::report::{Severity, Topic};
 use crate::doctor::series::Series;
 use crate::quantity::{BusIndex, Channel};
 
@@ -75,18 +75,13 @@ fn fewer_cells<'d>(judge: &mut Judge<'d>, absent: Vec<Absent<'d>>) -> Vec<Absent
     let reason = absent.iter().find(|(signal, _)| cell_number(signal).is_some()).map_or(Absence::Message, |(_, a)| *a);
     let may_be_dead = matches!(reason, Absence::Message | Absence::NotAvailable);
     let counts = format!("{first} cells, {configured} are configured");
-    let finding = if may_be_dead {
-        Finding::warning(Topic::CellCount, format!("the pack may have {counts}"))
-    } else {
-        Finding::error(Topic::CellCount, format!("the pack has {counts}"))
-    };
+    let (severity, has) = if may_be_dead { (Severity::Warning, "may have") } else { (Severity::Error, "has") };
     let (next, reason) = (first + 1, reason_for_cells(reason));
-    let finding = finding
+    find(judge, severity, Topic::CellCount, format!("the pack {has} {counts}"))
         .seen(format!("cells 1-{first} have data; cells {next}-{configured}: {reason}"))
         .why("exactly the last ones are missing: the DBC also serves a larger pack")
         .change("pack", "cells", first.to_string())
         .advice("or the last module does not report: count the cells before changing this");
-    judge.add(finding);
     absent.into_iter().filter(|(signal, _)| may_be_dead || cell_number(signal).is_none()).collect()
 }
 
@@ -114,15 +109,17 @@ fn silent(judge: &mut Judge<'_>, absent: &[Absent<'_>]) {
         let (id, what) = (signals[0].binding.id, channels(&list));
         judge.is_mixed_up |= absence == Absence::Zero && judge.cell_voltage() == Some(0.0);
         let (why, advice) = cause(judge, bus, id, absence);
-        let finding = Finding::new(severity, Topic::Silent, format!("{what}: configured, never seen"))
-            .seen(format!("{message} ({id}) {}", evidence(judge, absence, &signals, &what)))
-            .why(why);
+        let evidence = evidence(judge, absence, &signals, &what);
         let other = judge.other_bus(bus, id).filter(|_| absence == Absence::Zero);
         let (key, proposed) = match other {
             Some(other) => ("interface", format!("{:?}", other.name)),
             None => ("signal", "the signal that is on the bus".to_owned()),
         };
-        judge.add(finding.change(&signals[0].table, key, proposed).advice(advice));
+        find(judge, severity, Topic::Silent, format!("{what}: configured, never seen"))
+            .seen(format!("{message} ({id}) {evidence}"))
+            .why(why)
+            .change(&signals[0].table, key, proposed)
+            .advice(advice);
     }
 }
 
@@ -188,11 +185,10 @@ fn more_cells(judge: &mut Judge<'_>) {
     let names = further[..further.len().min(3)].join(", ");
     let more = if further.len() > 3 { ", ..." } else { "" };
     let title = format!("the pack has {cells} cells, {configured} are configured");
-    let finding = Finding::error(Topic::CellCount, title)
+    error(judge, Topic::CellCount, title)
         .seen(format!("{names}{more} also carry {} V, as the other cells do", number(median_v)))
         .why("the DBC's pattern continues, and these signals have values of cells")
         .change("pack", "cells", cells.to_string());
-    judge.add(finding);
 }
 
 /// Signals that came as configured.

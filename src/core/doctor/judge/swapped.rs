@@ -1,10 +1,10 @@
 //! One signal in another's place: by the units of the DBC, and by the values.
 
-use super::context::{Judge, MAX_C_RATE, SignalSeries};
+use super::context::{Judge, MAX_C_RATE, SignalSeries, error, warning};
 use super::unit::unit_of;
 use super::words::{channel, number};
 use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::{Finding, Topic};
+use crate::doctor::report::Topic;
 use crate::doctor::series::Series;
 use crate::quantity::Channel;
 
@@ -49,11 +49,10 @@ fn by_unit(judge: &mut Judge<'_>) -> bool {
             }
             None => (format!("{name} is read from a {}", unit.name()), format!("a signal that is a {}", kind.name())),
         };
-        let finding = Finding::error(Topic::Swapped, title)
+        error(judge, Topic::Swapped, title)
             .seen(format!("{} has the unit {:?} in the DBC", signal.name, signal.unit))
             .why(format!("a {} has no such unit", kind.name()))
             .change(&signal.table, "signal", proposed);
-        judge.add(finding);
     }
     !misfits.is_empty()
 }
@@ -71,11 +70,10 @@ fn pack_voltage_as_current(judge: &mut Judge<'_>) -> bool {
     if is_sum {
         judge.is_mixed_up = true;
         let (sum, cell) = (number(median.abs()), number(cell_v));
-        let finding = Finding::error(Topic::Swapped, "pack current is read from the pack's voltage")
+        error(judge, Topic::Swapped, "pack current is read from the pack's voltage")
             .seen(format!("{} reads {sum}, the sum of {cells} cells of {cell} V", signal.name))
             .why("a current changes and crosses zero; this is the sum of the cell voltages")
             .change(&signal.table, "signal", "the signal of the current");
-        judge.add(finding);
     }
     is_sum
 }
@@ -121,12 +119,11 @@ fn by_values(judge: &mut Judge<'_>) {
         format!("{} reads {} to {}", signal.name, number(series.extent.min), number(series.extent.max))
     };
     let names = [a, b].map(|(signal, _)| channel(signal.binding.channel));
-    let finding = Finding::error(Topic::Swapped, format!("{} are exchanged", names.join(" and ")))
+    error(judge, Topic::Swapped, format!("{} are exchanged", names.join(" and ")))
         .seen(format!("{}; {}", extent(a), extent(b)))
         .why("the values of each are plausible for the other, and not for the configured quantity")
         .change(&a.0.table, "signal", format!("{:?}", b.0.name))
         .change(&b.0.table, "signal", format!("{:?}", a.0.name));
-    judge.add(finding);
 }
 
 /// Whether the temperature jumps as only a current does, and the current stands where a temperature may.
@@ -149,12 +146,11 @@ fn odd_cells(judge: &mut Judge<'_>) {
         let is_temperature = (value - median_c).abs() < 8.0 && median_v > 1.0 && median_v < 6.0;
         let hint = if is_temperature { "; it reads like a temperature" } else { "" };
         let (name, value, others) = (channel(signal.binding.channel), number(value), number(median_v));
-        let finding = Finding::error(Topic::Cell, format!("{name} is unlike the other cells"))
+        error(judge, Topic::Cell, format!("{name} is unlike the other cells"))
             .seen(format!("{} reads {value} V, the others {others} V{hint}", signal.name))
             .why("cells in series do not differ this much: another signal's bits, a broken wire, or a dead cell")
             .change(&signal.table, "signal", "a pattern that gives each cell its own signal")
             .advice("measure the cell; compare the signal in the DBC with the sender's documentation");
-        judge.add(finding);
     }
 }
 
@@ -173,10 +169,9 @@ fn odd_sensors(judge: &mut Judge<'_>) {
         let still = if series.extent.changes == 0 { " and never moves" } else { "" };
         let (value, others) = (number(value), number(median_c));
         let title = format!("temperature {} is unlike the other sensors", sensor.0 + 1);
-        let finding = Finding::warning(Topic::Cell, title)
+        warning(judge, Topic::Cell, title)
             .seen(format!("{} reads {value} degrees C{still}, the others {others}", signal.name))
             .why("one pack does not differ this much: no sensor there, a broken wire, or another unit")
             .change(&signal.table, "signal", "a sensor that is there");
-        judge.add(finding);
     }
 }

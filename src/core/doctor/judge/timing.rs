@@ -1,9 +1,9 @@
 //! Periods: against the age from which readings are stale, and against the DBC's cycle times.
 
-use super::context::{Judge, SignalSeries};
+use super::context::{Judge, SignalSeries, find, warning};
 use super::words::{count, seconds, toml};
 use crate::doctor::plan::Kind;
-use crate::doctor::report::{Finding, Topic};
+use crate::doctor::report::{Severity, Topic};
 
 /// A period this many times the DBC's is a finding.
 const SLOWER: f64 = 2.0;
@@ -39,25 +39,24 @@ fn stale(judge: &mut Judge<'_>, (table, what): (&str, &str), (signal, series): S
     let limit_s = judge.plan.max_age_s(signal.binding.channel);
     let share = series.stale_gaps as f64 / series.count().max(1) as f64;
     let proposed_s = PROPOSED_PERIODS * period_s;
-    let (finding, why, proposed_s) = if period_s > limit_s {
-        let finding = Finding::error(Topic::Period, format!("{what} are stale before the next reading comes"));
-        (finding, "a reading older than max_age_s is not used: estimates coast or stop", proposed_s)
+    let (severity, title, why, proposed_s) = if period_s > limit_s {
+        let why = "a reading older than max_age_s is not used: estimates coast or stop";
+        (Severity::Error, format!("{what} are stale before the next reading comes"), why, proposed_s)
     } else if MIN_PERIODS * period_s > limit_s {
-        let finding = Finding::warning(Topic::Period, format!("{what}: one lost frame makes them stale"));
-        (finding, "single frames are lost on every bus", proposed_s)
+        let why = "single frames are lost on every bus";
+        (Severity::Warning, format!("{what}: one lost frame makes them stale"), why, proposed_s)
     } else if series.stale_gaps > 0 && share > STALE_SHARE {
-        let times = count(series.stale_gaps, "time");
-        let finding = Finding::warning(Topic::Period, format!("{what} were stale {times}"));
-        (finding, "the sender is uneven, or frames are lost on the way", 1.5 * series.longest_gap_s)
+        let title = format!("{what} were stale {}", count(series.stale_gaps, "time"));
+        let why = "the sender is uneven, or frames are lost on the way";
+        (Severity::Warning, title, why, 1.5 * series.longest_gap_s)
     } else {
         return;
     };
     let (period, gap, limit) = (seconds(period_s), seconds(series.longest_gap_s), seconds(limit_s));
-    let finding = finding
+    find(judge, severity, Topic::Period, title)
         .seen(format!("{} comes every {period}, longest gap {gap}; stale after {limit}", signal.name))
         .why(why)
         .change(table, "max_age_s", toml(round_up(proposed_s)));
-    judge.add(finding);
 }
 
 /// Rounds up to two digits.
@@ -72,17 +71,16 @@ fn cycle_times(judge: &mut Judge<'_>) {
         let Some(stats) = judge.bus(message.bus).and_then(|bus| bus.ids.get(&message.id)) else { continue };
         // The pages of a multiplexed message may come in bursts of any length.
         let Some(cycle_s) = message.cycle_time_s.filter(|_| message.pages <= 1) else { continue };
-        let (span_s, awake_s) = (stats.last.since(stats.first), judge.doctor.clock.awake_s);
+        let (span_s, awake_s) = (stats.last.since(stats.first), judge.doctor.awake_s);
         let span_s = if awake_s + 1.0 < span_s { awake_s } else { span_s };
         let period_s = span_s / (stats.count.max(2) - 1) as f64;
         if stats.count < 10 || period_s < SLOWER * cycle_s {
             continue;
         }
         let (period, span, cycle) = (seconds(period_s), seconds(span_s), seconds(cycle_s));
-        let finding = Finding::warning(Topic::Period, format!("{} comes less often than the DBC says", message.name))
+        warning(judge, Topic::Period, format!("{} comes less often than the DBC says", message.name))
             .seen(format!("every {period} ({} frames in {span}), GenMsgCycleTime is {cycle}", stats.count))
             .why("frames are lost, a gateway drops some of them, or the DBC is of another version")
             .advice("if this period is intended, correct GenMsgCycleTime in the DBC");
-        judge.add(finding);
     }
 }

@@ -1,13 +1,13 @@
 //! Units and layouts: values that no pack can have, and the unit or layout that would make them possible.
 
-use super::context::{Judge, MAX_C_RATE, SignalSeries};
+use super::context::{Judge, MAX_C_RATE, SignalSeries, error, find};
 use super::electrical;
 use super::unit::unit_of;
 use super::words::{number, toml};
 use crate::can::signal::{ByteOrder, ValueType};
 use crate::doctor::plan::{Kind, SignalPlan};
-use crate::doctor::report::{Finding, Severity, Topic};
-use crate::doctor::series::{AlternativeReading, Extent, LayoutVariant};
+use crate::doctor::report::{Severity, Topic};
+use crate::doctor::series::{AlternativeReading, Extent, LAYOUT_FAULTS};
 
 /// Factors by which a unit may be wrong.
 const UNIT_FACTORS: [f64; 6] = [1e-3, 1e-2, 1e-1, 10.0, 100.0, 1000.0];
@@ -33,9 +33,9 @@ fn better_layout<'d>(
     fits: impl Fn(SignalSeries<'d>, &AlternativeReading) -> bool,
 ) -> Option<(SignalSeries<'d>, &'d AlternativeReading)> {
     let alive = all.iter().filter(|(_, series)| series.count() > 0).count();
-    [LayoutVariant::ByteOrder, LayoutVariant::Sign, LayoutVariant::Both].into_iter().find_map(|variant| {
+    LAYOUT_FAULTS.into_iter().find_map(|fault| {
         let alternative = |(signal, series): SignalSeries<'d>| {
-            let other = series.alternatives.iter().find(|other| other.variant == variant)?;
+            let other = series.alternatives.iter().find(|other| other.fault == fault)?;
             (other.extent.count > 0 && fits((signal, series), other)).then_some(((signal, series), other))
         };
         let fitting: Vec<_> = all.iter().filter_map(|signal| alternative(*signal)).collect();
@@ -54,16 +54,12 @@ fn is_smoother((signal, series): SignalSeries<'_>, other: &AlternativeReading) -
     here.step() > 0.02 * width && there.step() * 8.0 < here.step() && there.range() < 0.25 * width
 }
 
-fn layout_finding(
+fn wrong_layout(
+    judge: &mut Judge<'_>,
     all: &[SignalSeries<'_>],
     ((signal, series), other): (SignalSeries<'_>, &AlternativeReading),
     what: &str,
-) -> Finding {
-    let fault = match other.variant {
-        LayoutVariant::ByteOrder => "wrong byte order",
-        LayoutVariant::Sign => "signed and unsigned exchanged",
-        LayoutVariant::Both => "wrong byte order and sign of the number",
-    };
+) {
     let span = |extent: &Extent| {
         format!("{} to {} in steps of {}", number(extent.min), number(extent.max), number(extent.step()))
     };
@@ -71,10 +67,10 @@ fn layout_finding(
     let order = if layout.byte_order == ByteOrder::LittleEndian { "@1" } else { "@0" };
     let sign = if layout.value_type == ValueType::Signed { "-" } else { "+" };
     let others = if all.len() > 1 { format!(" (and {} others)", all.len() - 1) } else { String::new() };
-    Finding::error(Topic::Layout, format!("{what}: {fault} in the DBC"))
+    error(judge, Topic::Layout, format!("{what}: {} in the DBC", other.fault))
         .seen(format!("{name} reads {here}; with the other layout {there}"))
         .why("a pack's values do not jump like this, and with the other layout they do not")
-        .advice(format!("in the DBC: {name}{others} : {}|{}{order}{sign}", layout.start_bit, layout.length_bits))
+        .advice(format!("in the DBC: {name}{others} : {}|{}{order}{sign}", layout.start_bit, layout.length_bits));
 }
 
 fn voltages(judge: &mut Judge<'_>) {
@@ -92,7 +88,7 @@ fn voltages(judge: &mut Judge<'_>) {
     });
     if let Some(better) = better {
         judge.is_mixed_up = true;
-        return judge.add(layout_finding(&all, better, what));
+        return wrong_layout(judge, &all, better, what);
     }
     if is_plausible {
         return;
@@ -100,25 +96,24 @@ fn voltages(judge: &mut Judge<'_>) {
     let seen = format!("{what}: the median reading is {} V{per}", number(median_v));
     let band = format!("a cell of this model has {} to {} V", number(low), number(high));
     let factor = UNIT_FACTORS.into_iter().find(|factor| (low..=high).contains(&(median_v * factor)));
-    let finding = if let Some(factor) = factor {
+    if let Some(factor) = factor {
         judge.voltage_factor = factor;
         let (by, volts) = (number(factor), number(median_v * factor));
-        Finding::error(Topic::Unit, format!("{what}: off by a factor of {}", above_one(factor)))
+        error(judge, Topic::Unit, format!("{what}: off by a factor of {}", above_one(factor)))
             .seen(seen)
             .why(format!("{band}; times {by} it is {volts} V"))
-            .change(&signal.table, "scale", toml(signal.scale * factor))
+            .change(&signal.table, "scale", toml(signal.scale * factor));
     } else if judge.plan.pack.is_total && median_v > 0.0 {
         judge.is_mixed_up = true;
-        pack_count(judge, median_v * cells)
+        pack_count(judge, median_v * cells);
     } else {
         judge.is_mixed_up = true;
-        Finding::error(Topic::CellModel, "cell voltages do not belong to this cell model")
+        error(judge, Topic::CellModel, "cell voltages do not belong to this cell model")
             .seen(seen)
             .why(format!("{band}, and no power of ten helps"))
             .change_cell_model()
-            .advice("or the signal is not a cell voltage")
-    };
-    judge.add(finding);
+            .advice("or the signal is not a cell voltage");
+    }
 }
 
 /// The factor or its reciprocal, whichever is above 1.
@@ -127,15 +122,16 @@ fn above_one(factor: f64) -> String {
 }
 
 /// A total voltage that the configured number of cells cannot have.
-fn pack_count(judge: &Judge<'_>, total_v: f64) -> Finding {
-    let pack = &judge.plan.pack;
+fn pack_count(judge: &mut Judge<'_>, total_v: f64) {
+    let plan = judge.plan;
+    let pack = &plan.pack;
     let (min_v, max_v) = pack.model.as_ref().map_or((2.8, 4.2), |m| (m.voltage_min_v, m.voltage_max_v));
     let (fewest, most) = ((total_v / max_v).ceil(), (total_v / min_v).floor());
     let (total, per_cell) = (number(total_v), number(total_v / f64::from(pack.cells.max(1))));
-    Finding::error(Topic::CellCount, format!("{} cells cannot make this pack voltage", pack.cells))
+    error(judge, Topic::CellCount, format!("{} cells cannot make this pack voltage", pack.cells))
         .seen(format!("{total} V in total: {per_cell} V a cell"))
         .why(format!("cells of this model have {min_v} to {max_v} V: it must be {fewest} to {most} of them"))
-        .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"))
+        .change("pack", "cells", format!("{fewest} to {most}, the number in the pack's documentation"));
 }
 
 fn current(judge: &mut Judge<'_>) {
@@ -150,13 +146,13 @@ fn current(judge: &mut Judge<'_>) {
     });
     if let Some(better) = better {
         judge.is_mixed_up = true;
-        return judge.add(layout_finding(&all, better, "pack current"));
+        return wrong_layout(judge, &all, better, "pack current");
     }
     let unit = unit_of(&signal.unit).map(|(_, factor, _)| factor).filter(|f| *f != 1.0 && signal.scale == 1.0);
     let c_rate = largest_a / judge.pack_ah();
     let finding = if let Some(factor) = unit {
         judge.current_factor = factor;
-        Finding::error(Topic::Unit, format!("pack current: off by a factor of {}", above_one(factor)))
+        error(judge, Topic::Unit, format!("pack current: off by a factor of {}", above_one(factor)))
             .why(format!("the DBC's unit is {:?}, and the configuration does not convert it", signal.unit))
             .change(&signal.table, "scale", toml(signal.scale * factor))
     } else if largest_a > limit_a {
@@ -170,7 +166,7 @@ fn current(judge: &mut Judge<'_>) {
     } else {
         return;
     };
-    judge.add(finding.seen(format!("{} reads up to {} A", signal.name, number(largest_a))));
+    finding.seen(format!("{} reads up to {} A", signal.name, number(largest_a)));
 }
 
 /// Wrong units of a temperature: factor, offset, name.
@@ -199,52 +195,47 @@ fn temperatures(judge: &mut Judge<'_>) {
         .min_by(|a, b| (a.3 - ambient_c).abs().total_cmp(&(b.3 - ambient_c).abs()));
     // A wrong unit explains more than another bit order, unless the values jump.
     let is_steady = all.iter().all(|(_, series)| series.extent.range() < 60.0);
-    let finding = if let Some(better) = better.filter(|_| unit.is_none() || !is_steady) {
-        layout_finding(&all, better, "temperatures")
-    } else if let Some(finding) = unconverted(&all, median_c) {
-        finding
-    } else if is_plausible {
-        return;
-    } else {
-        wrong_temperature(judge, &all, median_c, unit)
-    };
-    judge.add(finding);
+    if let Some(better) = better.filter(|_| unit.is_none() || !is_steady) {
+        wrong_layout(judge, &all, better, "temperatures");
+    } else if unconverted(judge, &all, median_c).is_none() && !is_plausible {
+        wrong_temperature(judge, &all, median_c, unit);
+    }
 }
 
 fn wrong_temperature(
-    judge: &Judge<'_>,
+    judge: &mut Judge<'_>,
     all: &[SignalSeries<'_>],
     median_c: f64,
     unit: Option<(f64, f64, &str, f64)>,
-) -> Finding {
+) {
     let seen = format!("the median sensor reads {} degrees C", number(median_c));
     let Some((factor, offset, name, converted_c)) = unit else {
-        return Finding::error(Topic::Unit, "temperatures no pack has")
+        error(judge, Topic::Unit, "temperatures no pack has")
             .seen(seen)
             .why("no common unit makes a temperature of it")
             .change(&all[0].0.table, "signal", "a temperature");
+        return;
     };
     let (severity, hint) = match HOT_C.contains(&median_c) {
         true => (Severity::Warning, "a pack this hot would be in danger"),
         false => (Severity::Error, "no pack has that"),
     };
     let (converted, ambient) = (number(converted_c), number(judge.plan.pack.ambient_c));
-    let finding = Finding::new(severity, Topic::Unit, format!("temperatures: {name}?"))
+    let finding = find(judge, severity, Topic::Unit, format!("temperatures: {name}?"))
         .seen(seen)
         .why(format!("{hint}; as {name} it is {converted} degrees C, near the {ambient} of pack.ambient_c"));
-    all.iter().fold(finding, |mut finding, (signal, _)| {
+    for (signal, _) in all {
         if factor != 1.0 {
-            finding = finding.change(&signal.table, "scale", toml(signal.scale * factor));
+            finding.change(&signal.table, "scale", toml(signal.scale * factor));
         }
         if offset != 0.0 || signal.offset != 0.0 && factor != 1.0 {
-            finding = finding.change(&signal.table, "offset", toml(signal.offset * factor + offset));
+            finding.change(&signal.table, "offset", toml(signal.offset * factor + offset));
         }
-        finding
-    })
+    }
 }
 
 /// Temperatures in another unit by their DBC that the configuration does not convert: 50 degrees F pass for a warm day.
-fn unconverted(all: &[SignalSeries<'_>], median_c: f64) -> Option<Finding> {
+fn unconverted(judge: &mut Judge<'_>, all: &[SignalSeries<'_>], median_c: f64) -> Option<()> {
     let conversion = |signal: &SignalPlan| {
         let (kind, factor, offset) = unit_of(&signal.unit)?;
         let is_plausible = kind == Kind::Temperature && PLAUSIBLE_C.contains(&(median_c * factor + offset));
@@ -254,13 +245,16 @@ fn unconverted(all: &[SignalSeries<'_>], median_c: f64) -> Option<Finding> {
     let found: Vec<_> = all.iter().filter_map(|(signal, _)| Some((*signal, conversion(signal)?))).collect();
     let &(first, (factor, offset)) = found.first()?;
     let (read, converted) = (number(median_c), number(median_c * factor + offset));
-    let finding = Finding::error(Topic::Unit, format!("temperatures: the DBC's unit is {:?}", first.unit))
+    let finding = error(judge, Topic::Unit, format!("temperatures: the DBC's unit is {:?}", first.unit))
         .seen(format!("the median sensor reads {read} degrees C"))
         .why(format!("the configuration does not convert it; it is {converted} degrees C"));
-    Some(found.into_iter().fold(finding, |finding, (signal, (factor, offset))| {
-        let finding = if factor == 1.0 { finding } else { finding.change(&signal.table, "scale", toml(factor)) };
-        finding.change(&signal.table, "offset", toml(offset))
-    }))
+    for (signal, (factor, offset)) in found {
+        if factor != 1.0 {
+            finding.change(&signal.table, "scale", toml(factor));
+        }
+        finding.change(&signal.table, "offset", toml(offset));
+    }
+    Some(())
 }
 
 /// Readings the service will reject although nothing else is wrong: limits too tight, or disturbances.
@@ -287,15 +281,14 @@ pub(super) fn check_limits(judge: &mut Judge<'_>) {
             false => (Severity::Note, "single readings are disturbances; they move no estimate"),
         };
         let [from, to, lowest, highest] = [low / cells, high / cells, limits.0, limits.1].map(number);
-        let mut finding = Finding::new(severity, Topic::Range, format!("{what} outside the limits"))
+        let finding = find(judge, severity, Topic::Range, format!("{what} outside the limits"))
             .seen(format!("{implausible} of {count} readings: {from} to {to}, allowed {lowest} to {highest}"))
             .why(why);
         if kind == Kind::Current && is_many && high > limits.1 {
-            finding = finding.change(table, "max_discharge_a", toml((1.2 * high).ceil()));
+            finding.change(table, "max_discharge_a", toml((1.2 * high).ceil()));
         }
         if kind == Kind::Current && is_many && low < limits.0 {
-            finding = finding.change(table, "max_charge_a", toml((-1.2 * low).ceil()));
+            finding.change(table, "max_charge_a", toml((-1.2 * low).ceil()));
         }
-        judge.add(finding);
     }
 }

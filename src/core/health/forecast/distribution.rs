@@ -13,6 +13,7 @@
 //! its own width w, an added variance of (w / L)^2 / 12.
 
 use super::{RATE_WALK, RATE_WALK_USE};
+use crate::cell::model::bisect;
 
 /// Slices of the loss.
 const SLICES: usize = 10;
@@ -93,17 +94,9 @@ impl Crossing {
         }
         let likely = || self.slices.iter().filter(|(weight, _)| *weight > 0.0);
         let ends = |sign: f64| likely().map(move |(_, (mean, std))| mean + sign * REACH * std);
-        let mut least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
-        let mut most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
-        for _ in 0..HALVINGS {
-            let middle = 0.5 * (least + most);
-            if self.probability_of_log(middle) < probability {
-                least = middle;
-            } else {
-                most = middle;
-            }
-        }
-        libm::exp(most)
+        let least = ends(-1.0).fold(LOG_RANGE.1, f64::min).max(LOG_RANGE.0);
+        let most = ends(1.0).fold(least, f64::max).min(LOG_RANGE.1);
+        libm::exp(bisect((least, most), HALVINGS, |log_use| self.probability_of_log(log_use) < probability).1)
     }
 }
 

@@ -26,9 +26,8 @@ const REFERENCE_CYCLES: u32 = 2;
 enum WalkPhase {
     Walk { steps_left: u32, current_a: f64, left_s: f64 },
     Charge { cycles_left: u32 },
-    RestFull { cycles_left: u32, left_s: f64 },
     Discharge { cycles_left: u32 },
-    RestEmpty { cycles_left: u32, left_s: f64 },
+    Rest { is_full: bool, cycles_left: u32, left_s: f64 },
 }
 
 /// Blocks of random loads, each followed by reference cycles; a block with its reference is the cycle that counts.
@@ -74,38 +73,34 @@ impl WalkCourse {
             WalkPhase::Charge { cycles_left } => {
                 let current_a = pack.current_at_highest_a(high_v).max(-REFERENCE_A * self.scale);
                 if current_a > -TAPER_END_A * self.scale {
-                    return self.enter(WalkPhase::RestFull { cycles_left, left_s: REST_S }, pack, dt_s);
+                    let rest = WalkPhase::Rest { is_full: true, cycles_left, left_s: REST_S };
+                    return self.enter(rest, pack, dt_s);
                 }
                 Demand::Current(current_a)
             }
-            WalkPhase::RestFull { cycles_left, left_s } if left_s > 0.0 => {
-                self.rest(WalkPhase::RestFull { cycles_left, left_s: left_s - dt_s })
+            WalkPhase::Rest { is_full, cycles_left, left_s } if left_s > 0.0 => {
+                self.phase = WalkPhase::Rest { is_full, cycles_left, left_s: left_s - dt_s };
+                Demand::Current(0.0)
             }
-            WalkPhase::RestFull { cycles_left, .. } => self.enter(WalkPhase::Discharge { cycles_left }, pack, dt_s),
+            WalkPhase::Rest { is_full: true, cycles_left, .. } => {
+                self.enter(WalkPhase::Discharge { cycles_left }, pack, dt_s)
+            }
+            WalkPhase::Rest { cycles_left: 0, .. } => self.next_block(pack, dt_s),
+            WalkPhase::Rest { cycles_left, .. } => self.enter(WalkPhase::Charge { cycles_left }, pack, dt_s),
             WalkPhase::Discharge { cycles_left } => {
                 let current_a = REFERENCE_A * self.scale;
                 if pack.lowest_v(current_a) <= low_v {
-                    let cycles_left = cycles_left - 1;
-                    return self.enter(WalkPhase::RestEmpty { cycles_left, left_s: REST_S }, pack, dt_s);
+                    let rest = WalkPhase::Rest { is_full: false, cycles_left: cycles_left - 1, left_s: REST_S };
+                    return self.enter(rest, pack, dt_s);
                 }
                 Demand::Current(current_a)
             }
-            WalkPhase::RestEmpty { cycles_left, left_s } if left_s > 0.0 => {
-                self.rest(WalkPhase::RestEmpty { cycles_left, left_s: left_s - dt_s })
-            }
-            WalkPhase::RestEmpty { cycles_left: 0, .. } => self.next_block(pack, dt_s),
-            WalkPhase::RestEmpty { cycles_left, .. } => self.enter(WalkPhase::Charge { cycles_left }, pack, dt_s),
         }
     }
 
     fn enter(&mut self, phase: WalkPhase, pack: &mut Pack, dt_s: f64) -> Demand {
         self.phase = phase;
         self.next(pack, dt_s)
-    }
-
-    fn rest(&mut self, phase: WalkPhase) -> Demand {
-        self.phase = phase;
-        Demand::Current(0.0)
     }
 
     fn next_block(&mut self, pack: &mut Pack, dt_s: f64) -> Demand {

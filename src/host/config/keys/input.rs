@@ -42,33 +42,19 @@ macro_rules! signal_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal, $unit:literal { $($keys:tt)* }) => {
         section! {
             $(#[doc = $about])+
-            $name at $path {
+            $name at $path gives SignalSource<'_>, |keys| {
                 /// `Message.Signal` of one of the DBC files; in `[input.cell_voltage]` a pattern, see there.
-                signal: String, "", NotEmpty, Required;
+                signal: String, "", NotEmpty, Required => signal: &keys.signal;
                 /// Interface that carries the signal. Needed when there are several.
-                interface: Option<String>, "", NotEmpty, Optional;
+                interface: Option<String>, "", NotEmpty, Optional => interface: keys.interface.as_deref();
                 /// Factor from the DBC's unit to this program's, after the DBC's own factor (0.001 for a DBC in milli-units).
                 scale: f64, $unit, Above(0.0, 1e9), Default("1.0");
                 /// Added after `scale`, in this program's unit (-273.15 for a DBC in kelvin).
                 offset: f64, "", Between(-1e9, 1e9), Default("0.0");
                 /// Raw codes that mean "not available", in addition to those of the DBC's value table.
-                not_available: Vec<u64>, "", Any, Default("[]");
+                not_available: Vec<u64>, "", Any, Default("[]") => not_available: &keys.not_available;
                 $($keys)*
-            }
-        }
-
-        impl $name {
-            /// The keys that all signal tables have.
-            pub(crate) fn source(&self) -> SignalSource<'_> {
-                SignalSource {
-                    place: &self.place,
-                    signal: &self.signal,
-                    interface: self.interface.as_deref(),
-                    scale: self.scale,
-                    offset: self.offset,
-                    not_available: &self.not_available,
-                }
-            }
+            } and { place: &keys.place }
         }
     };
 }
@@ -94,7 +80,7 @@ signal_section! {
     /// The pack current.
     CurrentInput at "input.current", "A per unit of the DBC" {
         /// What a positive value on the bus means. Buses differ, so there is no default. Inside this program and in everything it reports, positive is discharge.
-        positive: PositiveCurrent, "", Any, Required;
+        positive: PositiveCurrent, "", Any, Required =>;
     }
 }
 
@@ -103,7 +89,7 @@ signal_section! {
     /// `CellVoltages.Cell{n}`, `Module{m}.CellVoltage{n}`. Every cell must have exactly one signal; multiplexed signals are supported.
     CellVoltageInput at "input.cell_voltage", "V per unit of the DBC" {
         /// Number of the first cell in the names.
-        first: u16, "", Between(0.0, 60000.0), Default("1");
+        first: u16, "", Between(0.0, 60000.0), Default("1") =>;
     }
 }
 
@@ -116,7 +102,7 @@ signal_section! {
     /// A temperature sensor.
     TemperatureInput at "input.temperature", "degrees C per unit of the DBC" {
         /// Cells this sensor serves. Without it: all cells.
-        cells: Option<CellRanges>, "", Any, Optional;
+        cells: Option<CellRanges>, "", Any, Optional =>;
     }
 }
 
@@ -124,7 +110,7 @@ signal_section! {
     /// State of charge as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
     ReportedSocInput at "input.reported_soc", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
-        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0");
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("10.0") =>;
     }
 }
 
@@ -132,7 +118,7 @@ signal_section! {
     /// State of health (capacity over rated capacity) as the pack itself reports it, for the rule `bms_disagrees`; no estimate depends on it. Without `scale`, a signal whose unit in the DBC is % is divided by 100.
     ReportedSohInput at "input.reported_soh", "fraction per unit of the DBC" {
         /// A reading older than this is stale.
-        max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0");
+        max_age_s: f64, "s", Above(0.0, 1e6), Default("60.0") =>;
     }
 }
 
@@ -140,6 +126,6 @@ signal_section! {
     /// A number that identifies the pack, such as a serial number. A new value means that another pack is connected, also when the pack was exchanged while the program did not run. Everything learned of the old pack is reported once more and discarded, as with the command `pack-replaced`.
     PackIdentityInput at "input.pack_identity", "any unit" {
         /// Readings in a row that must show the same new value.
-        readings: u32, "", Between(1.0, 10000.0), Default("10");
+        readings: u32, "", Between(1.0, 10000.0), Default("10") =>;
     }
 }

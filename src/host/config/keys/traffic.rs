@@ -74,7 +74,7 @@ macro_rules! frame_section {
     ($(#[doc = $about:literal])+ $name:ident at $path:literal) => {
         section! {
             $(#[doc = $about])+
-            $name at $path {
+            $name at $path gives FrameKeys<'_>, |keys| {
                 /// Identifier. Without it: the DBC's.
                 id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
                 /// Whether `id` has 29 bits.
@@ -89,23 +89,7 @@ macro_rules! frame_section {
                 e2e: Option<E2eKey>, "", Any, Optional;
                 /// Data id of the protection, known to sender and receivers; each protected frame has its own, up to 0xFFF with "1C". Needed with `e2e`.
                 data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
-            }
-        }
-
-        impl $name {
-            /// The keys that all tables of frames have.
-            pub(crate) fn frame(&self) -> FrameKeys<'_> {
-                FrameKeys {
-                    place: &self.place,
-                    id: self.id,
-                    extended: self.extended,
-                    fd: self.fd,
-                    brs: self.brs,
-                    period_ms: self.period_ms,
-                    e2e: self.e2e,
-                    data_id: self.data_id,
-                }
-            }
+            } and { place: &keys.place }
         }
     };
 }
@@ -127,11 +111,11 @@ frame_section! {
 
 section! {
     /// Commands of other ECUs: a frame that acknowledges or clears alarms, or says that another pack is connected. Laid out as `PACKWATCH_Command` in the DBC of the frames. Off by default, and never without end-to-end protection; as with every protected message, the first frame after a start only shows the counter and is not executed.
-    Commands at "commands" {
+    Commands at "commands" gives FrameKeys<'_>, |keys| {
         /// Whether commands from the bus are executed.
-        enabled: bool, "", Any, Default("false");
+        enabled: bool, "", Any, Default("false") =>;
         /// Interface that carries the frame. Needed when there are several.
-        interface: Option<String>, "", NotEmpty, Optional;
+        interface: Option<String>, "", NotEmpty, Optional =>;
         /// Identifier. Without it: the DBC's.
         id: Option<u32>, "", Between(0.0, 0x1FFF_FFFF as f64), Optional;
         /// Whether `id` has 29 bits.
@@ -143,22 +127,6 @@ section! {
         /// Data id of the protection. Needed with `e2e`.
         data_id: Option<u16>, "", Between(0.0, 65535.0), Optional;
         /// Frames that may be lost between two.
-        max_delta_counter: u8, "frames", Between(1.0, 14.0), Default("1");
-    }
-}
-
-impl Commands {
-    /// The keys that all tables of frames have.
-    pub(crate) fn frame(&self) -> FrameKeys<'_> {
-        FrameKeys {
-            place: &self.place,
-            id: self.id,
-            extended: self.extended,
-            fd: self.fd,
-            brs: None,
-            period_ms: None,
-            e2e: self.e2e,
-            data_id: self.data_id,
-        }
-    }
+        max_delta_counter: u8, "frames", Between(1.0, 14.0), Default("1") =>;
+    } and { place: &keys.place, brs: None, period_ms: None }
 }

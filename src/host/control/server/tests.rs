@@ -163,7 +163,7 @@ fn a_dead_daemons_socket_is_replaced_and_a_live_ones_is_not() {
         assert!(path.exists(), "the file of a dead daemon stays");
         let (server, path) = serve(&folder).await;
         let (sender, _requests) = mpsc::channel(1);
-        let second = ControlServer::start(&ControlSetting::At(path.clone()), sender).await.unwrap_err();
+        let second = ControlServer::start(&PlaceSetting::At(path.clone()), sender).await.unwrap_err();
         let own = format!("process {} of user", std::process::id());
         assert!(second.contains("control.sock") && second.contains(&own), "{second}");
         use std::os::unix::fs::PermissionsExt as _;
@@ -180,9 +180,9 @@ fn a_file_that_is_no_socket_is_not_touched() {
         let path = folder.path().join("control.sock");
         std::fs::write(&path, "mine").unwrap();
         let (sender, _requests) = mpsc::channel(1);
-        let error = ControlServer::start(&ControlSetting::At(path.clone()), sender.clone()).await.unwrap_err();
+        let error = ControlServer::start(&PlaceSetting::At(path.clone()), sender.clone()).await.unwrap_err();
         assert!(error.ends_with("is there and no socket"), "{error}");
         assert_eq!(std::fs::read(&path).unwrap(), b"mine");
-        assert!(ControlServer::start(&ControlSetting::Off, sender).await.unwrap().is_none());
+        assert!(ControlServer::start(&PlaceSetting::Off, sender).await.unwrap().is_none());
     });
 }

@@ -11,15 +11,10 @@ use std::thread;
 /// Blocks in flight: one being filled, one being read, two to even out the delays between them.
 const BLOCKS: usize = 4;
 
-/// A message of the thread.
-enum AheadMessage {
-    Block(Vec<u8>),
-    End(io::Result<()>),
-}
-
 /// The reading end.
 pub(super) struct ReadAhead {
-    pieces: Receiver<AheadMessage>,
+    /// Blocks in their order; an empty one is the end.
+    pieces: Receiver<io::Result<Vec<u8>>>,
     used: Sender<Vec<u8>>,
     block: Vec<u8>,
     /// Bytes of the block already read.
@@ -33,7 +28,7 @@ impl ReadAhead {
         let (full, pieces) = sync_channel(BLOCKS);
         let (used, empty) = channel();
         for _ in 0..BLOCKS {
-            let _ = used.send(vec![0; block_len]);
+            let _ = used.send(Vec::with_capacity(block_len));
         }
         thread::Builder::new().name("unpack".to_owned()).spawn(move || work(source, &empty, &full))?;
         Ok(Self { pieces, used, block: Vec::new(), given: 0, ended: false })
@@ -44,25 +39,16 @@ impl ReadAhead {
         if self.ended {
             return Ok(false);
         }
-        match self.pieces.recv() {
-            Ok(AheadMessage::Block(block)) => {
-                let used = std::mem::replace(&mut self.block, block);
-                self.given = 0;
-                if !used.is_empty() {
-                    // An error means that the thread has ended.
-                    let _ = self.used.send(used);
-                }
-                Ok(true)
-            }
-            Ok(AheadMessage::End(result)) => {
-                self.ended = true;
-                result.map(|()| false)
-            }
-            Err(_) => {
-                self.ended = true;
-                Err(io::Error::other("unpacking stopped for an unknown reason"))
-            }
+        let stopped = |_| Err(io::Error::other("unpacking stopped for an unknown reason"));
+        let next = self.pieces.recv().unwrap_or_else(stopped);
+        self.ended = next.as_ref().map_or(true, Vec::is_empty);
+        let used = std::mem::replace(&mut self.block, next?);
+        self.given = 0;
+        if !used.is_empty() {
+            // An error means that the thread has ended.
+            let _ = self.used.send(used);
         }
+        Ok(!self.ended)
     }
 }
 
@@ -80,35 +66,25 @@ impl Read for ReadAhead {
     }
 }
 
-/// Fills blocks until the source ends or fails, or the reader is dropped.
-fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<AheadMessage>) {
+/// Fills empty blocks until the source ends or fails, or the reading end is gone.
+fn work(mut source: impl Read, empty: &Receiver<Vec<u8>>, full: &SyncSender<io::Result<Vec<u8>>>) {
     while let Ok(mut block) = empty.recv() {
-        let room = block.capacity();
-        block.resize(room, 0);
-        let (count, end) = fill(&mut source, &mut block);
-        block.truncate(count);
-        if count > 0 && full.send(AheadMessage::Block(block)).is_err() {
+        block.clear();
+        let room = block.capacity() as u64;
+        let read = source.by_ref().take(room).read_to_end(&mut block);
+        let is_end = block.is_empty();
+        // What was read before an error comes before it.
+        if (!is_end || read.is_ok()) && full.send(Ok(block)).is_err() {
             return;
         }
-        if let Some(end) = end {
-            let _ = full.send(AheadMessage::End(end));
+        if let Err(error) = read {
+            let _ = full.send(Err(error));
+            return;
+        }
+        if is_end {
             return;
         }
     }
-}
-
-/// Fills a block; returns the number of bytes, and the end of the source, if it was reached.
-fn fill(source: &mut impl Read, block: &mut [u8]) -> (usize, Option<io::Result<()>>) {
-    let mut count = 0;
-    while count < block.len() {
-        match source.read(&mut block[count..]) {
-            Ok(0) => return (count, Some(Ok(()))),
-            Ok(more) => count += more,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            Err(error) => return (count, Some(Err(error))),
-        }
-    }
-    (count, None)
 }
 
 #[cfg(test)]

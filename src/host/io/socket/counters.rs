@@ -1,67 +1,74 @@
-//! Counters of a link since the program's start: written by its task, read by others, without a lock.
+//! Counters of a link since the program's start: written by its task, read by others.
 
-use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use serde::{Deserialize, Serialize};
 
 /// State of an interface.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-#[repr(u8)]
 pub enum LinkState {
     /// Not looked at yet.
-    Unknown = 0,
+    #[default]
+    Unknown,
     /// It does not exist.
-    Missing = 1,
+    Missing,
     /// It exists and is down.
-    Down = 2,
+    Down,
     /// Frames may arrive.
-    Up = 3,
+    Up,
 }
 
-/// The counts of one interface.
-#[derive(Debug, Default)]
-pub struct LinkCounters {
-    state: AtomicU8,
-    ups: AtomicU64,
-    /// Frames the kernel had no room to keep for us.
-    pub kernel_dropped: AtomicU64,
-    /// Frames that found our own queue full.
-    pub inbox_full: AtomicU64,
+/// Frames of one interface that were sent or lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct LinkCounts {
+    /// Frames dropped by the kernel: its receive buffer was full.
+    pub kernel_dropped: u64,
+    /// Frames dropped by the daemon: its queue was full.
+    pub queue_dropped: u64,
     /// Reads that are no valid frame.
-    pub malformed: AtomicU64,
-    /// Frames the kernel took from us.
-    pub sent: AtomicU64,
-    /// Frames of ours that found the queue to the interface full.
-    pub send_queue_full: AtomicU64,
-    /// Frames of ours the kernel did not take, or that had waited too long.
-    pub send_failed: AtomicU64,
+    pub malformed: u64,
+    /// Frames sent.
+    pub sent: u64,
+    /// Frames not sent: the queue to the interface was full.
+    pub send_queue_full: u64,
+    /// Frames not sent: the kernel rejected them, or they had waited too long.
+    pub send_failed: u64,
 }
 
-impl LinkCounters {
-    /// Counts; a statistic, so nothing is ordered by it.
-    pub fn add(counter: &AtomicU64, times: u64) {
-        counter.fetch_add(times, Ordering::Relaxed);
+/// State and counts of one interface.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct LinkHealth {
+    /// The interface's state.
+    pub state: LinkState,
+    /// Times it came up.
+    pub ups: u64,
+    /// Frames sent and lost.
+    pub counts: LinkCounts,
+}
+
+/// The health of one interface, shared between its task and the loop.
+#[derive(Debug, Default)]
+pub(super) struct SharedHealth(Mutex<LinkHealth>);
+
+impl SharedHealth {
+    /// Counts.
+    pub(super) fn count(&self, note: impl FnOnce(&mut LinkCounts)) {
+        self.change(|health| note(&mut health.counts));
     }
 
     /// Notes the interface's state, when it has changed.
-    pub fn enter(&self, state: LinkState) {
-        self.state.store(state as u8, Ordering::Relaxed);
-        if state == LinkState::Up {
-            Self::add(&self.ups, 1);
-        }
+    pub(super) fn enter(&self, state: LinkState) {
+        self.change(|health| {
+            health.state = state;
+            health.ups += u64::from(state == LinkState::Up);
+        });
     }
 
-    /// The interface's state.
-    pub fn state(&self) -> LinkState {
-        match self.state.load(Ordering::Relaxed) {
-            1 => LinkState::Missing,
-            2 => LinkState::Down,
-            3 => LinkState::Up,
-            _ => LinkState::Unknown,
-        }
-    }
-
-    /// Times it came up again after the first.
-    pub fn reconnects(&self) -> u64 {
-        self.ups.load(Ordering::Relaxed).saturating_sub(1)
+    /// The health now.
+    pub(super) fn change(&self, change: impl FnOnce(&mut LinkHealth)) -> LinkHealth {
+        let mut health = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        change(&mut health);
+        *health
     }
 }

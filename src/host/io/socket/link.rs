@@ -16,11 +16,12 @@ use tokio::io::{Interest, Ready};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, sleep_until};
 
-use super::counters::{LinkCounters, LinkState};
-use super::raw::{CALL_BATCH, RawConfig, RawRead, RawSocket, index_of};
+use super::counters::{LinkHealth, LinkState, SharedHealth};
+use super::raw::{CALL_BATCH, RawRead, RawSocket, filters, index_of};
 use super::wire::Wire;
 use crate::can::{CanId, Frame};
 use crate::io::clock::{MappedClock, Reading, StampMapper};
+use crate::io::record::Record;
 use crate::monitor::BusEvent;
 use crate::quantity::{BusIndex, Timestamp};
 
@@ -54,32 +55,12 @@ pub struct LinkConfig {
     pub receive_buffer_bytes: usize,
 }
 
-/// A frame or event of an interface, on the program's clock.
-#[derive(Debug, Clone, Copy)]
-pub struct LinkMessage {
-    /// Time.
-    pub time: Timestamp,
-    /// Interface.
-    pub bus: BusIndex,
-    /// Content.
-    pub what: LinkEvent,
-}
-
-/// Frame or event.
-#[derive(Debug, Clone, Copy)]
-pub enum LinkEvent {
-    /// A frame.
-    Frame(Frame),
-    /// Anything else.
-    Event(BusEvent),
-}
-
 /// The sending end of a link. Dropped, it ends the link once what is queued has been sent.
 #[derive(Debug)]
 pub struct LinkOutput {
     queue: mpsc::Sender<QueuedFrame>,
     unsent: Arc<AtomicU64>,
-    counters: Arc<LinkCounters>,
+    health: Arc<SharedHealth>,
 }
 
 #[derive(Debug)]
@@ -93,13 +74,13 @@ impl LinkOutput {
     pub fn send(&self, frame: Frame) {
         if self.queue.try_send(QueuedFrame { since: Instant::now(), frame }).is_err() {
             self.unsent.fetch_add(1, Ordering::Relaxed);
-            LinkCounters::add(&self.counters.send_queue_full, 1);
+            self.health.count(|counts| counts.send_queue_full += 1);
         }
     }
 
     /// Counters of the link.
-    pub fn counters(&self) -> &LinkCounters {
-        &self.counters
+    pub fn health(&self) -> LinkHealth {
+        self.health.change(|_| ())
     }
 }
 
@@ -117,10 +98,10 @@ enum ServiceEnd {
 pub struct Link {
     config: LinkConfig,
     clock: MappedClock,
-    inbox: mpsc::Sender<LinkMessage>,
+    inbox: mpsc::Sender<Record>,
     outgoing: mpsc::Receiver<QueuedFrame>,
     unsent: Arc<AtomicU64>,
-    counters: Arc<LinkCounters>,
+    health: Arc<SharedHealth>,
     state: LinkState,
     /// When that was noted.
     state_since: Timestamp,
@@ -153,20 +134,20 @@ fn watch(socket: RawSocket) -> io::Result<AsyncFd<RawSocket>> {
 
 impl Link {
     /// A link, not yet running, and its sending end. Must be called inside the runtime.
-    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<LinkMessage>) -> (Self, LinkOutput) {
+    pub fn new(config: LinkConfig, clock: MappedClock, inbox: mpsc::Sender<Record>) -> (Self, LinkOutput) {
         let (queue, outgoing) = mpsc::channel(SEND_QUEUE);
         let unsent = Arc::new(AtomicU64::new(0));
         let mut report = interval(REPORT_PERIOD);
         report.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let counters = Arc::new(LinkCounters::default());
-        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), counters: Arc::clone(&counters) };
+        let health = Arc::<SharedHealth>::default();
+        let output = LinkOutput { queue, unsent: Arc::clone(&unsent), health: Arc::clone(&health) };
         let link = Self {
             config,
             clock,
             inbox,
             outgoing,
             unsent,
-            counters,
+            health,
             state: LinkState::Unknown,
             state_since: clock.now(),
             lost: 0,
@@ -192,17 +173,12 @@ impl Link {
 
     /// Opens the interface and sends its state as an event; `None` when it cannot be opened.
     async fn open(&mut self) -> Option<OpenSocket> {
-        let raw = RawConfig {
-            interface: &self.config.interface,
-            fd: self.config.fd,
-            ids: &self.config.ids,
-            patterns: &self.config.patterns,
-            receive_buffer_bytes: self.config.receive_buffer_bytes,
-        };
-        let opened = RawSocket::open(&raw).and_then(|socket| {
-            let error = socket.take_error()?;
-            Ok((watch(socket)?, error))
-        });
+        let LinkConfig { interface, fd, ids, patterns, receive_buffer_bytes, .. } = &self.config;
+        let opened =
+            RawSocket::open(interface, *fd, &filters(ids, patterns), *receive_buffer_bytes).and_then(|socket| {
+                let error = socket.take_error()?;
+                Ok((watch(socket)?, error))
+            });
         let (socket, error) = match opened {
             Ok(opened) => opened,
             Err(error) => {
@@ -261,19 +237,19 @@ impl Link {
                 Err(None) => return ServiceEnd::Stopped,
                 Err(Some(outgoing)) => open.pending = Some(outgoing),
                 Ok(()) => {
-                    if self.receive_all(open).await == Some(ServiceEnd::Dead) {
+                    if !self.receive_all(open).await {
                         return ServiceEnd::Dead;
                     }
                 }
             }
-            if self.send_pending(open).await == Some(ServiceEnd::Dead) {
+            if !self.send_pending(open).await {
                 return ServiceEnd::Dead;
             }
         }
     }
 
-    /// Reads until the socket is empty, with pauses for the other tasks.
-    async fn receive_all(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
+    /// Reads until the socket is empty, with pauses for the other tasks; `false` = it is dead.
+    async fn receive_all(&mut self, open: &mut OpenSocket) -> bool {
         loop {
             for _ in 0..READ_BATCH / CALL_BATCH {
                 open.received.clear();
@@ -286,14 +262,14 @@ impl Link {
                         }
                         if open.received.len() < CALL_BATCH {
                             open.mapper.socket_emptied(reading);
-                            return None;
+                            return true;
                         }
                     }
-                    Err(Errno::EAGAIN) => return None,
+                    Err(Errno::EAGAIN) => return true,
                     Err(Errno::EINTR) => {}
                     Err(error) => {
-                        if let Some(end) = self.failed(error).await {
-                            return Some(end);
+                        if !self.survives(error).await {
+                            return false;
                         }
                     }
                 }
@@ -314,19 +290,20 @@ impl Link {
         if self.state != LinkState::Up && time > self.state_since {
             self.enter_at(LinkState::Up, time).await;
         }
-        let what = match received.what {
+        let bus = self.config.bus;
+        let record = match received.what {
             Wire::Frame(frame) if !self.is_wanted(frame.id()) => return,
-            Wire::Frame(frame) => LinkEvent::Frame(frame),
-            Wire::Error(class) => LinkEvent::Event(BusEvent::ErrorFrame { class }),
+            Wire::Frame(frame) => Record::Frame { time, bus, frame },
+            Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
             Wire::Malformed => {
                 self.lost += 1;
-                LinkCounters::add(&self.counters.malformed, 1);
+                self.health.count(|counts| counts.malformed += 1);
                 return;
             }
         };
-        if self.inbox.try_send(LinkMessage { time, bus: self.config.bus, what }).is_err() {
+        if self.inbox.try_send(record).is_err() {
             self.lost += 1;
-            LinkCounters::add(&self.counters.inbox_full, 1);
+            self.health.count(|counts| counts.queue_dropped += 1);
         }
     }
 
@@ -335,67 +312,49 @@ impl Link {
         let total = open.socket.get_ref().dropped_total();
         let dropped = u64::from(total.wrapping_sub(std::mem::replace(&mut open.dropped_total, total)));
         self.lost += dropped;
-        LinkCounters::add(&self.counters.kernel_dropped, dropped);
+        self.health.count(|counts| counts.kernel_dropped += dropped);
     }
 
-    /// Sends what waits, if there is room.
-    async fn send_pending(&mut self, open: &mut OpenSocket) -> Option<ServiceEnd> {
-        let outgoing = open.pending.take()?;
+    /// Sends what waits, if there is room; `false` = the socket is dead.
+    async fn send_pending(&mut self, open: &mut OpenSocket) -> bool {
+        let Some(outgoing) = open.pending.take() else { return true };
         let useless = self.state != LinkState::Up || outgoing.since.elapsed() > SEND_MAX_AGE;
         let result = if useless { Err(Errno::ENETDOWN) } else { open.socket.get_ref().send(&outgoing.frame) };
         match result {
-            Ok(()) => {
-                LinkCounters::add(&self.counters.sent, 1);
-                None
-            }
-            Err(Errno::EAGAIN | Errno::EINTR) => {
-                open.pending = Some(outgoing);
-                None
-            }
+            Ok(()) => self.health.count(|counts| counts.sent += 1),
+            Err(Errno::EAGAIN | Errno::EINTR) => open.pending = Some(outgoing),
             Err(error) => {
                 self.count_unsent();
-                if useless || error == Errno::ENOBUFS { None } else { self.failed(error).await }
+                return useless || error == Errno::ENOBUFS || self.survives(error).await;
             }
         }
+        true
     }
 
-    /// Handles an error of the socket: notes the interface's state; returns whether the socket is dead.
-    async fn failed(&mut self, error: Errno) -> Option<ServiceEnd> {
-        match error {
-            Errno::ENETDOWN => {
-                self.enter(LinkState::Down).await;
-                None
-            }
-            Errno::ENODEV | Errno::ENXIO => {
-                self.enter(LinkState::Missing).await;
-                Some(ServiceEnd::Dead)
-            }
+    /// Handles an error of the socket: notes the interface's state; `false` = the socket is dead.
+    async fn survives(&mut self, error: Errno) -> bool {
+        let (state, is_known, is_alive) = match error {
+            Errno::ENETDOWN => (Some(LinkState::Down), true, true),
+            Errno::ENODEV | Errno::ENXIO => (Some(LinkState::Missing), true, false),
             // A frame this interface cannot carry; counted by the caller.
-            Errno::EINVAL | Errno::EMSGSIZE => {
-                self.problem(&error.into());
-                None
-            }
-            other => {
-                self.problem(&other.into());
-                self.enter(LinkState::Down).await;
-                Some(ServiceEnd::Dead)
-            }
+            Errno::EINVAL | Errno::EMSGSIZE => (None, false, true),
+            _ => (Some(LinkState::Down), false, false),
+        };
+        if !is_known {
+            self.problem(&error.into());
         }
+        if let Some(state) = state {
+            self.enter(state).await;
+        }
+        is_alive
     }
 
     /// Checks whether an interface that was down is up again; `false` when the socket is bound to one that is gone.
     async fn look(&mut self, open: &OpenSocket) -> bool {
-        let raw = RawConfig {
-            interface: &self.config.interface,
-            fd: false,
-            ids: &[],
-            patterns: &[],
-            receive_buffer_bytes: 0,
-        };
         if index_of(&self.config.interface).ok() != Some(open.socket.get_ref().index) {
             return false;
         }
-        if let Ok(None) = RawSocket::open(&raw).and_then(|probe| probe.take_error()) {
+        if let Ok(None) = RawSocket::open(&self.config.interface, false, &[], 0).and_then(|probe| probe.take_error()) {
             self.enter(LinkState::Up).await;
         }
         true
@@ -418,7 +377,7 @@ impl Link {
 
     fn count_unsent(&self) {
         self.unsent.fetch_add(1, Ordering::Relaxed);
-        LinkCounters::add(&self.counters.send_failed, 1);
+        self.health.count(|counts| counts.send_failed += 1);
     }
 
     fn lengthen_pause(&mut self) -> Duration {
@@ -442,7 +401,7 @@ impl Link {
         if state == LinkState::Up {
             self.pause = FIRST_PAUSE;
         }
-        self.counters.enter(state);
+        self.health.enter(state);
         let event = match state {
             LinkState::Up => BusEvent::Up,
             LinkState::Down => BusEvent::Down,
@@ -466,7 +425,7 @@ impl Link {
     /// Sends an event. Events are never dropped: a full inbox is waited for (meanwhile the kernel queues, drops and counts frames).
     async fn notify(&self, time: Timestamp, event: BusEvent) {
         // An error means that the daemon is stopping and no longer receives.
-        let _ = self.inbox.send(LinkMessage { time, bus: self.config.bus, what: LinkEvent::Event(event) }).await;
+        let _ = self.inbox.send(Record::Bus { time, bus: self.config.bus, event }).await;
     }
 
     /// Logs a problem once, until it is another one.

@@ -37,21 +37,6 @@ const MEMINFO_DROPS: usize = 8;
 /// Most filters the kernel takes (CAN_RAW_FILTER_MAX).
 const MAX_KERNEL_FILTERS: usize = 512;
 
-/// How a socket is to be opened.
-#[derive(Debug, Clone)]
-pub(super) struct RawConfig<'a> {
-    /// Kernel name of the interface.
-    pub(super) interface: &'a str,
-    /// Whether FD frames are accepted.
-    pub(super) fd: bool,
-    /// Wanted identifiers.
-    pub(super) ids: &'a [CanId],
-    /// Further extended identifiers, as identifier and mask.
-    pub(super) patterns: &'a [(u32, u32)],
-    /// Receive buffer to ask for, bytes.
-    pub(super) receive_buffer_bytes: usize,
-}
-
 /// A read and its stamps.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct RawRead {
@@ -113,42 +98,38 @@ pub(super) struct RawSocket {
 }
 
 impl RawSocket {
-    /// Opens and binds. Filters are set before the bind, so that not one unwanted frame is queued.
+    /// Opens and binds; `fd` = FD frames too. Filters are set before the bind, so that not one unwanted frame is queued.
     ///
     /// # Errors
     /// `ENODEV` when there is no such interface; an interface that is down opens, and says so in
     /// [`RawSocket::take_error`].
-    pub(super) fn open(config: &RawConfig<'_>) -> io::Result<Self> {
-        Self::open_filtered(config, &filters(config.ids, config.patterns))
-    }
-
-    /// As [`RawSocket::open`], for every identifier.
-    ///
-    /// # Errors
-    /// Those of [`RawSocket::open`].
-    pub(super) fn open_all(interface: &str) -> io::Result<Self> {
-        let receive_buffer_bytes = DEFAULT_RECEIVE_BUFFER_BYTES;
-        let config = RawConfig { interface, fd: true, ids: &[], patterns: &[], receive_buffer_bytes };
-        Self::open_filtered(&config, &[CanFilter::new(0, 0)])
-    }
-
-    fn open_filtered(config: &RawConfig<'_>, filters: &[CanFilter]) -> io::Result<Self> {
+    pub(super) fn open(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
         let flags = SockFlag::SOCK_NONBLOCK | SockFlag::SOCK_CLOEXEC;
-        let fd = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
-        set_stamping(&fd)?;
-        let socket = CanFdSocket::from(fd);
+        let descriptor = socket(AddressFamily::Can, SockType::Raw, flags, SockProtocol::CanRaw)?;
+        set_stamping(&descriptor)?;
+        let socket = CanFdSocket::from(descriptor);
         socket.set_recv_own_msgs(false)?;
         socket.set_socket_option_int(
             socketcan::socket::SOL_CAN_RAW,
             socketcan::socket::CAN_RAW_FD_FRAMES,
-            i32::from(config.fd),
+            i32::from(fd),
         )?;
         socket.set_filters(filters)?;
         socket.set_error_filter_accept_all()?;
-        socket.as_raw_socket().set_recv_buffer_size(config.receive_buffer_bytes)?;
-        let index = index_of(config.interface)?;
+        socket.as_raw_socket().set_recv_buffer_size(buffer_bytes)?;
+        let index = index_of(interface)?;
         socket.as_raw_socket().bind(&CanAddr::new(index).into_sock_addr())?;
         Ok(Self { socket, index })
+    }
+
+    /// As [`RawSocket::open`], on an interface that is up; errors name it.
+    ///
+    /// # Errors
+    /// Those of [`RawSocket::open`], and when the interface is down.
+    pub(super) fn open_up(interface: &str, fd: bool, filters: &[CanFilter], buffer_bytes: usize) -> io::Result<Self> {
+        let opened = Self::open(interface, fd, filters, buffer_bytes);
+        let opened = opened.and_then(|socket| socket.take_error()?.map_or(Ok(socket), Err));
+        opened.map_err(|error| io::Error::new(error.kind(), format!("{interface}: {error}")))
     }
 
     /// The pending error of the socket: `ENETDOWN` right after opening on an interface that is down.
@@ -224,7 +205,7 @@ fn set_stamping(fd: &impl AsFd) -> io::Result<()> {
 
 /// Filters for exactly these identifiers, data frames only. With more than the kernel accepts, the filter is
 /// open and the reader ignores unknown identifiers.
-fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
+pub(super) fn filters(ids: &[CanId], patterns: &[(u32, u32)]) -> Vec<CanFilter> {
     if ids.len() + patterns.len() > MAX_KERNEL_FILTERS {
         return vec![CanFilter::new(0, 0)];
     }

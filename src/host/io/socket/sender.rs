@@ -7,7 +7,7 @@ use std::time::Duration;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
-use super::raw::{RawConfig, RawSocket};
+use super::raw::RawSocket;
 use crate::can::Frame;
 
 /// Pause before a full transmit queue is tried again: about four frames of a 500 kbit/s bus.
@@ -29,13 +29,8 @@ impl CanSender {
     /// # Errors
     /// When the interface does not exist, is down, or this kernel has no SocketCAN.
     pub fn open(interface: &str, fd: bool) -> io::Result<Self> {
-        let named = |error: io::Error| io::Error::new(error.kind(), format!("{interface}: {error}"));
-        let config = RawConfig { interface, fd, ids: &[], patterns: &[], receive_buffer_bytes: 0 };
-        let socket = RawSocket::open(&config).map_err(named)?;
-        match socket.take_error().map_err(named)? {
-            Some(error) => Err(named(error)),
-            None => Ok(Self { socket, interface: interface.to_owned() }),
-        }
+        let socket = RawSocket::open_up(interface, fd, &[], 0)?;
+        Ok(Self { socket, interface: interface.to_owned() })
     }
 
     /// Sends one frame; waits while the transmit queue is full, at most about 2 s.

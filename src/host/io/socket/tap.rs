@@ -1,25 +1,17 @@
-//! Receives everything on an interface: all identifiers, classic and FD, error frames, and the number of dropped frames.
+//! Receives on an interface without a wait: frames, also those of this computer, error frames, and the number of dropped frames.
 
 use std::io;
 
 use nix::errno::Errno;
+use socketcan::CanFilter;
 
-use super::raw::{CALL_BATCH, RawRead, RawSocket};
+use super::raw::{CALL_BATCH, DEFAULT_RECEIVE_BUFFER_BYTES, RawRead, RawSocket, filters};
 use super::wire::Wire;
-use crate::can::Frame;
+use crate::can::CanId;
 use crate::io::clock::{MappedClock, Reading, StampMapper};
-use crate::quantity::Timestamp;
-
-/// A frame or event on the interface.
-#[derive(Debug, Clone, Copy)]
-pub enum TapEvent {
-    /// A frame.
-    Frame(Frame),
-    /// An error frame: its class.
-    Error(u32),
-    /// Number of frames the kernel dropped.
-    Dropped(u64),
-}
+use crate::io::record::Record;
+use crate::monitor::BusEvent;
+use crate::quantity::BusIndex;
 
 /// Listens on one interface; sends nothing and never waits.
 #[derive(Debug)]
@@ -34,30 +26,44 @@ pub struct Tap {
 }
 
 impl Tap {
-    /// Opens the interface; whether it is up.
+    /// Opens the interface for everything: all identifiers, classic and FD. Second: whether it is up.
     ///
     /// # Errors
     /// When the interface does not exist, or this kernel has no SocketCAN.
     pub fn open(interface: &str, clock: MappedClock) -> io::Result<(Self, bool)> {
-        let socket = RawSocket::open_all(interface)?;
+        let socket = RawSocket::open(interface, true, &[CanFilter::new(0, 0)], DEFAULT_RECEIVE_BUFFER_BYTES)?;
         let is_up = socket.take_error()?.is_none();
-        let before = Reading::now();
-        let (mapper, received) = (StampMapper::new(clock, before), Vec::with_capacity(CALL_BATCH));
-        Ok((Self { socket, mapper, received, dropped_total: 0, before }, is_up))
+        Ok((Self::new(socket, clock), is_up))
     }
 
-    /// Appends the frames and events received so far with their times; `false` = there are no more now.
+    /// Opens the interface for these identifiers, ascending, and for extended ones by identifier and mask; `fd` = FD
+    /// frames too.
+    ///
+    /// # Errors
+    /// When the interface does not exist, is down, or this kernel has no SocketCAN.
+    pub fn open_for(interface: &str, fd: bool, ids: &[CanId], patterns: &[(u32, u32)]) -> io::Result<Self> {
+        let socket = RawSocket::open_up(interface, fd, &filters(ids, patterns), DEFAULT_RECEIVE_BUFFER_BYTES)?;
+        Ok(Self::new(socket, MappedClock::new(Reading::now())))
+    }
+
+    fn new(socket: RawSocket, clock: MappedClock) -> Self {
+        let before = Reading::now();
+        let (mapper, received) = (StampMapper::new(clock, before), Vec::with_capacity(CALL_BATCH));
+        Self { socket, mapper, received, dropped_total: 0, before }
+    }
+
+    /// Appends the frames and events received so far, as of interface `bus`; `false` = there are no more now.
     ///
     /// # Errors
     /// When the interface went down (`ENETDOWN`: the tap stays good) or away.
-    pub fn next(&mut self, into: &mut Vec<(Timestamp, TapEvent)>) -> io::Result<bool> {
+    pub fn next(&mut self, bus: BusIndex, into: &mut Vec<Record>) -> io::Result<bool> {
         self.received.clear();
         match self.socket.receive(&mut self.received) {
             Ok(()) => self.before = Reading::now(),
             Err(Errno::EAGAIN) => {
                 self.mapper.socket_empty(self.before);
                 self.before = Reading::now();
-                self.note_dropped(into);
+                self.note_dropped(bus, into);
                 return Ok(false);
             }
             Err(Errno::EINTR) => return Ok(true),
@@ -65,21 +71,20 @@ impl Tap {
         }
         for received in &self.received {
             let time = self.mapper.arrival(received.stamps, self.before);
-            let what = match received.what {
-                Wire::Frame(frame) => TapEvent::Frame(frame),
-                Wire::Error(class) => TapEvent::Error(class),
-                Wire::Malformed => TapEvent::Dropped(1),
-            };
-            into.push((time, what));
+            into.push(match received.what {
+                Wire::Frame(frame) => Record::Frame { time, bus, frame },
+                Wire::Error(class) => Record::Bus { time, bus, event: BusEvent::ErrorFrame { class } },
+                Wire::Malformed => Record::Bus { time, bus, event: BusEvent::Dropped { frames: 1 } },
+            });
         }
         Ok(true)
     }
 
-    fn note_dropped(&mut self, into: &mut Vec<(Timestamp, TapEvent)>) {
+    fn note_dropped(&mut self, bus: BusIndex, into: &mut Vec<Record>) {
         let total = self.socket.dropped_total();
-        let lost = total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total));
-        if lost > 0 {
-            into.push((self.mapper.event(self.before), TapEvent::Dropped(u64::from(lost))));
+        let frames = u64::from(total.wrapping_sub(std::mem::replace(&mut self.dropped_total, total)));
+        if frames > 0 {
+            into.push(Record::Bus { time: self.mapper.event(self.before), bus, event: BusEvent::Dropped { frames } });
         }
     }
 }

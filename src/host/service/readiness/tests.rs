@@ -113,7 +113,7 @@ fn lost_signals_are_counted_and_named_and_all_of_them_are_no_input() {
     scene.feed(0.0, |time| Input::Frame { time, bus: BusIndex(0), frame });
     // Longer than a temperature may be old.
     let line = scene.wait(130).expect("signals were lost");
-    assert!(line.starts_with("running without input; 3 of 3 signals lost (current, "), "{line}");
+    assert!(line.starts_with("running without input; 3 of 3 signals lost (pack current, "), "{line}");
     for _ in 0..20 {
         scene.feed(0.1, |time| Input::Frame { time, bus: BusIndex(0), frame });
     }

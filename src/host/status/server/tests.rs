@@ -142,7 +142,7 @@ fn an_old_document_is_not_served() {
 fn a_second_daemon_does_not_take_the_sockets() {
     let folder = tempfile::tempdir().unwrap();
     let (_server, path) = serve(&folder, PATIENT);
-    let error = StatusServer::start(&SocketSetting::At(path)).unwrap_err();
+    let error = StatusServer::start(&PlaceSetting::At(path)).unwrap_err();
     assert!(error.contains("listens there already") && error.contains("--status"), "{error}");
 }
 

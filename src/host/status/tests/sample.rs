@@ -2,7 +2,7 @@
 
 use crate::alarm::{Alarm, AlarmState, Rule, Severity};
 use crate::control::protocol::UnknownAlarms;
-use crate::io::socket::LinkState;
+use crate::io::socket::{LinkCounts, LinkState};
 use crate::monitor::{AlarmCounts, BusStatistics, LearningCounts, Statistics, Validity, VoltageCounts};
 use crate::quantity::{CellIndex, Mode, Timestamp};
 use crate::sample::ReadingCounts;
@@ -76,15 +76,15 @@ fn interface(name: &str, state: LinkState) -> InterfaceStatus {
         name: name.to_owned(),
         state,
         reconnects: 1,
-        frames: 86_400,
-        error_frames: 4,
-        bus_offs: 1,
-        kernel_dropped: 6,
-        queue_dropped: 0,
-        malformed: 0,
-        sent: 1200,
-        send_queue_full: 8,
-        send_failed: 9,
+        received: BusStatistics { frames: 86_400, error_frames: 4, bus_offs: 1 },
+        link: LinkCounts {
+            kernel_dropped: 6,
+            queue_dropped: 0,
+            malformed: 0,
+            sent: 1200,
+            send_queue_full: 8,
+            send_failed: 9,
+        },
     }
 }
 

@@ -3,7 +3,6 @@
 use proptest::prelude::*;
 
 use super::*;
-use crate::can::dbc::Multiplex;
 use crate::can::e2e::{Profile, Protection};
 use crate::can::encode::{LayoutBase, LayoutSettings, MessageSettings, layout};
 use crate::can::signal::SignalLayout;
@@ -85,8 +84,8 @@ prop_compose! {
         values in prop::collection::vec((any::<i64>(), TEXT), 0..3),
         comment in prop::option::of(TEXT),
     ) -> Signal {
-        let (multiplex, name) = (Multiplex::default(), String::new());
-        Signal { name, layout, unit, receivers, multiplex, is_multiplexor: false, values, comment }
+        let (conditions, name) = (Vec::new(), String::new());
+        Signal { name, layout, unit, receivers, conditions, is_multiplexor: false, values, comment }
     }
 }
 
@@ -106,12 +105,12 @@ fn assemble(parts: Vec<(Signal, Hanging)>) -> Vec<Signal> {
     for (number, (mut signal, (condition, is_multiplexor))) in parts.into_iter().enumerate() {
         signal.name = format!("S{number}");
         signal.is_multiplexor = is_multiplexor;
-        let parents = made.iter().enumerate().filter(|(_, s)| s.is_multiplexor && s.multiplex.conditions.len() < 4);
+        let parents = made.iter().enumerate().filter(|(_, s)| s.is_multiplexor && s.conditions.len() < 4);
         let parents: Vec<usize> = parents.map(|(place, _)| place).collect();
         if let (Some((which, ranges)), false) = (condition, parents.is_empty()) {
             let selector = parents[which.index(parents.len())];
-            signal.multiplex.conditions.clone_from(&made[selector].multiplex.conditions);
-            signal.multiplex.conditions.push(MuxCondition { selector, ranges });
+            signal.conditions.clone_from(&made[selector].conditions);
+            signal.conditions.push(MuxCondition { selector, ranges });
         }
         made.push(signal);
     }

@@ -64,7 +64,7 @@ fn profile_5_moves_the_built_in_signals_by_a_byte_and_keeps_their_pages() {
         for (moved, shipped) in message.signals[2..].iter().zip(&shipped.signals) {
             assert_eq!((&moved.name, moved.layout.start_bit), (&shipped.name, shipped.layout.start_bit + 8));
             let selector = |message: &Message, signal: &Signal| {
-                signal.multiplex.conditions.first().map(|condition| message.signals[condition.selector].name.clone())
+                signal.conditions.first().map(|condition| message.signals[condition.selector].name.clone())
             };
             let shipped_message = default_database().unwrap();
             let shipped_message = shipped_message.message(&message.name).unwrap();

@@ -143,7 +143,7 @@ fn differences(model: &CellModel, config: &EstimatorConfig, rounds: u32) -> (f64
             soc = soc.max((a.mean - b.mean).abs()).max((a.std() - b.std()).abs());
             let near = |a: ScalarGaussian, b: ScalarGaussian| (a.mean - b.mean).abs().max((a.std() - b.std()).abs());
             learned = learned
-                .max(near(bank.capacity(*cell), estimator.capacity()))
+                .max(near(bank.cell(*cell).capacity(), estimator.capacity()))
                 .max(near(bank.log_resistance(*cell), estimator.log_resistance()))
                 .max((bank.mean_nis(*cell) - estimator.memory.mean_nis).abs());
             for (ours, theirs) in bank.branch_v(*cell).into_iter().zip(estimator.branch_v()) {
@@ -258,7 +258,7 @@ fn an_estimator_put_into_the_bank_is_returned_unchanged() {
     assert_eq!(bank.cell(4).snapshot(), other.snapshot());
     assert_ne!(bank.cell(4).snapshot(), before);
     bank.change(4, |estimator| estimator.hold_capacity(1.23));
-    assert_eq!((bank.capacity(4).mean, bank.capacity(7)), (1.23, other.capacity()));
+    assert_eq!((bank.cell(4).capacity().mean, bank.cell(7).capacity()), (1.23, other.capacity()));
     bank.put(4, &CellEstimator::new(&config));
-    assert_eq!((bank.soc(4), bank.capacity(4).mean), (None, config.initial.capacity_ah));
+    assert_eq!((bank.soc(4), bank.cell(4).capacity().mean), (None, config.initial.capacity_ah));
 }

@@ -73,7 +73,7 @@ fn perform(bench: &mut Bench, act: &Act) {
         }
         Act::Gap => {
             bench.transfer = None;
-            bench.node.handle_gap(at(bench.now_ms), &mut bench.out);
+            bench.node.start(at(bench.now_ms), &mut bench.out);
         }
     }
     if bench.node.is_silent() {

@@ -4,9 +4,8 @@
 
 use std::array::from_fn;
 
-use crate::cell::config::{Discretisation, EstimatorConfig};
 use crate::cell::estimator::state_vector::{BRANCHES, square};
-use crate::cell::model::CellModel;
+use crate::cell::{CellModel, Discretisation, EstimatorConfig};
 use crate::filter::simd::{Lanes, Mask};
 
 /// Filter states of L cells: N means each, the T numbers of the covariance's lower triangle, and a memory.

@@ -8,14 +8,14 @@ use tokio::time::{Instant, sleep_until};
 
 /// Waits for the end of the loop.
 #[derive(Debug)]
-pub(crate) struct Stop {
+pub struct Stop {
     terminate: Signal,
     interrupt: Signal,
     at: Option<Instant>,
 }
 
 impl Stop {
-    pub(crate) fn new(duration: Option<Duration>) -> io::Result<Self> {
+    pub fn new(duration: Option<Duration>) -> io::Result<Self> {
         Ok(Self {
             terminate: signal(SignalKind::terminate())?,
             interrupt: signal(SignalKind::interrupt())?,
@@ -23,7 +23,7 @@ impl Stop {
         })
     }
 
-    pub(crate) async fn wait(&mut self) {
+    pub async fn wait(&mut self) {
         let at = self.at;
         let timer = async move {
             match at {

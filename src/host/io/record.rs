@@ -4,9 +4,6 @@ use crate::can::Frame;
 use crate::monitor::{BusEvent, Command, Downtime, Input};
 use crate::quantity::{BusIndex, Timestamp};
 
-/// Content of an unused slot.
-pub(super) const UNUSED: Record = Record::Tick { time: Timestamp::ZERO };
-
 /// An input that owns its frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Record {
@@ -67,6 +64,9 @@ pub enum Record {
 }
 
 impl Record {
+    /// An unused place.
+    pub(super) const UNUSED: Self = Self::Tick { time: Timestamp::ZERO };
+
     /// The input of the core; `None` for a record that is none.
     pub fn input(&self) -> Option<Input<'_>> {
         Some(match self {
@@ -126,7 +126,7 @@ impl Batch {
     /// Room for up to `max` (1 to [`MAX`](Self::MAX)) records. With more than one, the source may be read a little further
     /// than the records used say.
     pub fn new(max: usize) -> Self {
-        Self { slots: vec![UNUSED; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
+        Self { slots: vec![Record::UNUSED; max.clamp(1, Self::MAX)].into_boxed_slice(), len: 0, carries_ticks: false }
     }
 
     /// The records.
