@@ -43,6 +43,7 @@
 //! | an end-to-end profile | `core/can/e2e.rs` (profiles, checksums), `core/can/e2e/receiver.rs` (states); its name in TOML: `host/config/protect.rs` |
 //! | plausibility of a reading | `core/sample/signal.rs` |
 //! | the filter's process or measurement noise | `core/cell/estimator/noise.rs` |
+//! | how an aged cell's open-circuit curve changes, a half-cell potential | `core/cell/aged_ocv.rs`, `core/cell/electrodes.rs`; found by `lab/ident/electrodes.rs` |
 //! | what a half-cycle teaches of the capacity | `core/health/learner.rs` |
 //! | what a stored state holds | `core/monitor/snapshot.rs` |
 //! | a configuration key | its table in `host/config/keys/` (`input`, `limits`, `algorithms`, `traffic`); `host/config/mod.rs` lists the steps |

@@ -129,7 +129,8 @@ impl TruthCell {
 
     fn unloaded_v(&self, model: &CellModel, hysteresis: &Hysteresis) -> f64 {
         let place = model.grid_position(self.soc, self.temperature_c);
-        model.ocv_v(&place) + hysteresis.magnitude_v * self.hysteresis - self.branch_v.iter().sum::<f64>()
+        let ocv_v = model.aged_ocv_v(&place, model.aged_ocv.segment(self.capacity_ah), self.capacity_ah);
+        ocv_v + hysteresis.magnitude_v * self.hysteresis - self.branch_v.iter().sum::<f64>()
     }
 
     fn step(&mut self, model: &CellModel, settings: &PackSettings, current_a: f64, dt_s: f64) {

@@ -130,7 +130,7 @@ section! {
         warning: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional;
         /// The same for severity "severe". Without it: no such alarm.
         severe: Option<Threshold>, "the rule's", Between(-1e9, 1e9), Optional;
-        /// The alarm clears when the value is back on the healthy side of the threshold by this much, where the threshold has no `clear`. Without it: 2 % of the threshold.
+        /// The alarm clears when the value is back on the healthy side of the threshold by this much, where the threshold has no `clear`. Without it: 2 % of the threshold. An alarm of a learned value also waits until the truth is there with a probability of 95 %.
         hysteresis: Option<f64>, "the rule's", Between(0.0, 1e9), Optional;
         /// What is compared with the threshold. "mean": the value itself. `{ probability = 0.95 }`: the alarm is raised when the probability that the true value is beyond the threshold exceeds that level, and clears when the probability that it is beyond the clear threshold is at most that level and at most one half. A level above one half raises the alarm later and less often wrongly; a level below it raises it earlier.
         when: Comparison, "", Any, Default("\"mean\"");

@@ -43,6 +43,19 @@ fn faults_of_a_cell_model() {
             "cell.toml:9: thermal.resistance_k_per_w = 0, must be above 0 and at most 1000000000",
         ),
         ("[tables]", "[tables]\nx = 1", "cell.toml:10: tables.x is not a known key"),
+        (
+            "[provenance]",
+            "[electrodes]\npositive = \"nmc\"\nnegative = \"graphite\"\npositive_content = [0.9, 0.3]\n\
+             negative_content = [0.0, 0.9]\n[provenance]",
+            "cell.toml:8: electrodes.positive = \"nmc\", must be nmc811 or nmc532 or nca or nco or lco or \
+             lco_ramadass or lmo or lfp",
+        ),
+        (
+            "[provenance]",
+            "[electrodes]\npositive = \"nmc811\"\nnegative = \"graphite\"\npositive_content = [0.3, 0.9]\n\
+             negative_content = [0.0, 0.9]\n[provenance]",
+            "cell.toml:10: electrodes.positive_content = [0.3, 0.9], must be two numbers, empty and full, the higher first",
+        ),
     ];
     for (from, to, fault) in table {
         assert!(CELL.contains(from), "{from}");
