@@ -82,8 +82,7 @@ mod tests {
     #[test]
     fn time_moves_forward_and_jumps_are_reported() {
         let at = Timestamp::from_secs;
-        let mut clock = Clock::default();
-        clock.now = at(100.0);
+        let mut clock = Clock { now: at(100.0), ..Clock::default() };
         assert_eq!((clock.advance(at(105.0)), clock.now), (None, at(105.0)));
         // Merged out of order: counted, and the time stays.
         assert_eq!((clock.advance(at(104.5)), clock.now), (None, at(105.0)));
