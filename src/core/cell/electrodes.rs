@@ -12,7 +12,7 @@
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
 //! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve.
 
-use super::model::bisect;
+use crate::filter::bisect;
 
 /// Smallest distance of a lithium content from 0 and 1, where the half-cell functions diverge.
 const EDGE: f64 = 1e-4;
@@ -320,67 +320,4 @@ impl AgedElectrodes {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use super::*;
-
-    /// The LG M50 of Chen et al. (2020), as fitted to its slow discharge.
-    pub(crate) const M50: Electrodes = Electrodes {
-        positive: PositiveMaterial::Nmc811,
-        negative: NegativeMaterial::GraphiteSiox,
-        positive_content: [0.8531, 0.2679],
-        negative_content: [0.0335, 0.9107],
-    };
-
-    #[test]
-    fn materials_fall_with_their_lithium_content() {
-        // Functions fitted to measurements rise by a few millivolts somewhere.
-        let falls = |potential_v: &dyn Fn(f64) -> f64| {
-            (1..=90).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
-        };
-        assert!(NegativeMaterial::ALL.iter().all(|(material, _)| falls(&|x| material.potential_v(x))));
-        // The polynomial of NCA holds from 0.3 on, the functions of LCO from 0.45 on.
-        for (material, from) in PositiveMaterial::ALL.map(|(material, _)| match material {
-            PositiveMaterial::Nca => (material, 0.3),
-            PositiveMaterial::Lco | PositiveMaterial::LcoRamadass => (material, 0.45),
-            _ => (material, 0.15),
-        }) {
-            assert!(falls(&|y| material.potential_v(y.max(from))), "{material:?}");
-        }
-    }
-
-    #[test]
-    fn an_unaged_cell_is_the_new_one() {
-        let same = M50.aged(LostMaterial::default(), 1.0).expect("a cell");
-        assert!(same.lithium_lost().abs() < 1e-6, "{same:?}");
-        for k in 0..=20 {
-            let soc = f64::from(k) / 20.0;
-            assert!((same.voltage_v(soc) - M50.voltage_v(soc)).abs() < 1e-6, "{soc}");
-        }
-    }
-
-    #[test]
-    fn proportional_loss_of_everything_keeps_the_curve() {
-        let lost = LostMaterial { negative: 0.2, positive: 0.2 };
-        let aged = M50.aged(lost, 0.8).expect("a cell");
-        assert!((aged.lithium_lost() - 0.2).abs() < 1e-6, "{aged:?}");
-        assert!((0..=10).map(|k| 0.1 * f64::from(k)).all(|z| (aged.voltage_v(z) - M50.voltage_v(z)).abs() < 1e-6));
-    }
-
-    #[test]
-    fn lost_lithium_alone_slides_the_electrodes_and_keeps_both_ends() {
-        let aged = M50.aged(LostMaterial::default(), 0.8).expect("a cell");
-        assert!((aged.capacity() - 0.8).abs() < 1e-6);
-        for end in [0.0, 1.0] {
-            assert!((aged.voltage_v(end) - M50.voltage_v(end)).abs() < 1e-6);
-        }
-        // The graphite's last stage comes at a lower SOC; the positive electrode is emptier all along.
-        assert!(aged.voltage_v(0.5) - M50.voltage_v(0.5) > 0.03, "{}", aged.voltage_v(0.5) - M50.voltage_v(0.5));
-        assert!((0..100).all(|k| aged.voltage_v(0.01 * f64::from(k + 1)) > aged.voltage_v(0.01 * f64::from(k))));
-    }
-
-    #[test]
-    fn a_loss_that_leaves_no_such_cell_has_no_curve() {
-        assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
-        assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
-    }
-}
+pub(crate) mod tests;

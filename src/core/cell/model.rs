@@ -12,6 +12,7 @@
 //! Effect: none where both are constant.
 
 use super::aged_ocv::{AgedOcv, OffsetLine};
+use crate::filter::bisect;
 
 /// Most RC branches a model may have.
 pub const MAX_BRANCHES: usize = 3;
@@ -246,15 +247,6 @@ impl CellModel {
         let (low, high) = bisect((-0.5, 1.5), 40, is_below);
         0.5 * (low + high)
     }
-}
-
-/// Halves the interval `ends` again and again towards the place where `is_below` turns false; the nearest end if it never
-/// does.
-pub(crate) fn bisect(ends: (f64, f64), halvings: u32, is_below: impl Fn(f64) -> bool) -> (f64, f64) {
-    (0..halvings).fold(ends, |(low, high), _| {
-        let middle = 0.5 * (low + high);
-        if is_below(middle) { (middle, high) } else { (low, middle) }
-    })
 }
 
 #[cfg(test)]

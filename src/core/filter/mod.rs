@@ -1,11 +1,13 @@
-//! Kalman filters on plain numbers, independent of batteries.
+//! Kalman filters and bisection on plain numbers, independent of batteries.
 //!
 //! In: means, (co)variances and measurements in any unit. Out: the same after a prediction or an update. A step that
 //! cannot be computed returns a [`FilterError`] and changes nothing.
 
+pub mod bisection;
 pub mod linear;
 pub mod simd;
 pub mod unscented;
 
+pub use bisection::bisect;
 pub use linear::{Measurement, ScalarGaussian, update_states};
 pub use unscented::{FilterError, Gaussian, MeasurementNoise, SigmaPointWeights, Update};

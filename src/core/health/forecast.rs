@@ -30,7 +30,7 @@ mod tests;
 use serde::{Deserialize, Serialize};
 
 use self::distribution::Crossing;
-use crate::cell::model::bisect;
+use crate::filter::bisect;
 use crate::filter::update_states;
 use crate::quantity::InvalidState;
 

@@ -13,7 +13,7 @@
 //! its own width w, an added variance of (w / L)^2 / 12.
 
 use super::{RATE_WALK, RATE_WALK_USE};
-use crate::cell::model::bisect;
+use crate::filter::bisect;
 
 /// Slices of the loss.
 const SLICES: usize = 10;
