@@ -34,7 +34,7 @@ pub(crate) struct Args {
     #[arg(long, value_name = "AH", value_parser = above_0)]
     rated: Option<f64>,
     /// How far the open-circuit curve shifts with lost capacity: 0 = it shrinks evenly, 1 = pure loss of lithium. A prior: no fit
-    /// of a new cell determines it [default: 0, for an ageing cell 0.5, chosen on two whole lives]
+    /// of a new cell determines it [default: electrodes found in a slow test; without them 0.5 for a slow test or an ageing cell, chosen on two whole lives, else 0]
     #[arg(long, value_name = "SHARE", value_parser = share)]
     ageing_shift: Option<f64>,
     /// Lowest voltage under load [default: from the data]

@@ -16,7 +16,7 @@ pub use picture::write as write_plot;
 pub use toml::text;
 
 use super::measured::MeasuredFile;
-use crate::cell::Thermal;
+use crate::cell::{AgedOcv, Thermal};
 use crate::error::LabError;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
@@ -54,7 +54,7 @@ const TAU_S: [&[f64]; 3] = [&[60.0], &[10.0, 150.0], &[5.0, 50.0, 500.0]];
 /// Temperature of the half-cell potentials, degrees C.
 const ELECTRODES_C: f64 = 25.0;
 
-/// Shift of an ageing cell's open-circuit curve (see `CellModel::ocv_soc`) unless another is given. A prior, not a result: no
+/// Shift of an ageing cell's open-circuit curve (see `AgedOcv::of_shift`) unless another is given. A prior, not a result: no
 /// fit of a new cell determines it. 0 = the curve shrinks evenly, 1 = pure loss of lithium. The value was
 /// chosen on two measured whole lives.
 pub const AGEING_SHIFT: f64 = 0.5;
@@ -72,7 +72,8 @@ pub struct FitRequest {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity; `None` = 0, of an ageing cell [`AGEING_SHIFT`].
+    /// How far the open-circuit curve shifts with lost capacity; `None` = electrodes from a slow test, else [`AGEING_SHIFT`]
+    /// for a slow test or an ageing cell, else 0.
     pub ageing_shift: Option<f64>,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
@@ -162,7 +163,12 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let files = by_file(&all, &prepared, &records, &fitted);
     // The curve of full discharges under load is too coarse.
     let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
-    let electrodes = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
+    let found = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
+    let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(fitted.grid.soc.len()).map(<[f64]>::to_vec).collect();
+    let ages = |found: &FittedElectrodes| {
+        AgedOcv::of_electrodes(&found.electrodes, &fitted.grid.soc, prepared.capacity_ah, &rows).is_some()
+    };
+    let electrodes = found.filter(ages);
     let mut outcome = FitOutcome {
         electrodes,
         capacity_ah: prepared.capacity_ah,

@@ -39,7 +39,7 @@ class Model:
         raw = tomllib.loads(path.read_text())
         tables = raw["tables"]
         (branch,) = tables["branches"]
-        if raw.get("ocv_ageing_shift", 0) or "voltage_error_v" in tables:
+        if raw.get("ocv_ageing_shift", 0) or "electrodes" in raw or "voltage_error_v" in tables:
             sys.exit("replay.py: ageing shift and error tables are not implemented here")
         self.rated_ah, self.capacity_ah = raw["rated_capacity_ah"], raw["capacity_ah"]
         self.soc, self.temperature_c = tables["soc"], tables["temperature_c"]

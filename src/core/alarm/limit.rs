@@ -5,17 +5,16 @@
 //!
 //! ```text
 //! beyond    P(truth beyond the set threshold)   >  p
-//! healthy   P(truth beyond the clear threshold) <= min(p, 0.5)
+//! healthy   P(truth beyond the clear threshold) <= min(p, c)
 //! ```
 //!
-//! where the second holds at most at p = 0.5: an alarm is cleared by a value that is at the clear threshold or better,
+//! where c is 0.5, and 0.05 for a learned value: an alarm is cleared by a value that is at the clear threshold or better,
 //! never by doubt that has grown. As the clear threshold is on the healthy side of the set threshold, the second
 //! probability is the larger one: no value is both. With p = 0.5 this is the plain comparison. A value without a standard
 //! deviation where one is needed is not to be judged.
 //!
 //! A learned value (a capacity, a resistance, a life) does not recover by itself: an estimate that wanders about its
-//! threshold must not clear its alarm. With `when = "mean"` it is healthy only while P(truth beyond the clear threshold)
-//! is at most 0.05 as well.
+//! threshold must not clear its alarm, whichever quantity is compared.
 
 use super::{Direction, Rule, Severity};
 
@@ -114,14 +113,14 @@ impl LimitCheck {
         };
         let (set, clear) = (good_by(rule.threshold), good_by(rule.clear));
         let probability = std.map(|std| probability_beyond(set, std));
+        let clear_level = if rule.rule.spec().is_learned { LEARNED_CLEAR_LEVEL } else { CLEAR_LEVEL };
         let (is_beyond, is_healthy) = match rule.when {
             Comparison::Mean => {
-                let is_sure = std.is_none_or(|std| probability_beyond(clear, std) <= LEARNED_CLEAR_LEVEL);
-                (set < 0.0, clear >= 0.0 && (is_sure || !rule.rule.spec().is_learned))
+                (set < 0.0, clear >= 0.0 && std.is_none_or(|std| probability_beyond(clear, std) <= clear_level))
             }
             Comparison::Probability(level) => {
                 let (Some(beyond), Some(std)) = (probability, std) else { return (Self::Unknown, None) };
-                (beyond > level, probability_beyond(clear, std) <= level.min(CLEAR_LEVEL))
+                (beyond > level, probability_beyond(clear, std) <= level.min(clear_level))
             }
         };
         let check = match (is_beyond, is_healthy) {
@@ -187,7 +186,8 @@ mod tests {
         // Cleared by a value at the clear threshold, not by doubt.
         assert_eq!(check(&rule, 1.5 - 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
         assert_eq!(check(&rule, 1.2, Some(10.0)), LimitCheck::Between);
-        assert_eq!(check(&rule, 1.5, Some(10.0)), LimitCheck::Healthy);
+        let soc = RuleConfig { rule: Rule::SocLow, ..rule.clone() };
+        assert_eq!(check(&soc, 1.5, Some(10.0)), LimitCheck::Healthy);
         let early = low(Comparison::Probability(0.05));
         assert_eq!(check(&early, 1.4 + 0.1 * 1.64, Some(0.1)), LimitCheck::Beyond);
         assert_eq!(check(&early, 1.5 + 0.1 * 1.64, Some(0.1)), LimitCheck::Between);
@@ -200,9 +200,11 @@ mod tests {
     fn half_probability_is_the_mean_rule() {
         for step in -20..20 {
             let value = 1.4 + 0.013 * f64::from(step) + 1e-6;
-            let not_learned = |when| RuleConfig { rule: Rule::SocLow, ..low(when) };
-            let by_mean = check(&not_learned(Comparison::Mean), value, Some(0.07));
-            assert_eq!(check(&not_learned(Comparison::Probability(0.5)), value, Some(0.07)), by_mean, "{value}");
+            for rule in [Rule::CapacityLow, Rule::SocLow] {
+                let with = |when| RuleConfig { rule, ..low(when) };
+                let by_mean = check(&with(Comparison::Mean), value, Some(0.07));
+                assert_eq!(check(&with(Comparison::Probability(0.5)), value, Some(0.07)), by_mean, "{value}");
+            }
         }
     }
 

@@ -19,11 +19,15 @@ pub const MATERIAL_SHARE: f64 = 0.3;
 /// Standard deviation of [`MATERIAL_SHARE`], of each electrode.
 pub const MATERIAL_SHARE_STD: f64 = 0.3;
 
-/// Capacities of the table, parts of the new cell's, rising.
-const CAPACITIES: [f64; 13] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0, 1.05, 1.1];
+/// Capacities of aged cells in the table, parts of the new cell's, rising. Further above the new one's capacity a cell is
+/// a larger one, whose curve no longer changes.
+const LOST_CAPACITIES: [f64; 10] = [0.4, 0.5, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95];
 
-/// Largest shift: the curve would fold at 1.
-const MAX_SHIFT: f64 = 0.9;
+/// Capacity down to which the electrodes must say how the cell ages, part of the new cell's: a usual end of life.
+const LEAST_KNOWN: f64 = 0.7;
+
+/// Least slope that an aged curve keeps anywhere, part of the new curve's.
+const LEAST_RISE: f64 = 0.1;
 
 /// Offsets of the open-circuit voltage over capacity and SOC; without capacities it never changes.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -58,46 +62,81 @@ impl OffsetLine {
 }
 
 impl AgedOcv {
-    /// By the electrodes of the new cell; `None` when they allow no aged cell.
-    pub fn of_electrodes(electrodes: &Electrodes, soc: &[f64], new_capacity_ah: f64) -> Option<Self> {
-        let curve = |share: LostMaterial, part: f64| {
-            let lost = |share: f64| share * (1.0 - part);
-            let lost = LostMaterial { negative: lost(share.negative), positive: lost(share.positive) };
+    /// By the electrodes of the new cell; `None` when they do not say how it ages down to [`LEAST_KNOWN`]. `rows` are the new
+    /// cell's open-circuit voltages, V, by temperature.
+    pub fn of_electrodes(
+        electrodes: &Electrodes,
+        soc: &[f64],
+        new_capacity_ah: f64,
+        rows: &[Vec<f64>],
+    ) -> Option<Self> {
+        let curve = |negative: f64, positive: f64, part: f64| {
+            let lost = LostMaterial { negative: negative * (1.0 - part), positive: positive * (1.0 - part) };
             let aged = electrodes.aged(lost, part)?;
             Some(soc.iter().map(|&z| aged.voltage_v(z) - electrodes.voltage_v(z)).collect::<Vec<f64>>())
         };
-        let mean = LostMaterial { negative: MATERIAL_SHARE, positive: MATERIAL_SHARE };
         let (low, high) = (MATERIAL_SHARE - MATERIAL_SHARE_STD, MATERIAL_SHARE + MATERIAL_SHARE_STD);
-        let mut table = Self::default();
-        for part in CAPACITIES {
-            // A cell above the new one's capacity is a larger cell, with the new one's curve.
-            let part_or_new = part.min(1.0);
-            let Some(offset_v) = curve(mean, part_or_new) else { continue };
-            let spread = |share: fn(f64) -> LostMaterial| {
-                let (low, high) = (curve(share(low), part_or_new), curve(share(high), part_or_new));
-                low.zip(high).map(|(low, high)| low.iter().zip(high).map(|(a, b)| 0.5 * (b - a)).collect::<Vec<f64>>())
-            };
-            let negative = spread(|negative| LostMaterial { negative, positive: MATERIAL_SHARE });
-            let positive = spread(|positive| LostMaterial { negative: MATERIAL_SHARE, positive });
-            let Some((negative, positive)) = negative.zip(positive) else { continue };
-            table.capacity_ah.push(part * new_capacity_ah);
-            table.offset_v.push(offset_v);
-            table.error_v.push(negative.iter().zip(positive).map(|(a, b)| libm::hypot(*a, b)).collect());
+        let half_width = |a: Vec<f64>, b: Vec<f64>| a.iter().zip(b).map(|(a, b)| 0.5 * (b - a)).collect::<Vec<f64>>();
+        let row = |part: f64| {
+            let offset_v = curve(MATERIAL_SHARE, MATERIAL_SHARE, part)?;
+            let negative = half_width(curve(low, MATERIAL_SHARE, part)?, curve(high, MATERIAL_SHARE, part)?);
+            let positive = half_width(curve(MATERIAL_SHARE, low, part)?, curve(MATERIAL_SHARE, high, part)?);
+            let error_v = negative.iter().zip(positive).map(|(a, b)| libm::hypot(*a, b));
+            Some((offset_v, error_v.collect::<Vec<f64>>()))
+        };
+        // From the new cell down, as far as there are such cells.
+        let aged: Vec<_> = LOST_CAPACITIES.iter().rev().map_while(|&part| Some((part, row(part)?))).collect();
+        if aged.last().is_none_or(|(part, _)| *part > LEAST_KNOWN) {
+            return None;
         }
-        (table.capacity_ah.len() > CAPACITIES.len() / 2).then_some(table)
+        let mut table = Self::default();
+        for (part, (offset_v, error_v)) in aged.into_iter().rev() {
+            table.push(part * new_capacity_ah, offset_v, rows);
+            table.error_v.push(error_v);
+        }
+        table.error_v.extend([vec![0.0; soc.len()], vec![0.0; soc.len()]]);
+        table.finish(new_capacity_ah, rows);
+        Some(table)
     }
 
-    /// By a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new) and the new cell's curve `ocv_v`. 1 = the top keeps its
-    /// ampere-hours, 0 = the curve shrinks evenly.
-    pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, ocv_v: impl Fn(f64) -> f64) -> Self {
+    /// By a shift: OCV(s + a s (1 - s)) with a = shift (1 - C / C_new) and the middle one of the new cell's `rows`, V, by
+    /// temperature. 1 = the top keeps its ampere-hours, 0 = the curve shrinks evenly.
+    pub fn of_shift(shift: f64, soc: &[f64], new_capacity_ah: f64, rows: &[Vec<f64>]) -> Self {
         let mut table = Self::default();
-        for part in CAPACITIES.into_iter().filter(|_| shift != 0.0) {
-            let lost = (shift * (1.0 - part)).clamp(-MAX_SHIFT, MAX_SHIFT);
-            let row = soc.iter().map(|&z| ocv_v(z + lost * z * (1.0 - z)) - ocv_v(z));
-            table.capacity_ah.push(part * new_capacity_ah);
-            table.offset_v.push(row.collect());
+        if shift == 0.0 {
+            return table;
         }
+        let ocv_v = |at: f64| interpolate(soc, &rows[rows.len() / 2], at);
+        for part in LOST_CAPACITIES {
+            let lost = shift * (1.0 - part);
+            let offset_v = soc.iter().map(|&z| ocv_v(z + lost * z * (1.0 - z)) - ocv_v(z)).collect();
+            table.push(part * new_capacity_ah, offset_v, rows);
+        }
+        table.finish(new_capacity_ah, rows);
         table
+    }
+
+    /// Adds the new cell, and a little above it the opposite of the first loss: round the capacity at which cells start the
+    /// curve changes smoothly.
+    fn finish(&mut self, new_capacity_ah: f64, rows: &[Vec<f64>]) {
+        let Some((&aged_ah, aged_v)) = self.capacity_ah.last().zip(self.offset_v.last().cloned()) else { return };
+        self.push(new_capacity_ah, vec![0.0; aged_v.len()], rows);
+        self.push(2.0 * new_capacity_ah - aged_ah, aged_v.iter().map(|offset_v| -offset_v).collect(), rows);
+    }
+
+    /// Adds a row of offsets, made smaller where the aged curve would not rise with the SOC at every temperature: the tables
+    /// of the new cell differ from its electrodes' curve.
+    fn push(&mut self, capacity_ah: f64, mut offset_v: Vec<f64>, rows: &[Vec<f64>]) {
+        let factor = rows.iter().flat_map(|row| row.windows(2).zip(offset_v.windows(2))).fold(
+            1.0_f64,
+            |factor, (new, offset)| {
+                let (rise_v, change_v) = (new[1] - new[0], offset[1] - offset[0]);
+                if change_v < 0.0 { factor.min((1.0 - LEAST_RISE) * rise_v / -change_v) } else { factor }
+            },
+        );
+        offset_v.iter_mut().for_each(|offset_v| *offset_v *= factor);
+        self.capacity_ah.push(capacity_ah);
+        self.offset_v.push(offset_v);
     }
 
     /// Borders between the segments of capacity, Ah, rising: one segment more than borders.
@@ -142,53 +181,11 @@ impl AgedOcv {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::cell::electrodes::tests::M50;
-
-    const SOC: [f64; 6] = [0.0, 0.2, 0.4, 0.6, 0.8, 1.0];
-
-    fn offset_v(table: &AgedOcv, s: usize, capacity_ah: f64) -> f64 {
-        table.line(&SOC, table.segment(capacity_ah), s).at(SOC[s], capacity_ah)
-    }
-
-    #[test]
-    fn nothing_changes_without_capacities_and_for_a_new_cell() {
-        let none = AgedOcv::default();
-        assert_eq!((none.line(&SOC, 0, 2), none.error_v(2, 1.0)), (OffsetLine::default(), None));
-        assert_eq!(AgedOcv::of_shift(0.0, &SOC, 2.0, |z| z), none);
-        let table = AgedOcv::of_electrodes(&M50, &SOC, 5.0).expect("a table");
-        for (s, capacity_ah) in [(0, 4.0), (1, 5.0), (4, 5.2), (5 - 1, 9.0)] {
-            assert!(offset_v(&table, s, capacity_ah).abs() < 1e-6, "{s} {capacity_ah}");
-        }
-    }
-
-    #[test]
-    fn offsets_are_the_aged_curve_less_the_new_one_and_continuous_over_capacity() {
-        let table = AgedOcv::of_electrodes(&M50, &SOC, 5.0).expect("a table");
-        let lost = LostMaterial { negative: 0.3 * 0.2, positive: 0.3 * 0.2 };
-        let aged = M50.aged(lost, 0.8).expect("a cell");
-        for (s, z) in SOC.into_iter().enumerate().take(5) {
-            let expected_v = aged.voltage_v(z) - M50.voltage_v(z);
-            assert!((offset_v(&table, s, 4.0) - expected_v).abs() < 1e-9, "{z}");
-            for border in table.borders_ah() {
-                let (below, above) = (offset_v(&table, s, border - 1e-9), offset_v(&table, s, border + 1e-9));
-                assert!((below - above).abs() < 1e-6, "{z} {border}");
-            }
-            let (least, edge) = (offset_v(&table, s, 0.5), offset_v(&table, s, 2.0));
-            assert!((least - edge).abs() < 1e-9, "constant below the lowest capacity: {least} {edge}");
-        }
-        let error_v = |capacity_ah| table.error_v(2, capacity_ah).expect("known");
-        assert!(error_v(4.0) > 0.002 && error_v(5.0) < 1e-6, "{}", error_v(4.0));
-    }
-
-    #[test]
-    fn a_shift_moves_the_inside_of_the_curve_only() {
-        let table = AgedOcv::of_shift(0.8, &SOC, 2.0, |z| 3.0 + z);
-        // A quarter lost: a = 0.8 x 0.25 = 0.2.
-        assert!((offset_v(&table, 2, 1.5) - 0.2 * 0.4 * 0.6).abs() < 1e-12);
-        assert_eq!(offset_v(&table, 0, 1.5), 0.0);
-        assert!(table.line(&SOC, table.segment(1.5), 4).at(1.0, 1.5).abs() < 1e-12);
-    }
+/// Linear between the points, which rise in `x`; the outer lines continue.
+fn interpolate(x: &[f64], y: &[f64], at: f64) -> f64 {
+    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
+    y[k] + (y[k + 1] - y[k]) * (at - x[k]) / (x[k + 1] - x[k])
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,19 +6,25 @@
 //! when new; its capacity is Q_n (x_full - x_empty).
 //!
 //! An ageing cell loses lithium (n falls) and active material of either electrode (Q_n, Q_p fall): Birkl et al., J. Power
-//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. Which lithium the lost material takes along
-//! need not be known: it moves n alone, and n follows from the capacity.
+//! Sources 341 (2017) 373; Dubarry et al., J. Power Sources 219 (2012) 204. The lithium that lost material takes
+//! along need not be known: it changes n alone, and n follows from the capacity.
 //!
 //! In: materials and lithium contents of the new cell. Out: V, and capacity as a fraction of the new cell's. Nothing
-//! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve.
+//! outside the contents 0 to 1 is returned; a loss that leaves no cell has no curve. An ageing cell never gains lithium.
 
 use crate::filter::bisect;
 
 /// Smallest distance of a lithium content from 0 and 1, where the half-cell functions diverge.
 const EDGE: f64 = 1e-4;
 
-/// Least and greatest cyclable lithium in the search for a capacity, relative to the new cell's.
-const LITHIUM_RANGE: (f64, f64) = (0.05, 1.2);
+/// Least cyclable lithium in the search for a capacity, relative to the new cell's.
+const LEAST_LITHIUM: f64 = 0.05;
+
+/// Lithium, relative to the new cell's, with which a cell without an excess of it has less capacity.
+const LITHIUM_PROBE: f64 = 0.995;
+
+/// Largest error of an aged cell's end voltages, V.
+const END_TOLERANCE_V: f64 = 0.001;
 
 /// Half-cell potential of a positive electrode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,9 +77,20 @@ impl PositiveMaterial {
         (Self::Lfp, "lfp"),
     ];
 
-    /// Potential against lithium, V, at a lithium content.
+    /// Least lithium content at which its function holds: below it the published fits rise, or have poles.
+    pub const fn least_content(self) -> f64 {
+        match self {
+            Self::Nca => 0.3,
+            Self::Lco => 0.4,
+            Self::LcoRamadass => 0.44,
+            Self::Nmc811 | Self::Nmc532 | Self::Nco | Self::Lmo | Self::Lfp => EDGE,
+        }
+    }
+
+    /// Potential against lithium, V, at a lithium content; beyond the contents where the function holds, that at their end.
     pub fn potential_v(self, y: f64) -> f64 {
         use libm::{exp, pow, tanh};
+        let y = y.clamp(self.least_content(), 1.0 - EDGE);
         match self {
             Self::Nmc811 => {
                 -0.8090 * y + 4.4875 - 0.0428 * tanh(18.5138 * (y - 0.5542)) - 17.7326 * tanh(15.7890 * (y - 0.3117))
@@ -131,9 +148,10 @@ impl NegativeMaterial {
         (Self::McmbRamadass, "mcmb_ramadass"),
     ];
 
-    /// Potential against lithium, V, at a lithium content.
+    /// Potential against lithium, V, at a lithium content; beyond [`EDGE`], that at the edge.
     pub fn potential_v(self, x: f64) -> f64 {
         use libm::{exp, tanh};
+        let x = x.clamp(EDGE, 1.0 - EDGE);
         match self {
             Self::GraphiteSiox => {
                 1.9793 * exp(-39.3631 * x) + 0.2482
@@ -236,7 +254,7 @@ impl Electrodes {
 
     /// Open-circuit voltage of the new cell, V.
     pub fn voltage_v(&self, soc: f64) -> f64 {
-        let between = |[empty, full]: [f64; 2]| (empty + soc * (full - empty)).clamp(EDGE, 1.0 - EDGE);
+        let between = |[empty, full]: [f64; 2]| empty + soc * (full - empty);
         self.positive.potential_v(between(self.positive_content))
             - self.negative.potential_v(between(self.negative_content))
     }
@@ -248,11 +266,13 @@ impl Electrodes {
         [negative, positive, negative * self.negative_content[1] + positive * self.positive_content[1]]
     }
 
-    /// The cell that has lost this material and so much lithium that this part of the capacity is left; `None` when there
-    /// is no such cell.
+    /// The cell that has lost this material and so much lithium that this part of the capacity is left. `None` when there
+    /// is no such cell, when it cannot reach its end voltages, or when the new cell holds more lithium than it can use: then
+    /// the capacity does not say how much is lost.
     pub fn aged(&self, lost: LostMaterial, capacity: f64) -> Option<AgedElectrodes> {
         let [negative, positive, new_lithium] = self.new_contents();
-        let cell = |lithium: f64| {
+        let ends_v = [0.0, 1.0].map(|soc| self.voltage_v(soc));
+        let cell = |lost: LostMaterial, lithium: f64| {
             let mut cell = AgedElectrodes {
                 electrodes: *self,
                 negative_capacity: negative * (1.0 - lost.negative),
@@ -260,14 +280,18 @@ impl Electrodes {
                 lithium,
                 negative_content: [0.0; 2],
             };
-            cell.negative_content = [0.0, 1.0].map(|soc| cell.content_at(self.voltage_v(soc)));
+            cell.negative_content = ends_v.map(|voltage_v| cell.content_at(voltage_v));
             cell
         };
-        let least = LITHIUM_RANGE.0 * new_lithium;
-        // More lithium than the electrodes hold at their best balance lowers the capacity again.
-        let most = most_capable(least, LITHIUM_RANGE.1 * new_lithium, |lithium| cell(lithium).capacity());
-        let found = cell(crossing((least, most), |lithium| cell(lithium).capacity() < capacity));
-        ((found.capacity() - capacity).abs() < 1e-6).then_some(found)
+        let new = |lithium: f64| cell(LostMaterial::default(), lithium).capacity();
+        if new(LITHIUM_PROBE * new_lithium) >= new(new_lithium) {
+            return None;
+        }
+        let is_below = |lithium: f64| cell(lost, lithium).capacity() < capacity;
+        let found = cell(lost, crossing((LEAST_LITHIUM * new_lithium, new_lithium), is_below));
+        let reaches = |(soc, end_v): (f64, f64)| (found.voltage_v(soc) - end_v).abs() < END_TOLERANCE_V;
+        let is_whole = [0.0, 1.0].into_iter().zip(ends_v).all(reaches);
+        (is_whole && (found.capacity() - capacity).abs() < 1e-6).then_some(found)
     }
 }
 
@@ -277,22 +301,11 @@ fn crossing(ends: (f64, f64), is_below: impl Fn(f64) -> bool) -> f64 {
     0.5 * (low + high)
 }
 
-/// Where a function with one maximum between `low` and `high` has it, by golden section.
-fn most_capable(mut low: f64, mut high: f64, f: impl Fn(f64) -> f64) -> f64 {
-    const GOLDEN: f64 = 0.618_033_988_749_894_8;
-    for _ in 0..40 {
-        let (a, b) = (high - GOLDEN * (high - low), low + GOLDEN * (high - low));
-        if f(a) < f(b) { low = a } else { high = b }
-    }
-    0.5 * (low + high)
-}
-
 impl AgedElectrodes {
     /// Voltage at a lithium content of the negative electrode, V; rises with it.
     fn voltage_at(&self, x: f64) -> f64 {
         let y = (self.lithium - self.negative_capacity * x) / self.positive_capacity;
-        let inside = |content: f64| content.clamp(EDGE, 1.0 - EDGE);
-        self.electrodes.positive.potential_v(inside(y)) - self.electrodes.negative.potential_v(inside(x))
+        self.electrodes.positive.potential_v(y) - self.electrodes.negative.potential_v(x)
     }
 
     /// Lithium content of the negative electrode at which the cell has this voltage.

@@ -34,7 +34,7 @@ section! {
         rated_capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
         /// Charge of a new cell from full to empty open-circuit voltage.
         capacity_ah: f64, "Ah", Above(0.0, 1e5), Required;
-        /// How far the open-circuit curve shifts as the cell loses capacity, where `[electrodes]` does not say it: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner.
+        /// How far the open-circuit curve shifts as the cell loses capacity, where `[electrodes]` does not say it: 0 = it shrinks evenly over SOC; 1 = the top keeps its ampere-hours and the empty end comes sooner. Without either: 0.
         ocv_ageing_shift: Option<f64>, "", Between(0.0, 1.0), Optional;
         /// Lowest voltage under load.
         voltage_min_v: f64, "V", Above(0.0, 100.0), Required;
@@ -70,7 +70,7 @@ section! {
 }
 
 section! {
-    /// The electrodes of the new cell, as `packwatch fit` finds them: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a part of its most.
+    /// The electrodes of the new cell, as `packwatch fit` finds them: how the open-circuit curve changes as lithium and active material are lost. The lithium content of an electrode is a fraction of its maximum.
     ElectrodesKeys at "electrodes" gives Electrodes, |keys| {
         /// Material of the positive electrode.
         positive: PositiveMaterial, "", Any, Required;
@@ -176,38 +176,28 @@ fn aged_ocv(head: &Head, tables: &Tables, electrodes: Option<&ElectrodesKeys>, f
     if !faults.is_empty() {
         return AgedOcv::default();
     }
+    let (soc, rows) = (&tables.soc, &tables.ocv_v);
     let Some(keys) = electrodes else {
-        // The curve of the middle temperature stands for all.
-        let ocv_v = &tables.ocv_v[tables.temperature_c.len() / 2];
-        let shift = head.ocv_ageing_shift.unwrap_or(0.0);
-        return AgedOcv::of_shift(shift, &tables.soc, head.capacity_ah, |soc| interpolated(&tables.soc, ocv_v, soc));
+        return AgedOcv::of_shift(head.ocv_ageing_shift.unwrap_or(0.0), soc, head.capacity_ah, rows);
     };
     if head.ocv_ageing_shift.is_some() {
         head.place.fault(faults, "ocv_ageing_shift", "must not be given together with [electrodes]");
     }
-    for (key, [empty, full], rises) in [
-        ("positive_content", ends(&keys.positive_content), false),
-        ("negative_content", ends(&keys.negative_content), true),
-    ] {
-        let count = if key == "positive_content" { keys.positive_content.len() } else { keys.negative_content.len() };
-        if count != 2 || empty == full || (full > empty) != rises {
-            let what =
-                format!("must be two numbers, empty and full, the {} first", if rises { "lower" } else { "higher" });
-            keys.place.fault(faults, key, &what);
+    let (positive, negative) = (&keys.positive_content, &keys.negative_content);
+    for (key, contents, rises) in [("positive_content", positive, false), ("negative_content", negative, true)] {
+        let [empty, full] = ends(contents);
+        if contents.len() != 2 || empty == full || (full > empty) != rises {
+            let first = if rises { "lower" } else { "higher" };
+            keys.place.fault(faults, key, &format!("must be two numbers, empty and full, the {first} first"));
         }
     }
     if !faults.is_empty() {
         return AgedOcv::default();
     }
-    AgedOcv::of_electrodes(&keys.config(), &tables.soc, head.capacity_ah).unwrap_or_else(|| {
-        keys.place.note(faults, "positive_content", "these electrodes allow no aged cell");
+    AgedOcv::of_electrodes(&keys.config(), soc, head.capacity_ah, rows).unwrap_or_else(|| {
+        keys.place.note(faults, "positive_content", "these electrodes do not say how the cell ages");
         AgedOcv::default()
     })
-}
-
-fn interpolated(x: &[f64], y: &[f64], at: f64) -> f64 {
-    let k = x[1..x.len() - 1].iter().take_while(|&&border| at >= border).count();
-    y[k] + (y[k + 1] - y[k]) * (at - x[k]) / (x[k + 1] - x[k])
 }
 
 fn model(

@@ -22,7 +22,8 @@ const BOUNDS: [(f64, f64); 4] = [(0.0005, 0.25), (0.4, 0.999), (0.55, 0.9995), (
 /// Steps of the fit; it settles within 20.
 const STEPS: usize = 60;
 /// Residual above which no pair is accepted, V: the library does not have the cell's materials. Curves of published cells
-/// fit within 5 mV by their own materials; by others only beyond 10 mV, and then age no better than by a shift.
+/// fit within 5 mV by their own materials, by others mostly beyond 10 mV. A pair of others within the limit can age better
+/// than by a shift, or worse: the limit is a compromise.
 pub const MAX_RESIDUAL_V: f64 = 0.008;
 
 /// The electrodes found.
@@ -87,7 +88,9 @@ fn fit_pair(curve: &[(f64, f64)], pair: (PositiveMaterial, NegativeMaterial)) ->
         let gradient = Vector4::from_fn(|i, _| dot(&columns[i], &r));
         let Some(inverse) = normal.try_inverse() else { break };
         let mut next = x - inverse * gradient;
-        next.iter_mut().zip(BOUNDS).for_each(|(x, (low, high))| *x = x.clamp(low, high));
+        let least = [0.0, 0.0, 0.0, pair.0.least_content()];
+        let bounds = next.iter_mut().zip(BOUNDS).zip(least);
+        bounds.for_each(|((x, (low, high)), least)| *x = x.clamp(low.max(least), high));
         let trial = residuals(&next);
         if cost(&trial) < cost(&r) {
             (x, r) = (next, trial);

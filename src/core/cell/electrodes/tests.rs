@@ -10,20 +10,25 @@ pub(crate) const M50: Electrodes = Electrodes {
     negative_content: [0.0335, 0.9107],
 };
 
+/// An LFP cell.
+pub(crate) const LFP: Electrodes = Electrodes {
+    positive: PositiveMaterial::Lfp,
+    negative: NegativeMaterial::GraphiteSiox,
+    positive_content: [0.92, 0.03],
+    negative_content: [0.02, 0.81],
+};
+
 #[test]
 fn materials_fall_with_their_lithium_content() {
     // Functions fitted to measurements rise by a few millivolts somewhere.
     let falls = |potential_v: &dyn Fn(f64) -> f64| {
-        (1..=90).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
+        (1..=98).all(|k| potential_v(0.01 * f64::from(k)) > potential_v(0.01 * f64::from(k + 1)) - 0.004)
     };
     assert!(NegativeMaterial::ALL.iter().all(|(material, _)| falls(&|x| material.potential_v(x))));
-    // The polynomial of NCA holds from 0.3 on, the functions of LCO from 0.45 on.
-    for (material, from) in PositiveMaterial::ALL.map(|(material, _)| match material {
-        PositiveMaterial::Nca => (material, 0.3),
-        PositiveMaterial::Lco | PositiveMaterial::LcoRamadass => (material, 0.45),
-        _ => (material, 0.15),
-    }) {
-        assert!(falls(&|y| material.potential_v(y.max(from))), "{material:?}");
+    for (material, _) in PositiveMaterial::ALL {
+        assert!(falls(&|y| material.potential_v(y)), "{material:?}");
+        // Constant where the function does not hold.
+        assert_eq!(material.potential_v(0.0), material.potential_v(material.least_content()));
     }
 }
 
@@ -61,4 +66,12 @@ fn lost_lithium_alone_slides_the_electrodes_and_keeps_both_ends() {
 fn a_loss_that_leaves_no_such_cell_has_no_curve() {
     assert!(M50.aged(LostMaterial { negative: 0.5, positive: 0.0 }, 0.9).is_none());
     assert!(M50.aged(LostMaterial::default(), 3.0).is_none());
+    // An excess of lithium: less of it leaves more capacity.
+    let excess = Electrodes {
+        negative: NegativeMaterial::Mcmb,
+        negative_content: [0.035, 0.956],
+        positive_content: [0.979, 0.376],
+        ..LFP
+    };
+    assert!(excess.aged(LostMaterial::default(), 0.9).is_none());
 }

@@ -166,7 +166,7 @@ section! {
         end_error_v: f64, "V", DEVIATION, Default("0.005");
         /// The same, relative to the voltage that the load drops in the cell ("swing" only).
         end_load_error: f64, "", DEVIATION, Default("0.075");
-        /// Standard deviation of the cell model's `ocv_ageing_shift` ("swing" only): uncertainty of how the curve changes with lost capacity.
+        /// Standard deviation of the cell model's `ocv_ageing_shift` ("swing" only): uncertainty of how the curve changes with lost capacity. With `[electrodes]` the model states its own.
         ageing_shift_error: f64, "", DEVIATION, Default("0.3");
         /// Standard deviation of the current sensor's gain: no capacity is more accurate than this.
         current_gain_std: f64, "fraction", Between(0.0, 1.0), Default("0.005");
