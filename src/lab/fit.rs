@@ -318,3 +318,36 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn test_of(ocv_v: impl Fn(f64) -> f64) -> OcvCurve {
+        let soc: Vec<f64> = (0..=1000).map(|k| f64::from(k) / 1000.0).collect();
+        let voltage_v = soc.iter().map(|&soc| ocv_v(soc)).collect();
+        OcvCurve { temperature_c: 25.0, soc, voltage_v }
+    }
+
+    #[test]
+    fn a_straight_curve_needs_no_more_breakpoints() {
+        assert_eq!(curvature_nodes(&test_of(|soc| 3.0 + soc)), SLOW_TEST_SOC_NODES);
+    }
+
+    #[test]
+    fn breakpoints_are_added_where_the_curve_bends() {
+        let step = |soc: f64| 3.0 + soc + 0.05 * ((soc - 0.63) / 0.02).tanh();
+        let nodes = curvature_nodes(&test_of(step));
+        assert!(nodes.len() > SLOW_TEST_SOC_NODES.len() && nodes.len() <= MAX_NODES, "{nodes:?}");
+        assert!(nodes.windows(2).all(|pair| pair[1] - pair[0] > 0.99 * NODE_GAP), "{nodes:?}");
+        // Only the two intervals at the step are divided.
+        let added = nodes.iter().filter(|node| !SLOW_TEST_SOC_NODES.contains(node));
+        assert!(added.into_iter().all(|&node| (0.5..0.8).contains(&node)), "{nodes:?}");
+        let error_v = (500..800).map(|k| f64::from(k) / 1000.0).map(|soc| {
+            let s = nodes.partition_point(|&node| node <= soc) - 1;
+            let (from, to) = (nodes[s], nodes[s + 1]);
+            (step(soc) - step(from) - (step(to) - step(from)) * (soc - from) / (to - from)).abs()
+        });
+        assert!(error_v.fold(0.0, f64::max) < 0.008, "{nodes:?}");
+    }
+}

@@ -375,7 +375,9 @@ fn half_cycle(moved_ah: f64, duration_s: f64, a: &CellMark, b: &CellMark) -> Hal
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cell::AgedOcv;
     use crate::cell::CellStep;
+    use crate::cell::electrodes::tests::M50;
     use crate::cell::estimator::tests::config as estimator_config;
     use crate::cell::model::tests::small_model;
 
@@ -463,6 +465,18 @@ mod tests {
         let expected = (1.8 / swing) * (1.8 / swing) * soc_variance;
         let found = end_variance_ah2(&model, &config, &moved, 1.8);
         assert!((found / expected - 1.0).abs() < 1e-9, "{found} {expected}");
+        // With electrodes the model states the error of the aged curve; a new cell has none.
+        let mut known = model.clone();
+        known.aged_ocv =
+            AgedOcv::of_electrodes(&M50, &model.soc, model.capacity_ah, &model.ocv_v.values).expect("a table");
+        config.ageing_shift_error = 9.0;
+        let with = |model: &CellModel, capacity_ah: f64| end_variance_ah2(model, &config, &moved, capacity_ah);
+        let plain = CapacityConfig { ageing_shift_error: 0.0, ..config };
+        let without = |capacity_ah: f64| end_variance_ah2(&known, &plain, &moved, capacity_ah);
+        assert!((with(&known, 2.0) / without(2.0) - 1.0).abs() < 1e-9, "the shift's error does not count");
+        let slopes = with(&known, 1.7) / end_variance_ah2(&model, &plain, &moved, 1.7);
+        assert!(slopes > 1.05, "{slopes}");
+        config.ageing_shift_error = 0.5;
         // A tiny swing counts as the smallest one; a half-cycle without an estimated end has no ends.
         let tiny = HalfCycle { charge_ah: 0.001, ..moved };
         let least = (1.8 / MIN_WEIGHED_SWING) * (1.8 / MIN_WEIGHED_SWING) * soc_variance;

@@ -67,3 +67,41 @@ fn faults_of_a_cell_model() {
     let none = read_texts(PACK, CELL.split("[[tables.branches]]").next().unwrap(), DBC).unwrap_err();
     assert_eq!(none, ["cell.toml:9: tables.branches: 0 tables [[tables.branches]], must be 1 to 3"]);
 }
+
+#[test]
+fn electrodes_say_how_the_curve_ages() {
+    let with = |contents: &str| {
+        let keys =
+            format!("[electrodes]\npositive = \"nmc811\"\nnegative = \"graphite_siox\"\n{contents}\n[provenance]");
+        read_texts(PACK, &CELL.replacen("[provenance]", &keys, 1), DBC)
+    };
+    let good = "positive_content = [0.8531, 0.2679]\nnegative_content = [0.0335, 0.9107]";
+    let model = with(good).expect("a configuration").0.monitor.model;
+    assert!(model.aged_ocv.borders_ah().contains(&model.capacity_ah), "{:?}", model.aged_ocv.borders_ah());
+    assert_eq!(good_model().aged_ocv, crate::cell::AgedOcv::default(), "without them the curve only shrinks");
+    let faults = [
+        (
+            "positive_content = [0.85, 0.27]\nnegative_content = [0.9, 0.03]",
+            "cell.toml:11: electrodes.negative_content = [0.9, 0.03], must be two numbers, empty and full, the lower first",
+        ),
+        (
+            "positive_content = [0.85, 0.27]\nnegative_content = [0.03, 0.5, 0.9]",
+            "cell.toml:11: electrodes.negative_content = [0.03, 0.5, 0.9], must be two numbers, empty and full, the lower first",
+        ),
+        (
+            "positive_content = [0.4, 0.39]\nnegative_content = [0.0, 0.01]",
+            "cell.toml:10: electrodes.positive_content: these electrodes do not say how the cell ages",
+        ),
+    ];
+    for (contents, fault) in faults {
+        assert_eq!(with(contents).expect_err("a fault"), [fault]);
+    }
+    let both = CELL.replacen("[provenance]", "ocv_ageing_shift = 0.5\n[provenance]", 1);
+    let keys = format!("[electrodes]\npositive = \"nmc811\"\nnegative = \"graphite_siox\"\n{good}\n[provenance]");
+    let faults = read_texts(PACK, &both.replacen("[provenance]", &keys, 1), DBC).expect_err("a fault");
+    assert_eq!(faults, ["cell.toml:7: ocv_ageing_shift = 0.5, must not be given together with [electrodes]"]);
+}
+
+fn good_model() -> crate::cell::CellModel {
+    good(PACK).monitor.model
+}
