@@ -166,7 +166,7 @@ mod tests {
         let mut batch = VariantBatch::default();
         let numbers = [1.5, 1.6].map(|threshold| batch.watch(&low(Rule::CapacityLow, threshold)));
         let mut engines = batch.engines(1);
-        for (second, value) in [(1, 1.7), (2, 1.55), (3, 1.7), (4, 1.4)] {
+        for (second, value) in [(1, 1.9), (2, 1.55), (3, 1.9), (4, 1.4)] {
             let (rule, cell) = (Rule::CapacityLow, Some(CellIndex(0)));
             let seen = Observation::new(Some(value)).with_std(0.1);
             let time = Timestamp::from_secs(f64::from(second));
