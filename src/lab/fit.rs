@@ -20,8 +20,8 @@ use crate::cell::{AgedOcv, Thermal};
 use crate::error::LabError;
 use crate::ident::electrodes::{self, FittedElectrodes};
 use crate::ident::error_table::WeightedRecord;
-use crate::ident::fit::{FitSettings, FittedTables, OcvCurve, Residual};
-use crate::ident::grid::{Grid, interpolate};
+use crate::ident::fit::{FitSettings, FittedTables, Residual};
+use crate::ident::grid::Grid;
 use crate::ident::prior::PriorDeviations;
 use crate::ident::record::{self, Record};
 use crate::ident::{error_table, fit, thermal};
@@ -33,16 +33,8 @@ const SOC_NODES: [f64; 24] = [
     0.0, 0.025, 0.05, 0.075, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85,
     0.9, 0.95, 0.975, 1.0,
 ];
-/// First SOC breakpoints where slow tests give the OCV's shape; more are put where that bends ([`curvature_nodes`]).
+/// SOC breakpoints where slow tests give the OCV's shape.
 const SLOW_TEST_SOC_NODES: [f64; 15] = [0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0];
-/// Largest error of the SOC read from the interpolated OCV of a slow test, fraction: below the noise of good sensors.
-const NODE_ERROR_SOC: f64 = 0.003;
-/// Error of the voltage below which no breakpoint is added, V: below a good sensor's step.
-const NODE_ERROR_V: f64 = 0.001;
-/// Most SOC breakpoints.
-const MAX_NODES: usize = 41;
-/// Least distance of SOC breakpoints.
-const NODE_GAP: f64 = 0.01;
 /// SOC breakpoints for an ageing cell's full discharges, whose knee is sharp.
 const AGEING_SOC_NODES: [f64; 25] = [
     0.0, 0.03, 0.045, 0.06, 0.075, 0.09, 0.105, 0.12, 0.14, 0.17, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.75, 0.8, 0.85,
@@ -72,9 +64,10 @@ pub struct FitRequest {
     pub voltage_min_v: Option<f64>,
     /// Highest voltage under charge, V; `None` = from the data.
     pub voltage_max_v: Option<f64>,
-    /// How far the open-circuit curve shifts with lost capacity; `None` = electrodes from a slow test, else [`AGEING_SHIFT`]
-    /// for a slow test or an ageing cell, else 0.
+    /// How far the open-circuit curve shifts with lost capacity; `None` = 0, of an ageing cell [`AGEING_SHIFT`].
     pub ageing_shift: Option<f64>,
+    /// Whether to find the electrodes in a slow test instead.
+    pub find_electrodes: bool,
     /// Slow tests.
     pub ocv: Vec<PathBuf>,
     /// RC branches, 1 to 3; `None` = 2, of an ageing cell 1.
@@ -162,7 +155,7 @@ pub fn run(request: &FitRequest, mut progress: impl FnMut(FitProgress)) -> Resul
     let all: Vec<&MeasuredFile> = files.iter().chain(&slow).collect();
     let files = by_file(&all, &prepared, &records, &fitted);
     // The curve of full discharges under load is too coarse.
-    let has_curve = !prepared.ocv.is_empty() && request.ageing_shift.is_none();
+    let has_curve = !prepared.ocv.is_empty() && request.find_electrodes;
     let found = if has_curve { electrodes::identify(|soc| fitted.ocv_v(soc, ELECTRODES_C)) } else { None };
     let rows: Vec<Vec<f64>> = fitted.tables.ocv_v.chunks(fitted.grid.soc.len()).map(<[f64]>::to_vec).collect();
     let ages = |found: &FittedElectrodes| {
@@ -222,7 +215,7 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
     let temperature_c = request.temperature_c.clone().unwrap_or_else(|| prepared.temperature_nodes());
     let (default_soc, deviations) = match (ageing, prepared.ocv.first()) {
         (true, _) => (AGEING_SOC_NODES.to_vec(), PriorDeviations::AGEING),
-        (false, Some(test)) => (curvature_nodes(test), PriorDeviations::SLOW_TEST),
+        (false, Some(_)) => (SLOW_TEST_SOC_NODES.to_vec(), PriorDeviations::SLOW_TEST),
         (false, None) => (SOC_NODES.to_vec(), PriorDeviations::FREE_OCV),
     };
     Ok(FitSettings {
@@ -234,27 +227,6 @@ fn settings(request: &FitRequest, prepared: &prepare::FitInputs) -> Result<FitSe
         empty_ocv_v: ageing.then_some(prepared.voltage_v.0),
         deviations,
     })
-}
-
-/// SOC breakpoints between which the curve of a slow test is straight: one after the other where the SOC read from the
-/// interpolated curve errs most.
-fn curvature_nodes(test: &OcvCurve) -> Vec<f64> {
-    let mut nodes = SLOW_TEST_SOC_NODES.to_vec();
-    let ocv_v = |soc: f64| interpolate(&test.soc, &test.voltage_v, soc);
-    while nodes.len() < MAX_NODES {
-        let worst = (1..100).map(|k| f64::from(k) / 100.0).filter_map(|soc| {
-            let s = nodes.partition_point(|&node| node <= soc) - 1;
-            let (from, to) = (nodes[s], nodes[s + 1]);
-            let (from_v, to_v) = (ocv_v(from), ocv_v(to));
-            let error_v = (ocv_v(soc) - from_v - (to_v - from_v) * (soc - from) / (to - from)).abs();
-            let error_soc = error_v * (to - from) / (to_v - from_v).max(1e-6);
-            let fits = soc - from >= NODE_GAP && to - soc >= NODE_GAP;
-            (fits && error_v > NODE_ERROR_V && error_soc > NODE_ERROR_SOC).then_some((error_soc, soc, s + 1))
-        });
-        let Some((_, soc, at)) = worst.max_by(|a, b| a.0.total_cmp(&b.0)) else { break };
-        nodes.insert(at, soc);
-    }
-    nodes
 }
 
 /// Least slope of an ageing cell's OCV: relaxation slower than its branch would bend the top of the curve down.
@@ -295,10 +267,9 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
     if let Some(found) = &outcome.electrodes {
         let (positive, negative) = found.electrodes.names();
         outcome.notes.push(format!("electrodes {positive} and {negative}, within {:.1} mV", 1e3 * found.residual_v));
-    } else if !request.ocv.is_empty() && request.ageing_shift.is_none() {
+    } else if request.find_electrodes {
         let most_mv = 1e3 * electrodes::MAX_RESIDUAL_V;
-        let what =
-            format!("no known electrodes within {most_mv} mV: the curve ages by ocv_ageing_shift = {AGEING_SHIFT}");
+        let what = format!("no known electrodes within {most_mv} mV of a slow test's curve: how it ages is not known");
         outcome.notes.push(what);
     }
     let outliers: usize = outcome.files.iter().map(|file| file.outliers).sum();
@@ -316,38 +287,5 @@ fn add_notes(request: &FitRequest, outcome: &mut FitOutcome) {
                 format!("no data near {t} degrees C at soc {}: these nodes follow their neighbours", soc.join(", "));
             outcome.notes.push(what);
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn test_of(ocv_v: impl Fn(f64) -> f64) -> OcvCurve {
-        let soc: Vec<f64> = (0..=1000).map(|k| f64::from(k) / 1000.0).collect();
-        let voltage_v = soc.iter().map(|&soc| ocv_v(soc)).collect();
-        OcvCurve { temperature_c: 25.0, soc, voltage_v }
-    }
-
-    #[test]
-    fn a_straight_curve_needs_no_more_breakpoints() {
-        assert_eq!(curvature_nodes(&test_of(|soc| 3.0 + soc)), SLOW_TEST_SOC_NODES);
-    }
-
-    #[test]
-    fn breakpoints_are_added_where_the_curve_bends() {
-        let step = |soc: f64| 3.0 + soc + 0.05 * ((soc - 0.63) / 0.02).tanh();
-        let nodes = curvature_nodes(&test_of(step));
-        assert!(nodes.len() > SLOW_TEST_SOC_NODES.len() && nodes.len() <= MAX_NODES, "{nodes:?}");
-        assert!(nodes.windows(2).all(|pair| pair[1] - pair[0] > 0.99 * NODE_GAP), "{nodes:?}");
-        // Only the two intervals at the step are divided.
-        let added = nodes.iter().filter(|node| !SLOW_TEST_SOC_NODES.contains(node));
-        assert!(added.into_iter().all(|&node| (0.5..0.8).contains(&node)), "{nodes:?}");
-        let error_v = (500..800).map(|k| f64::from(k) / 1000.0).map(|soc| {
-            let s = nodes.partition_point(|&node| node <= soc) - 1;
-            let (from, to) = (nodes[s], nodes[s + 1]);
-            (step(soc) - step(from) - (step(to) - step(from)) * (soc - from) / (to - from)).abs()
-        });
-        assert!(error_v.fold(0.0, f64::max) < 0.008, "{nodes:?}");
     }
 }

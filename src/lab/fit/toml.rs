@@ -37,7 +37,7 @@ fn head(out: &mut String, request: &FitRequest, outcome: &FitOutcome) {
     line(out, &format!("name = {}", quoted(&request.name)));
     line(out, &format!("rated_capacity_ah = {:.4}", request.rated_ah.unwrap_or(outcome.capacity_ah)));
     line(out, &format!("capacity_ah = {:.4}", outcome.capacity_ah));
-    let unknown = outcome.electrodes.is_none() && (request.first_cycles.is_some() || !request.ocv.is_empty());
+    let unknown = outcome.electrodes.is_none() && (request.first_cycles.is_some());
     if let Some(shift) = request.ageing_shift.or(unknown.then_some(AGEING_SHIFT)) {
         line(out, &format!("ocv_ageing_shift = {shift}"));
     }
