@@ -263,3 +263,20 @@ fn a_restated_capacity_moves_the_mean_and_never_lowers_the_variance() {
     estimator.restate_capacity(ScalarGaussian { mean: 1.6, variance: 9.0 * before.variance });
     assert_eq!(estimator.capacity(), ScalarGaussian { mean: 1.6, variance: 9.0 * before.variance });
 }
+
+#[test]
+fn an_aged_cell_starts_on_its_aged_curve() {
+    let mut model = small_model();
+    model.aged_ocv = crate::cell::AgedOcv::of_shift(0.8, &model.soc, model.capacity_ah, &model.ocv_v.values);
+    let mut config = config();
+    config.initial.capacity_ah = 1.5;
+    // So sure of its start that the first voltage does not move it.
+    config.initial.soc_std = 1e-3;
+    let mut truth = Truth { soc: 0.4, branch_v: 0.0, capacity_ah: 1.5, ratio: 1.0 };
+    let mut estimator = CellEstimator::new(&config);
+    let step = truth.step(&model, 0.0, 1.0);
+    estimator.step(&model, &config, &step);
+    let soc = estimator.soc().expect("started").mean;
+    // The new cell's curve would give 0.45.
+    assert!((soc - 0.4).abs() < 0.005, "{soc}");
+}
